@@ -289,7 +289,18 @@ def begun_session(
         "the session has its own",
     )
     if words.robot is not None:
-        session = _with_robot(session, words.robot)
+        document = {
+            **session.document,
+            "robot": {**session.document.get("robot", {}), "model": words.robot},
+        }
+        session = Session.assemble(
+            document,
+            session.columns,
+            [[view.cell(column) for column in session.columns] for view in session.views],
+            session.images,
+            target_document=session.target_document,
+            robot_document=load_robot(words.robot).document,
+        )
     recorded = calibrate_partially(session, progress=progress)
     begun = start_from_session(recorded, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))
@@ -334,18 +345,6 @@ def pose_of(words: str, option: str) -> FloatArray:
     numbers = numbers_in(",".join(words.replace(",", " ").split()), option, "x,y,z,rx,ry,rz")
     turn = Rotation.from_euler("xyz", numbers[3:], degrees=True).as_matrix()
     return compose(turn, 1e-3 * np.array(numbers[:3]))
-
-
-def _with_robot(session: Session, name: str) -> Session:
-    document = {**session.document, "robot": {**session.document.get("robot", {}), "model": name}}
-    return Session.assemble(
-        document,
-        session.columns,
-        [[view.cell(column) for column in session.columns] for view in session.views],
-        session.images,
-        target_document=session.target_document,
-        robot_document=load_robot(name).document,
-    )
 
 
 def _calibrated(

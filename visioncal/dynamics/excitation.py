@@ -332,7 +332,8 @@ class _ExcitationSearch:
                 "--duration, --margin-deg, --clearance-mm, --floor.",
             )
         condition, series, kept = self._best
-        result = (series, condition, self._random(), kept, starts)
+        drawn = [self._figures(self._modest(self._posture())) for _ in range(20)]
+        result = (series, condition, float(np.median(drawn)), kept, starts)
         return Excitation(request, self._base, self._weights, *result)
 
     @property
@@ -434,8 +435,3 @@ class _ExcitationSearch:
         ]
         scaled = 0.5 * np.min(shares, axis=0)[:, None] * free
         return Series(self._harmonics, scaled + np.outer(posture, resting[0]))
-
-    def _random(self) -> float:
-        """Median condition of random motions, for comparison."""
-        drawn = [self._figures(self._modest(self._posture())) for _ in range(20)]
-        return float(np.median(drawn))

@@ -9,7 +9,6 @@ import numpy as np
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.threads import on_one_blas_thread
-from visioncal.core.types import FloatArray
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.identified import Identified, Lag
 from visioncal.dynamics.identify import (
@@ -273,7 +272,11 @@ def _split(
 ) -> _Split | None:
     """Holds out the end of the fastest motion; None where the rest determines too little."""
     # Sweeps move one joint after the other: no part of them is representative.
-    fastest = int(np.argmax([_speed(stream) for stream in streams]))
+    speeds = [
+        np.concatenate([piece.measured.motion.dq for piece in stream.pieces]) for stream in streams
+    ]
+    # By the root mean square speed of the slowest joint.
+    fastest = int(np.argmax([np.sqrt(np.mean(dq**2, axis=0)).min() for dq in speeds]))
     filtered = replace(request, cutoff_hz=streams[fastest].cutoff_hz)
     begin = recorded[fastest].part(0.0, 1.0 - HELD_OUT)
     end = recorded[fastest].part(1.0 - HELD_OUT, 1.0)
@@ -305,9 +308,3 @@ def _quick(options: Options, rotors: bool) -> Options:
     """Options for base parameters alone."""
     terms = replace(options.terms, motor_inertia=rotors)
     return Options(terms, stribeck=False, consistent=False, checked=False)
-
-
-def _speed(stream: Conditioned) -> FloatArray:
-    """Root mean square speed of the slowest joint [rad/s]."""
-    speeds = np.concatenate([piece.measured.motion.dq for piece in stream.pieces])
-    return np.asarray(np.sqrt(np.mean(speeds**2, axis=0)).min())

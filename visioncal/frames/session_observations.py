@@ -62,7 +62,30 @@ def detect_session_target(
     Raises:
         DataError: No view is usable, or the session is of another camera.
     """
-    target = _checked_target(session, calibration)
+    check_mount(session, calibration)
+    if session.robot_document is not None and calibration.robot is not None:
+        check_robot(session, Robot.from_document(session.robot_document), calibration.robot)
+    if session.mount == "instrument":
+        raise DataError(
+            f"session {session.name!r} is of an instrument; a camera sees what is located.",
+            culprits=[session.name],
+            next_step="Name a session with images of it. visioncal verify checks a calibration by "
+            "readings of the instrument.",
+        )
+    if session.target is None:
+        raise DataError(
+            f"session {session.name!r} names no target to look for.",
+            culprits=["session.toml: target"],
+            next_step='Add target = "charuco_9x6_30mm", or what the images show.',
+        )
+    if session.targets:
+        names = ", ".join(session.targets)
+        raise DataError(
+            f"session {session.name!r} has several targets ({names}); one is looked for at a time.",
+            culprits=["session.toml: targets"],
+            next_step="Make a session with the rows of the one that is meant.",
+        )
+    target = session.target
     wanted = session.views if among is None else tuple(among)
     poses, lost = _poses(session, calibration, parent, wanted)
     detected = detect(session, progress=progress, among=_usable(session, wanted, target, lost))
@@ -133,33 +156,6 @@ def no_usable_image(shown: SessionImages, lost: Mapping[int, str]) -> DataError:
         culprits=culprits,
         next_step=f"First: {culprits[0]}.",
     )
-
-
-def _checked_target(session: Session, calibration: Calibration) -> Target:
-    check_mount(session, calibration)
-    if session.robot_document is not None and calibration.robot is not None:
-        check_robot(session, Robot.from_document(session.robot_document), calibration.robot)
-    if session.mount == "instrument":
-        raise DataError(
-            f"session {session.name!r} is of an instrument; a camera sees what is located.",
-            culprits=[session.name],
-            next_step="Name a session with images of it. visioncal verify checks a calibration by "
-            "readings of the instrument.",
-        )
-    if session.target is None:
-        raise DataError(
-            f"session {session.name!r} names no target to look for.",
-            culprits=["session.toml: target"],
-            next_step='Add target = "charuco_9x6_30mm", or what the images show.',
-        )
-    if session.targets:
-        names = ", ".join(session.targets)
-        raise DataError(
-            f"session {session.name!r} has several targets ({names}); one is looked for at a time.",
-            culprits=["session.toml: targets"],
-            next_step="Make a session with the rows of the one that is meant.",
-        )
-    return session.target
 
 
 def _poses(

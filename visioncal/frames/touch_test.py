@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, listed
 from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.transforms import compose, invert
-from visioncal.core.types import FloatArray, Target
+from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.frames.frame_from_images import seen_frame
@@ -117,7 +117,13 @@ def touch_targets(
     independent = (shifted**2 + turned**2) * np.eye(3) + tip.covariance[3:, 3:]
     rotation = frame.edge.matrix[:3, :3]
     points = []
-    for name, at in _five_corners(board).items():
+    # The four outermost corners, and the one nearest to the middle.
+    places = corner_positions(board)
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    chosen = [int(np.argmax((places - middle)[:, :2] @ sign)) for sign in signs]
+    chosen.append(int(np.argmin(np.linalg.norm(places - middle, axis=1))))
+    for name, at in {f"corner {index}": places[index] for index in dict.fromkeys(chosen)}.items():
         placed = frame.edge.matrix @ compose(np.eye(3), at)
         located = point_covariance(frame.edge.matrix, frame.edge.covariance, at)
         covariance = located + rotation @ independent @ rotation.T
@@ -188,13 +194,3 @@ def touch_test_finding(test: TouchTest) -> Finding:
             "Measure the tool's tip anew, then look whether the camera or the robot was moved."
         )
     return Finding("touch_test", words, step, is_fatal=True)
-
-
-def _five_corners(board: Target) -> dict[str, FloatArray]:
-    """The four outermost corners and the one nearest to the middle, by name."""
-    places = corner_positions(board)
-    middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
-    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    chosen = [int(np.argmax((places - middle)[:, :2] @ sign)) for sign in signs]
-    chosen.append(int(np.argmin(np.linalg.norm(places - middle, axis=1))))
-    return {f"corner {index}": places[index] for index in dict.fromkeys(chosen)}

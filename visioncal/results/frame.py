@@ -63,17 +63,16 @@ class FrameFile:
     def load(cls, path: Path | str) -> Self:
         """Reads a file of frames; raises DataError."""
         with reading(str(path), "frames", "Run visioncal tcp or visioncal fixture again."):
-            return cls(_read_file(parse_stored(read_bytes(path), str(path))))
+            document = parse_stored(read_bytes(path), str(path))
+            if "transforms" in document:
+                raise ValueError("it is a calibration, whose folder is named with -c")
+            if document.get("schema") != _SCHEMA:
+                raise ValueError(
+                    f"schema is {document.get('schema')!r}, this version reads {_SCHEMA}"
+                )
+            return cls(dict(read(FrameFile, document, "").frames))
 
 
 def frames_document(frames: Mapping[str, Frame]) -> dict[str, Any]:
     """JSON form of frames."""
     return write(FrameFile, FrameFile(frames))["frames"]  # type: ignore[no-any-return]
-
-
-def _read_file(document: Mapping[str, Any]) -> dict[str, Frame]:
-    if "transforms" in document:
-        raise ValueError("it is a calibration, whose folder is named with -c")
-    if document.get("schema") != _SCHEMA:
-        raise ValueError(f"schema is {document.get('schema')!r}, this version reads {_SCHEMA}")
-    return dict(read(FrameFile, document, "").frames)

@@ -113,7 +113,15 @@ class JointPoseCheck:
             )
         q = np.array([state.q, *(other.q for other in self._states)])
         pose = np.array([other.base_from_flange for other in (state, *self._states)])
-        shift_m, angle = _deviation(self.robot.base_from_flange(q), pose)
+        model = self.robot.base_from_flange(q)
+        found = [(0.0, 0.0)] if len(pose) == 1 else []
+        # With a tool on the flange, `invert(model) @ pose` is constant; with another base,
+        # `pose @ invert(model)` is.
+        for constant in (invert(model) @ pose, pose @ invert(model)):
+            differences = invert(constant[1:]) @ constant[0]
+            shifts = np.linalg.norm(differences[:, :3, 3], axis=1)
+            found += zip(shifts.tolist(), rotation_angle(differences).tolist(), strict=True)
+        shift_m, angle = min(found, key=lambda pair: pair[0] / _SAME_M + pair[1] / _SAME_RAD)
         if shift_m <= _SAME_M and angle <= _SAME_RAD:
             self._states.append(state)
             return ""
@@ -126,18 +134,6 @@ class JointPoseCheck:
             f"{np.rad2deg(angle):.1f} deg (limits {1e3 * _SAME_M:.0f} mm and "
             f"{np.rad2deg(_SAME_RAD):.1f} deg): {cause}"
         )
-
-
-def _deviation(model: FloatArray, pose: FloatArray) -> tuple[float, float]:
-    """Deviation of the first state from the nearest with which it shares a constant [m, rad]."""
-    found = [(0.0, 0.0)] if len(pose) == 1 else []
-    # With a tool on the flange, `invert(model) @ pose` is constant; with another base,
-    # `pose @ invert(model)` is.
-    for constant in (invert(model) @ pose, pose @ invert(model)):
-        differences = invert(constant[1:]) @ constant[0]
-        shifts = np.linalg.norm(differences[:, :3, 3], axis=1)
-        found += zip(shifts.tolist(), rotation_angle(differences).tolist(), strict=True)
-    return min(found, key=lambda pair: pair[0] / _SAME_M + pair[1] / _SAME_RAD)
 
 
 def planned_accuracy(plan: PlanFile) -> Prediction:

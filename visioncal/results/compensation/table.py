@@ -48,23 +48,6 @@ def read_targets(path: Path, robot: Robot) -> Targets:
             and radians.
     """
     table = read_table(path)
-    _check_columns(table, robot)
-    reader = TableReader(table)
-    poses = reader.numbers(*(Column(name, is_needed=True) for name in POSE))
-    joints = joint_columns(table.columns)
-    seeds = np.full((len(poses), robot.joint_count), np.nan)
-    if joints:
-        seeds = reader.numbers(*map(Column, joints))
-        reader.complete(joints)
-    reader.check()
-    places = tuple(map(table.place, range(len(poses))))
-    reader.unit(QUATERNION)
-    reader.check()
-    rotations = Rotation.from_quat(poses[:, 3:]).as_matrix()
-    return Targets(table, places, compose(rotations, poses[:, :3]), seeds)
-
-
-def _check_columns(table: TextTable, robot: Robot) -> None:
     name, columns = table.label, table.columns
     done = [name for name in ADDED if name in columns]
     if done:
@@ -92,6 +75,19 @@ def _check_columns(table: TextTable, robot: Robot) -> None:
             culprits=joints,
             next_step="Name one for each joint, or none.",
         )
+    reader = TableReader(table)
+    poses = reader.numbers(*(Column(name, is_needed=True) for name in POSE))
+    joints = joint_columns(table.columns)
+    seeds = np.full((len(poses), robot.joint_count), np.nan)
+    if joints:
+        seeds = reader.numbers(*map(Column, joints))
+        reader.complete(joints)
+    reader.check()
+    places = tuple(map(table.place, range(len(poses))))
+    reader.unit(QUATERNION)
+    reader.check()
+    rotations = Rotation.from_quat(poses[:, 3:]).as_matrix()
+    return Targets(table, places, compose(rotations, poses[:, :3]), seeds)
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
