@@ -15,6 +15,10 @@ from visioncal.vision.targets import extent_m
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 
+_INK, _PAPER, _PLATE = 30, 222, 152
+# Margins around the print in sides of a square: white paper, its plate, the plate's shadow.
+_PAPER_MARGIN, _PLATE_MARGIN, _SHADOW_MARGIN = 0.55, 0.85, 1.35
+
 
 @dataclass(frozen=True, eq=False)
 class SheetTexture:
@@ -42,20 +46,19 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
     finest = unit_m(target) / texels
     # Whole squares for most boards; a remaining part of a texel stays white.
     width, height = np.ceil(np.round((high - low) / finest, 6)).astype(int).tolist()
-    margin = 2 * int(np.ceil(0.5 * 1.35 * texels))
-    grey = np.full((height + 2 * margin, width + 2 * margin), 152, np.uint8)
-    # Margins in sides of a square: white paper, its plate, the plate's shadow.
-    paper = margin - round(0.55 * texels)
-    grey[paper:-paper, paper:-paper] = 222
+    margin = 2 * int(np.ceil(0.5 * _SHADOW_MARGIN * texels))
+    grey = np.full((height + 2 * margin, width + 2 * margin), _PLATE, np.uint8)
+    paper = margin - round(_PAPER_MARGIN * texels)
+    grey[paper:-paper, paper:-paper] = _PAPER
     dark = _dark_shares(target, (height, width), finest)
-    grey[margin:-margin, margin:-margin] = np.rint(222 + (30 - 222) * dark)
-    plate = margin - round(0.85 * texels)
+    grey[margin:-margin, margin:-margin] = np.rint(_PAPER + (_INK - _PAPER) * dark)
+    plate = margin - round(_PLATE_MARGIN * texels)
     # Coverage: 255 on the plate, fading in the shadow around it, which is computed at low
     # resolution, as it is smooth.
     factor = max(texels // 16, 1)
     small = np.zeros((-(-grey.shape[0] // factor), -(-grey.shape[1] // factor)), np.float32)
     inner = plate // factor
-    small[inner:-inner, inner:-inner] = 255.0 * 0.7
+    small[inner:-inner, inner:-inner] = 0.7 * 255.0
     soft = cv2.GaussianBlur(small, (0, 0), 0.16 * texels / factor)
     coverage = np.asarray(cv2.resize(soft, (grey.shape[1], grey.shape[0])), np.uint8)
     coverage[plate:-plate, plate:-plate] = 255
@@ -79,7 +82,7 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
 
 def margin_m(target: Target) -> float:
     """Width of the drawn sheet and its shadow beyond the print [m]."""
-    return 1.35 * unit_m(target)
+    return _SHADOW_MARGIN * unit_m(target)
 
 
 def draw_backdrop(rng: np.random.Generator, size: int, blur: float) -> Image:

@@ -128,7 +128,7 @@ class BoardViews:
         middle = 0.5 * (np.array(camera.resolution) - 1.0)
         # Least half size of the board in the image, with a margin for uncertainty. A drawn view
         # need not show the board; this only avoids drawing many that cannot.
-        across = 0.8 * 0.5 * float((self._high - self._low).min())
+        across = 0.4 * float((self._high - self._low).min())
         doubt = 2.0 * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance, cell.sigma_rad)
         occupied_px = camera.matrix[:2].mean() * (across / distance + doubt)
         room = np.maximum(middle - limits.edge_px - occupied_px, 0.0)

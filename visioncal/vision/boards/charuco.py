@@ -269,7 +269,7 @@ def _identified(image: Image, markers: Sequence[Marker]) -> Identity | None:
         near = whole.any(axis=2) & (share * lengths < _NEAR)
         near &= (np.abs(share * steps - whole) < _OFF).all(axis=2)
         # Printable boards have fewer columns.
-        for columns, legacy in product(range(3, 40 + 1), (False, True)):
+        for columns, legacy in product(range(3, 41), (False, True)):
             places = _places(ids, columns, legacy=legacy)
             pairs = near & (places - places[:, None] == whole).all(axis=2)
             agreeing[share, columns, legacy] = pairs

@@ -147,8 +147,8 @@ class CircleGrid(Board):
             scale = np.linalg.norm(px - px.mean(axis=0)) / np.linalg.norm(
                 places - places.mean(axis=0)
             )
-            # Larger circles are fitted at half the image size.
-            if scale * target.diameter_m > 2 * 20.0:
+            # Circles of a larger diameter are fitted at half the image size.
+            if scale * target.diameter_m > 40.0:
                 # Half of the size has edges of enough pixels.
                 half = self.refine(shrunk(image, 2), target, ids, (px - 0.5) / 2)
                 return Refined(2 * half.px + 0.5, 2 * half.sigma_px, 2 * half.blur_px)
@@ -281,7 +281,7 @@ def _lattice(blobs: Blobs) -> tuple[IntArray, IntArray]:
 
 def _first_steps(px: FloatArray, tree: cKDTree, seed: int) -> FloatArray | None:
     """Two steps (2, 2) [px] to neighbours of a point that has opposite neighbours as well."""
-    neighbours = tree.query(px[seed], k=min(8 + 1, len(px)))[1][1:]
+    neighbours = tree.query(px[seed], k=min(9, len(px)))[1][1:]
     steps: list[FloatArray] = []
     for neighbour in neighbours.tolist():
         step = px[neighbour] - px[seed]

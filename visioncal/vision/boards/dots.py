@@ -181,7 +181,7 @@ class Dots(PointsKind, Board):
         if len(blobs.px) < 8:
             return NotFound("no board: no dots are seen")
         places, tree = self.corners(target)[:, :2], cKDTree(blobs.px)
-        around = tree.query(blobs.px, min(6 + 1, len(blobs.px)))[1][:, 1:]
+        around = tree.query(blobs.px, min(7, len(blobs.px)))[1][:, 1:]
         ratios = blobs.diameters / np.median(blobs.diameters[around], axis=1)
         large, radii = _large(target), _radii_m(target)
         unlike = np.abs(np.log(ratios * np.median(radii) / radii[large].mean()))
