@@ -79,11 +79,6 @@ class _JointFactor:
     triangle: FloatArray  # (c + 1, c + 1) R factor of [x, y].
     count: int  # Number of rows.
 
-    def squared_residuals(self, values: FloatArray) -> float:
-        """Sum of squared residuals."""
-        left = self.triangle[:, :-1] @ values[self.columns] - self.triangle[:, -1]
-        return float(left @ left)
-
 
 def regress(blocks: Sequence[NoiseBlock]) -> Regression:
     """Fits parameters and the joints' noise, and masks outliers.
@@ -188,7 +183,8 @@ def _sigma(joint: _JointFactor, values: FloatArray, root: FloatArray, before: fl
     freedom = max(joint.count - fitted, 1.0)
     # Residuals of exact torques are rounding, which must not give a joint all the weight.
     size = np.linalg.norm(joint.triangle[:, -1]) / np.sqrt(max(joint.count, 1))
-    return float(max(np.sqrt(joint.squared_residuals(values) / freedom), 1e-9 * size, 1e-12))
+    left = joint.triangle[:, :-1] @ values[joint.columns] - joint.triangle[:, -1]
+    return float(max(np.sqrt(left @ left / freedom), 1e-9 * size, 1e-12))
 
 
 def _covariance(fit: Regression) -> FloatArray:

@@ -148,8 +148,9 @@ def seen_frame(
             "scatter_over_expected": seen.scatter,
             "sigma_by_images_mm": float(1e3 * np.sqrt(own)),
             "sigma_in_common_mm": float(1e3 * np.sqrt(common)),
-        }
-        | camera_details(calibration),
+            SEEN_BY: calibration.created,
+            "note": _COUNTED_TWICE,
+        },
     )
 
 
@@ -190,11 +191,6 @@ def view_findings(session: Session, lost: Mapping[int, str]) -> Iterator[Finding
             f"{'; '.join(by_reason(missing)[:3])}.",
             views=tuple(missing),
         )
-
-
-def camera_details(calibration: Calibration) -> dict[str, Any]:
-    """Details in the record of any frame that a camera has placed."""
-    return {SEEN_BY: calibration.created, "note": _COUNTED_TWICE}
 
 
 def _observations(

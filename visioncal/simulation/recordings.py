@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import apply_each, compose, exp, invert
-from visioncal.core.types import Camera, Corners, FloatArray, Mask, Target
+from visioncal.core.types import Camera, Corners, FloatArray, Mask
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.session.columns import POSE
@@ -79,17 +79,13 @@ def detected(sheet: Sheet, exact: Corners, sigma_px: float, noise: np.random.Gen
     The numbering of a symmetric board starts at the upper left.
     """
     corners = replace(exact, px=exact.px + sigma_px * noise.standard_normal(exact.px.shape))
-    if not is_symmetric(sheet.target) or not len(corners.ids):
+    is_symmetric = len(rotation_transforms(sheet.target)) > 1
+    if not is_symmetric or not len(corners.ids):
         return corners
     if corners.px[0].sum() <= corners.px[-1].sum():
         return corners
     last = sheet.target.columns * sheet.target.rows - 1
     return replace(corners, ids=(last - corners.ids)[::-1], px=corners.px[::-1])
-
-
-def is_symmetric(target: Target) -> bool:
-    """Whether a board is invariant under a half turn."""
-    return len(rotation_transforms(target)) > 1
 
 
 def moved_cell(

@@ -108,15 +108,6 @@ class Fields:
         return some_of(words, 40)
 
 
-def fields_of_table(table: TextTable, path: Path) -> Fields:
-    """Reads the rows of a table; stacked or adjacent 4 x 4 matrices give a row each."""
-    if matrices := _stacked_matrices(table, path):
-        return matrices
-    records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
-    places = [table.place(index) for index in range(len(table.rows))]
-    return fields_of_records(records, places, path.stem, path.parent)
-
-
 def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
     """Reads 4 x 4 matrices stacked below each other, or side by side in four rows."""
     height, width = len(table.rows), len(table.columns)
@@ -276,7 +267,11 @@ def read_fields(path: Path) -> Fields:
             culprits=[str(path)],
             next_step="Convert the folder.",
         )
-    return fields_of_table(table, path)
+    if matrices := _stacked_matrices(table, path):
+        return matrices
+    records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    places = [table.place(index) for index in range(len(table.rows))]
+    return fields_of_records(records, places, path.stem, path.parent)
 
 
 def read_document(path: Path) -> object:

@@ -169,18 +169,14 @@ def poor_image_reason(image: Image, max_blur_px: float) -> str:
             f"the image is almost uniform, with {high - low:.0f} grey levels of contrast "
             f"({_LEAST_CONTRAST:.0f} are needed)"
         )
-    blur = blur_of_edges(image)
+    # Of the sharpest edges.
+    blur = float(_edge_sigma(image[None])[0])
     if blur > max_blur_px:
         return (
             f"the image is blurred, its sharpest edges are {blur:.0f} px wide "
             f"(limit {max_blur_px:g} px)"
         )
     return ""
-
-
-def blur_of_edges(image: Image) -> float:
-    """Sigma of the sharpest edges of an image [px]; see `blur_at_corners`."""
-    return float(_edge_sigma(image[None])[0])
 
 
 def _edge_sigma(patches: Image) -> FloatArray:
