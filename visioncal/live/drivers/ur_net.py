@@ -27,7 +27,7 @@ _HEADER = struct.Struct(">HB")
 # Types of RTDE's frames: request of a version, output recipe, start, state.
 _PROTOCOL, _OUTPUTS, _START, _DATA = b"VOSU"
 # Primary interface: the read-only port is open where the other may not be.
-_PORTS = (30011, 30001)
+PRIMARY_PORTS = (30011, 30001)
 _PRIMARY_HEADER = struct.Struct(">IB")
 _ROBOT_STATE, _CARTESIAN = 16, 4
 _TOOL = struct.Struct(">6d6d")
@@ -198,9 +198,9 @@ def read_tool_offset(host: str) -> list[float]:
     """Reads the active tool offset: x, y, z [m] and a rotation vector [rad]; raises DriverError."""
     ends_s = time.monotonic() + _WAIT_S
     try:
-        link = connect(host, _PORTS[0], "the primary interface")
+        link = connect(host, PRIMARY_PORTS[0], "the primary interface")
     except DriverError:
-        link = connect(host, _PORTS[1], "the primary interface")
+        link = connect(host, PRIMARY_PORTS[1], "the primary interface")
     with link, link.makefile("rb") as file, suppress(OSError, struct.error):
         while time.monotonic() < ends_s:
             size, kind = _PRIMARY_HEADER.unpack(file.read(_PRIMARY_HEADER.size))

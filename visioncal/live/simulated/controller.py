@@ -32,6 +32,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
+from visioncal.live.drivers.ur_net import DASHBOARD_PORT, PRIMARY_PORTS, RTDE_PORT, SCRIPT_PORT
 from visioncal.simulation.arms import ArmOptions, DhArm, forward, ur_arm
 
 # `none` mends all others.
@@ -44,7 +45,6 @@ Fault: TypeAlias = Literal[
     "link-lost",
     "silent",
 ]
-RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT = PORTS = 30004, 29999, 30003, 30011
 # Starting takes a second, but much longer on a busy computer [s].
 _START_S = 60.0
 # The payload that is set, and its centre of mass in the flange frame [kg, m].
@@ -355,7 +355,8 @@ class _Server:
         self._loop = asyncio.get_running_loop()
         handlers = (self._serve_rtde, self._serve_dashboard, self._take_script, self._send_primary)
         with ExitStack() as servers:
-            for port, handler in zip(PORTS, handlers, strict=True):
+            ports = RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORTS[0]
+            for port, handler in zip(ports, handlers, strict=True):
                 server = await asyncio.start_server(_tolerant(handler), self._host, port)
                 servers.callback(server.close)
             ready()
