@@ -94,13 +94,7 @@ def command_of(words: tuple[str, ...]) -> tuple[typer.core.TyperCommand, list[st
 
 
 def parse(words: tuple[str, ...], *, whole: bool) -> None:
-    """Parses a command line without running it.
-
-    Args:
-        words: What follows `visioncal`.
-        whole: Whether it is complete: values are converted, and what is required has to be there.
-            Else its options alone are looked at.
-    """
+    """Parses a command line without running it."""
     command, left, name = command_of(words)
     try:
         if whole:

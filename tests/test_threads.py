@@ -1,7 +1,6 @@
 """Several threads calibrate and write at once, and leave the process as it was."""
 
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Barrier
@@ -14,7 +13,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from visioncal.calibration.run import calibrate, run
 from visioncal.calibration.stages import detect
 from visioncal.core.errors import DataError
-from visioncal.core.threads import SharedSetting
 from visioncal.dynamics import run as dynamics
 from visioncal.interchange.outputs import write_outputs
 from visioncal.present.recording import read_evidence
@@ -81,22 +79,6 @@ def test_threads_change_no_digit(tmp_path, monkeypatch):
     assert to_document(one) == to_document(three)
     with pytest.raises(DataError, match="threads is 0; at least 1"):
         calibrate(tmp_path / "cell", threads=0)
-
-
-def test_a_shared_setting_is_made_by_the_first_and_undone_by_the_last():
-    log = []
-
-    @contextmanager
-    def setting():
-        log.append("made")
-        yield
-        log.append("undone")
-
-    shared = SharedSetting(setting)
-    for expected in (["made", "undone"], ["made", "undone"] * 2):
-        with shared.held(), shared.held():
-            assert len(log) % 2 == 1
-        assert log == expected
 
 
 def test_dynamics_are_identified_on_one_thread(monkeypatch):

@@ -32,14 +32,7 @@ def wished(usual: int, quick: int = 1) -> int:
 
 
 def write_section(name: str, command: str, text: str, path: Path = RESULTS) -> None:
-    """Replaces the section called `name`, or appends it; not with `--quick`.
-
-    Args:
-        name: The section's heading, which also identifies it.
-        command: What to run, from the repository's root, to measure again.
-        text: Markdown below the heading.
-        path: The file.
-    """
+    """Replaces the section called `name`, or appends it; not with `--quick`."""
     if QUICK:
         return
     begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->\n"

@@ -143,24 +143,20 @@ def test_a_result_outlives_a_drawing_that_fails(tmp_path, monkeypatch, module, n
     assert "18 mm of 25 mm" in missing.cause
 
 
-@pytest.mark.parametrize("as_json", [False, True])
-def test_calibrate_ends_with_1_and_the_result_where_a_drawing_fails(tmp_path, monkeypatch, as_json):
-    cell = write_session(simulate(CellOptions(views=12, seed=1)), tmp_path / "p", images=False)
-    monkeypatch.setattr(page, "write_report", breaking)
-    out = tmp_path / "out"
-    done = visioncal("calibrate", cell, "-o", out, *(["--json"] if as_json else []))
-    assert done.status == 1
-    assert f"{out / 'report.html'} could not be drawn (ValueError" in done.err
-    assert f"The result is safe in {out / 'calibration.json'}" in done.err
-    assert sorted(path.name for path in out.iterdir()) == ["calibration.json", "recording.rrd"]
-    if as_json:
-        assert json.loads(done.out) == json.loads((out / "calibration.json").read_bytes())
-    else:
-        assert "views used" in done.out
-
-
-def test_calibrate_leaves_out_what_is_not_wanted(tmp_path):
+def test_calibrate_ends_with_1_and_the_result_where_a_drawing_fails(tmp_path, monkeypatch):
     cell = write_session(simulate(CellOptions(views=12, seed=1)), tmp_path / "p", images=False)
     out = tmp_path / "out"
+    # What is not wanted is left out.
     assert visioncal("calibrate", cell, "-o", out, "--no-report", "--no-recording").status == 0
     assert [path.name for path in out.iterdir()] == ["calibration.json"]
+    monkeypatch.setattr(page, "write_report", breaking)
+    for more in ((), ("--json",)):
+        done = visioncal("calibrate", cell, "-o", out, *more)
+        assert done.status == 1
+        assert f"{out / 'report.html'} could not be drawn (ValueError" in done.err
+        assert f"The result is safe in {out / 'calibration.json'}" in done.err
+        assert sorted(path.name for path in out.iterdir()) == ["calibration.json", "recording.rrd"]
+        if more:
+            assert json.loads(done.out) == json.loads((out / "calibration.json").read_bytes())
+        else:
+            assert "views used" in done.out

@@ -59,15 +59,7 @@ def again(
     *,
     repeated: int = 0,
 ) -> SimulatedCell:
-    """Fresh stops of a cell at postures that its calibration has not seen, with noise of their own.
-
-    Args:
-        cell: With `FITTED` views and more.
-        rng: Which postures, and the noise.
-        change: What has changed since; nothing where None.
-        stops: How many.
-        repeated: Number of first views of which some postures are repeated; 0 for new postures.
-    """
+    """Fresh stops of a cell, with noise of their own; `repeated`: of how many first postures."""
     change, count = change or Change(), len(cell.robot.joints) - FITTED
     first, among = (0, repeated) if repeated else (FITTED, count)
     rows = first + rng.choice(among, stops, replace=False)

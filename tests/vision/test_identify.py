@@ -120,33 +120,21 @@ def test_a_description_loads_once_the_size_is_known(name):
     assert described.marker_m == pytest.approx(target.marker_m, abs=2.5e-4)
 
 
-# Kind, columns, rows, dictionary, and a marker's side over a square's.
-REAL = {
-    "sessions/ric_charuco_eye_to_hand/images/*.png": (
-        ("charuco", 5, 7, "DICT_6X6_250"),
-        18.256 / 36.195,
-    ),
-    "doosan_a0509_charuco/intrinsics_images/*.jpg": (("charuco", 7, 5, "DICT_4X4_50"), 22 / 30),
-    "visp_franka_hand_eye/data-eye-to-hand/*.png": (("marker", 1, 1, "DICT_APRILTAG_36h11"), 0.0),
-}
+VISP = "visp_franka_hand_eye/data-eye-to-hand/*.png"
+DOOSAN = "doosan_a0509_charuco/intrinsics_images/*.jpg"
+RIC = "sessions/ric_charuco_eye_to_hand/images/*.png"
 
 
-LARGE = (
-    "sessions/ric_charuco_eye_to_hand/images/*.png",
-    "doosan_a0509_charuco/intrinsics_images/*.jpg",
-)
-
-
+# A marker's side is over a square's.
 @pytest.mark.parametrize(
-    ("pattern", "expected"),
+    ("pattern", "kind", "columns", "rows", "dictionary", "share"),
     [
-        pytest.param(*pair, marks=pytest.mark.slow if pair[0] in LARGE else ())
-        for pair in REAL.items()
+        (VISP, "marker", 1, 1, "DICT_APRILTAG_36h11", 0.0),
+        slow(DOOSAN, "charuco", 7, 5, "DICT_4X4_50", 22 / 30),
+        slow(RIC, "charuco", 5, 7, "DICT_6X6_250", 18.256 / 36.195),
     ],
-    ids=str,
 )
-def test_real_photographs_are_named(real_data, pattern, expected):
-    (kind, columns, rows, dictionary), share = expected
+def test_real_photographs_are_named(real_data, pattern, kind, columns, rows, dictionary, share):
     files = sorted(real_data.glob(pattern))
     assert len(files) >= 8
     # Neighbours in a recording look alike: every second one is named.
@@ -161,10 +149,8 @@ def test_real_photographs_are_named(real_data, pattern, expected):
     assert found.keys() <= {(kind, columns, rows), (kind, columns, rows - 1)}
     assert all(dictionary in (identity.board.dictionary, *identity.larger) for identity in named)
     # Two standard deviations: of 22 photographs one may be farther off.
-    far = [
-        identity for identity in named if abs(identity.board.marker_m - share) > 0.06 * share + 0.02
-    ]
-    assert len(far) <= 0.05 * len(named)
+    far = sum(abs(board.marker_m - share) > 0.06 * share + 0.02 for board in boards)
+    assert far <= 0.05 * len(named)
 
 
 def run(*arguments):

@@ -38,12 +38,3 @@ def test_maps_follow_the_sides_of_tags_through_a_lens(camera, most_px, cut_px):
         scale = np.linalg.norm(np.diff(px[:2], axis=0)) / np.linalg.norm(np.diff(board[:2], axis=0))
         errors.append(scale * off)
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < most_px
-
-
-def test_too_few_corners_leave_the_lens_to_a_homography():
-    board = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    px = 100 * board + 20
-    every = np.arange(4)
-    axis = OpticalAxis.of((480, 640), np.zeros(2))
-    on_board = maps_about(board, px, every >= 0, every, axis)[0]
-    np.testing.assert_allclose(on_board(px[:, None] + [10, 0])[:, 0], [[0.1, 0]] * 4, atol=1e-9)

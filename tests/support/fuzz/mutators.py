@@ -193,13 +193,7 @@ _AS_FILE, _BY_KIND = 0.15, 0.7
 
 
 def mutate(input_: Path, chance: Chance, others: Sequence[Path]) -> str:
-    """Breaks one thing of a file or folder, and says what was done.
-
-    Args:
-        input_: The file or folder.
-        chance: What is broken depends on it alone.
-        others: Sound inputs that it may be exchanged with.
-    """
+    """Breaks one thing of a file or folder, and says what was done."""
     files = [input_]
     if input_.is_dir():
         files = sorted(path for path in input_.rglob("*") if path.is_file())
