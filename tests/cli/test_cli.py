@@ -17,7 +17,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from support.advice import failures, printed_commands
-from support.commands import every_command, started, turned_poses, visioncal, write_poses
+from support.commands import every_command, turned_poses, visioncal, write_poses
 from support.fuzz.broken_sessions import BROKEN, broken_session, edit_rows
 from support.marks import slow
 from support.samples import made_up
@@ -48,12 +48,14 @@ STEERING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]")
 
 def test_calibrate_writes_three_files_and_says_how_good_it_is(rendered, tmp_path):
     out = tmp_path / "out put, größer"
-    done = started("calibrate", rendered, "-o", out, "-v")
-    assert done.status == 0, done.err
+    words = [sys.executable, "-m", "visioncal", "calibrate", str(rendered), "-o", str(out), "-v"]
+    strict = os.environ | {"PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
+    done = subprocess.run(words, check=False, capture_output=True, text=True, env=strict)
+    assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in out.iterdir()) == FILES
-    assert "\ngood" in f"\n{done.out}"
-    assert "flange_from_cam" in done.out
-    assert "daniilidis" in done.out
+    assert "\ngood" in f"\n{done.stdout}"
+    assert "flange_from_cam" in done.stdout
+    assert "daniilidis" in done.stdout
 
 
 @pytest.mark.slow

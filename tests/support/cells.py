@@ -122,22 +122,10 @@ def exact(options: CellOptions | None = None) -> CellOptions:
     Its reports, its detections and its board are the truth; its images are only rounded to grey
     levels.
     """
-    return replace(
-        options or CellOptions(),
-        pixel_sigma_px=0.0,
-        image_noise=0.0,
-        robot_sigma_m=0.0,
-        robot_sigma_rad=0.0,
-        dh_sigma_m=0.0,
-        dh_sigma_rad=0.0,
-        offset_sigma_rad=0.0,
-        eccentricity_sigma_rad=0.0,
-        ripple_sigma_rad=0.0,
-        function_sigma_rad=0.0,
-        compliance_rad_per_nm=(),
-        backlash_rad=(),
-        lens_mismatch_px=0.0,
-        wrong_views=0,
-        board_scale=1.0,
-        board_bow_m=0.0,
+    sigmas = (
+        *("pixel_sigma_px", "robot_sigma_m", "robot_sigma_rad", "dh_sigma_m", "dh_sigma_rad"),
+        *("offset_sigma_rad", "eccentricity_sigma_rad", "ripple_sigma_rad", "function_sigma_rad"),
+        *("image_noise", "lens_mismatch_px", "board_bow_m"),
     )
+    sound = {"compliance_rad_per_nm": (), "backlash_rad": (), "wrong_views": 0, "board_scale": 1.0}
+    return replace(options or CellOptions(), **dict.fromkeys(sigmas, 0.0), **sound)

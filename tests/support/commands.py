@@ -3,13 +3,12 @@
 import csv
 import io
 import os
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TextIO
+from typing import Any, Self
 from unittest.mock import patch
 
 import numpy as np
@@ -72,20 +71,6 @@ def visioncal(*arguments: object, columns: int = _WIDE) -> Done:
         except SystemExit as stop:
             status = int(stop.code or 0)
     return Done(status, out.getvalue(), err.getvalue())
-
-
-def started(*arguments: object, stdout: int | TextIO = subprocess.PIPE) -> Done:
-    """Runs a command as a process of its own, as a user does: for what only that can show."""
-    done = subprocess.run(
-        [sys.executable, "-m", "visioncal", *map(str, arguments)],
-        check=False,
-        stdout=stdout,
-        stderr=subprocess.PIPE,
-        text=True,
-        encoding="utf-8",
-        env=os.environ | {"COLUMNS": str(_WIDE), "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"},
-    )
-    return Done(done.returncode, done.stdout or "", done.stderr)
 
 
 def every_command(group: Any = None, before: str = "") -> Iterator[tuple[str, Any]]:
