@@ -122,6 +122,8 @@ FEWEST_COMPARED = 5
 FEWEST_STOPS = 6
 # Ratio of residuals from which on the smaller is clearly better.
 CLEAR_RATIO = 3.0
+# A parameter is determined where its sigma is at most this share of its prior's.
+DETERMINED = 0.7
 # Sigmas from which on a stated value counts as contradicted.
 CONTRADICTION = 3.0
 # Greatest blur of an image in which a board is detected, as a Gaussian's sigma [px].

@@ -12,6 +12,7 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import STARTS, Fit, is_about_one_axis, robust_fits
 from visioncal.calibration.guess.search import (
+    CLEAR,
     EVIDENCE,
     FEWEST_ROWS,
     IMPOSSIBLE,
@@ -29,11 +30,8 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, Mount
 
-# Log posterior odds from which one reading is preferred to another.
-_CLEAR = 3.0
-# Random orders of the rows, by which a reading closes the chain by chance; a score from which on it
-# explains nothing, as of a board that looks the same after half a turn.
-_SHUFFLES, _MOST_SCORE = 8, 0.3
+# Random orders of the rows, by which a reading closes the chain by chance.
+_SHUFFLES = 8
 # Log prior odds by the logarithm of the ratio of the edges' lengths, and their bound.
 _BY_LENGTH = 10.0
 # Poses of two readings that differ by less than this share of the residuals are the same.
@@ -113,10 +111,9 @@ def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
     """
     declared, *others = tried
     best = others[0] if others else declared
-    beaten = best.log_posterior - _CLEAR
+    beaten = best.log_posterior - CLEAR
     if (
         beaten <= declared.log_posterior
-        or best.fit.score > _MOST_SCORE
         or _turns_about_one_axis(best)
         or any(other.log_posterior > beaten and not _are_same(best, other) for other in others)
         or beaten <= EVIDENCE * _by_other_rows(best)
@@ -206,7 +203,7 @@ def _beside_other_mount(best: Candidate) -> float:
 def _check_mount(likely: Sequence[Candidate]) -> None:
     """Refuses a choice between two mounts that fit alike, the likelier one first."""
     first, *others = likely
-    least = _beside_other_mount(first) - _CLEAR
+    least = _beside_other_mount(first) - CLEAR
     is_clear = all(_beside_other_mount(other) < least for other in others)
     if not first.fit.closes or (is_clear and not _turns_about_one_axis(first)):
         return

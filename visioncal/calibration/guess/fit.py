@@ -31,11 +31,8 @@ _SUBSET = 4
 _FOLLOWED = 3
 # Smaller turns about a second axis, relative to the largest or absolute, are noise of the poses.
 _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
-# The unknowns of both edges, and the equations of a view.
-_UNKNOWNS, _PER_VIEW = 12, 6
-# Standard deviation by axis [rad, or share of the distance], at least and at most: readings are not
-# distinguished by less than the first.
-_LEAST_SIGMA, _MOST_SIGMA = 5e-4, 1.0
+# Least standard deviation by axis [rad, or share of the distance] by which readings differ.
+_LEAST_SIGMA = 5e-4
 # Prior probability of an outlier view.
 _OUTLIER_PRIOR = 0.05
 
@@ -67,9 +64,9 @@ class Fit:
         count = len(self.kept)
         if not count:
             return np.inf
-        freedom = max(_PER_VIEW * count - _UNKNOWNS, _PER_VIEW)
-        mean_square = float(np.mean(self.residuals[self.kept] ** 2))
-        return float(np.sqrt(mean_square * _PER_VIEW * count / freedom))
+        # Six equations a view, less the twelve unknowns of both edges.
+        squares = float(np.sum(self.residuals[self.kept] ** 2))
+        return float(np.sqrt(6 * squares / max(6 * count - 12, 6)))
 
     @property
     def rms(self) -> tuple[float, float]:
@@ -111,12 +108,12 @@ class Fit:
     @cached_property
     def _estimate(self) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (2,) by axis of position and rotation, and each view's weight."""
-        sigma, squares = np.full(2, _MOST_SIGMA), self._squares
+        sigma, squares = np.ones(2), self._squares
         weights = np.where(np.isin(np.arange(len(self.angle)), self.kept), 1.0, 0.0)
         for _ in range(5 if self.is_readable else 0):
             # Three equations a view each, less the six unknowns of the edges.
-            freedom = max(3.0 * weights.sum() - 0.5 * _UNKNOWNS, 3.0)
-            sigma = np.clip(np.sqrt(squares @ weights / freedom), _LEAST_SIGMA, _MOST_SIGMA)
+            freedom = max(3.0 * weights.sum() - 6.0, 3.0)
+            sigma = np.maximum(np.sqrt(squares @ weights / freedom), _LEAST_SIGMA)
             inlier, outlier = self._densities(sigma)
             weights = 1.0 / (1.0 + np.exp(np.clip(outlier - inlier, -500.0, 500.0)))
         return sigma, weights
@@ -140,7 +137,7 @@ class Fit:
         views = np.logaddexp(inlier, outlier)
         views[self.kept] = inlier[self.kept]
         total = float(views.sum() + lost)
-        return total * max(1.0 - _UNKNOWNS / (_PER_VIEW * max(count, 1)), 0.0)
+        return total * max(1.0 - 2.0 / max(count, 1), 0.0)
 
 
 def is_about_one_axis(rotations: FloatArray) -> bool:

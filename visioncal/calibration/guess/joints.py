@@ -30,11 +30,9 @@ _FITS, _FLOOR = 2e-3, 1e-4
 # Ratio to the best score within which readings are equivalent: those with the fewest mistakes are
 # chosen.
 _EQUIVALENT = 2.0
-# Rows by which zeros are sought.
-_FEW = 10
-# Steps of a joint's zero from afar to the finest. A shift of 180 degrees is left out: it looks like
-# an opposite sign of the joint before or behind it.
-_STEP_RAD, _FARTHEST_RAD, _FINEST_RAD = 0.25, 2.75, 1e-6
+# First step of a joint's zero. A shift of 180 degrees is left out: it looks like an opposite sign
+# of the joint before or behind it.
+_STEP_RAD = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +189,7 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
         (declared,) = _fitted([recorded], q, poses, rows, STARTS)
         if declared.score <= _FITS or is_about_one_axis(poses[:, :3, :3]):
             return JointGuess(declared, declared)
-        readings = [*joint_readings(robot), *_with_zeros(robot, q, poses, thinned(rows, _FEW))]
+        readings = [*joint_readings(robot), *_with_zeros(robot, q, poses, rows)]
         tried = _fitted(readings, q, poses, rows, STARTS)
     least = min(item.score for item in tried)
     equivalent = [item for item in tried if item.score <= _EQUIVALENT * least]
@@ -208,10 +206,10 @@ def _with_zeros(
 ) -> list[JointReading]:
     """The best zero of each inner joint; those of the first and last hide in the constants."""
     step = _STEP_RAD
-    grid = np.arange(-_FARTHEST_RAD, _FARTHEST_RAD + step, step)
+    grid = np.arange(step - np.pi, np.pi - 0.5 * step, step)
     zeros = dict.fromkeys((np.flatnonzero(~robot.chain.prismatic[1:-1]) + 1).tolist(), 0.0)
     best: list[FittedJoints] = []
-    while zeros and step > _FINEST_RAD:
+    while zeros and step > _FLOOR:
         tried = [_with_zero(robot, joint, zeros[joint] + more) for joint in zeros for more in grid]
         fits = _fitted(tried, q, poses, rows)
         of_joints = (fits[at : at + len(grid)] for at in range(0, len(fits), len(grid)))

@@ -24,6 +24,7 @@ from visioncal.calibration.guess.readings import (
     rewritten,
 )
 from visioncal.core.conventions import UNITS_M, PoseNumbers
+from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Mount
 
@@ -32,15 +33,16 @@ FEWEST_ROWS, _FITTED_ROWS = 4, 30
 # Share of the log-likelihood that counts: the errors of an arm, a lens and a board are common to
 # the views, which count as half as many independent ones.
 EVIDENCE = 0.5
-# Log prior odds against a change of the declared reading, and against a cell that cannot be.
-_CHANGE, IMPOSSIBLE = 4.0, 20.0
+# Log odds by which one reading is preferred to another, against each change of the declared one,
+# and against a cell that cannot be.
+CLEAR, _CHANGE, IMPOSSIBLE = 3.0, 4.0, 20.0
 # Plausible distances between camera and board [m].
 _BOARD_DISTANCE_M = (0.02, 30.0)
-# The screening and the first fits hand on at most so many readings, within this ratio of the best
-# score plus a quarter of a degree, which noisy poses of few views add to any bound.
-_TURNED, _REFINED, _RATIO, _SLACK = 100, 12, 3.0, 5e-3
+# The screening and the first fits hand on at most so many readings, whose scores are near the best
+# one's but for a quarter of a degree, which noisy poses of few views add to any bound.
+_HANDED_ON, _SLACK = 100, 5e-3
 # Quantile of the pairs' mismatch: with a quarter of the views wrong, 56 % of pairs are right.
-_PAIRS_SHARE = 0.35
+PAIRS_SHARE = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +151,10 @@ def fitted(
     return [found[at] for at in range(len(tried))]
 
 
-def thinned(rows: IntArray, most: int = _FITTED_ROWS) -> IntArray:
-    """At most `most` rows, evenly spread."""
-    spread = np.linspace(0, len(rows) - 1, most).round().astype(int)
-    return rows if len(rows) <= most else np.asarray(rows[spread])
+def thinned(rows: IntArray) -> IntArray:
+    """At most as many rows as are fitted, evenly spread."""
+    spread = np.linspace(0, len(rows) - 1, _FITTED_ROWS).round().astype(int)
+    return rows if len(rows) <= _FITTED_ROWS else np.asarray(rows[spread])
 
 
 def search(recording: Recording) -> list[Candidate]:
@@ -170,7 +172,7 @@ def search(recording: Recording) -> list[Candidate]:
     for strange in ([], [*rewritten(recording.robot.rows(rows))]):
         tried += _undone(declared, product((None, *plain), strange))
         likely = [*filter(recording.is_likely, tried)]
-        likely = _near(likely, [*map(mismatch, likely)], _TURNED) if likely else []
+        likely = _near(likely, [*map(mismatch, likely)]) if likely else []
         classes: dict[Hashable, list[Hypothesis]] = {}
         for reading in sorted([declared, *likely], key=lambda item: item.cost):
             of_class = classes.setdefault((reading.chain_class, recording.is_likely(reading)), [])
@@ -179,7 +181,7 @@ def search(recording: Recording) -> list[Candidate]:
         scores = [item.fit.score for item in fitted(recording, labels, rows, 0)]
         if min(scores) <= _SLACK:
             break
-    near = _near([*labels], scores, _REFINED)
+    near = _near([*labels], scores)
     refined = [declared, *(reading for reading in near if reading != declared)]
     first, *others = fitted(recording, refined, rows, STARTS)
     others.sort(key=lambda item: -item.log_posterior)
@@ -197,15 +199,15 @@ def _undone(
     ]
 
 
-def _near(tried: Sequence[Hypothesis], scores: Sequence[float], most: int) -> list[Hypothesis]:
+def _near(tried: Sequence[Hypothesis], scores: Sequence[float]) -> list[Hypothesis]:
     """The readings whose scores are near the least, the best and simplest first."""
-    limit = _RATIO * min(scores) + _SLACK
+    limit = CLEAR_RATIO * min(scores) + _SLACK
     near = [
         ((score + _SLACK) * (1.0 + reading.cost), at)
         for at, (reading, score) in enumerate(zip(tried, scores, strict=True))
         if score <= limit
     ]
-    return [tried[at] for _, at in sorted(near)[:most]]
+    return [tried[at] for _, at in sorted(near)[:_HANDED_ON]]
 
 
 def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], float]:
@@ -228,7 +230,7 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
     @cache
     def away(of_robot: tuple[str, str, str], of_camera: str) -> float:
         difference = np.abs(by_robot(*of_robot) - by_camera(of_camera))
-        rank = int(_PAIRS_SHARE * len(difference))
+        rank = int(PAIRS_SHARE * len(difference))
         return float(np.partition(np.nan_to_num(difference, nan=np.inf), rank)[rank])
 
     def mismatch(reading: Hypothesis) -> float:

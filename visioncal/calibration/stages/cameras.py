@@ -13,6 +13,7 @@ from visioncal.calibration.stages.observed import CameraObservations, Observed, 
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
 from visioncal.calibration.stages.repeats import with_stop_means, without_repeats
 from visioncal.core.errors import VisioncalError
+from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Corners, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
@@ -25,15 +26,9 @@ from visioncal.vision.targets import first_corners
 
 T = TypeVar("T", bound=Observed)
 
-# Corners are found to a few tenths of a pixel, and an outdated calibration of the same lens fits to
-# a pixel or two. Stated intrinsics belong to another camera where their residual is above this
-# [px], and that of estimated ones is below this share of it.
-_WRONG_LENS_PX, _MUCH_BETTER = 2.0, 0.1
-# Small boards before a long lens hardly show wrong intrinsics: from this residual [px] on, others
-# are estimated. They replace the stated ones where focal lengths differ by more than any focusing
-# [share], by more sigmas than a bent board causes, and the residual falls below this share.
-_DOUBTFUL_PX, _CLEARLY_BETTER = 0.5, 0.5
-_OTHER_FOCAL, _OTHER_SIGMAS = 0.1, 20.0
+# Stated intrinsics belong to another camera where estimated ones fit clearly better, and either
+# their focal lengths differ by more than any focusing [share] or the stated ones fit badly.
+_OTHER_FOCAL = 0.1
 
 
 def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
@@ -170,7 +165,7 @@ def locate_targets(seen: T) -> T:
         with _naming(of):
             free = 0 if lens.covariance is None else len(lens.covariance)
             fit = estimate_poses(fitted, targets, lens.camera, free)
-        if fit.sigma_px > _DOUBTFUL_PX and not lens.estimated:
+        if fit.sigma_px > CalibrationLimits().pixel_px[0] and not lens.estimated:
             other = _other_lens(look, targets, fitted, fit.sigma_px)
             if other is not None:
                 lens, fit, finding = other
@@ -200,12 +195,9 @@ def _other_lens(
     except VisioncalError:
         # The images do not determine a lens, or show another board than the stated one.
         return None
-    # The estimated lens differs by more than the stated one can have changed.
-    change = np.abs(lens.camera.matrix[:2] - stated.matrix[:2])
-    sigma = np.sqrt(np.diag(lens.covariance)[:2])
-    is_far = np.all((change > _OTHER_FOCAL * stated.matrix[:2]) & (change > _OTHER_SIGMAS * sigma))
-    is_wrong = stated_px > _WRONG_LENS_PX and lens.sigma_px <= _MUCH_BETTER * stated_px
-    if not (is_wrong or (is_far and lens.sigma_px <= _CLEARLY_BETTER * stated_px)):
+    change = np.abs(lens.camera.matrix[:2] / stated.matrix[:2] - 1.0)
+    is_other = change.min() > _OTHER_FOCAL or stated_px > CalibrationLimits().pixel_px[1]
+    if not is_other or CLEAR_RATIO * lens.sigma_px > stated_px:
         return None
     poses = estimate_poses(corners, targets, lens.camera, len(lens.covariance))
     words = (

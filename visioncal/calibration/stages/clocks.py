@@ -14,6 +14,7 @@ from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.clock_offset import (
     LARGEST_SIGMA_S,
     LEAST_CORRELATION,
+    STATED_SIGMA_S,
     ClockedViews,
     ClockPair,
     change_doubt,
@@ -60,8 +61,6 @@ from visioncal.vision.targets import numbered_positions
 
 T = TypeVar("T", bound=Observed)
 
-# Assumed sigma of a stated offset [s].
-_STATED_SIGMA_S = 1e-3
 _SHOW_OFFSET = Remedy(
     "Take the views at rest, or record a sweep that turns fast enough to show the clocks' offset."
 )
@@ -231,7 +230,7 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
             shutter=shutter,
         )
         notes = tuple(motion_notes(clock, sweep.motion.name))
-        doubts = (*offset_doubts(clock, views), *([] if change is None else [change]))
+        doubts = (*offset_doubts(clock), *([] if change is None else [change]))
         clocked = _at_offset(sweep, clock, doubts, notes)
         return _with_shutter(sweep, clocked, fit) if is_rolling else clocked
     return _undetermined(sweep, clock, why_undetermined(fits, matches))
@@ -252,9 +251,9 @@ def _undetermined(sweep: _Sweep, clock: ClockResult, why: str) -> ClockedViews:
     if clock.stated_s is not None:
         words = (
             f"[clock] camera_minus_robot_s is taken as stated, {1e3 * offset_s:+.4g} ms, to "
-            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {why}."
+            f"{1e3 * STATED_SIGMA_S:g} ms, although views were taken in motion: {why}."
         )
-        clock = replace(clock, method="stated", sigma_s=_STATED_SIGMA_S)
+        clock = replace(clock, method="stated", sigma_s=STATED_SIGMA_S)
         return _at_offset(sweep, clock, (Finding("clock", words, _SHOW_OFFSET),))
     if resting.sum() < FEWEST_VIEWS:
         raise undetermined_error(sweep.motion, views, resting, why)

@@ -17,12 +17,8 @@ from visioncal.vision.targets import corner_positions, point_numbers
 
 # Largest homography residual as a share of the corners' spread.
 _MOST_LEFT = 0.3
-# Fewest corners of a view whose numbers are checked.
-_FEWEST_CHECKED = 6
 # Distance outside the image from which on corners are none, as a share of its size.
 _OUTSIDE = 0.1
-# Share of the views whose corners are numbered as from behind: single ones may be wrong.
-_FROM_BEHIND = 0.9
 
 
 def usable_corners(
@@ -101,8 +97,7 @@ def _misnumbered(views: Sequence[Corners], target: Target) -> list[int]:
     points = corner_positions(target)
     if np.ptp(points[:, 2]) > 0.0:
         return []
-    many = [corners for corners in views if len(corners.ids) >= _FEWEST_CHECKED]
-    wrong = [at.view for at in many if _residual(points[at.ids, :2], at.px) > _MOST_LEFT]
+    wrong = [at.view for at in views if _residual(points[at.ids, :2], at.px) > _MOST_LEFT]
     if 2 * len(wrong) > len(views):
         raise DataError(
             f"target {target.name!r}: in {len(wrong)} of {len(views)} views the corners of "
@@ -125,7 +120,7 @@ def _residual(points: FloatArray, px: FloatArray) -> float:
 
 
 def are_from_behind(views: Sequence[tuple[Corners, Target]]) -> bool:
-    """Whether corners have the orientation of printed boards that are seen from behind."""
+    """Whether most corners have the orientation of printed boards that are seen from behind."""
 
     def turn(corners: Corners, target: Target) -> float:
         points = corner_positions(target)[corners.ids, :2]
@@ -135,4 +130,4 @@ def are_from_behind(views: Sequence[tuple[Corners, Target]]) -> bool:
     # The z axis of a rig may point either way.
     if not views or any(target.is_rig for _, target in views):
         return False
-    return float(np.mean([turn(*view) < 0.0 for view in views])) > _FROM_BEHIND
+    return bool(np.median([turn(*view) for view in views]) < 0.0)

@@ -2,13 +2,10 @@
 
 import numpy as np
 
+from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
-
-# A scale error is reported above the first share and this number of sigmas. An arm's lengths may
-# explain it, unless the scale leaves less than the third share of the misfit, or is above the last.
-_LEAST, _SURE, _EXPLAINED, _NO_ARM = 2e-3, 5.0, 0.1, 0.02
 
 
 def distance_scale(
@@ -25,8 +22,8 @@ def distance_scale(
         flange_from_seer: (4, 4) the camera's transform, of which the rotation is used.
 
     Returns:
-        The finding; None where the scale is one, or a small error leaves more than a tenth of the
-        misfit.
+        The finding; None where another scale does not explain nearly all of the misfit, as an
+        arm's own errors leave more.
     """
     count = len(cam_from_target)
     if 3 * count < 14:
@@ -40,12 +37,10 @@ def distance_scale(
     misfit = float(np.sum((b - a @ solution) ** 2))
     unscaled, *_ = np.linalg.lstsq(a[:, :6], b - a[:, 6])
     unscaled_misfit = float(np.sum((b - a[:, 6] - a[:, :6] @ unscaled) ** 2))
+    if CLEAR_RATIO**2 * misfit > unscaled_misfit:
+        return None
     share = float(solution[6]) - 1.0
     variance = misfit / (3 * count - 7) * np.linalg.pinv(a.T @ a)[6, 6]
-    if abs(share) < max(_LEAST, _SURE * variance**0.5):
-        return None
-    if abs(share) < _NO_ARM and misfit > _EXPLAINED * unscaled_misfit:
-        return None
     short, size = ("short", "larger") if share > 0.0 else ("long", "smaller")
     percent = f"{figure(100 * abs(share))} % (sigma {figure(100 * variance**0.5)} %)"
     return Finding(
@@ -56,5 +51,5 @@ def distance_scale(
             "Measure the board with a caliper, and measure the poses again with its true size; or "
             f"multiply cft_x_m, cft_y_m and cft_z_m by {1.0 + share:.5g}."
         ),
-        mahalanobis_sq=share**2 / variance if variance > 0.0 else np.inf,
+        mahalanobis_sq=share**2 / max(variance, np.finfo(float).tiny),
     )

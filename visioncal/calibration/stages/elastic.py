@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from visioncal.core.limits import CONTRADICTION, DETERMINED
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
@@ -15,10 +16,6 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpring, Sag
-
-# A compliance is determined where its sigma is below this share of its prior sigma, on a joint with
-# this torque [N m]; a joint has a stiffness where its compliance is this many sigmas.
-_DETERMINED, _LOADED_NM, _SURE = 0.5, 0.05, 2.0
 
 
 def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult | None:
@@ -32,14 +29,14 @@ def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult |
         return None
     model, loads, names = arm.model, arm.loads, arm.model.nominal.joint_names
     torques = model.robot.load_torques(model.bent(arm.q, loads), loads)
-    greatest, sigmas, prior = np.abs(torques).max(axis=0), np.zeros(len(names)), 0.0
+    sigmas, prior = np.zeros(len(names)), 0.0
     if COMPLIANCE in errors:
         prior = errors[COMPLIANCE].sigma / model.torque_nm
         variances = np.diag(arm.arm_covariance)[model.columns_of(COMPLIANCE)]
         unit = model.weights[COMPLIANCE] / model.torque_nm
         sigmas = np.minimum(unit * np.sqrt(variances), prior)
-    determined = (greatest > _LOADED_NM) & (sigmas < _DETERMINED * prior)
-    is_stiff = determined & (model.compliance > 0.0) & (model.compliance >= _SURE * sigmas)
+    determined = sigmas < DETERMINED * prior
+    is_stiff = determined & (model.compliance > CONTRADICTION * sigmas)
     springs = []
     for at, (name, compliance, sigma) in enumerate(
         zip(names, model.compliance.tolist(), sigmas.tolist(), strict=True)

@@ -15,10 +15,6 @@ from visioncal.estimation.moves import Move
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, by_noise_alone
 
-# Factor on the limit of an observation's squared distance at other stops than its own: the
-# prediction has errors, too, and wrong stops are much farther.
-_NEAR = 4.0
-
 
 def other_stops(
     problem: Problem,
@@ -42,9 +38,7 @@ def other_stops(
         alike = turns.get(seen.observed[at].partition("@")[0], np.eye(4)[None])
         squares = np.min([_at_stops(problem, fit, at, moves, turn) for turn in alike], axis=0)
         # Stops in the same posture do not count: an observation fits its own about as well.
-        limit = min(
-            _NEAR * chi2_limit(FALSE_REJECTION, 6), squares[seen.stops[at]] / CLEAR_RATIO**2
-        )
+        limit = min(chi2_limit(FALSE_REJECTION, 6), squares[seen.stops[at]] / CLEAR_RATIO**2)
         near = np.flatnonzero(squares < limit)
         if len(near):
             found[at] = near[np.argsort(squares[near])].tolist()

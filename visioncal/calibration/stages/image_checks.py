@@ -18,8 +18,8 @@ from visioncal.vision.boards.identity import Identity
 from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.targets import board_words
 
-# Names that are listed, and images that are searched for any board.
-_LISTED, _LOOKED_AT = 6, 3
+# Images that are searched for any board.
+_LOOKED_AT = 3
 # Properties of a board that an image shows, beside its markers' dictionary.
 _COMPARED = ("kind", "columns", "rows", "legacy", "marker_id")
 # Least share of a board's corners in an image that identifies it.
@@ -32,7 +32,7 @@ def missing_images(session: Session) -> Finding | None:
     missing = [view for view in searched if session.images.absence(view.image) == "is missing"]
     if not missing:
         return None
-    images = some_of([view.image for view in missing], _LISTED)
+    images = some_of([view.image for view in missing])
     views = tuple(view.number for view in missing)
     return Finding(
         "missing_images",
@@ -61,7 +61,7 @@ def empty_rows(session: Session) -> Finding | None:
     return Finding(
         "lost_views",
         f"{len(views)} of {count} rows of views.csv have neither an image nor rows in corners.csv: "
-        f"view {some_of([*map(str, views)], _LISTED)}.",
+        f"view {some_of([*map(str, views)])}.",
         Remedy(
             "Write corners.csv again, as a whole; or in views.csv, fill in column image of these "
             "rows, or delete them."

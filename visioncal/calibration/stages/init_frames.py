@@ -42,9 +42,6 @@ from visioncal.vision.targets import rotation_transforms
 
 # Most orientations of boards that are tried.
 _MOST_TRIED = 256
-# Fewest stops at which points are read to determine them and the instrument; assumed sigma of these
-# starts [m].
-_FEWEST_STOPS, _ROUGH_M = 4, 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,7 +337,7 @@ class _Growth:
             branch = self.problem.tree.branches[flange]
             rows = np.concatenate([pair.rows for pair in pairs])
             stops = self.problem.observations.stops[rows]
-            if len(np.unique(stops)) < _FEWEST_STOPS:
+            if len(np.unique(stops)) <= FEWEST_VIEWS:
                 continue
             problem = mounting_problem(
                 self.problem.poses[branch.robot][stops],
@@ -348,7 +345,7 @@ class _Growth:
                 np.repeat(np.arange(len(pairs)), [len(pair.rows) for pair in pairs]),
             )
             mounting, errors = find_mounting(problem, np.unique(stops, return_inverse=True)[1])
-            sigma_m = float(np.median(np.linalg.norm(errors, axis=1))) + _ROUGH_M
+            sigma_m = float(np.median(np.linalg.norm(errors, axis=1))) + AGREE_M
             yield _Relation(branch.parent, seer, mounting.frame[None], sigma_m)
             for pair, point in zip(pairs, mounting.points, strict=True):
                 yield _Relation(flange, pair.seen, compose(np.eye(3), point)[None], sigma_m)
@@ -366,7 +363,7 @@ class _Growth:
             if seer is not None:
                 places = apply(invert(body), apply(seer[None], read[:, None]))
                 point = np.median(places[:, 0], axis=0)
-                yield _Relation(of_seen, pair.seen, compose(np.eye(3), point)[None], _ROUGH_M)
+                yield _Relation(of_seen, pair.seen, compose(np.eye(3), point)[None], AGREE_M)
             elif seen is not None:
                 points = apply(body, np.broadcast_to(seen[:3, 3], (len(read), 1, 3)))
                 readings.setdefault(pair.seer, []).append((points[:, 0], read))
@@ -374,7 +371,7 @@ class _Growth:
             points, read = (np.concatenate(pair) for pair in zip(*parts, strict=True))
             if len(read) >= FEWEST_VIEWS and spreads(points)[0][1] > AGREE_M:
                 of_seer = self.problem.tree.body(name)
-                yield _Relation(of_seer, name, align(points, read)[None], _ROUGH_M)
+                yield _Relation(of_seer, name, align(points, read)[None], AGREE_M)
 
     def _score(self, joined: _Joined) -> float:
         """Mean distance [m] of the early views from their predictions."""

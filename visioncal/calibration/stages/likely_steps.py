@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.core.limits import FEWEST_STOPS
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import ArmErrors, stops_of
 from visioncal.estimation.pose_errors import find_pose_errors
@@ -26,8 +26,6 @@ from visioncal.estimation.steps import (
 
 # Most steps that are fitted.
 _MOST_FITTED = 6
-# Largest ratio of the residuals beside a step to others.
-_ALIKE = 3.0
 # Log-likelihood ratio, doubled, by which one step is clearly likelier: odds of a hundred to one.
 _CLEARLY = 2.0 * float(np.log(100.0))
 
@@ -89,4 +87,4 @@ def _leaves_noise(problem: Problem, fit: Solution, step: Step) -> bool:
     sides = (involved & ~behind, seen.involves([*problem.unknown][-1]) & behind)
     if step.kind == SIZE:
         sides = (involved & ~behind, involved & behind)
-    return all(np.median(squares[side]) < _ALIKE**2 * np.median(squares) for side in sides)
+    return all(np.median(squares[side]) < CLEAR_RATIO**2 * np.median(squares) for side in sides)

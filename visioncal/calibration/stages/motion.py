@@ -10,14 +10,14 @@ from visioncal.core.number_format import counted
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.trajectory import Samples, Trajectory
-from visioncal.robot import Robot
+from visioncal.robot import REPEATABILITY, Robot
 from visioncal.session import Session, View
 from visioncal.session.columns import POSE
 
 ROBOT_STREAM = "robot"
-# The flange is standing still, and clocks have no effect, where it stays within this for this time
-# before and after [mm, deg, s].
-_REST_MM, _REST_DEG, _REST_S = 0.1, 0.01, 0.25
+# The flange is standing still, and clocks have no effect, where it stays within what arms repeat to
+# for this time before and after [s].
+_REST_S = 0.25
 # Of many moments the slower share is used, and more where that gives too few, up to the most; each
 # has to differ from the others by this [rad, m].
 _SLOW_SHARE, _ENOUGH_VIEWS, _MOST_VIEWS = 0.5, 20, 200
@@ -103,8 +103,8 @@ def is_standing_still(flange: Trajectory, at_s: FloatArray) -> Mask:
     still = np.ones(len(pose), dtype=bool)
     for offset_s in (-_REST_S, -0.5 * _REST_S, 0.5 * _REST_S, _REST_S):
         moved = invert(pose) @ flange.at(at_s[resting] + offset_s)
-        still &= 1e3 * np.linalg.norm(moved[:, :3, 3], axis=1) < _REST_MM
-        still &= np.rad2deg(rotation_angle(moved)) < _REST_DEG
+        still &= 1e3 * np.linalg.norm(moved[:, :3, 3], axis=1) < REPEATABILITY[0]
+        still &= np.rad2deg(rotation_angle(moved)) < REPEATABILITY[1]
     resting[resting] = still
     return resting
 

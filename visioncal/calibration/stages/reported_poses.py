@@ -15,11 +15,8 @@ from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import Finding
 from visioncal.robot import Robot
 from visioncal.session import Session
+from visioncal.session.observations import APART_DEG, APART_MM
 from visioncal.session.table import reported_matrices
-
-# Largest difference of poses within a stop: the robot is standing still, but is reported with
-# noise.
-_ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +92,12 @@ def _check_stops(session: Session, poses: Mapping[int, FloatArray]) -> None:
     for stop, views in rows.items():
         differences = [pose_difference(poses[views[0]], poses[view]) for view in views]
         mm, deg = np.max(differences, axis=0)
-        if mm > _ONE_STOP_MM or deg > _ONE_STOP_DEG:
+        if mm > APART_MM or deg > APART_DEG:
             named = ", ".join(map(str, views))
             raise DataError(
                 f"views.csv: the rows of stop {stop} (views {named}) have poses of the robot up to "
                 f"{mm:.4g} mm and {deg:.3g} deg apart; those of one stop lie within "
-                f"{_ONE_STOP_MM:g} mm and {_ONE_STOP_DEG:g} deg.",
+                f"{APART_MM:g} mm and {APART_DEG:g} deg.",
                 culprits=[f"views.csv: view {view}" for view in views],
                 next_step="Remove the stop numbers, or correct the poses.",
             )

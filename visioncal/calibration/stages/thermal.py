@@ -13,6 +13,7 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.limits import DETERMINED
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -30,6 +31,7 @@ from visioncal.robot import Robot
 from visioncal.robot.thermal import Heating, Inputs, Kind, ThermalModel
 from visioncal.session import Session
 from visioncal.session.kinds import name_of
+from visioncal.session.observations import APART_RAD
 from visioncal.session.selecting import streams_of
 from visioncal.session.streams import STAMP, Stream
 
@@ -49,14 +51,12 @@ _TAU_S: Mapping[Kind, float] = {"currents": 2400.0, "temperatures": 120.0}
 _TAU_SIGMA: Mapping[Kind, float] = {"currents": 0.6, "temperatures": 1.0}
 # Rise of joints at work above the air, within a factor [K].
 _RISE_K, _GAIN_SIGMA = 20.0, 0.8
-# Smaller rises of all joints determine nothing: temperatures [K], and shares of the final rise.
-_LEAST_RISE_K, _LEAST_SHARE = 3.0, 0.15
-# A parameter counts as determined where its sigma is at most this share of its prior's.
-_UNDETERMINED = 0.8
+# Smaller rises of all joints determine nothing [K].
+_LEAST_RISE_K = 3.0
 # Step at convergence [prior sigmas].
 _SETTLED = 1e-3
-# Largest difference of joints in one posture [rad], and points of the reported course.
-_SAME_RAD, _COURSE_POINTS = 1e-3, 200
+# Points of the reported course.
+_COURSE_POINTS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,14 +103,12 @@ class HeatedStops:
                 f"taken from {least_s:.10g} to {most_s:.10g} s"
             )
         links = _expected(inputs).links_c(inputs, self.stamps_s)
-        rise, least, unit = float(np.ptp(links, axis=0).max()), _LEAST_RISE_K, "K"
-        if inputs.kind == "currents":
-            rise, least, unit = 100.0 * rise / _RISE_K, 100.0 * _LEAST_SHARE, "% of the way"
-        if rise < least:
+        rise_k = float(np.ptp(links, axis=0).max())
+        if rise_k < _LEAST_RISE_K:
             raise DegenerateError(
-                f"thermal: the joints warm up by at most {figure(rise)} {unit} in the "
+                f"thermal: the joints warm up by at most {figure(rise_k)} K in the "
                 f"{figure((most_s - least_s) / 3600.0)} h of the {len(self.q)} used stops, and "
-                f"{least:g} {unit} are needed: the views do not show how the arm drifts.",
+                f"{_LEAST_RISE_K:g} K are needed: the views do not show how the arm drifts.",
                 culprits=["temperatures"],
                 next_step="Begin with a cold robot, let it work for an hour or more, and look at "
                 "the same few reference views every five to ten minutes.",
@@ -231,7 +229,7 @@ class ThermalFit:
         kinds = ("growth", "drift", "tau", "gain")
         names = [f"{kind} of {joint}" for kind in kinds for joint in self.model.robot.joint_names]
         pairs = zip(names, self.shares, strict=False)
-        return tuple(name for name, share in pairs if share > _UNDETERMINED)
+        return tuple(name for name, share in pairs if share > DETERMINED)
 
     def moved(self, step: FloatArray) -> Self:
         """The drift after a (p,) step of its values."""
@@ -371,7 +369,7 @@ def drift_result(fit: ThermalFit, stops: HeatedStops) -> ThermalResult:
         columns["gain_k_per_a2"] = model.heating.gain_k_per_a2
     columns |= dict(zip(names, sigmas, strict=False))
     # Drift over time in the most frequent posture; of several, in the most central one.
-    counts = [int((np.abs(stops.q - q).max(axis=1) < _SAME_RAD).sum()) for q in stops.q]
+    counts = [int((np.abs(stops.q - q).max(axis=1) < APART_RAD).sum()) for q in stops.q]
     distance = np.abs(stops.q - np.median(stops.q, axis=0)).sum(axis=1)
     typical = stops.q[np.lexsort((distance, -np.array(counts)))[0]]
     at_s = np.linspace(inputs.stamps_s[0], inputs.stamps_s[-1], _COURSE_POINTS)

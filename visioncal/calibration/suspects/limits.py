@@ -12,14 +12,11 @@ from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.calibration.suspects.suspect import UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg
-from visioncal.core.verdict import REVIEW, Finding, Remedy, look_at, without
+from visioncal.core.verdict import LEAST_NEED_MM, REVIEW, Finding, Remedy, look_at, without
+from visioncal.estimation.arm import LEVER_M
 from visioncal.results import ViewResult
 
 _LIMITS = CalibrationLimits()
-# Scatter below a nanometre or a micro-degree is rounding, so that ratios mean nothing.
-_ROUNDING = 1e-6
-# Distance of what is seen from a flange, at which the flange's turns move it [m].
-_SEEN_AT_M = 0.3
 # Views that are named.
 _LISTED = 3
 
@@ -55,7 +52,7 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
     # A servo arm's own noise puts what is seen so far away.
     by_arm = np.max([(0.0, 0.0), *(arm.repeatability for arm in judged.arms)], axis=0)
     by_arm *= _LIMITS.repeatability * np.sqrt(3.0)
-    by_arm[0] += 1e3 * _SEEN_AT_M * np.deg2rad(by_arm[1])
+    by_arm[0] += 1e3 * LEVER_M * np.deg2rad(by_arm[1])
     for pair in judged.pairs:
         held = pair.weighted_held_out or pair.held_out
         beyond = []
@@ -116,10 +113,10 @@ def _holdout(pair: JudgedPair) -> Iterator[Finding]:
     if holdout is None:
         return
     ratio = max(
-        one / max(other, _ROUNDING)
+        one / max(other, LEAST_NEED_MM)
         for one, other in ((holdout.mm, left_out.mm), (holdout.deg or 0.0, left_out.deg or np.inf))
     )
-    if ratio > _LIMITS.holdout and max(holdout.mm, holdout.deg or 0.0) > _ROUNDING:
+    if ratio > _LIMITS.holdout:
         yield Finding(
             "holdout",
             f"The views that the session holds back are missed by {holdout.words}, {ratio:.0f} "

@@ -6,12 +6,9 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import Suspect
+from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Remedy
-
-# What rides on a flange is nearer to it than this [m], or than so many times what it is compared
-# with.
-_NEAR_M, _RATIO = 0.3, 3.0
 
 
 def _found(run: RunState) -> Iterator[Finding]:
@@ -27,7 +24,7 @@ def _found(run: RunState) -> Iterator[Finding]:
     )
     in_hand = run.mount == MOUNTS[0]
     (carried, carried_m), (placed, placed_m) = (camera, target) if in_hand else (target, camera)
-    if carried_m > _NEAR_M and carried_m > _RATIO * placed_m:
+    if carried_m > CLEAR_RATIO * placed_m:
         yield Finding(
             "mirrored_cell",
             f"By this result, {carried} is {carried_m:.2f} m away from the flange that carries it, "

@@ -7,7 +7,7 @@ from itertools import islice
 import numpy as np
 
 from visioncal.calibration.guess.fit import robust_fits
-from visioncal.calibration.guess.search import FEWEST_ROWS, relative_angles, thinned
+from visioncal.calibration.guess.search import FEWEST_ROWS, PAIRS_SHARE, relative_angles, thinned
 from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.corner_numbers import are_from_behind
@@ -21,10 +21,10 @@ from visioncal.estimation.chain import robot_part
 
 # A robot that moves by less stood still [m].
 _STILL_M = 1e-3
-# In a third of the pairs, those of sound views, the angles by which robot and camera turn differ by
-# less [rad]: by 2 degrees for a servo arm that repeats to 2 degrees, by 4 to 15 where angles were
-# misread or rows are mixed up.
-_PAIRS_SHARE, _MISREAD_RAD = 0.35, float(np.deg2rad(3.5))
+# In `PAIRS_SHARE` of the pairs, those of sound views, the angles by which robot and camera turn
+# differ by less [rad]: by 2 degrees for a servo arm that repeats to 2 degrees, by 4 to 15 where
+# angles were misread or rows are mixed up.
+_MISREAD_RAD = float(np.deg2rad(3.5))
 # Where a third of the rows are sound, in a ninth of the pairs the angles differ by less [rad].
 _ALIKE_RAD, _PAIRS_IN_PLACE = 0.01, 1.0 / 9.0
 
@@ -115,7 +115,7 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
     words = "The robot's poses are not those of the images: "
     if np.ptp(both[:, 0, :3, 3], axis=0).max() < _STILL_M:
         words += "all rows have one position of the robot."
-    elif np.quantile(away, _PAIRS_SHARE) > _MISREAD_RAD and alike < _PAIRS_IN_PLACE:
+    elif np.quantile(away, PAIRS_SHARE) > _MISREAD_RAD and alike < _PAIRS_IN_PLACE:
         words += (
             "between two views, robot and camera must turn by the same angle; here these differ by "
             f"{np.rad2deg(np.median(away)):.0f} deg (median of all pairs)."

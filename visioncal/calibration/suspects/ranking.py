@@ -33,8 +33,6 @@ from visioncal.core.types import Need
 from visioncal.core.verdict import ADD_VIEWS, CALIBRATE, REVIEW, Finding, Remedy
 from visioncal.results import NeedMet
 
-# Least logarithm of a false-alarm probability.
-_LEAST_LOG = -1e6
 # Probability from which on a mistake precedes sigmas beyond their limits.
 _LIKELIER = 0.5
 # Removing a source with a smaller share of the variance would reduce a pick's error by under 5 %.
@@ -200,7 +198,7 @@ def _log_odds(doubt: Finding, misfit_mm: float = 0.0) -> float:
     log_chance = float(np.log(SUSPECTS[doubt.kind].chance))
     if doubt.mahalanobis_sq:
         log_chance = min(np.log(2.0) + float(log_ndtr(-np.sqrt(doubt.mahalanobis_sq))), log_chance)
-    log_chance = max(log_chance, _LEAST_LOG)
+    log_chance = max(log_chance, np.finfo(float).min)
     log_odds = float(-1.0 - log_chance - np.log(-log_chance))
     if doubt.up_to_mm >= misfit_mm:
         return log_odds
