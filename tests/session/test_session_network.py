@@ -253,51 +253,22 @@ def test_points_are_on_what_moves_while_they_are_read(tmp_path):
     ]
 
 
-BOARDS_TOML = """schema = 1
-name = "cell"
-mount = "eye-in-hand"
-
-[camera]
-resolution = [1280, 800]
-
-[targets]
-wall = "checkerboard_9x6_25mm"
-
-[targets.floor]
-target = "boards/floor.toml"
-"""
-BOARD = """kind = "charuco"
-columns = 5
-rows = 7
-square_m = 0.04
-marker_m = 0.03
-dictionary = "DICT_5X5_100"
-"""
-BOARDS_TABLE = """view,stop,target,image,x_m,y_m,z_m,qx,qy,qz,qw
-0,0,floor,a.png,0.1,0.2,0.3,0,0,0,1
-1,0,wall,a.png,0.1,0.2,0.3,0,0,0,1
-2,1,wall,b.png,0.2,0.2,0.3,0,0,0,1
-"""
-
-
-@pytest.fixture
-def boards(tmp_path):
-    session = tmp_path / "cell"
-    (session / "boards").mkdir(parents=True)
-    (session / "session.toml").write_text(BOARDS_TOML)
-    (session / "views.csv").write_text(BOARDS_TABLE)
-    (session / "boards" / "floor.toml").write_text(BOARD)
+def test_rows_say_which_board_they_show(tmp_path):
+    (tmp_path / "session.toml").write_text(
+        'schema = 1\nname = "cell"\nmount = "eye-in-hand"\n[camera]\nresolution = [1280, 800]\n'
+        '[targets]\nwall = "checkerboard_9x6_25mm"\n[targets.floor]\ntarget = "floor.toml"\n'
+    )
+    board = 'kind = "charuco"\ncolumns = 5\nrows = 7\nsquare_m = 0.04\nmarker_m = 0.03\n'
+    (tmp_path / "floor.toml").write_text(f'{board}dictionary = "DICT_5X5_100"\n')
+    (tmp_path / "views.csv").write_text(
+        "view,stop,target,image,x_m,y_m,z_m,qx,qy,qz,qw\n"
+        f"0,0,floor,a.png,{POSE}\n1,0,wall,a.png,{POSE}\n2,1,wall,b.png,{POSE}\n"
+    )
     for name in ("a.png", "b.png"):
-        (session / name).write_bytes(b"\x89PNG " + name.encode())
-    return session
-
-
-def test_rows_say_which_board_they_show(boards):
-    session = Session.load(boards)
-    assert {name: board.kind for name, board in session.boards.items()} == {
-        "wall": "checkerboard",
-        "floor": "charuco",
-    }
+        (tmp_path / name).write_bytes(b"\x89PNG " + name.encode())
+    session = Session.load(tmp_path)
+    kinds = {name: board.kind for name, board in session.boards.items()}
+    assert kinds == {"wall": "checkerboard", "floor": "charuco"}
     assert [session.board_of(view) for view in session.views] == ["floor", "wall", "wall"]
     # Two rows of one image that show two boards are no mistake.
     assert session.warnings == ()

@@ -5,11 +5,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from support.boards import charuco
+from support.boards import charuco, checkerboard
 from support.refusals import raised
 
 from visioncal.core.errors import DataError
-from visioncal.core.types import Target
 from visioncal.present.recording.board import picture
 from visioncal.simulation.textures import draw_sheet
 from visioncal.vision.boards import NotFound
@@ -42,10 +41,6 @@ MARKER: dict[str, Any] = {
     "size_m": 0.1,
     "dictionary": "DICT_APRILTAG_36h11",
 }
-
-
-def checkerboard(columns, rows):
-    return Target("board", "checkerboard", columns, rows, 0.02, 1e-5)
 
 
 @pytest.mark.parametrize("name", target_names())
