@@ -94,11 +94,3 @@ def test_what_describes_somebody_elses_poses_is_refused_for_a_session(folder, tm
         "is a session already"
     )
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize("name", ["absent", "empty", "notes.txt"])
-def test_what_is_no_session_is_named(tmp_path, name):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "notes.txt").write_text("no session")
-    raised(DataError, name, convert, tmp_path / name, tmp_path / "new.rrd")
-    assert not (tmp_path / "new.rrd").exists()

@@ -84,14 +84,12 @@ def test_a_controller_ends_with_the_process_that_started_it():
     host = parent.stdout.strip()
     # It ends within milliseconds; the limit is for a busy computer.
     ends_s = time.monotonic() + 20.0
-    while _is_open(host):
+    while True:
+        with socket.socket() as probe:
+            if probe.connect_ex((host, DASHBOARD_PORT)) != 0:
+                break
         assert time.monotonic() < ends_s
         time.sleep(0.01)
-
-
-def _is_open(host):
-    with socket.socket() as probe:
-        return probe.connect_ex((host, DASHBOARD_PORT)) == 0
 
 
 TARGET = CellOptions().target

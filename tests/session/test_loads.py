@@ -26,10 +26,6 @@ def session_with(**cells):
     )
 
 
-def hung(options, joints):
-    return session_of(tracked(options, joints))
-
-
 def test_loads_are_read_and_nothing_is_no_load():
     view = session_with(payload_kg="5", payload_z_m="0.1", force_z_n="-20").views[0]
     loads = loads_of([view.numbers, {}], ["+", ""])
@@ -56,11 +52,12 @@ def test_what_can_be_no_load_is_refused(cells, words):
 def test_a_load_that_changes_while_the_arm_stands_still_is_refused():
     options = InstrumentOptions(robot=NOMINAL.name, payloads=HUNG)
     with pytest.raises(DegenerateError, match="views are all from one pose of the robot"):
-        known_of(hung(options, np.repeat(loaded_postures(1)[:1], 12, axis=0)))
+        known_of(session_of(tracked(options, np.repeat(loaded_postures(1)[:1], 12, axis=0))))
 
 
 def test_views_of_one_stop_share_its_load():
-    session = hung(InstrumentOptions(robot=NOMINAL.name, payloads=HUNG), loaded_postures(6))
+    options = InstrumentOptions(robot=NOMINAL.name, payloads=HUNG)
+    session = session_of(tracked(options, loaded_postures(6)))
     views = tuple(replace(view, stop=view.stop // 4) for view in session.views)
     with pytest.raises(DataError, match="views 0 and 1 are of stop 0 and differ in payload"):
         known_of(replace(session, views=views))

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.edited import changed as edit
 from support.refusals import raised
 
 from visioncal.core.errors import DataError
@@ -52,12 +53,6 @@ def folder(tmp_path):
     (session / "images" / "a.png").write_bytes(b"\x89PNG a")
     (session / "images" / "b 2.png").write_bytes(b"\x89PNG b")
     return session
-
-
-def edit(folder, name, old, new):
-    text = (folder / name).read_text(encoding="utf-8")
-    assert old in text
-    (folder / name).write_text(text.replace(old, new), encoding="utf-8")
 
 
 def refusal(folder):

@@ -113,20 +113,6 @@ def test_cells_that_come_with_visioncal_are_calibrated(name, place):
         assert misfit(item, truth, among) < MOST, edge
 
 
-@pytest.mark.parametrize("read", [slow("point"), "probe"])
-def test_readings_of_a_tracker_are_calibrated(read, place):
-    folder, out = place / read, place / f"{read}-out"
-    errs = ("--arm-sigma-mm", 0.3, "--arm-sigma-mrad", 0.3) if read == "point" else ()
-    done("simulate", folder, "--instrument", read, *errs, "--views", 24)
-    done("calibrate", folder, "-o", out)
-    found, (_, edges) = Calibration.load(out), truth_of(folder)
-    assert found.arm_is_calibrated == bool(errs)
-    assert misfit(found.edges["base_from_instrument"], edges["base_from_instrument"]) < MOST
-    probe = found.edges["flange_from_probe"]
-    among = slice(None) if read == "probe" else slice(3, 6)
-    assert misfit(probe, edges["flange_from_probe"], among) < MOST
-
-
 def test_another_recording_of_a_whole_cell_is_that_of_a_cell_whose_camera_was_knocked(place):
     first, again = place / "whole-1", place / "whole-2"
     shipped = Path(simulation.__file__).parent / "cells" / "two-arms.toml"

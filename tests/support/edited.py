@@ -7,9 +7,9 @@ from pathlib import Path
 
 def changed(folder: Path, name: str, old: str, new: str) -> Path:
     """Replaces a text that has to be in a file of a folder."""
-    text = (folder / name).read_text()
+    text = (folder / name).read_text("utf-8")
     assert old in text
-    (folder / name).write_text(text.replace(old, new))
+    (folder / name).write_text(text.replace(old, new), "utf-8")
     return folder
 
 

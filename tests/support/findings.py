@@ -15,40 +15,26 @@ CONTRADICTS = "disagrees with the other views: it places the target 36 mm and 1.
 _FLAT = dict.fromkeys(BOARD_NAMES, 0.0)
 
 
-def healthy() -> dict[str, dict[str, Any]]:
-    """A flat board of the stated size, and no errors of the arm."""
-    return {
-        "board": {"shape": _FLAT, "sigma": {"scale": 8e-5}, "estimated": [], "bend_mm": 0.0},
-        "uncertainty": {
-            "point_cam_m": [0.0, 0.3, 0.4],
-            "budget_mm": {"pixels": 0.06, "robot": 0.08, "board": 0.001, "total": 0.1},
-            "radius95_mm": 0.163,
-            "noise_95": {
-                "robot_translation_mm": [0.041, 0.062],
-                "robot_rotation_deg": [0.0033, 0.0052],
-            },
-            "spectrum": [0.001 * index for index in range(1, 13)],
-        },
-    }
-
-
 def sick() -> dict[str, dict[str, Any]]:
     """A larger board that is bent, and an arm whose links are off."""
-    documents = healthy()
-    documents["board"] |= {
-        "shape": _FLAT | {"scale": 2e-3, "aspect": 1e-3, "bow_xx": 3e-4},
-        "sigma": {"scale": 1e-3, "aspect": 2e-5} | {"bow_xx": 1e-5},
-        "estimated": ["scale", "aspect", "bow_xx"],
-        "bend_mm": 0.29,
+    noise = {"robot_translation_mm": [0.041, 0.062], "robot_rotation_deg": [0.0033, 0.0052]}
+    arm = {"sigma_mm": 0.46, "sigma_deg": 0.053, "likelihood_ratio": 356.3, "estimated": True}
+    return {
+        "board": {
+            "shape": _FLAT | {"scale": 2e-3, "aspect": 1e-3, "bow_xx": 3e-4},
+            "sigma": {"scale": 1e-3, "aspect": 2e-5, "bow_xx": 1e-5},
+            "estimated": ["scale", "aspect", "bow_xx"],
+            "bend_mm": 0.29,
+        },
+        "uncertainty": {
+            "point_cam_m": [0.0, 0.3, 0.4],
+            "budget_mm": {"robot": 0.3, "arm": 1.2, "total": 1.237},
+            "radius95_mm": 0.163,
+            "noise_95": noise,
+            "spectrum": [0.001 * index for index in range(1, 13)],
+        },
+        "arm_errors": arm,
     }
-    documents["arm_errors"] = {
-        "sigma_mm": 0.46,
-        "sigma_deg": 0.053,
-        "likelihood_ratio": 356.3,
-        "estimated": True,
-    }
-    documents["uncertainty"]["budget_mm"] = {"robot": 0.3, "arm": 1.2, "total": 1.237}
-    return documents
 
 
 def with_findings(sample: Sample, documents: dict[str, dict[str, Any]]) -> Calibration:

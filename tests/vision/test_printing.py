@@ -179,7 +179,6 @@ CHARUCO = ("--kind", "charuco", "--columns", 9, "--rows", 6)
         (("charuco_13x8_30mm", "--page", "A4"), "does not fit on A4"),
         (("charuco_9x6_30mm", "--dpi", 1e6), "--dpi"),
         (("--kind", "marker", "--id", 1, "--name", "../tag"), "name of files"),
-        # 300 bytes, where file systems take 255.
     ],
     ids=str,
 )
