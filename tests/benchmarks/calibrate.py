@@ -32,10 +32,6 @@ VIEWS = few(40, 5)
 REPEATS = wished(3)
 THREADS = [name for name in (1, 2, 4) if name <= (os.cpu_count() or 1)]
 COMMAND = [sys.executable, "-m", "visioncal"]
-# Installed packages have their byte code beside them.
-ENVIRONMENT = {
-    name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
-}
 
 
 def opencv_alone(files: list[Path], board: cv2.aruco.CharucoBoard, threads: int) -> int:
@@ -61,7 +57,7 @@ def seconds(work: Callable[[], object]) -> np.ndarray:
 def of_program(command: list[str]) -> np.ndarray:
     """Wall and processor time of a program, (2,)."""
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    subprocess.run(command, check=True, capture_output=True, env=ENVIRONMENT)
+    subprocess.run(command, check=True, capture_output=True)
     after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - start
     used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return np.array([wall, used])

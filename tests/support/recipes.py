@@ -85,7 +85,7 @@ def match(expected: str, said: str, page: str) -> None:
             (
                 index
                 for index in range(at, len(words) - len(wanted) + 1)
-                if _alike(wanted, words[index:])
+                if all(map(_same, wanted, words[index:]))
             ),
             None,
         )
@@ -96,10 +96,6 @@ def match(expected: str, said: str, page: str) -> None:
 def _words(text: str) -> list[str]:
     """What a page may end a quotation before: commas and semicolons."""
     return [part.rstrip(",;") for part in text.split()]
-
-
-def _alike(wanted: list[str], words: list[str]) -> bool:
-    return all(_same(a, b) for a, b in zip(wanted, words, strict=False))
 
 
 def _same(wanted: str, word: str) -> bool:
