@@ -1,17 +1,21 @@
 """Transforms, quantiles, and figures as messages and pages state them."""
 
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, f, t
+from typing_extensions import TypeAliasType
 
 import visioncal
 from visioncal.core import transforms
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, rounded_up, significant
 from visioncal.core.quantiles import chi2_limit, f_limit, t_chance
+from visioncal.core.types import FloatArray, scalar_of
 from visioncal.robot import REPEATABILITY
 
 
@@ -137,3 +141,14 @@ def test_the_page_states_where_doubt_begins_and_where_trust_ends():
 def test_a_limit_is_rounded_up_to_the_digits_shown(limit, shown):
     assert figure(rounded_up(limit)) == shown
     assert float(significant(rounded_up(limit))) == float(shown) >= limit
+
+
+def test_annotations_of_arrays_are_read_in_the_form_of_newer_numpy_too(monkeypatch):
+    assert scalar_of(FloatArray) is np.float64
+    assert scalar_of(tuple[int, int]) is None
+    # NumPy 2.5 declares it as `type NDArray[S] = ndarray[tuple[Any, ...], dtype[S]]`.
+    scalar = TypeVar("scalar", bound=np.generic)
+    declared = np.ndarray[Any, np.dtype[scalar]]
+    alias = TypeAliasType("NDArray", declared, type_params=(scalar,))
+    monkeypatch.setattr(npt, "NDArray", alias)
+    assert scalar_of(alias[np.uint8]) is np.uint8

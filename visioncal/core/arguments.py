@@ -17,7 +17,7 @@ from pydantic_core import ErrorDetails
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
-from visioncal.core.types import Target
+from visioncal.core.types import Target, scalar_of
 
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
@@ -98,8 +98,8 @@ def _adapter(hint: Any) -> TypeAdapter[Any]:  # noqa: ANN401 - a type
 def _checkable(hint: Any) -> Any:  # noqa: ANN401 - a type
     """The type by which pydantic checks, of all but collections, only whose instance it is."""
     origin, inner = get_origin(hint), get_args(hint)
-    if hint is npt.ArrayLike or origin is np.ndarray:
-        dtype = get_args(inner[1])[0] if origin is np.ndarray else Any
+    dtype = scalar_of(hint)
+    if hint is npt.ArrayLike or dtype is not None:
         is_image = isinstance(dtype, type) and issubclass(dtype, np.unsignedinteger)
         return Annotated[Any, AfterValidator(partial(_array, dtype if is_image else None))]
     if hint is bool:

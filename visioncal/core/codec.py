@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, scalar_of
 
 _T = TypeVar("_T")
 _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
@@ -268,7 +268,7 @@ def _read_tuple(args: tuple[Any, ...], value: object, path: str) -> tuple[Any, .
 
 def _array(kind: Any, form: Array, value: object, path: str) -> Any:  # noqa: ANN401
     """Reads an array of a type such as `npt.NDArray[np.float64]`."""
-    (wanted,) = get_args(get_args(kind)[1])
+    wanted = scalar_of(kind)
     sizes = " x ".join("n" if index < 0 else str(index) for index in form.shape)
     shape_error = type_error(value, f"an array of {sizes} numbers", path)
     try:

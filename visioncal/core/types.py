@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args, get_origin
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,15 @@ Image: TypeAlias = npt.NDArray[np.uint8]
 Image16: TypeAlias = npt.NDArray[np.uint16]
 
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
+
+
+def scalar_of(hint: Any) -> Any:  # noqa: ANN401 - a type
+    """Scalar type of an annotation such as `FloatArray`; None for what is no array."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is np.ndarray:
+        return get_args(inner[1])[0]
+    # From NumPy 2.5 on, which needs Python 3.12, it is an alias that does not stand for another.
+    return inner[0] if inner and origin is npt.NDArray else None
 
 
 # Called with a stage's name, its steps done, and its steps in all.
