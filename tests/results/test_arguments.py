@@ -1,8 +1,6 @@
 """Public functions given what they do not take: refused by name, never from inside."""
 
 import inspect
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,51 +21,29 @@ METHODS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Bench:
-    """A cell, and what functions take of it."""
-
-    session: visioncal.Session
-    calibration: visioncal.Calibration
-    image: np.ndarray
-    pose: np.ndarray
-    folder: Path
-
-    @property
-    def foreign(self):
-        """What people hand over by mistake."""
-        files = [None, BOARD, self.folder / "views.csv", {"a": 1}, 3.5, [1], object()]
-        in_colour = np.dstack([self.image] * 3)
-        return [*files, self.session, self.calibration, self.image.astype(float), in_colour]
-
-    @property
-    def sound(self):
-        """Arguments by name; what is not here is given as the wrong one is."""
-        return {
-            "session": self.session,
-            "calibration": self.calibration,
-            "a": self.calibration,
-            "b": self.calibration,
-            "px": [[640.0, 400.0]],
-            "plane": visioncal.Plane.horizontal(0.0),
-            "base_from_flange": self.pose,
-            "seen": self.image,
-            "target": BOARD,
-            "sights": [visioncal.Sight("1", self.image, self.pose)],
-            "parent": "base",
-            "kind": "fixture",
-        }
-
-
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("bench") / "session"
+def sound(tmp_path_factory):
+    """What functions take, by the arguments' names; what is not here is given as the wrong one."""
+    folder = tmp_path_factory.mktemp("sound") / "session"
     cell = simulate(CellOptions(views=4, seed=2))
     write_session(cell, folder)
-    session = visioncal.Session.load(folder)
+    session, calibration = visioncal.Session.load(folder), calibration_of(cell)
     image = decode_image(session.images.read(session.views[0].image))
     pose = session.views[0].base_from_flange().as_matrix()
-    return Bench(session, calibration_of(cell), image, pose, folder)
+    return {
+        "session": session,
+        "calibration": calibration,
+        "a": calibration,
+        "b": calibration,
+        "px": [[640.0, 400.0]],
+        "plane": visioncal.Plane.horizontal(0.0),
+        "base_from_flange": pose,
+        "seen": image,
+        "target": BOARD,
+        "sights": [visioncal.Sight("1", image, pose)],
+        "parent": "base",
+        "kind": "fixture",
+    }
 
 
 def public_functions():
@@ -79,17 +55,13 @@ def public_functions():
             yield getattr(thing, method)
 
 
-def is_refused(function, given):
-    try:
-        function(**given)
-    except VisioncalError:
-        return True
-    return False
-
-
 @pytest.mark.slow
-def test_nothing_public_fails_from_inside(bench, tmp_path, monkeypatch):
+def test_nothing_public_fails_from_inside(sound, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    # What people hand over by mistake.
+    foreign = [None, BOARD, tmp_path / "views.csv", {"a": 1}, 3.5, [1], object()]
+    foreign += [sound["session"], sound["calibration"], sound["seen"].astype(float)]
+    foreign.append(np.dstack([sound["seen"]] * 3))
     refused = 0
     for function in public_functions():
         parameters = inspect.signature(function).parameters
@@ -97,17 +69,21 @@ def test_nothing_public_fails_from_inside(bench, tmp_path, monkeypatch):
             name for name, of in parameters.items() if of.default is of.empty and of.kind != 4
         ]
         for wrong in parameters:
-            for value in bench.foreign:
-                given = {name: bench.sound.get(name, value) for name in needed} | {wrong: value}
-                refused += is_refused(function, given)
+            for value in foreign:
+                try:
+                    function(**{name: sound.get(name, value) for name in needed} | {wrong: value})
+                except VisioncalError:
+                    refused += 1
     # Most of what is tried is wrong; without a check it would not get here.
     assert refused > 500
 
 
-def test_pictures_of_16_bits_are_taken_where_they_are_stored(bench):
-    deep = 257 * bench.image.astype(np.uint16)
-    taken = visioncal.Session.from_arrays([deep], bench.pose[None], BOARD)
-    shallow = visioncal.Session.from_arrays([bench.image], bench.pose[None], BOARD)
-    assert taken.views[0].image == shallow.views[0].image
+def test_pictures_of_16_bits_are_taken_where_they_are_stored(sound):
+    image, pose = sound["seen"], sound["base_from_flange"]
+    deep, shallow = (
+        visioncal.Session.from_arrays([picture], pose[None], BOARD)
+        for picture in (257 * image.astype(np.uint16), image)
+    )
+    assert deep.views[0].image == shallow.views[0].image
     with pytest.raises(DataError, match="seen is an array of uint16"):
-        visioncal.locate_target(bench.calibration, deep, BOARD, bench.pose)
+        visioncal.locate_target(sound["calibration"], 257 * image.astype(np.uint16), BOARD, pose)

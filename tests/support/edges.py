@@ -4,51 +4,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.estimation.chain import FLANGE
-from visioncal.estimation.observability import (
-    Direction,
-    chain_words,
-    check_determined,
-    directions,
-    refuse_too_few,
-)
+from visioncal.estimation.observability import chain_words, check_determined, refuse_too_few
 from visioncal.estimation.outliers import InlierFit, closed_form, find_inliers
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import (
-    Solution,
-    covariance_of,
-    estimate_noise,
-    fit_problem,
-    starting_noise,
-)
+from visioncal.estimation.solve import covariance_of, fit_problem
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The answer of one solver."""
+    """The unknowns of a chain, its levels of noise, and the covariance of the unknowns."""
 
-    problem: Problem
-    fit: Solution
+    state: State
+    noise: Noise
     covariance: np.ndarray
-    worst: tuple[Direction, ...]
-
-    @property
-    def state(self) -> State:
-        """The unknowns."""
-        return self.fit.state
-
-    @property
-    def noise(self) -> Noise:
-        """Its levels."""
-        return self.fit.noise
-
-
-def mount_of(problem: Problem) -> str:
-    """Where the camera of a chain is."""
-    carried = problem.tree.branches["cam"].parent == FLANGE
-    return "eye-in-hand" if carried else "eye-to-hand"
 
 
 def inliers_of(problem: Problem) -> InlierFit:
@@ -56,19 +26,11 @@ def inliers_of(problem: Problem) -> InlierFit:
     return find_inliers(problem, closed_form(problem, np.arange(len(problem))))
 
 
-def solved(problem: Problem, solver: str = "joint") -> Solved:
+def solved(problem: Problem) -> Solved:
     """Solves for both edges of a chain with one target, refusing motion that is too poor."""
-    mount = mount_of(problem)
+    carried = problem.tree.branches["cam"].parent == FLANGE
+    mount = "eye-in-hand" if carried else "eye-to-hand"
     refuse_too_few(problem, mount)
-    start = closed_form(problem, np.arange(len(problem)))
-    if solver == "joint":
-        fit = fit_problem(problem, start)
-    else:
-        state = closed_form_state(problem, solver, start, mount)
-        noise = starting_noise(problem)
-        fit = Solution(state, estimate_noise(problem, state, noise, from_above=True))
-    words = chain_words(problem, mount)
-    check_determined(problem, fit.state, fit.noise, words)
-    covariance = covariance_of(problem, fit)
-    worst = directions(problem, fit.state, covariance, words.names)
-    return Solved(problem, fit, covariance, tuple(direction for _, direction in worst))
+    fit = fit_problem(problem, closed_form(problem, np.arange(len(problem))))
+    check_determined(problem, fit.state, fit.noise, chain_words(problem, mount))
+    return Solved(fit.state, fit.noise, covariance_of(problem, fit))
