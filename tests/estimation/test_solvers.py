@@ -26,16 +26,13 @@ BOTH_AT_ONCE = ("shah", "li")
 
 @dataclass(frozen=True)
 class World:
-    """What a set of views is drawn from."""
+    """What a set of 20 views is drawn from."""
 
-    views: int = 20  # How many.
     tilt_deg: float = 40.0  # The largest angle between the optical axis and the board's normal.
     roll_deg: float = 40.0  # The largest rotation about the optical axis.
-    distance_m: tuple[float, float] = (0.4, 0.8)  # The nearest and the farthest camera.
-    robot_mm: float = 0.0  # Noise of the reported robot pose, a standard deviation for each axis.
-    robot_mrad: float = 0.0  # The same for its rotation.
-    camera_mm: float = 0.0  # Noise of the board's centre across the optical axis.
-    camera_mrad: float = 0.0  # Noise of the board's orientation.
+    robot_m: float = 0.0  # Noise of the reported robot pose, a standard deviation for each axis.
+    robot_rad: float = 0.0  # The same for its rotation.
+    camera: float = 0.0  # Noise of the board's centre [m] and 1.5 times that of its turn [rad].
     mount: Mount = "eye-in-hand"  # What holds the camera.
 
 
@@ -49,8 +46,8 @@ class Problem:
     z: FloatArray
 
 
-PRECISE = World(robot_mm=0.03, robot_mrad=0.05, camera_mm=0.2, camera_mrad=0.3)
-COARSE = World(robot_mm=0.3, robot_mrad=0.5, camera_mm=0.2, camera_mrad=0.3)
+PRECISE = World(robot_m=3e-5, robot_rad=5e-5, camera=2e-4)
+COARSE = World(robot_m=3e-4, robot_rad=5e-4, camera=2e-4)
 
 NOISY_WORLDS = {
     "precise robot": PRECISE,
@@ -79,15 +76,31 @@ def random_turns(rng: np.random.Generator, count: int, largest_rad: float) -> Fl
     return turn(axes * rng.uniform(0.0, largest_rad, size=(count, 1)))
 
 
-def simulate(world: World, seed: int) -> Problem:
+def simulate(world: World, seed: int, m: int = 20) -> Problem:
     rng = np.random.default_rng(seed)
     # What is bolted to the flange is near it; the base is not.
     reach_x, reach_z = (0.15, 0.8) if world.mount == "eye-in-hand" else (0.8, 0.15)
-    x = rigid(random_turns(rng, 1, np.pi)[0], rng.uniform(-reach_x, reach_x, size=3))
-    z = rigid(random_turns(rng, 1, np.pi)[0], rng.uniform(-reach_z, reach_z, size=3))
-    camera = _looking_at_board(world, rng)
+    x, z = any_x(rng, reach_x), any_x(rng, reach_z)
+    # Looking at the board.
+    heading = rng.uniform(-np.pi, np.pi, size=m)
+    tilt = np.radians(world.tilt_deg) * np.sqrt(rng.uniform(size=m))
+    roll = np.radians(world.roll_deg) * rng.uniform(-1.0, 1.0, size=m)
+    zero = np.zeros(m)
+    tilted = turn(np.stack([tilt * np.cos(heading), tilt * np.sin(heading), zero], axis=1))
+    rotation = turn(np.stack([zero, zero, roll], axis=1)) @ tilted
+    centre = rng.uniform(-0.05, 0.05, size=(m, 3))
+    centre[:, 2] = rng.uniform(0.4, 0.8, size=m)
+    camera = rigid(rotation, centre - rotation @ BOARD_CENTRE_M)
     robot = z @ np.linalg.inv(x @ camera)
-    return Problem(_robot_noise(robot, world, rng), _camera_noise(camera, world, rng), x, z)
+    # The error is the flange's own: at the right of base_from_flange, at the left of its inverse.
+    error = rigid(
+        turn(world.robot_rad * rng.normal(size=(m, 3))), world.robot_m * rng.normal(size=(m, 3))
+    )
+    robot = robot @ error if world.mount == "eye-in-hand" else error @ robot
+    # A pose from an image is sharp at the board's centre, not at the frame's far origin.
+    centre = centre + world.camera * rng.normal(size=(m, 3))
+    rotation = rotation @ turn(1.5 * world.camera * rng.normal(size=(m, 3)))
+    return Problem(robot, rigid(rotation, centre - rotation @ BOARD_CENTRE_M), x, z)
 
 
 def free_poses(
@@ -99,38 +112,6 @@ def free_poses(
         random_turns(rng, views, largest_rad), rng.uniform(-reach_m, reach_m, size=(views, 3))
     )
     return Problem(z @ np.linalg.inv(x @ camera), camera, x, z)
-
-
-def _looking_at_board(world: World, rng: np.random.Generator) -> FloatArray:
-    m = world.views
-    heading = rng.uniform(-np.pi, np.pi, size=m)
-    tilt = np.radians(world.tilt_deg) * np.sqrt(rng.uniform(size=m))
-    roll = np.radians(world.roll_deg) * rng.uniform(-1.0, 1.0, size=m)
-    zero = np.zeros(m)
-    tilted = turn(np.stack([tilt * np.cos(heading), tilt * np.sin(heading), zero], axis=1))
-    rotation = turn(np.stack([zero, zero, roll], axis=1)) @ tilted
-    centre = rng.uniform(-0.05, 0.05, size=(m, 3))
-    centre[:, 2] = rng.uniform(*world.distance_m, size=m)
-    return rigid(rotation, centre - rotation @ BOARD_CENTRE_M)
-
-
-def _robot_noise(robot: FloatArray, world: World, rng: np.random.Generator) -> FloatArray:
-    m = len(robot)
-    error = rigid(
-        turn(1e-3 * world.robot_mrad * rng.normal(size=(m, 3))),
-        1e-3 * world.robot_mm * rng.normal(size=(m, 3)),
-    )
-    # The error is the flange's own: at the right of base_from_flange, at the left of its inverse.
-    return robot @ error if world.mount == "eye-in-hand" else error @ robot
-
-
-def _camera_noise(camera: FloatArray, world: World, rng: np.random.Generator) -> FloatArray:
-    m = len(camera)
-    shift = 1e-3 * world.camera_mm * rng.normal(size=(m, 3))
-    rotation = camera[:, :3, :3] @ turn(1e-3 * world.camera_mrad * rng.normal(size=(m, 3)))
-    centre = camera[:, :3, :3] @ BOARD_CENTRE_M + camera[:, :3, 3] + shift
-    # A pose from an image is sharp at the board's centre, not at the frame's far origin.
-    return rigid(rotation, centre - rotation @ BOARD_CENTRE_M)
 
 
 def opencv(name: str, problem: Problem) -> FloatArray:
@@ -362,7 +343,7 @@ def test_what_motion_leaves_open_is_zero(solver: Solver):
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1 << 30))
 def test_frames_may_be_turned_and_views_come_in_any_order(solver: Solver, seed: int):
-    problem, rng = simulate(replace(COARSE, views=9), seed), np.random.default_rng(seed)
+    problem, rng = simulate(COARSE, seed, 9), np.random.default_rng(seed)
     found, order = solver(problem.robot, problem.camera), rng.permutation(9)
     shuffled = solver(problem.robot[order], problem.camera[order])
     # The same sums in another order: rounding alone.

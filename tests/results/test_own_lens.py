@@ -24,34 +24,21 @@ ORDINARY = CellOptions(
 )
 
 
-def tilted_lens(camera):
-    """OpenCV's 14 coefficients of the lens without decentring, before a tilted sensor."""
-    coefficients = np.zeros(14)
-    coefficients[:5] = camera.distortion[:5]
-    coefficients[2:4] = 0.0
-    coefficients[12:] = np.deg2rad(TILT_DEG)
-    return coefficients
-
-
-def behind_tilted_sensor(cell):
-    """The cell, and the corners that its camera shows with a tilted sensor."""
-    rng = np.random.default_rng(cell.options.seed)
-    camera = cell.options.camera
-    board = corners_m(cell.board())
-    shown = []
+@pytest.fixture(scope="module")
+def cell():
+    """A cell whose camera shows what it sees by a tilted sensor, without decentring."""
+    cell = simulate(replace(ORDINARY, seed=1))
+    rng, camera, board = np.random.default_rng(1), cell.options.camera, corners_m(cell.board())
+    # OpenCV's 14 coefficients.
+    lens = np.zeros(14)
+    lens[[0, 1, 4]], lens[12:] = camera.distortion[[0, 1, 4]], np.deg2rad(TILT_DEG)
+    shown, zero = [], np.zeros(3)
     for pose, corners in zip(cell.cam_from_target, cell.corners, strict=True):
         points = board[corners.ids] @ pose[:3, :3].T + pose[:3, 3]
-        px, _ = cv2.projectPoints(
-            points, np.zeros(3), np.zeros(3), matrix_3x3(camera), tilted_lens(camera)
-        )
+        px, _ = cv2.projectPoints(points, zero, zero, matrix_3x3(camera), lens)
         noise = rng.normal(0.0, cell.options.pixel_sigma_px, (len(points), 2))
         shown.append(replace(corners, px=px[:, 0] + noise))
     return showing(cell, shown)
-
-
-@pytest.fixture(scope="module")
-def cell():
-    return behind_tilted_sensor(simulate(replace(ORDINARY, seed=1)))
 
 
 @pytest.fixture(scope="module")
