@@ -291,7 +291,7 @@ def test_a_robot_without_joints_stays_as_it_reports_itself():
 def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
     cell = simulate(replace(PLAIN, boards=PLAIN.boards[:2], stops=8))
     caught = raised(DegenerateError, "nothing ties base_b to base_a", solved, cell)
-    assert "let cam_left, cam_right see a board on flange_b" in caught.next_step
+    assert "a camera see a board, one of both on base_b or on its robot" in caught.next_step
 
 
 def test_a_camera_that_one_standing_view_ties_is_refused():
@@ -374,8 +374,8 @@ def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
     with pytest.raises(DegenerateError, match="differ in position only") as caught:
         calibrate(turned(0.0, stops=8, turn_deg=0.0)[1])
     assert caught.value.next_step == (
-        "To tie base_b: let cam_left, cam_right see target_b at 5 stops or more, tilted by 20 to "
-        "40 degrees about different axes."
+        "To tie base_b: let a camera see a board, one of both on base_b or on its robot and the "
+        "other one tied, at 5 stops or more, tilted by 20 to 40 degrees about different axes."
     )
 
 

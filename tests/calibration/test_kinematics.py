@@ -339,27 +339,6 @@ def test_functions_of_joints_are_found_and_make_the_arm_better_where_it_never_wa
     assert kinematics.functions is None
 
 
-def test_where_it_carries_over_is_what_is_predicted_there(waved):
-    _, known = waved
-    found = arm_found(known).sections.arm.carries_over
-    assert found.measured_mm == known.robot_arm.kinematics.result.chosen.held_out_mm
-    # The wave's own noise and another session's share come on top of what is not known of the arm.
-    assert found.session_mm < found.sigma_mm < found.nominal_mm
-    assert found.better_share > 0.9
-    assert found.words in known.verdict.reasons
-    # Stops near one another tell less elsewhere, where the arm as stated is worse.
-    small = dict.fromkeys(("dh_sigma_m", "dh_sigma_rad", "offset_sigma_rad"), 2e-4)
-    q = np.array([0.3, -1.2, 1.4, -0.4, 1.2, 0.1])
-    near = q + 0.15 * np.random.default_rng(5).standard_normal((24, 6))
-    shop = tracked(replace(OPTIONS, function_sigma_rad=0.0, **small), near)
-    known = tracked_known(session_of(shop), level="kinematics")
-    found = arm_found(known).sections.arm.carries_over
-    assert found.sigma_mm > 3.0 * found.measured_mm
-    # One arm of errors that few values tell of: its error is within a factor of what is predicted.
-    ours = 1e3 * float(np.sqrt(np.mean(np.sum(away_m(shop, known) ** 2, axis=1))))
-    assert 0.4 < ours / found.sigma_mm < 1.5
-
-
 @pytest.fixture(scope="module")
 def carrying():
     """A cobot that was seen with nothing, 5 and 10 kg on its flange."""

@@ -362,7 +362,6 @@ WORLDS: dict[str, World] = {
         joints=True,
         status="check",
         causes=("weak_motion",),
-        kinds=("weak_lens",),
     ),
 }
 

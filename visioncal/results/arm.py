@@ -8,7 +8,6 @@ import numpy as np
 
 from visioncal.core.choices import Convention
 from visioncal.core.codec import Array, Key, Matrix, Section, WrittenForm
-from visioncal.core.number_format import figure, percent
 from visioncal.core.types import FloatArray
 from visioncal.results.edge import Covariance
 from visioncal.robot import Robot
@@ -89,31 +88,6 @@ class WorkspacePlace:
     sigma_mm: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class CarriesOver:
-    """Comparison of calibrated and nominal arm over the workspace."""
-
-    measured_mm: float  # Error of the calibrated arm at stops left out of the fit (rms) [mm].
-    measured_nominal_mm: float  # The same of the nominal arm [mm].
-    # Predicted error of the calibrated arm outside the box of the stops in another session, with
-    # noise (rms over the workspace) [mm].
-    sigma_mm: float
-    nominal_mm: float  # The same of the nominal arm [mm].
-    session_mm: float  # Part of that for another session, as assumed for arms of this size [mm].
-    better_share: float  # Share of the workspace where the calibrated arm is significantly better.
-
-    @property
-    def words(self) -> str:
-        """The comparison in sentences."""
-        return (
-            f"Where it was measured, the calibrated arm errs by {figure(self.measured_mm)} mm (the "
-            f"stated arm by {figure(self.measured_nominal_mm)} mm). Elsewhere "
-            f"{figure(self.sigma_mm)} mm are predicted (the stated arm: {figure(self.nominal_mm)} "
-            f"mm), {figure(self.session_mm)} mm of this for another session. The calibrated arm is "
-            f"clearly better in {percent(self.better_share)} of the workspace."
-        )
-
-
 @dataclass(frozen=True)
 class JointRange:
     """Range of a joint's positions at the stops of the fit."""
@@ -174,7 +148,6 @@ class ArmResult(Section):
     # The same at postures within the ranges of the joints at the stops, where the stops determine
     # more than at other postures with the same flange position.
     measured_map: tuple[WorkspacePlace, ...] = ()
-    carries_over: CarriesOver | None = None  # Comparison with the nominal arm over the workspace.
     measured: tuple[JointRange, ...] = ()  # Ranges of the joints at the stops.
     observability: Observability | None = None  # Observability of the parameters at the stops.
     not_determined: tuple[str, ...] | None = None  # Undetermined directions, in words.

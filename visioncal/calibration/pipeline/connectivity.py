@@ -26,7 +26,7 @@ def refuse_unconnected_robots(cell: Cell, lost: Collection[str]) -> None:
     untied = [base for base in bases if base in lost] or [*lost]
     moves = [robot_motion(cell, base, _stations(cell, base)) for base in bases]
     how = ", tilted by 20 to 40 degrees about different axes"
-    advice = [connection_advice(cell, base, how) for base in bases]
+    advice = [connection_advice(base, how) for base in bases]
     raise DegenerateError(
         f"cell: nothing ties {some_of(untied)} to {cell.reference}: the observations that link "
         f"{'this robot' if len(bases) == 1 else 'these robots'} to the rest of the cell are too "
@@ -37,13 +37,9 @@ def refuse_unconnected_robots(cell: Cell, lost: Collection[str]) -> None:
     )
 
 
-def _robot_on(cell: Cell, base: str) -> str:
-    return next(robot for robot, name in cell.tree.bases.items() if name == base)
-
-
 def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
     """Describes a robot's motion over some stations, and why it determines little."""
-    robot = _robot_on(cell, base)
+    robot = next(robot for robot, name in cell.tree.bases.items() if name == base)
     poses, who = cell.poses[robot][stations], f"robot {robot}"
     if robot == robot_key(""):
         who = "the robot"
@@ -63,29 +59,20 @@ def _stations(cell: Cell, base: str) -> IntArray:
     return np.array(sorted(stations), dtype=np.int64)
 
 
-def connection_advice(cell: Cell, frame: str, how: str = "") -> str:
+def connection_advice(frame: str, how: str = "") -> str:
     """Advice on observations that would connect a frame to the rest, in a sentence.
 
     `how` is what else the stops of a robot must be like, as the end of the sentence.
     """
-    tree, connected = cell.tree, cell.connected_frames()
     if frame.startswith(("instrument", "point")):
         return (
             f"To tie {frame}: let an instrument read points on a robot's flange at 5 stops or "
             "more, or three points that an instrument reads which is tied."
         )
-    carried = [name for name in tree.branches if frame in tree.above(name)]
-    boards = [name for name in carried if name.startswith("target")]
-    cameras = [name for name in carried if name.startswith("cam")]
-    seers = [name for name in connected if name.startswith("cam") and name not in carried]
-    lying = [name for name in connected if name.startswith("target") and name not in carried]
-    flange = next((end for end in tree.flanges.values() if tree.branches[end].parent == frame), "")
-    if cameras and not boards:
-        who, what = some_of(cameras), some_of(lying) or "a board that is tied"
-    else:
-        who = some_of(seers) or "a camera that is tied"
-        what = some_of(boards) or f"a board on {flange or frame}"
-    return f"To tie {frame}: let {who} see {what} at 5 stops or more{how}."
+    return (
+        f"To tie {frame}: let a camera see a board, one of both on {frame} or on its robot and the "
+        f"other one tied, at 5 stops or more{how}."
+    )
 
 
 def ambiguous_error(cell: Cell, frames: Sequence[str]) -> DegenerateError:

@@ -341,7 +341,7 @@ def _cell(run: RunState, edges: Mapping[str, str]) -> CellResult:
         noise=answer.sigmas,
         moved=answer.moved,
         untied=tuple(
-            UnconnectedFrame(name, connection_advice(cell, name)) for name in cell_fit.unconnected
+            UnconnectedFrame(name, connection_advice(name)) for name in cell_fit.unconnected
         ),
         weakest=weakest_link(cell_fit.cell, answer.last_edges),
         details=CellDetails({pair.words: clock for pair, clock in answer.clocks(run).items()}),

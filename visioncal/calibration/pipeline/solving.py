@@ -30,7 +30,6 @@ from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.types import Mask, Mount
-from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import ConvergedFit, fit_jointly, target_sizes
 from visioncal.estimation.observability import (
     chain_words,
@@ -169,16 +168,13 @@ def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
 
 
 def _without_misreported(
-    inliers: InlierFit, arms: Mapping[str, RobotArm], before: Mask
+    inliers: InlierFit, cell: Cell, arms: Mapping[str, RobotArm], before: Mask
 ) -> InlierFit:
     """Removes new inliers whose reported robot pose contradicts the arm's joint angles."""
     # They agree with joints and camera, but their reported poses would mislead the next fit.
-    problem, used = inliers.problem, inliers.used.copy()
-    stops = problem.observations.stops
-    for robot, arm in arms.items():
-        by_robot = rows_of(problem, robot)
-        sound = np.isin(np.arange(len(arm.has_pose)), stops[by_robot & before])
-        used &= before | ~by_robot | arm.reports_matching_joints(sound)[stops]
+    matched = (arm.matched.contradicting for arm in arms.values() if arm.matched is not None)
+    wrong = {view for views in matched for view in views}
+    used = inliers.used & (before | [row.view not in wrong for row in cell.rows])
     if np.array_equal(used, inliers.used):
         return inliers
     return replace(inliers, used=used).refitted()
@@ -211,7 +207,10 @@ def _calibrate_arms(
             break
         # Beside errors that repeated views share, the noise is another: each search has its own.
         inliers = _without_misreported(
-            updated_inliers(cell_fit.cell, before.with_noise(noise)), cell_fit.arms, before.used
+            updated_inliers(cell_fit.cell, before.with_noise(noise)),
+            cell_fit.cell,
+            cell_fit.arms,
+            before.used,
         )
         noise = inliers.fit.noise
         # Other inliers, or other moved frames, may allow another calibration level.

@@ -8,11 +8,10 @@ from visioncal.calibration.stages import elastic
 from visioncal.calibration.stages.kinematics import SelectedArmLevel
 from visioncal.core.choices import Convention
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding
 from visioncal.estimation.armmodel import RIGID
-from visioncal.estimation.armpair import ArmData, ArmPair
+from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.identifiability import (
     Identifiability,
     Jacobians,
@@ -23,13 +22,11 @@ from visioncal.estimation.parameters import (
     free_parameters,
     parameter_moves,
 )
-from visioncal.estimation.problem_parts import State
 from visioncal.estimation.workspace import postures
 from visioncal.results.arm import (
     ArmParameter,
     ArmResult,
     ArmSections,
-    CarriesOver,
     JointRange,
     Observability,
     WorkspacePlace,
@@ -39,11 +36,6 @@ from visioncal.robot import convert_table, parallel_axes, table_from_document, t
 
 # Number of postures of a map of the accuracy.
 _PLACES = 200
-# Error of real arms between sessions (warm-up, wear, remounting), which one session does not show
-# [m per m of reach]. Of a UR10, 0.15 to 0.2 mm after months.
-_SESSION_SHARE = 1.2e-4
-# The calibrated arm is better where its error is below this share of the nominal arm's.
-_BETTER = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +72,8 @@ def report_of(
     # With backlash and compliance alone the table stays nominal.
     if model.weights.keys() & set(RIGID):
         result, advice = add_parameters(result, arm, convention)
-        with one_blas_thread():
-            carried = _carries_over(arm, levels)
-        result = replace(result, left_out=levels.left_out(), carries_over=carried)
-        notes += [carried.words, advice] if advice else [carried.words]
+        result = replace(result, left_out=levels.left_out())
+        notes += [advice] if advice else []
     springs = elastic.elastic_of(arm, levels.errors)
     notes += elastic.play_remarks(result.backlash)
     notes += () if springs is None else elastic.remarks(springs)
@@ -181,42 +171,3 @@ def _error_jacobians(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobia
     errors = by_flange @ (columns * arm.error_rad)
     frames = by_flange @ arm.pair.frame_jacobian(flange)
     return Jacobians(frames.reshape(-1, 12), errors.reshape(-1, columns.shape[2]))
-
-
-def _carries_over(arm: ArmData, levels: SelectedArmLevel) -> CarriesOver:
-    """Computes where a calibrated arm is more accurate than the nominal one."""
-    model, q = arm.model, postures(arm.model.robot)
-    flange = model.base_from_flange(q)
-    places, jacobian = flange[:, :3, 3], arm.place_jacobian(q)[1]
-    noise = np.repeat(arm.noise.robots[arm.problem.robots.index(arm.robot)], 3) ** 2
-    session_m = _SESSION_SHARE * float(np.linalg.norm(places, axis=1).max())
-    variances = np.einsum("mij,j,mij->m", jacobian, noise, jacobian) + session_m**2
-    variances += arm.place_sigmas_m(q) ** 2
-    difference = _carried_position(arm, arm.state, flange) - _carried_position(
-        arm,
-        levels.nominal.fit.state,
-        model.nominal.base_from_flange(q) @ model.flange_from_reported,
-    )
-    # The calibrated arm's own error is independent of its difference from the nominal arm.
-    squares = 1e6 * np.array([variances, np.sum(difference**2, axis=1) + variances])
-    stops = model.base_from_flange(arm.q, arm.loads)[:, :3, 3]
-    is_away = np.any((places < stops.min(axis=0)) | (places > stops.max(axis=0)), axis=1)
-    is_away |= not is_away.any()
-    sigma_mm, nominal_mm = np.sqrt(squares[:, is_away].mean(axis=1)).tolist()
-    return CarriesOver(
-        measured_mm=levels.result.chosen.held_out_mm,
-        measured_nominal_mm=levels.result.nominal.held_out_mm,
-        sigma_mm=sigma_mm,
-        nominal_mm=nominal_mm,
-        session_mm=1e3 * session_m,
-        better_share=float(np.mean(squares[0] < _BETTER**2 * squares[1])),
-    )
-
-
-def _carried_position(arm: ArmData, state: State, flange: FloatArray) -> FloatArray:
-    """Position (k, 3) of what the arm carries, in the frame of what stands still [m]."""
-    pair = ArmPair.of(arm.problem, state, arm.robot)
-    poses = pair.at(flange)[1]
-    if pair.is_observer_carried:
-        return invert(poses)[:, :3, 3]
-    return np.asarray(poses[:, :3, :3] @ arm.at + poses[:, :3, 3])

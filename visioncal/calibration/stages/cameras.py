@@ -139,7 +139,7 @@ def estimate_lenses(seen: T) -> T:
             with _naming(of):
                 fit = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
             lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
-            seen = seen.noting(fit.rejections, (warning.of(of) for warning in fit.warnings))
+            seen = seen.noting(fit.rejections)
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
 

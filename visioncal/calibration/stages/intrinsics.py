@@ -1,6 +1,6 @@
 """Estimation of the camera's intrinsics, where the session states none."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -11,7 +11,6 @@ from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
-from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.bundle import BundleFit, fit_bundle
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.gating import gate
@@ -20,8 +19,6 @@ from visioncal.vision.targets import numbered_positions
 
 # Starts for the focal length, in image widths, where Zhang's own start does not converge.
 _FOCAL_WIDTHS = (0.3, 0.6, 1.0, 2.0)
-# Limits of the warning: relative sigma of the focal length, and that of the principal point [px].
-_FOCAL_LIMIT, _CENTRE_LIMIT_PX = 0.005, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +29,6 @@ class Intrinsics:
     covariance: FloatArray  # (4 + k, 4 + k) of fx, fy, cx, cy and the distortion.
     sigma_px: float  # Standard deviation of a corner's coordinate, stated or by the residuals [px].
     rejections: tuple[Rejection, ...]  # Outlier views.
-    warnings: tuple[Finding, ...]  # What the views do not determine.
 
 
 def estimate_intrinsics(
@@ -90,8 +86,7 @@ def estimate_intrinsics(
             next_step="Add views tilted by 30 to 45 degrees, or give matrix and distortion.",
         )
     rejections = tuple(Rejection(*item) for item in reasons.items())
-    warnings = tuple(_warnings(fit))
-    return Intrinsics(fit.camera, fit.covariance, fit.sigma_px, rejections, warnings)
+    return Intrinsics(fit.camera, fit.covariance, fit.sigma_px, rejections)
 
 
 def _gated(stack: CornerStack, fit: BundleFit) -> tuple[BundleFit, dict[int, str]]:
@@ -139,20 +134,3 @@ def _first_fit(stack: CornerStack, model: CameraKind, resolution: tuple[int, int
             next_step="Check the target's description against the print.",
         )
     return best
-
-
-def _warnings(fit: BundleFit) -> Iterator[Finding]:
-    """States what the views do not determine."""
-    sigma = np.sqrt(np.diag(fit.covariance))
-    focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
-    if focal > _FOCAL_LIMIT or centre > _CENTRE_LIMIT_PX:
-        yield Finding(
-            "weak_lens",
-            f"The corners alone determine the focal length to {100 * focal:.1f} % only, and the "
-            f"image centre to {centre:.1f} px.",
-            Remedy(
-                "Add views tilted by 30 to 45 degrees, at different distances, and near the "
-                "image's edges."
-            ),
-            until_mm=0.0,
-        )

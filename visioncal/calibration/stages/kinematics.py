@@ -12,8 +12,7 @@ from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy
-from visioncal.estimation.arm import SIGNIFICANT, ArmErrors, rows_of, stops_of
+from visioncal.estimation.arm import ArmErrors, rows_of, stops_of
 from visioncal.estimation.arm_sizes import ArmSizes, estimate_arm_sizes
 from visioncal.estimation.armmodel import (
     BACKLASH,
@@ -114,8 +113,6 @@ class SelectedArmLevel:
     fit: LevelFit  # That with the errors; the nominal one where none explain more than chance.
     was_asked: bool  # Whether the user named the level.
     views: tuple[int, ...] = ()  # (m,) the view of each residual of these.
-    # The fit with all blocks of errors, where the user named a level without some that are likely.
-    beyond: LevelFit | None = None
 
     @property
     def level(self) -> str:
@@ -219,10 +216,7 @@ def select_errors(
             return None
         nominal = LevelFit.of(problem, state, robot, noise, None)
         fit = fitted(sizes)
-        beyond = fit if ASKED[asked] == _ALL else fitted(likely(_ALL))
-    is_beyond = beyond.gain - fit.gain > SIGNIFICANT
-    was_asked = asked not in ("auto", "thermal")
-    return SelectedArmLevel(nominal, fit, was_asked, views, beyond if is_beyond else None)
+    return SelectedArmLevel(nominal, fit, asked not in ("auto", "thermal"), views)
 
 
 def check_level(asked: str) -> None:
@@ -251,21 +245,6 @@ def check_level_is_possible(asked: str, *, can: bool, misread: str = "") -> None
             "they belong to.",
             culprits=["level"],
             next_step=misread or "Record q1_rad ..., and name [robot] model in session.toml.",
-        )
-
-
-def doubts(kinematics: SelectedArmLevel) -> Iterator[Finding]:
-    """Reports where other errors explain the views far better than those of the requested level."""
-    if kinematics.beyond is None:
-        return
-    chosen, best = kinematics.fit.result, kinematics.beyond.result
-    if best.held_out_mm < chosen.held_out_mm:
-        yield Finding(
-            "level",
-            f"The views speak for more than the arm's {chosen.level}: with its {best.level} stops "
-            f"left out are predicted to {figure(best.held_out_mm)} mm instead of "
-            f"{figure(chosen.held_out_mm)} mm.",
-            Remedy("Leave --level out.", CALIBRATE),
         )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages import thermal
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.calibration.stages.kinematics import doubts, findings
+from visioncal.calibration.stages.kinematics import findings
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.verdict import NOTE, PLAN, Finding, Remedy, remarks
@@ -37,8 +37,6 @@ def _of(arm: RobotArm, level: str) -> Iterator[Finding]:
         step = "Record joint angles, and name the arm as [robot] model in session.toml"
         step += "; record temp1_c ... or current1_a ... in a stream." * is_cold or "."
         yield Finding("level", words, Remedy(step))
-    if arm.kinematics is not None:
-        yield from doubts(arm.kinematics)
     errors = arm.errors
     if errors is None or not errors.is_significant:
         return

@@ -53,7 +53,7 @@ def _unconnected(run: RunState) -> Iterator[Finding]:
             step = Remedy("Add views that show it, or delete it from session.toml.")
             yield Finding("unseen_target", words, step)
         else:
-            step = Remedy(connection_advice(run.cell, frame))
+            step = Remedy(connection_advice(frame))
             yield Finding("untied", f"{frame} is tied to nothing.", step)
 
 
@@ -96,7 +96,6 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("other_lens", chance=FACT),
     Suspect("lost_views", chance=REMARK),
     *map(Suspect, ("remark", "unused")),
-    Suspect("weak_lens", chance=REMARK),
     Suspect("corner_noise", chance=1e-4),
     # Conventions, clocks, joints.
     misread_poses.MISREAD_POSES,
@@ -110,7 +109,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect(UNEXPLAINED, None, REMARK, True, size=3, order=1),
     Suspect("too_few_stops", chance=FACT),
     Suspect("few_stops"),
-    Suspect("weak_motion", hides=("weak_lens",), size=5, is_sigma=True),
+    Suspect("weak_motion", size=5, is_sigma=True),
     Suspect("place", size=6, is_sigma=True),
     Suspect("workspace", size=7, is_sigma=True),
     *map(Suspect, SOURCES),
