@@ -54,12 +54,9 @@ def test_threads_write_what_one_alone_writes(tmp_path):
     for folder in folders:
         for name in ("calibration.json", "report.html"):
             # The report's commands name the folder.
-            assert _without_its_name(folder, name) == _without_its_name(alone, name)
+            texts = [(of / name).read_text("utf-8").replace(str(of), "") for of in (folder, alone)]
+            assert texts[0] == texts[1]
         assert_same_evidence(read_evidence(folder / "recording.rrd"), evidence)
-
-
-def _without_its_name(folder: Path, name: str) -> str:
-    return (folder / name).read_text("utf-8").replace(str(folder), "")
 
 
 def test_threads_change_no_digit(tmp_path, monkeypatch):

@@ -1,6 +1,6 @@
 """What recordings of others leave open or get wrong: found, told, or refused with a next step.
 
-Some of these were once read wrongly without a word. Links need a file system that has them.
+Some of these were once read wrongly without a word.
 """
 
 import json
@@ -304,22 +304,11 @@ def naming(table):
     return assembled
 
 
-def linked(path, to):
-    try:
-        path.symlink_to(to)
-    except OSError:
-        pytest.skip("no links here")
-
-
-def grey(path, level):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.full((20, 30), level, np.uint8))
-
-
 def test_every_row_keeps_its_own_image(tmp_path, naming):
     names = ("a/x.png", "b/x.png", "c/1_x.png", "d/X.png", "a/x.png")
     for level, name in enumerate(names[:4], start=1):
-        grey(tmp_path / name, 10 * level)
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), np.full((20, 30), 10 * level, np.uint8))
     session = naming(*names)
     data = [session.images.read(view.image) for view in session.views]
     levels = [int(cv2.imdecode(np.frombuffer(value, np.uint8), 0)[0, 0]) for value in data]
@@ -346,17 +335,17 @@ def test_links_that_lead_out_are_not_followed(tmp_path, naming):
     inside, outside = tmp_path / "in", tmp_path / "outside"
     picture(outside / "a.png")
     inside.mkdir()
-    linked(inside / "a.png", outside / "a.png")
-    linked(inside / "folder", outside)
+    (inside / "a.png").symlink_to(outside / "a.png")
+    (inside / "folder").symlink_to(outside)
     picture(inside / "own.png")
-    linked(inside / "b.png", inside / "own.png")
-    linked(tmp_path / "circle.png", tmp_path / "circle.png")
+    (inside / "b.png").symlink_to(inside / "own.png")
+    (tmp_path / "circle.png").symlink_to(tmp_path / "circle.png")
     assert [path.name for path in files_in(inside)] == ["b.png", "own.png"]
-    linked(tmp_path / "out.png", "/etc/hostname")
+    (tmp_path / "out.png").symlink_to("/etc/hostname")
     for name in ("out.png", "circle.png"):
         raised(DataError, "or leaves the folder", naming, name)
     # The folder that the user names may be a link itself.
-    linked(tmp_path / "alias", inside)
+    (tmp_path / "alias").symlink_to(inside)
     assert [path.name for path in files_in(tmp_path / "alias")] == ["b.png", "own.png"]
 
 

@@ -42,11 +42,10 @@ def plan_cell(options: CellOptions, sigma_rad: float = 0.0, sigma_m: float = 0.0
     return replace(true, x=true.x @ off[0], z=true.z @ off[1], sigma_rad=sigma_rad, sigma_m=sigma_m)
 
 
-def next_best(begun: SessionStart, purpose: Purpose, q: FloatArray, count: int, **draw) -> Design:
-    """The stops that a plan adds to a session, wherever the arm can drive."""
-    cells = (begun.cell, *begun.cell.guesses(draw.get("worlds", WORLDS) - 1, draw.get("seed", 0)))
-    worlds = predict_worlds(cells, purpose, q, recorded=begun.recorded)
-    return choose_stops(worlds, count)
+def next_best(begun: SessionStart, purpose: Purpose, q: FloatArray, worlds: int = WORLDS) -> Design:
+    """Three stops that a plan adds to a session, wherever the arm can drive."""
+    cells = (begun.cell, *begun.cell.guesses(worlds - 1, 0))
+    return choose_stops(predict_worlds(cells, purpose, q, recorded=begun.recorded), 3)
 
 
 def so_far_of(cell: SimulatedCell, **changes) -> PartialCalibration:
@@ -181,7 +180,7 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
     assert known.robot_arm.errors.is_significant
     assert known.robot_arm.errors.is_estimated
     begun, q = start_from_session(found), postures_in_view(CELL, 40)
-    design = next_best(begun, HAND_EYE, q, 3)
+    design = next_best(begun, HAND_EYE, q)
     # How well the sizes of the arm's errors and of the noise are known cannot be told beforehand.
     beside = ("size of arm errors", "noise_level")
     untold = sum((known.assessment.covariance_by_source.get(name, 0.0) for name in beside), 0.0)
@@ -198,10 +197,10 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
 def test_stops_for_the_arm_need_joint_angles():
     begun = start_from_session(so_far_of(simulate(replace(ERRING, views=12))))
     q = postures_in_view(CELL, 60)
-    added = next_best(begun, KINEMATICS, q, 3, worlds=2)
+    added = next_best(begun, KINEMATICS, q, worlds=2)
     assert added.predicted.mm < added.before.mm
     poses_only = replace(begun, recorded=replace(begun.recorded, q=None))
-    raised(DataError, "no joint angles", next_best, poses_only, KINEMATICS, q, 3)
+    raised(DataError, "no joint angles", next_best, poses_only, KINEMATICS, q)
 
 
 def test_two_stops_are_too_few_to_add_to():

@@ -71,17 +71,11 @@ def test_the_truth_is_the_real_arm_and_stays_known(controller):
 
 
 def test_a_controller_ends_with_the_process_that_started_it():
-    code = (
-        "import os\n"
-        "from visioncal.live.simulated.controller import spawn\n"
-        "running = spawn()\n"
-        "print(running.host, flush=True)\n"
-        "os.kill(os.getpid(), 9)\n"
-    )
-    parent = subprocess.run(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=False
-    )
-    host = parent.stdout.strip()
+    code = "import os; from visioncal.live.simulated.controller import spawn; running = spawn()\n"
+    code += "print(running.host, flush=True); os.kill(os.getpid(), 9)"
+    words = [sys.executable, "-c", code]
+    host = subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip()
+    assert host
     # It ends within milliseconds; the limit is for a busy computer.
     ends_s = time.monotonic() + 20.0
     while True:

@@ -56,23 +56,13 @@ def session_of(cell: SimulatedCell, rows: Sequence[Shot], **more: Sequence[str])
         "target": f"{target.name}.toml",
         "camera": {"resolution": list(camera.resolution)},
     }
-    cells = [
-        [
-            str(30 + at),
-            f"{at}.png",
-            *_cells(row.base_from_flange),
-            *(group[at] for group in more.values()),
-        ]
-        for at, row in enumerate(rows)
-    ]
+    cells = []
+    for at, row in enumerate(rows):
+        pose = row.base_from_flange
+        numbers = [""] * len(POSE) if pose is None else map(repr, pose_row(pose).values())
+        cells.append([str(30 + at), f"{at}.png", *numbers, *(group[at] for group in more.values())])
     images = MemoryImages({f"{at}.png": picture(mount, row.picture) for at, row in enumerate(rows)})
     columns = ("view", "image", *POSE, *more)
     return Session.assemble(
         document, columns, cells, images, target_document=target_document(target)
     )
-
-
-def _cells(pose: FloatArray | None) -> list[str]:
-    if pose is None:
-        return [""] * len(POSE)
-    return [*map(repr, pose_row(pose).values())]
