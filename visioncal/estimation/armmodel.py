@@ -109,6 +109,8 @@ class ArmModel:
     @cached_property
     def bare(self) -> Robot:
         """The arm with its errors, up to its own flange."""
+        if not len(self.values):
+            return self.nominal
         return self.nominal.corrected(*self.changes(self.values), self.harmonics)
 
     @cached_property

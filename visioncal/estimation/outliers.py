@@ -255,7 +255,7 @@ def _trimmed_core(problem: Problem, state: State, among: Mask) -> tuple[Mask, So
     )
     search, mask = _ObservationSearch(part), _of_pairs(part, mask, start)
     every = np.ones(len(rows), dtype=bool)
-    mask, fit = widened(search, mask, search.fit_from(mask, start), every)
+    mask, fit = widened(search, mask, search.fit_from(mask, start, turns=1), every)
     used = among.copy()
     used[rows] = mask
     return used, fit

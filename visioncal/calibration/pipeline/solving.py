@@ -301,10 +301,11 @@ def _choose_levels(
             return found
         # They also explain much of a slipped joint: where the slip explains more, they are left
         # out.
-        gain = found.function_gain
-        joints = joints_of(part, joint_offsets({arm.robot: arm})) if gain else []
+        if not (gain := found.function_gain):
+            return arm
+        joints = joints_of(part, joint_offsets({arm.robot: arm}))
         slips = any(step.gain > gain for step in find_steps(part, fit, joints))
-        return found if gain and not slips else arm
+        return arm if slips else found
 
     return change_each(cell_fit.arms, part, fit, with_level)
 
