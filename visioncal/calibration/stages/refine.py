@@ -200,8 +200,9 @@ def _estimated(
         levels[name], lenses[name], boards = estimate_sizes(
             seen, problem, rows, state, noise, name, uneven
         )
-    # Errors of links look like a scale, too.
-    holds = bool(model.arms_without_joints) or model.has_links
+    # Errors of links look like a scale, too, but not like different scales of several boards.
+    has_links = model.has_links and len(optics.printed) == 1
+    holds = bool(model.arms_without_joints) or has_links
     return fitted.camera_parameters.with_sizes(levels, lenses, boards, holds_scales=holds)
 
 
