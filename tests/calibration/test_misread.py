@@ -367,6 +367,10 @@ SLIPS = {
         {"poses": np.diag([-1.0, -1.0, 1.0, 1.0]) @ POSES},
         "base_link was taken for base",
     ),
+    "poses of a tool": (
+        {"poses": POSES @ exp(np.array([0.2, 0.4, -0.3, 0.0, 0.05, 0.12]))},
+        "The reported poses are of a tool frame",
+    ),
     "the other convention": (
         {"robot": {**ROBOT.document, "convention": "modified"}},
         "read as standard",
@@ -404,8 +408,9 @@ IDENTIFIED = ROBOT.corrected(
     [
         {"poses": exp(np.array([0.0, 0.0, 1.2, 0.4, -0.7, 0.3])) @ POSES},
         {"robot": {**IDENTIFIED.document, "name": "mine"}},
+        {"poses": CELL.robot.true_base_from_flange},
     ],
-    ids=["in the world", "identified"],
+    ids=["in the world", "identified", "as built"],
 )
 def test_sound_sessions_raise_no_alarm(changes):
     found = visioncal.doctor(told(**changes))

@@ -469,6 +469,7 @@ def test_poses_that_are_misread_explain_the_rest_but_exchanged_rows() -> None:
         # Both have to hold.
         ({}, 0.1, Need(0.5, 0.05), "good", []),
         ({}, 0.1, Need(0.5, 0.005), "bad", ["calibration"]),
+        ({}, 0.1, Need(None, 0.05), "good", []),
         ({}, 0.2, None, "good", []),
         ({}, 0.7, None, "check", ["calibration"]),
         # What moves picks by 0.08 mm is no doubt where they err by three times that anyway.
