@@ -233,18 +233,14 @@ WORLDS: dict[str, World] = {
     "lens zoomed midway": World(
         OPEN,
         zoomed_midway,
-        causes=("lens_changed",),
-        words=(r"from view 7 on, its focal length is (\S+) % longer",),
-        # By a step of Newton's method, which is exact to as much as the step.
-        figure=(2.0, 0.3),
-        of=NONE,
+        causes=("focus",),
+        words=("^The lens changes its focal length by",),
     ),
     "lens hit midway": World(
         OPEN,
         hit_midway,
-        causes=("lens_changed",),
-        words=(r"from view 7 on, .* its principal point is \((\S+), -",),
-        figure=(8.0, 3.0),
+        causes=("moved_at_once",),
+        words=("The camera moved at once: from view 7 on",),
         of=NONE,
     ),
     "autofocus": World(

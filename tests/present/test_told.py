@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.aligned_cells import made_up_cell, with_cell
-from support.arm_documents import calibrated, levels, unseen
+from support.arm_documents import calibrated, levels
 from support.findings import sick, with_contradiction, with_findings
 from support.samples import fixture_frame, made_up, tool_frame, with_frames
 
@@ -127,10 +127,8 @@ def shown():
     frames = {"flange_from_bare": bare, "fixture": replace(fixture_frame(), observations=unknown)}
     yield "bare tools", replace(sample.calibration, frames=frames), None
     arm = calibrated()
-    kept_back = {"left_out": arm["left_out"][:-2], "holdout": [unseen(7), unseen(8)]}
     for name, document in (
         ("arm", arm),
-        ("arm, held out", arm | kept_back),
         ("arm as stated", {"level": "nominal", "levels": levels()[:1]}),
     ):
         yield name, with_findings(sample, {"kinematics": document}), sample

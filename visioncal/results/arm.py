@@ -153,8 +153,6 @@ class ArmResult(Section):
     not_determined: tuple[str, ...] | None = None  # Undetermined directions, in words.
     # Residuals of views that were left out of the fit in turn.
     left_out: tuple[UnseenView, ...] = ()
-    # Residuals of views that the session holds out of every fit.
-    holdout: tuple[UnseenView, ...] = ()
 
     def __post_init__(self) -> None:
         if self.is_calibrated and self.level not in [level.level for level in self.levels]:

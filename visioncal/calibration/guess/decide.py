@@ -30,8 +30,9 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, Mount
 
-# Random orders of the rows, by which a reading closes the chain by chance.
-_SHUFFLES = 8
+# Random orders of the rows, by which a reading closes the chain by chance; a score from which on it
+# explains nothing, as of a board that looks the same after half a turn.
+_SHUFFLES, _MOST_SCORE = 8, 0.3
 # Log prior odds by the logarithm of the ratio of the edges' lengths, and their bound.
 _BY_LENGTH = 10.0
 # Poses of two readings that differ by less than this share of the residuals are the same.
@@ -114,6 +115,7 @@ def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
     beaten = best.log_posterior - CLEAR
     if (
         beaten <= declared.log_posterior
+        or best.fit.score > _MOST_SCORE
         or _turns_about_one_axis(best)
         or any(other.log_posterior > beaten and not _are_same(best, other) for other in others)
         or beaten <= EVIDENCE * _by_other_rows(best)

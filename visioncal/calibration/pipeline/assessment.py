@@ -21,7 +21,6 @@ from visioncal.calibration.stages.arm_report import ArmReport
 from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.clock_offset import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
-from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.likely_steps import likely_steps
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -47,7 +46,6 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.steps import Step
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
-from visioncal.results.arm import UnseenView
 from visioncal.results.sections import ClockResult, Intervals
 
 _T = TypeVar("_T")
@@ -336,33 +334,6 @@ def _views(
 
 def _finite_or_none(figures: FloatArray) -> list[float | None]:
     return [value if np.isfinite(value) else None for value in figures.tolist()]
-
-
-def held_back_by_arm(cell_fit: CellFit, observed: Observed, robot: str) -> tuple[UnseenView, ...]:
-    """Residuals of held-back views by the nominal arm with its own fit, and by the calibrated."""
-    arm, held = cell_fit.arms[robot], held_back(cell_fit, observed)
-    if held is None or arm.kinematics is None:
-        return ()
-    nominal = arm.without_errors(held.problem)
-    before, after = (
-        np.stack(pose_residuals(problem, _state_in(problem, state))[::-1], axis=1)
-        for problem, state in (
-            (nominal, arm.kinematics.nominal.fit.state),
-            (held.problem, cell_fit.inlier_fit.fit.state),
-        )
-    )
-    views = [row.view for row in held.rows]
-    return unseen_views(views, before, after, np.isfinite(after[:, 0]))
-
-
-def _state_in(problem: Problem, state: State) -> State:
-    """Fits an earlier state to a problem with other random lens coefficients, which are zero."""
-    if not problem.effects:
-        return state
-    first = problem.effects[0]
-    behind = len(problem.start_values) - len(first)
-    values = [state.values[: len(first) - first.random], np.zeros(first.random)]
-    return State(state.edges, np.concatenate([*values, state.values[len(state.values) - behind :]]))
 
 
 def _problem(cell_fit: CellFit, observed: Observed, views: Sequence[ViewPoses]) -> Problem:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.calibration.pipeline.assessment import fitted_rows, held_back, held_back_by_arm
+from visioncal.calibration.pipeline.assessment import fitted_rows, held_back
 from visioncal.calibration.pipeline.cell_fit import within
 from visioncal.calibration.pipeline.connectivity import connection_advice
 from visioncal.calibration.pipeline.judging import weakest_link
@@ -132,9 +132,6 @@ def _sections_of_pair(
     session, answer, readings, arm = run.session, run.assessment, run.readings, run.robot_arm
     solutions = compare_solvers(answer.problem, answer.state, session.mount, run.solver)
     sections = run.assessment.arms[arm.robot].sections
-    if sections.arm is not None and arm.model is not None:
-        views = held_back_by_arm(run.cell_fit, run, arm.robot)
-        sections = replace(sections, arm=replace(sections.arm, holdout=views))
     used = [view.numbers for view in session.views if view.number in run.used]
     # A single target without a name has one section.
     is_unnamed = not session.targets

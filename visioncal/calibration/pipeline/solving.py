@@ -29,7 +29,7 @@ from visioncal.calibration.stages.refine import PRINTED_SCALE, refine_jointly, w
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.limits import CONTRADICTION
-from visioncal.core.types import Mask, Mount
+from visioncal.core.types import Mount
 from visioncal.estimation.joint import ConvergedFit, fit_jointly, target_sizes
 from visioncal.estimation.observability import (
     chain_words,
@@ -167,19 +167,6 @@ def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
     return other if misfit(inliers) - misfit(other.inlier_fit) > CONTRADICTION else cell_fit
 
 
-def _without_misreported(
-    inliers: InlierFit, cell: Cell, arms: Mapping[str, RobotArm], before: Mask
-) -> InlierFit:
-    """Removes new inliers whose reported robot pose contradicts the arm's joint angles."""
-    # They agree with joints and camera, but their reported poses would mislead the next fit.
-    matched = (arm.matched.contradicting for arm in arms.values() if arm.matched is not None)
-    wrong = {view for views in matched for view in views}
-    used = inliers.used & (before | [row.view not in wrong for row in cell.rows])
-    if np.array_equal(used, inliers.used):
-        return inliers
-    return replace(inliers, used=used).refitted()
-
-
 def _calibrate_arms(
     cell_fit: CellFit, observed: Observed, final: InlierFit | None
 ) -> tuple[CellFit, Noise]:
@@ -206,12 +193,7 @@ def _calibrate_arms(
         if iteration == _ROUNDS or before is final:
             break
         # Beside errors that repeated views share, the noise is another: each search has its own.
-        inliers = _without_misreported(
-            updated_inliers(cell_fit.cell, before.with_noise(noise)),
-            cell_fit.cell,
-            cell_fit.arms,
-            before.used,
-        )
+        inliers = updated_inliers(cell_fit.cell, before.with_noise(noise))
         noise = inliers.fit.noise
         # Other inliers, or other moved frames, may allow another calibration level.
         if (

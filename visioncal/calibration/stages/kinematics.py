@@ -131,35 +131,27 @@ class SelectedArmLevel:
 
     def left_out(self) -> tuple[UnseenView, ...]:
         """Residuals of held-out stops with both arms, by view."""
-        before, after = (np.sqrt(level.squares[:, 1]) for level in (self.nominal, self.fit))
-        return unseen_views(self.views, before, after, self.nominal.has_rotation)
+        scale = np.array([np.rad2deg(1.0), 1e3])
+        before, after = (
+            (np.sqrt(level.squares[:, 1]) * scale).tolist() for level in (self.nominal, self.fit)
+        )
+        columns = zip(self.views, before, after, self.nominal.has_rotation, strict=True)
+        return tuple(
+            UnseenView(
+                view=view,
+                nominal_mm=was_mm,
+                mm=now_mm,
+                nominal_deg=was_deg if has_rotation else None,
+                deg=now_deg if has_rotation else None,
+            )
+            for view, (was_deg, was_mm), (now_deg, now_mm), has_rotation in columns
+        )
 
     @cached_property
     def result(self) -> ArmResult:
         """Both levels, as a section of a calibration."""
         fits = (self.nominal,) if self.fit is self.nominal else (self.nominal, self.fit)
         return ArmResult(level=self.level, levels=tuple(fit.result for fit in fits))
-
-
-def unseen_views(
-    views: Sequence[int], before: FloatArray, after: FloatArray, turned: Mask
-) -> tuple[UnseenView, ...]:
-    """Residuals of held-out views with the nominal arm (`before`) and with the calibrated one.
-
-    Both are (m, 2), rotation [rad] and distance [m]; `turned` is whether a rotation was measured.
-    """
-    scale = np.array([np.rad2deg(1.0), 1e3])
-    columns = zip(views, (before * scale).tolist(), (after * scale).tolist(), turned, strict=True)
-    return tuple(
-        UnseenView(
-            view=view,
-            nominal_mm=was_mm,
-            mm=now_mm,
-            nominal_deg=was_deg if has_rotation else None,
-            deg=now_deg if has_rotation else None,
-        )
-        for view, (was_deg, was_mm), (now_deg, now_mm), has_rotation in columns
-    )
 
 
 def select_errors(

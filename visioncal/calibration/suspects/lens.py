@@ -1,21 +1,18 @@
 """Lenses: stated ones that do not fit, errors beyond their models, and changes during a session."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, INFLATED, Suspect
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation.joint import ConvergedFit, moved_mahalanobis_sq
-from visioncal.estimation.lens_field import displacements
 from visioncal.estimation.lens_levels import SIGNIFICANT
-from visioncal.estimation.lens_step import lens_step
 from visioncal.estimation.scene import ONLY_CAMERA
 from visioncal.estimation.solve import covariance_of, held_shift
 from visioncal.vision.camera import normalise, project
@@ -152,50 +149,8 @@ def _named(camera: str, count: int) -> str:
     return "The lens" if count == 1 else f"The lens of {camera}"
 
 
-def _changed(run: RunState) -> Iterator[Finding]:
-    """Lenses that were zoomed, refocused or hit during the session, by the corners alone."""
-    seen, optics = run.cell_fit.linearised_corners, run.cell_fit.camera_parameters
-    if seen is None or optics is None:
-        return
-    cell = run.cell_fit.cell
-    stations = {row.view: row.station for row in cell.rows}
-    for which, (name, problem) in enumerate(optics.problems.items()):
-        # Images for the intrinsics alone have no time.
-        timed = np.array([view in stations for view in problem.stack.views])
-        points = optics.points[problem.stack.ids]
-        stack = replace(problem.stack, points=points, zooms=None)
-        stack = stack.keep(timed[stack.view_of])
-        order = np.argsort([stations[view] for view in stack.views], kind="stable")
-        compressed, camera = seen.compressed[which], optics.camera(name)
-        poses, beyond = compressed.cam_from_target[timed], np.zeros_like(stack.px)
-        if compressed.coefficients is not None and problem.levels is not None:
-            field = replace(problem.levels, breathing=0.0)
-            for rows, _ in stack.blocks():
-                columns = displacements(stack.px[rows], camera, 0.0, field)
-                beyond[rows] = columns @ compressed.coefficients.mean[: columns.shape[2]]
-        step = lens_step(stack, camera, poses, beyond, order)
-        if step is None:
-            continue
-        at, change, sigmas, gain = step
-        first, (zoom, x, y) = stations[stack.views[int(order[at])]], change.tolist()
-        yield Finding(
-            "lens_changed",
-            f"{_named(name, len(optics.problems))} changed: {cell.start_words(first)}, "
-            f"its focal length is {figure(100.0 * abs(zoom))} % "
-            f"{'longer' if zoom > 0.0 else 'shorter'} (sigma {figure(100.0 * float(sigmas[0]))} "
-            f"%) and its principal point is ({figure(x)}, {figure(y)}) px from where it was (sigma "
-            f"{figure(float(sigmas[1:].max()))} px), by the corners alone; the result is between "
-            "both lenses.",
-            cell.or_separately(
-                "Switch off autofocus and image stabilisation, fasten zoom and focus rings", first
-            ),
-            mahalanobis_sq=gain,
-        )
-
-
 # A held lens that the corners contradict looks like a board of another size or shape, and, by the
 # views' postures, like arm errors; the lens is tested beside all three.
 LENS = Suspect("lens", _stated, 1e-4, True, ("board_size", "board_shape", ARM_ERRORS))
 FIELD = Suspect("lens_field", _beyond, 1e-4, True)
 FOCUS = Suspect("focus", None, 1e-4, True)
-CHANGED = Suspect("lens_changed", _changed, 1e-4, True, (CHAIN,), INFLATED)

@@ -78,7 +78,6 @@ _ENTRIES: tuple[Suspect, ...] = (
     steps.MOVED_SLOWLY,
     lens.FIELD,
     lens.FOCUS,
-    lens.CHANGED,
     Suspect("prior", _contradicted, 2.7e-3),
     lens.LENS,
     board.SIZE,

@@ -14,8 +14,6 @@ from visioncal.present.report.plotting import (
     INK,
     LINE,
     MIDDLE_IN,
-    MUTED,
-    SMALL,
     WIDE_IN,
     beside,
     colour_bar,
@@ -36,9 +34,7 @@ def before_and_after(arm: ArmResult) -> tuple[Figure, str] | None:
     """Residuals of views that the fit did not use, by the nominal and the calibrated arm."""
     if not arm.left_out:
         return None
-    views, count = [*arm.left_out, *arm.holdout], len(arm.left_out)
-    positions = np.arange(float(len(views)))
-    positions[count:] += 1.5
+    views, positions = arm.left_out, np.arange(float(len(arm.left_out)))
     kinds = [("position [mm]", "nominal_mm", "mm"), ("orientation [deg]", "nominal_deg", "deg")]
     kinds = kinds if all(view.deg is not None for view in views) else kinds[:1]
     figure, grid = panels(
@@ -53,19 +49,12 @@ def before_and_after(arm: ArmResult) -> tuple[Figure, str] | None:
         axes.plot(positions, pairs[:, 0], "o", color=_BEFORE, fillstyle="none", markersize=5.5)
         axes.plot(positions, pairs[:, 1], "o", color=_AFTER, markersize=5.5)
         # Above and below, so that similar values do not overlap.
-        rms = np.sqrt(np.mean(pairs[:count] ** 2, axis=0)).tolist()
+        rms = np.sqrt(np.mean(pairs**2, axis=0)).tolist()
         for value, colour, rise in zip(rms, (_BEFORE, _AFTER), ("bottom", "top"), strict=True):
             beside(axes, value, f"rms {significant(value)}", colour, rise)
-        if arm.holdout:
-            axes.axvline(count + 0.25, color=MUTED, linewidth=0.9)
     step = max(1, -(-len(views) // 25))
     grid[-1, 0].set_xticks(positions[::step], [str(view.view) for view in views][::step])
     grid[-1, 0].set_xlabel("view")
-    sets = [("left out in turn", -0.4), ("held back by the session", positions[-1])]
-    for index, (words, x) in enumerate(sets if arm.holdout else []):
-        grid[0, 0].annotate(words, (x, 1.0), xycoords=("data", "axes fraction"), fontsize=SMALL,
-                            ha="right" if index else "left", color=MUTED,
-                            xytext=(0.0, 3.0), textcoords="offset points")  # fmt: skip
     entries = [("ring", _BEFORE, "arm as stated"), ("o", _AFTER, "calibrated arm")]
     legend(figure, entries)
     words = "Residuals of each view that was left out, before and after the arm was calibrated"
