@@ -12,8 +12,9 @@ import pypdfium2
 import pytest
 from support import browser
 from support import whole_cells as two_arms
+from support.arm_documents import calibrated
 from support.commands import visioncal
-from support.findings import with_contradiction
+from support.findings import with_contradiction, with_findings
 from support.pages import Page, section
 from support.samples import REJECTED, made_up
 
@@ -111,7 +112,10 @@ def test_nothing_is_loaded_from_elsewhere(html):
     assert "@import" not in html
 
 
-def test_identifiers_of_figures_stay_apart(html):
+def test_figures_are_drawn_and_their_identifiers_stay_apart(sample):
+    arm = with_findings(sample, {"kinematics": calibrated()})
+    html = render(arm, sample.session, sample.evidence)
+    assert html.count('<svg role="img"') > 2
     identifiers = re.findall(r'\bid="([^"]+)"', html)
     assert len(identifiers) == len(set(identifiers))
     assert {value.removeprefix("#") for value in re.findall(r'xlink:href="(#[^"]+)"', html)} <= set(

@@ -44,6 +44,8 @@ from visioncal.simulation.dynamics import (
     drive_torques,
     multi_sine,
     nominal_dynamics,
+    real_dynamics,
+    record,
     slow_sweep,
 )
 
@@ -348,6 +350,17 @@ def test_motions_are_their_own_derivatives(motion):
         by_differences = (value[2:] - value[:-2]) / (2.0 * step)
         # Central differences over 2 ms of at most 0.5 Hz: a third derivative's 1e-5.
         assert by_differences == pytest.approx(slope[1:-1], abs=3e-5)
+
+
+def test_recordings_have_the_noise_that_they_are_asked_for():
+    rng = np.random.default_rng(3)
+    built, done = real_dynamics("ur5e", rng), multi_sine(6, rng)
+    stream = record(built, done, rng)
+    true = drive_torques(built, done.q, done.dq, done.ddq)
+    torques = np.stack([stream[f"tau{index}_nm"] for index in range(1, 7)], axis=1)
+    noise = np.std(torques - true, axis=0) / np.sqrt(np.mean(true**2, axis=0))
+    # The standard deviation of 10,000 draws is known to 0.7 %.
+    assert noise == pytest.approx(np.full(6, 0.03), rel=0.03)
 
 
 def test_mistaken_intrinsics_are_off_by_what_was_asked_for():
