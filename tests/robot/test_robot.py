@@ -1,6 +1,7 @@
 """Robots: kinematics against plain matrices, derivatives, corrections, and their files."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.robot import Robot, load_robot, read_robot_document, robot_file, robot_names
+from visioncal.robot.loads import Masses
 from visioncal.robot.writing import (
     corrected_urdf,
     small_urdf,
@@ -241,6 +243,32 @@ def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot):
     np.testing.assert_allclose(robot.placement_jacobian(q), links, **tolerance)
     functions = slope(functioning, 4 * count)
     np.testing.assert_allclose(robot.function_jacobian(q), functions, **tolerance)
+
+
+@pytest.mark.parametrize("robot", [load_robot("ur5e"), load_robot("panda"), other(of_urdf())])
+def test_frames_and_their_jacobian_are_those_of_pinocchio(robot):
+    import pinocchio as pin
+
+    centres_m = np.linspace(-0.1, 0.2, 3 * robot.joint_count).reshape(-1, 3)
+    masses = robot.masses or Masses(np.linspace(8.0, 1.0, robot.joint_count), centres_m)
+    robot = replace(robot, masses=masses)
+    model, q = robot.pinocchio_model, some_joints(robot)
+    data, tip = model.createData(), model.getFrameId(robot.tip)
+    frames, jacobians = robot.link_frames(q), robot.placement_jacobian(q)
+    gravity = robot.gravity_torques(q)
+    for at, positions in enumerate(robot.chain.effective(q)):
+        pin.forwardKinematics(model, data, positions)
+        expected = [joint.homogeneous for joint in data.oMi[1:]]
+        expected.append(pin.updateFramePlacement(model, data, tip).homogeneous)
+        # Products of some ten matrices of order one in double precision.
+        np.testing.assert_allclose(frames[at], expected, atol=1e-13)
+        regressor = pin.computeFrameKinematicRegressor(model, data, tip, pin.LOCAL)
+        # Pinocchio puts translations first.
+        halves = regressor.reshape(2, 3, -1, 2, 3)[::-1, :, :, ::-1].reshape(6, -1)
+        np.testing.assert_allclose(jacobians[at, :, :-6], halves, atol=1e-13)
+        torques = pin.computeGeneralizedGravity(model, data, positions)
+        # Of up to some 100 N m.
+        np.testing.assert_allclose(gravity[at], torques, atol=1e-11)
 
 
 def test_corrections_are_what_they_say():

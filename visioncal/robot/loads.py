@@ -152,13 +152,11 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
 def load_torques(robot: "Robot", q: FloatArray, loads: Loads | None = None) -> FloatArray:
     """Torques (m, n) of weight, payload and force on the joints [N m, or N for a prismatic joint].
 
-    That of the links' weight is the negative of Pinocchio's generalised gravity (Featherstone 2008,
-    section 5.3), zero where masses are unknown; those at the flange follow by the transpose of the
+    That of the links' weight is the negative of the generalised gravity (Featherstone 2008, section
+    5.3), zero where masses are unknown; those at the flange follow by the transpose of the
     geometric Jacobian.
     """
-    torques = np.zeros((len(q), robot.joint_count))
-    if robot.masses is not None:
-        torques -= robot.gravity_torques(q)
+    torques = -robot.gravity_torques(q)
     if loads is None or not loads.any:
         return torques
     base_from_flange = robot.base_from_flange(q)

@@ -5,14 +5,15 @@ frame that the controller calls base.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
-from visioncal.core.transforms import exp
+from visioncal.core.transforms import adjoint, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables
 from visioncal.robot.inertia import INERTIA_KEY, Inertias, inertias_of_rows
@@ -62,7 +63,6 @@ class Robot:
     gravity: FloatArray  # (3,) gravitational acceleration in the base's frame [m/s^2].
     # Standard deviation of the flange from stop to stop [mm], [deg].
     repeatability: tuple[float, float]
-    _model: "pin.Model" = field(repr=False)
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "Robot":
@@ -98,12 +98,11 @@ class Robot:
             masses = masses_of_rows(joints, frames)
             inertias = inertias_of_rows(joints, frames)
             rates = DriveLimits.of_rows(joints)
-        model = _pinocchio_model(name, tip, chain, masses)
         gravity = gravity_of(document, table.label)
         repeats_mm = table.number("repeatability_mm", REPEATABILITY[0], positive=True)
         repeats_deg = table.number("repeatability_deg", REPEATABILITY[1], positive=True)
         facts = (masses, inertias, rates, gravity, (repeats_mm, repeats_deg))
-        return cls(name, tip, dict(document), chain, *facts, model)
+        return cls(name, tip, dict(document), chain, *facts)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -140,33 +139,43 @@ class Robot:
         """(n,) greatest torques [N m]; inf where unknown."""
         return self.rates.torque
 
-    @property
+    @cached_property
     def pinocchio_model(self) -> "pin.Model":
         """Pinocchio's model, over effective joint positions; for use in this package only."""
-        return self._model
+        import pinocchio as pin
+
+        along = {(1.0, 0.0, 0.0): "X", (0.0, 1.0, 0.0): "Y", (0.0, 0.0, 1.0): "Z"}
+        model, last, chain = pin.Model(), 0, self.chain
+        model.name, model.gravity.linear = self.name, self.gravity
+        for place, joint in enumerate(chain.joint_names):
+            kind = "Prismatic" if chain.prismatic[place] else "Revolute"
+            letter = along.get(tuple(chain.axes[place].tolist()))
+            if letter is None:
+                motion = getattr(pin, f"JointModel{kind}Unaligned")(chain.axes[place])
+            else:
+                motion = getattr(pin, f"JointModel{kind[0]}{letter}")()
+            last = model.addJoint(last, motion, pin.SE3(chain.placements[place]), joint)
+            if (masses := self.masses) is not None:
+                # The rotational inertia does not matter to an arm at rest.
+                body = pin.Inertia(masses.kg[place], masses.centres_m[place], np.zeros((3, 3)))
+                model.appendBodyToJoint(last, body, pin.SE3.Identity())
+        tip_placement = pin.SE3(chain.placements[-1])
+        model.addFrame(pin.Frame(self.tip, last, 0, tip_placement, pin.FrameType.OP_FRAME))
+        return model
 
     def base_from_flange(self, q: FloatArray) -> FloatArray:
         """Forward kinematics: (m, 4, 4) `base_from_flange` [m] at (m, n) joint angles [rad]."""
-        import pinocchio as pin
-
-        positions = self._effective(q)
-        data, frame = self._model.createData(), self._model.getFrameId(self.tip)
-        poses = np.empty((len(positions), 4, 4))
-        for row, configuration in enumerate(positions):
-            pin.forwardKinematics(self._model, data, configuration)
-            poses[row] = pin.updateFramePlacement(self._model, data, frame).homogeneous
-        return poses
+        return self.link_frames(q)[:, -1]
 
     def link_frames(self, q: FloatArray) -> FloatArray:
         """Frames (m, n + 1, 4, 4) of the joints, after their motion, and of the flange [m]."""
-        import pinocchio as pin
-
-        positions, data = self._effective(q), self._model.createData()
-        frames = np.empty((len(positions), self.joint_count + 1, 4, 4))
-        for row, configuration in enumerate(positions):
-            pin.forwardKinematics(self._model, data, configuration)
-            frames[row, :-1] = [joint.homogeneous for joint in data.oMi[1:]]
-        frames[:, -1] = frames[:, -2] @ self.chain.placements[-1]
+        motions = exp(self._effective(q)[:, :, None] * self.chain.twists)
+        *placements, last = self.chain.placements
+        frames = np.empty((len(motions), self.joint_count + 1, 4, 4))
+        here = np.eye(4)
+        for place, placement in enumerate(placements):
+            here = frames[:, place] = here @ placement @ motions[:, place]
+        frames[:, -1] = here @ last
         return frames
 
     def placement_jacobian(self, q: FloatArray) -> FloatArray:
@@ -175,27 +184,18 @@ class Robot:
         Placements are those of `chain.placements`: six columns (rotation [rad], translation [m])
         for each joint's frame in the one before it, and six for the flange in the last. Both the
         flange and the placements are perturbed on the right, so each block is the adjoint of the
-        flange seen from a joint (Pinocchio, computeFrameKinematicRegressor), and the last one is
-        the identity.
+        placement's frame, before the joint's motion, seen from the flange; the last is the
+        identity.
 
         Returns:
             (m, 6, 6 (n + 1)) derivatives of `log(base_from_flange^-1 base_from_flange(step))`.
         """
-        import pinocchio as pin
-
-        positions, count = self._effective(q), self.joint_count
-        data, frame = self._model.createData(), self._model.getFrameId(self.tip)
-        derivatives = np.empty((len(positions), 6, 6 * count))
-        for row, configuration in enumerate(positions):
-            pin.forwardKinematics(self._model, data, configuration)
-            pin.updateFramePlacement(self._model, data, frame)
-            derivatives[row] = pin.computeFrameKinematicRegressor(
-                self._model, data, frame, pin.LOCAL
-            )
-        # Pinocchio puts translations first.
-        halves = derivatives.reshape(-1, 2, 3, count, 2, 3)[:, ::-1, :, :, ::-1]
-        own = np.broadcast_to(np.eye(6), (len(positions), 6, 6))
-        return np.concatenate([halves.reshape(-1, 6, 6 * count), own], axis=2)
+        frames = self.link_frames(q)
+        placed = np.empty_like(frames)
+        placed[:, 0] = self.chain.placements[0]
+        placed[:, 1:] = frames[:, :-1] @ self.chain.placements[1:]
+        blocks = adjoint(invert(frames[:, -1:]) @ placed)
+        return np.swapaxes(blocks, 1, 2).reshape(len(frames), 6, -1)
 
     def joint_jacobian(self, q: FloatArray) -> FloatArray:
         """Jacobian (m, 6, n) of the flange over the joint angles, in the flange's frame.
@@ -235,16 +235,22 @@ class Robot:
 
     def gravity_torques(self, q: FloatArray) -> FloatArray:
         """Joint torques (m, n) that hold the links' weight [N m]; zero where masses are unknown."""
-        import pinocchio as pin
-
-        positions = self._effective(q)
-        self._model.gravity.linear = self.gravity
-        data = self._model.createData()
-        torques = [
-            pin.computeGeneralizedGravity(self._model, data, position).copy()
-            for position in positions
-        ]
-        return np.array(torques).reshape(positions.shape)
+        frames = self.link_frames(q)[:, :-1]
+        if self.masses is None:
+            return np.zeros(frames.shape[:2])
+        rotations, origins = frames[..., :3, :3], frames[..., :3, 3]
+        axes, centres = (
+            (rotations @ local[:, :, None])[..., 0]
+            for local in (self.chain.axes, self.masses.centres_m)
+        )
+        weights = np.broadcast_to(self.masses.kg[:, None] * self.gravity, axes.shape)
+        # Each joint holds all links from its own on.
+        forces, moments = (
+            np.cumsum(each[:, ::-1], axis=1)[:, ::-1]
+            for each in (weights, np.cross(origins + centres, weights))
+        )
+        held = np.where(self.chain.prismatic[:, None], forces, moments - np.cross(origins, forces))
+        return np.asarray(-np.sum(axes * held, axis=2))
 
     def weight_jacobian(self, q: FloatArray) -> FloatArray:
         """Derivatives of the joint torques by weight over masses and first moments.
@@ -255,13 +261,11 @@ class Robot:
         import pinocchio as pin
 
         positions, count = self._effective(q), self.joint_count
-        self._model.gravity.linear = self.gravity
-        data, still = self._model.createData(), np.zeros(count)
+        model, still = self.pinocchio_model, np.zeros(count)
+        data = model.createData()
         rows = np.empty((len(positions), count, count, 4))
         for row, configuration in enumerate(positions):
-            regressor = pin.computeJointTorqueRegressor(
-                self._model, data, configuration, still, still
-            )
+            regressor = pin.computeJointTorqueRegressor(model, data, configuration, still, still)
             # Ten parameters a body: mass, first moments, and inertias, which do not matter at rest.
             rows[row] = -regressor.reshape(count, count, 10)[:, :, :4]
         return rows.reshape(len(positions), count, 4 * count)
@@ -368,27 +372,3 @@ class Robot:
                 culprits=[self.name],
             )
         return values
-
-
-def _pinocchio_model(name: str, tip: str, chain: Chain, masses: Masses | None) -> "pin.Model":
-    """Builds Pinocchio's model of a chain, whose positions are the joints' effective ones."""
-    import pinocchio as pin
-
-    along = {(1.0, 0.0, 0.0): "X", (0.0, 1.0, 0.0): "Y", (0.0, 0.0, 1.0): "Z"}
-    model, last = pin.Model(), 0
-    model.name = name
-    for place, joint in enumerate(chain.joint_names):
-        kind = "Prismatic" if chain.prismatic[place] else "Revolute"
-        letter = along.get(tuple(chain.axes[place].tolist()))
-        if letter is None:
-            motion = getattr(pin, f"JointModel{kind}Unaligned")(chain.axes[place])
-        else:
-            motion = getattr(pin, f"JointModel{kind[0]}{letter}")()
-        last = model.addJoint(last, motion, pin.SE3(chain.placements[place]), joint)
-        if masses is not None:
-            # The rotational inertia does not matter to an arm at rest.
-            body = pin.Inertia(masses.kg[place], masses.centres_m[place], np.zeros((3, 3)))
-            model.appendBodyToJoint(last, body, pin.SE3.Identity())
-    tip_placement = pin.SE3(chain.placements[-1])
-    model.addFrame(pin.Frame(tip, last, 0, tip_placement, pin.FrameType.OP_FRAME))
-    return model
