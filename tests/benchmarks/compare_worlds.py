@@ -4,6 +4,7 @@ What a checkout is asked are commands, `visioncal.locate` and `Calibration.base_
 is read of its answers are the keys of calibration.json that are contracts.
 """
 
+import csv
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +18,7 @@ import numpy as np
 import tomli_w
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, norm
-from support import kept_answers, touched, wrong_arms
+from support import kept_answers, later, touched, wrong_arms
 from support.commands import QUATERNIONS, visioncal, write_poses, write_table
 from support.fuzz import mistakes, varied
 from support.paired import Outcome
@@ -35,7 +36,14 @@ from visioncal.simulation import (
     simulate_warm_up,
 )
 from visioncal.simulation.arms import heated_poses
-from visioncal.simulation.layout import BoardAt, CameraAt, Moved, NetworkOptions, RobotAt, Swept
+from visioncal.simulation.layout import (
+    BoardAt,
+    CameraAt,
+    Moved,
+    NetworkOptions,
+    RobotAt,
+    Swept,
+)
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -327,6 +335,11 @@ def verified(seed: int, folder: Path) -> Command:
     moved = replace(options, views=5, recording=1, camera_moved_m=5e-4 * knocked)
     for name, each in (("session", options), ("later", moved)):
         cell_session(simulate(each), name, seen="corners").save(folder / name)
+    return _later_of(folder, knocked=knocked)
+
+
+def _later_of(folder: Path, *, knocked: bool) -> Command:
+    """Verifies the session `later` against what is calibrated of `session`."""
 
     def judge(document, _):
         causes = [change["cause"] for change in document["changes"]]
@@ -337,6 +350,23 @@ def verified(seed: int, folder: Path) -> Command:
         return ["verify", folder / "later", "--against", out]
 
     return Command(folder / "session", argv, judge, calibrates=True)
+
+
+def repeated(seed: int, folder: Path) -> Command:
+    """Five stops of an arm without joints, off by its posture, stood at again; half are knocked."""
+    wrong = {"dh_sigma_m": 6e-5, "dh_sigma_rad": 6e-5, "branches": True, "roll_rad": np.pi}
+    options = CellOptions(seed=seed, mount=MOUNTS[seed // 2 % 2], views=25, **wrong)
+    cell, rng, knocked = simulate(options), np.random.default_rng(seed), bool(seed % 2)
+    knock = later.knock(rng, 0.3 * knocked, 0.0)
+    again = later.again(cell, rng, later.Change(camera=knock), repeated=25)
+    for name, each in (("session", cell), ("later", again)):
+        cell_session(each, name, seen="corners").save(folder / name)
+        views = folder / name / "views.csv"
+        columns, *rows = csv.reader(views.read_text().splitlines())
+        kept = [at for at, column in enumerate(columns) if not re.match(r"q\d", column)]
+        table = [[row[at] for at in kept] for row in rows]
+        write_table(views, [columns[at] for at in kept], table)
+    return _later_of(folder, knocked=knocked)
 
 
 def tool(*, slips: bool):
@@ -446,6 +476,7 @@ WORLDS: Mapping[str, Callable[[int, Path], Made | Command | None]] = {
        if kind != "base_link for base"},
     "need": needed,
     "verify": verified,
+    "verify: stops repeated": repeated,
     "tcp: touches": tool(slips=False),
     "tcp: a slip of 1.4 mm": tool(slips=True),
     "thermal: by temperatures": warming(temperatures=True),

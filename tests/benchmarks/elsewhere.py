@@ -73,6 +73,22 @@ def lens_field(sigma_px: float, length: float = 0.2):
     return drawn
 
 
+def thin_prism(size: float):
+    """Displacement of Brown's thin prism of this size, in units of the focal length."""
+
+    def drawn(rng):
+        turn = rng.uniform(0, 2 * np.pi)
+        along = np.array([np.cos(turn), np.sin(turn)])
+
+        def at(px):
+            away = (px - MATRIX[:2, 2]) / MATRIX[0, 0]
+            return MATRIX[0, 0] * size * np.sum(away**2, axis=1)[:, None] * along
+
+        return at
+
+    return drawn
+
+
 def correlated(share: float):
     """Noise of stop after stop that remembers its last value by a share."""
 
@@ -201,6 +217,16 @@ def sagging(size):
     return by_rad
 
 
+def playing(size_rad):
+    """Each joint stands on the side that it came from."""
+
+    def by_rad(_, q, rng):
+        way = np.sign(np.diff(q, axis=0, prepend=rng.normal(q[:1], 1.0)))
+        return 0.5 * size_rad * way * np.abs(rng.normal(1.0, 0.3, 6))
+
+    return by_rad
+
+
 def bending(size_m):
     """What the flange carries bends with its weight: it looks as if the flange were elsewhere."""
 
@@ -249,6 +275,7 @@ WORLDS = {
     "field 0.2 px, 200 views": World(shift=lens_field(0.2), views=200),
     "lens grows by 0.15 %, 30 views": World(focus=growing(0.0015), views=30),
     "base tilts by 1.5 mrad/m, 30 views": World(robot=tilting(1.5e-3), views=30),
+    "thin prism": World(shift=thin_prism(0.002)),
     "breathing 0.1 %": World(focus=breathing(0.001)),
     "breathing 0.3 %": World(focus=breathing(0.003)),
     "breathing 1 %": World(focus=breathing(0.01)),
@@ -266,6 +293,7 @@ WORLDS = {
     "arm off by 0.05 mm": World(robot=arm_off_by(5e-5)),
     "arm off by 0.1 mm": World(robot=arm_off_by(1e-4)),
     "arm off by 0.3 mm": World(robot=arm_off_by(3e-4)),
+    "backlash 0.2 mrad": World(robot=joints_off_by(playing(2e-4))),
     "sag 1 mm": World(robot=joints_off_by(sagging(5e-4))),
     "mount flex 0.1 mm": World(robot=bending(1e-4)),
 }
