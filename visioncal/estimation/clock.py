@@ -17,6 +17,7 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.chain import chain
 from visioncal.estimation.clock_correlation import (
     FEWEST_FRAMES,
+    MOST_FRAMES,
     NEAR_S,
     WIDEST_OFFSET_S,
     WINDOW_S,
@@ -40,21 +41,15 @@ from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.trajectory import Trajectory
 
-# Frames for a start; most frames of a fit; most with dozens of corners each.
-_START_FRAMES, _MOST_FRAMES, _MOST_STACKED = 60, 1200, 400
 _CONVERGED_S = 1e-7
 # Frames beyond this multiple of the typical residual are outliers.
 _OUTLYING = 4.0
 # Length of a stretch of time within which errors may be correlated [s]; fewest stretches for a
 # test.
 _STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
-# Most frames whose own offset is estimated.
-_MOST_OWN = 600
 # Ratio of residual noise, rotations times positions, up to which fits are equally good; share to
 # which a change of the offset must reduce it.
 _ALIKE, _CLEARLY_LESS = 1.2, 0.9
-# A change is refined until its step is below this share of its sigma.
-_SETTLED = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +153,7 @@ def fit_offset(
     """
     # Sparse frames taken at rest match over as long as the rests last.
     near_s = NEAR_S if frames.are_dense else WIDEST_OFFSET_S
-    recorded = _Recorded(robot, frames.only(evenly(len(frames), _MOST_FRAMES)))
+    recorded = _Recorded(robot, frames.only(evenly(len(frames), MOST_FRAMES)))
     with one_blas_thread():
         fits = [
             fit
@@ -181,7 +176,7 @@ def fit_readout(
     """
     if frames.stack is None or camera is None:
         return None
-    recorded = _Recorded(robot, frames.only(evenly(len(frames), _MOST_STACKED)), camera)
+    recorded = _Recorded(robot, frames.only(evenly(len(frames), MOST_FRAMES)), camera)
     with one_blas_thread():
         return _fitted(recorded, start.offset_s, start.fit.state)
 
@@ -209,7 +204,7 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
     change = _tested_change(frames.stamps_s[chosen], own_s, weights)
     if change is None:
         return None
-    for _ in range(6):
+    for _ in range(3):
         corrected = replace(frames, stamps_s=change.corrected(frames.stamps_s))
         fits = fit_offset(robot, corrected, [fit.offset_s])
         if not fits or fits[0].residual > _CLEARLY_LESS * fit.residual:
@@ -220,8 +215,6 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
         chosen, own_s, weights = _own_offsets(robot, corrected, fits[0])
         more_s, sigma_s, _ = _fit_slope(change.shares(frames.stamps_s[chosen]), own_s, weights)
         change = replace(change, step_s=change.step_s + more_s, sigma_s=sigma_s)
-        if abs(more_s) < _SETTLED * sigma_s:
-            break
     return change
 
 
@@ -260,7 +253,7 @@ def _own_offsets(
 
     Frames that no offset explains have no information.
     """
-    chosen = evenly(len(frames), _MOST_OWN)
+    chosen = evenly(len(frames), MOST_FRAMES)
     margin_s = 0.5 * robot.speed_window_s
     chosen = chosen[robot.covers(frames.stamps_s[chosen] - fit.offset_s, margin_s)]
     problem = clock_problem(robot, frames.only(chosen), fit.offset_s)
@@ -326,7 +319,7 @@ def _iterated(
             return None
         if start is None:
             problem = clock_problem(covered.robot, covered.frames, offset_s)
-            start = closed_form(problem, evenly(count, _START_FRAMES))
+            start = closed_form(problem, np.arange(count))
         if start is None:
             raise RuntimeError("no closed form gives a start")
         problem, pulls = covered.problem(offset_s, readout_s, start.edges[0])

@@ -19,8 +19,8 @@ WIDEST_OFFSET_S = 5.0
 WINDOW_S, _STEP_S = 0.2, 0.01
 # Peaks within this share of the best are rivals; least distance of distinct peaks [s].
 _RIVAL_SHARE, NEAR_S = 0.9, 0.1
-# Most rivals; fewest frames, or pairs of them, and most pairs.
-_MOST_RIVALS, FEWEST_FRAMES, _MOST_PAIRS = 12, 4, 500
+# Most rivals; fewest and most frames, or pairs of them.
+_MOST_RIVALS, FEWEST_FRAMES, MOST_FRAMES = 12, 4, 600
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def turning_matches(
     first = np.flatnonzero(later < len(frames))
     if len(first) < FEWEST_FRAMES:
         return ()
-    first = first[evenly(len(first), _MOST_PAIRS)]
+    first = first[evenly(len(first), MOST_FRAMES)]
     later = later[first]
     poses = frames.cam_from_target
     by_camera = rotation_angle(invert(poses[first]) @ poses[later])

@@ -12,14 +12,15 @@ State = TypeVar("State")
 ITERATIONS = 400
 # Decrease of the cost, relative to the cost plus one, below which it has converged.
 SETTLED = 1e-10
-START_DAMPING, _LEAST_DAMPING, _WORST_DAMPING = 1e-4, 1e-12, 1e9
+START_DAMPING = 1e-4
 # The iteration ends at a step that raises the cost with a smaller predicted decrease (a hundredth
 # of a sigma).
 _LITTLE = 1e-4
 # At convergence, a step whose predicted decrease is below this share of the tolerance is skipped,
 # so that the problem is already linearised at the returned state.
 _NOTHING = 0.1
-# Near the solution, where poorly determined directions would need many damped steps.
+# Least damping, and that near the solution, where poorly determined directions would need many
+# damped steps; its inverse leaves no step.
 NEAR_DAMPING = 1e-9
 
 
@@ -58,7 +59,7 @@ def levenberg_marquardt(
         trial = linearise(now.step(damping))
         if trial.cost <= now.cost:
             decrease = now.cost - trial.cost
-            damping = max(damping * _change(decrease, predicted), _LEAST_DAMPING)
+            damping = max(damping * _change(decrease, predicted), NEAR_DAMPING)
             now = trial
             if decrease <= tolerance:
                 return now.state, True
@@ -68,7 +69,7 @@ def levenberg_marquardt(
             if predicted <= _LITTLE:
                 return now.state, True
             damping *= 10
-            if damping > _WORST_DAMPING:
+            if damping > 1.0 / NEAR_DAMPING:
                 return now.state, True
     return now.state, False
 

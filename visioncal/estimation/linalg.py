@@ -15,10 +15,8 @@ _Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 _LEAST_PIVOT_SQ = 1e-11
 # Share of a variance, or of an information, below which what is left is rounding.
 ROUNDING = 1e-6
-# The same of eigenvalues beside the largest.
-NULL_SHARE = 1e-9
-# Scaled eigenvalue ratio below which a direction is undetermined.
-NULL_RATIO = 1e-8
+# Share of the largest eigenvalue below which a direction is undetermined.
+NULL_SHARE = 1e-8
 
 
 def eigenvalue_shares(information: FloatArray) -> FloatArray:

@@ -11,19 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.limits import FEWEST_VIEWS
-from visioncal.core.quantiles import FALSE_ALARM, FALSE_REJECTION, chi2_limit, f_limit
+from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.solve import Solution, by_noise_alone, fitted_covariance
+from visioncal.estimation.solve import Solution, by_noise_alone
 
 # Least share of the following observations explained; others may have moved, too, or be wrong.
 _LEAST_SHARE = 0.25
 # Number of observations whose implied change is tried as a candidate.
 _CANDIDATES = 24
-# Factor on the noise, which a share of the stops underestimates.
-_MARGIN = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,29 +62,13 @@ def explained_by_noise(problem: Problem, fit: Solution, among: int) -> Mask:
 
 def _noise_limit(among: int) -> float:
     """Limit of the squared distance of noise, for `among` observations."""
-    return _MARGIN**2 * float(chi2_limit(FALSE_REJECTION / among, 6))
+    return float(chi2_limit(FALSE_REJECTION / among, 6))
 
 
 def _weighted_mean(twists: FloatArray, weights: FloatArray) -> FloatArray:
     """(6,) weighted mean of (n, 6) twists, by their (n, 6, 6) information."""
     weighted_sum = np.einsum("nij,nj->i", weights, twists)
     return np.asarray(np.linalg.solve(weights.sum(axis=0), weighted_sum))
-
-
-def needless_move(problem: Problem, fit: Solution, moves: Sequence[Move]) -> Move | None:
-    """The least significant move if its two poses are equal up to noise; else None."""
-    if not moves:
-        return None
-    covariance = fitted_covariance(problem, fit.state, fit.noise)
-    squares = []
-    for move in moves:
-        change, known = fitted_change(problem, fit, covariance, move.frame, move.twin)
-        squares.append(float(change @ np.linalg.solve(known, change)))
-    least = int(np.argmin(squares))
-    tried = len(problem.unknown) * len(np.unique(problem.observations.stops))
-    freedom = max(0.5 * (6.0 * len(problem) - problem.size), 6.0)
-    limit = 6.0 * float(f_limit(FALSE_ALARM / tried, 6, freedom))
-    return moves[least] if squares[least] < limit else None
 
 
 def fitted_change(
@@ -102,26 +84,6 @@ def fitted_change(
     jacobian = np.zeros((6, len(known)))
     jacobian[:, first], jacobian[:, second] = -adjoint(invert(between)), np.eye(6)
     return log(between), jacobian @ known @ jacobian.T
-
-
-def unmoved(
-    problem: Problem, fit: Solution, moves: Sequence[Move], move: Move
-) -> tuple[Problem, Solution, list[Move]]:
-    """The problem without a move, its two frames merged; later moves stay."""
-    twin_index = problem.unknown[move.twin]
-    all_rows = np.ones(len(problem), dtype=bool)
-    merged = replace(
-        problem,
-        tree=problem.tree.without([move.twin]),
-        observations=problem.observations.renamed(move.twin, move.frame, all_rows),
-    )
-    state = State(np.delete(fit.state.edges, twin_index, axis=0), fit.state.values)
-    remaining = [
-        replace(item, frame=move.frame if item.frame == move.twin else item.frame)
-        for item in moves
-        if item is not move
-    ]
-    return merged, replace(fit, state=state), remaining
 
 
 def find_move(

@@ -26,8 +26,8 @@ SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(float(np.deg2rad(0.05)), 1e-4), 0.2
 # Least component along an axis for a direction to be called by it.
 _NEARLY_AXIS = 0.95
-# Least rotation of a robot between any of its stops, and most stops that are paired.
-_STILL_RAD, _PAIRED = float(np.deg2rad(0.5)), 300
+# Most stops of a robot that are paired.
+_PAIRED = 300
 # A direction with a larger predicted sigma is not determined at all [m or rad].
 _OPEN = 0.2
 # Cause and advice where unknowns common to all views are not determined.
@@ -114,7 +114,7 @@ class Turning:
     @property
     def is_still(self) -> bool:
         """Whether it hardly turns at all."""
-        return self.largest_rad < _STILL_RAD
+        return self.largest_rad < SIGMA_LIMIT_RAD
 
     @property
     def has_lone_axis(self) -> bool:

@@ -15,7 +15,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.core.limits import FEWEST_COMPARED
+from visioncal.core.limits import FEWEST_COMPARED, FEWEST_STOPS
 from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -26,8 +26,6 @@ from visioncal.estimation.moves import (
     explained_by_noise,
     find_move,
     moved,
-    needless_move,
-    unmoved,
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Problem
@@ -49,9 +47,8 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.steps import find_steps, frames_of
 
-# Least share, and least number, of the earliest stops with which the search begins.
-EARLY_SHARE, FEWEST_EARLY = 0.4, 8
-_MOST_MOVES = 8
+# Share of the earliest stops with which the search begins.
+EARLY_SHARE = 0.4
 # Limit of an observation's distance from its prediction: in metres, and over the median.
 _NEAR_M, _FAR = 0.04, 6.0
 # Multiple of the median distance beyond which an observation is an outlier even without a
@@ -142,7 +139,7 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
     used, fit = _trimmed_core(problem, state, _early(problem))
     moves: list[Move] = []
     used, fit = widened(_ObservationSearch(problem), used, fit)
-    while len(moves) < _MOST_MOVES:
+    while True:
         relative_squares = _ObservationSearch(problem).distances(used, fit).beyond
         found = find_move(problem, fit, relative_squares < 1.0, movable)
         if found is None:
@@ -154,16 +151,7 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
         used = np.where(involved, explained_by_noise(problem, fit, len(problem)), used)
         used, fit = _widened(problem, used, fit)
     fit = _ObservationSearch(problem).fit_from(used, fit.state, fit.noise)
-    return _without_needless(_inlier_fit(problem, used, fit, moves))
-
-
-def _without_needless(agreed: InlierFit) -> InlierFit:
-    """Removes insignificant moves, after the joint fit."""
-    problem, fit, used, moves = agreed.problem, agreed.fit, agreed.used, list(agreed.moves)
-    while (move := needless_move(problem.subset(used), fit, moves)) is not None:
-        problem, fit, moves = unmoved(problem, fit, moves, move)
-        used, fit = _widened(problem, used, fit)
-    return agreed if len(moves) == len(agreed.moves) else _inlier_fit(problem, used, fit, moves)
+    return _inlier_fit(problem, used, fit, moves)
 
 
 def all_as_inliers(problem: Problem, state: State) -> InlierFit:
@@ -179,7 +167,7 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
     if not movable:
         return find_inliers(problem, agreed.fit.state, agreed.used, agreed.fit.noise)
     used, fit = _refined(problem, *_widened(problem, agreed.used, agreed.fit))
-    while len(moves) < _MOST_MOVES:
+    while True:
         part = problem.subset(used)
         if not (slight := find_steps(part, fit, frames_of(part, movable))):
             break
@@ -188,7 +176,7 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
         moves.append(move)
         used, fit = _refined(problem, *_widened(problem, used, fit))
     fit = _ObservationSearch(problem).fit_from(used, fit.state, fit.noise)
-    return _without_needless(_inlier_fit(problem, used, fit, moves))
+    return _inlier_fit(problem, used, fit, moves)
 
 
 def find_inliers(
@@ -274,7 +262,7 @@ def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
 def _early(problem: Problem) -> Mask:
     """(n,) the observations of the earliest stops."""
     stops = problem.observations.stops
-    last = max(EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:FEWEST_EARLY][-1]))
+    last = max(EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:FEWEST_STOPS][-1]))
     return np.asarray(stops <= last)
 
 

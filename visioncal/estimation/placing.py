@@ -8,7 +8,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.linalg import NULL_RATIO, covariance_from, eigenvalue_shares
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
 from visioncal.estimation.points import GroupFit
 
@@ -136,24 +136,24 @@ def refuse_poor(
         wild: The error where the noise is beyond the limit, too; None for none of its own.
 
     Raises:
-        DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
+        DegenerateError: The predicted sigma of a direction is over the limit.
         DataError: `wild`.
     """
     level = min(max(fit.sigma, LEAST_NOISE_M), SIGMA_LIMIT_M)
     information = fit.groups.subset(fit.used).information(level)
     directions = worst(covariance_from(information))
-    is_null = eigenvalue_shares(information)[0] < NULL_RATIO
     beyond = [direction for direction in directions if direction.sigma > direction.limit]
-    if not beyond and not is_null:
+    if not beyond:
         return
     if wild is not None and fit.sigma > SIGMA_LIMIT_M:
         raise wild
-    poorest = max(directions, key=lambda direction: direction.sigma / direction.limit)
-    first = beyond[0] if beyond else poorest
-    fault = "is not determined at all" if is_null else f"has a predicted sigma of {first.figure}"
+    first = beyond[0]
+    fault = "is not determined at all"
+    if not first.is_open:
+        fault = f"has a predicted sigma of {first.figure}"
     words, next_step = cause(first)
     raise DegenerateError(
         f"{label}: {first.words} {fault}: {words}.",
-        culprits=[*(direction.words for direction in beyond or [first]), *culprits],
+        culprits=[*(direction.words for direction in beyond), *culprits],
         next_step=next_step,
     )

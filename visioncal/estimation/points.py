@@ -23,7 +23,7 @@ from visioncal.core.transforms import apply_each, exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import (
-    NULL_RATIO,
+    NULL_SHARE,
     covariance_from,
     damped_step,
     eigenvalue_shares,
@@ -96,7 +96,7 @@ class Groups:
     def freedom(self) -> int:
         """Degrees of freedom: residuals observed less directions determined."""
         shares = eigenvalue_shares(gram(self.jacobian, self.jacobian))
-        return int(self.observed.sum() - np.sum(shares > NULL_RATIO))
+        return int(self.observed.sum() - np.sum(shares > NULL_SHARE))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import numpy as np
 from visioncal.core.transforms import exp, skew
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.estimation.corners import CornerStack, Reprojection, reproject
+from visioncal.estimation.levenberg_marquardt import NEAR_DAMPING, START_DAMPING
 from visioncal.estimation.linalg import damped_step
 from visioncal.vision.camera import normalise
 
@@ -20,11 +21,6 @@ FEWEST_CORNERS, _ON_LINE = 4, 1e-6
 _FLAT = 0.1
 # Converged step [rad or m]: the next, some hundred times smaller, is negligible beside any noise.
 _CONVERGED = 1e-6
-# Step below which a view no longer iterates with others: it is rounding.
-_IDLE_STEP = 1e-8
-_START_DAMPING = 1e-6
-# Relative rounding of converged costs, which must not reject a step.
-_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +114,7 @@ class PoseFit:
 
 def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -> PoseFit:
     """Minimises each view's reprojection error by Levenberg-Marquardt, from (v, 4, 4) starts."""
-    damping = np.full(len(cam_from_target), _START_DAMPING)
+    damping = np.full(len(cam_from_target), START_DAMPING)
     return _descended(stack, camera, cam_from_target, damping, 30)
 
 
@@ -135,7 +131,7 @@ def _descended(
         if np.all(np.abs(step) < _CONVERGED):
             poses = candidate
             break
-        moving = np.any(np.abs(step) >= _IDLE_STEP, axis=1)
+        moving = np.any(np.abs(step) >= _CONVERGED, axis=1)
         if 2 * moving.sum() <= len(moving):
             corners, residuals = moving[stack.view_of], current.residuals.copy()
             rest = _descended(
@@ -147,10 +143,12 @@ def _descended(
             return PoseFit(poses, information, residuals)
         trial = reproject(stack, camera, candidate, lens=False)
         trial_cost = stack.sum_by_view(np.sum(trial.residuals**2, axis=1))
-        better = trial_cost <= cost * (1.0 + _ROUNDING)
+        better = trial_cost <= cost
         poses = np.where(better[:, None, None], candidate, poses)
         cost = np.where(better, trial_cost, cost)
-        damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-12, 1e6)
+        damping = np.clip(
+            np.where(better, damping / 10, damping * 10), NEAR_DAMPING, 1.0 / NEAR_DAMPING
+        )
         current = trial if better.all() else reproject(stack, camera, poses, lens=False)
         information, gradient = _normal_equations(stack, current)
     return PoseFit(poses, information, current.residuals)

@@ -19,12 +19,10 @@ from scipy.special import fdtr, ndtri
 from visioncal.core.types import FloatArray
 
 _POINTS, _SIZE = 4096, 6
-# F equals chi-square beyond, and its series lose digits.
-_MOST_FREEDOM = 1e6
-# Search range of radii about a first guess, as a factor, and relative tolerance.
-_FAR, _TOLERANCE = 1e3, 1e-9
-# Radii beyond are infinite.
-_INFINITE = 1e15
+# What stands for infinity: degrees of freedom, radii, and the ratio of a radius to a first guess.
+_INFINITE = 1e6
+# Relative tolerance of a radius.
+_TOLERANCE = 1e-9
 
 
 def chance_within(
@@ -75,7 +73,7 @@ def radius_within(
         limit = guess * float(np.exp(logarithm))
         return _mean_chance([_crossings(errors, known, limit)], freedom) - share
 
-    root = brentq(missing, -np.log(_FAR), np.log(_FAR), xtol=_TOLERANCE)
+    root = brentq(missing, -np.log(_INFINITE), np.log(_INFINITE), xtol=_TOLERANCE)
     # Rounded up, so that the share is reached at the radius.
     return guess * float(np.exp(root + 2.0 * _TOLERANCE))
 
@@ -85,7 +83,7 @@ def _mean_chance(crossings: Sequence[tuple[FloatArray, FloatArray]], freedom: fl
     lowest = np.max([low for low, _ in crossings], axis=0)
     highest = np.maximum(np.min([high for _, high in crossings], axis=0), lowest)
     below, above = (
-        fdtr(_SIZE, min(freedom, _MOST_FREEDOM), radius**2 / _SIZE) for radius in (lowest, highest)
+        fdtr(_SIZE, min(freedom, _INFINITE), radius**2 / _SIZE) for radius in (lowest, highest)
     )
     return float(np.mean(above - below))
 

@@ -54,7 +54,7 @@ class Samples:
     def _joined(self) -> Mask:
         """(n - 1,) mask of the intervals without a gap."""
         steps = np.diff(self.stamps_s)
-        limit_s = min(max(_GAP_RATIO * self.step_s, _SHORT_GAP_S), LONGEST_GAP_S)
+        limit_s = max(_GAP_RATIO * self.step_s, _SHORT_GAP_S)
         return np.asarray((steps <= limit_s) & (steps < LONGEST_GAP_S))
 
     def _before(self, at_s: FloatArray) -> IntArray:

@@ -11,9 +11,8 @@ from scipy.special import digamma, polygamma
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray
 
-# Bounds of the variance of log variances between views; and of the logarithm of the distribution's
-# shape.
-_BETWEEN, _LOGS = (1e-3, 1e2), (-3.0, 8.0)
+# Bounds of the logarithm of the distribution's shape.
+_LOGS = (-3.0, 8.0)
 
 
 def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | None:
@@ -33,7 +32,8 @@ def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | No
     # Imported here for `locate`, which rarely needs it: the import takes a tenth of a second.
     from scipy.optimize import brentq
 
-    between = float(np.clip(np.var(logs, ddof=1) - np.mean(by_chance), *_BETWEEN))
+    most, least = polygamma(1, np.exp(_LOGS))
+    between = float(np.clip(np.var(logs, ddof=1) - np.mean(by_chance), least, most))
     half = float(np.exp(brentq(lambda value: polygamma(1, np.exp(value)) - between, *_LOGS)))
     scale = np.exp(np.mean(logs) + digamma(half))
     variances = (scale + squares / 2.0) / (half + freedom / 2.0)

@@ -30,10 +30,10 @@ from visioncal.calibration.stages.pairwise import (
 )
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DegenerateError
-from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Rejection, Target
-from visioncal.estimation.outliers import EARLY_SHARE, FEWEST_EARLY
+from visioncal.estimation.outliers import EARLY_SHARE
 from visioncal.estimation.positions import find_mounting, mounting_problem
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.procrustes import align, spreads
@@ -170,7 +170,7 @@ class _Growth:
                 frames += ends if step.is_up else ends[::-1]
             frames.append(target if is_oriented else problem.tree.body(target))
             segments = tuple(zip(frames[::2], frames[1::2], strict=True))
-            early = every[: max(count, FEWEST_EARLY)]
+            early = every[: max(count, FEWEST_STOPS)]
             pair = _Pair(seer, target, every, early, robots, segments)
             pairs[not is_oriented].append(pair)
         return cls(problem, candidates, symmetries, *pairs)

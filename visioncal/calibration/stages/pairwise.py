@@ -14,7 +14,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
-from visioncal.estimation.linalg import NULL_RATIO, covariance_from, eigenvalue_shares
+from visioncal.estimation.linalg import NULL_SHARE, covariance_from, eigenvalue_shares
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robust import ROUNDS, nearest, trimmed_start, trimmed_sum
@@ -167,7 +167,7 @@ def hand_eye(robot: FloatArray, candidates: Candidates) -> PairEdges | None:
     problem = chain("eye-in-hand", robot[half], picked, exact)
     state = State(np.stack([edges.x, edges.z]), np.zeros(0))
     information = fisher_information(problem, state, _NOISE)
-    if eigenvalue_shares(information)[0] < NULL_RATIO:
+    if eigenvalue_shares(information)[0] < NULL_SHARE:
         return None
     variances = np.diag(covariance_from(information)).reshape(4, 3).sum(axis=1)
     # Views that agree poorly determine less than their motion would.
