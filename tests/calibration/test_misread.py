@@ -466,7 +466,7 @@ def test_one_row_of_wrong_joints_costs_its_view_alone():
     result = visioncal.calibrate(told(joints))
     assert [view.view for view in result.arm.left_out] == [at for at in range(16) if at != 5]
     assert result.arm.level == "geometry"
-    assert result.views[5].reason.endswith("away from its pose")
+    assert result.views[5].reason.endswith("with which the camera agrees")
 
 
 def test_joints_are_judged_by_their_fit():

@@ -31,8 +31,9 @@ _SUBSET = 4
 _FOLLOWED = 3
 # Smaller turns about a second axis, relative to the largest or absolute, are noise of the poses.
 _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
-# Least standard deviation by axis [rad, or share of the distance] by which readings differ.
-_LEAST_SIGMA = 5e-4
+# Standard deviation by axis [rad, or share of the distance], at least and at most: readings are not
+# distinguished by less than the first.
+_LEAST_SIGMA, _MOST_SIGMA = 5e-4, 1.0
 # Prior probability of an outlier view.
 _OUTLIER_PRIOR = 0.05
 
@@ -108,12 +109,12 @@ class Fit:
     @cached_property
     def _estimate(self) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (2,) by axis of position and rotation, and each view's weight."""
-        sigma, squares = np.ones(2), self._squares
+        sigma, squares = np.full(2, _MOST_SIGMA), self._squares
         weights = np.where(np.isin(np.arange(len(self.angle)), self.kept), 1.0, 0.0)
         for _ in range(5 if self.is_readable else 0):
             # Three equations a view each, less the six unknowns of the edges.
             freedom = max(3.0 * weights.sum() - 6.0, 3.0)
-            sigma = np.maximum(np.sqrt(squares @ weights / freedom), _LEAST_SIGMA)
+            sigma = np.clip(np.sqrt(squares @ weights / freedom), _LEAST_SIGMA, _MOST_SIGMA)
             inlier, outlier = self._densities(sigma)
             weights = 1.0 / (1.0 + np.exp(np.clip(outlier - inlier, -500.0, 500.0)))
         return sigma, weights

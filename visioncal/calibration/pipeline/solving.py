@@ -29,7 +29,8 @@ from visioncal.calibration.stages.refine import PRINTED_SCALE, refine_jointly, w
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.limits import CONTRADICTION
-from visioncal.core.types import Mount
+from visioncal.core.types import Mask, Mount
+from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import ConvergedFit, fit_jointly, target_sizes
 from visioncal.estimation.observability import (
     chain_words,
@@ -167,6 +168,22 @@ def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
     return other if misfit(inliers) - misfit(other.inlier_fit) > CONTRADICTION else cell_fit
 
 
+def _without_misreported(
+    inliers: InlierFit, arms: Mapping[str, RobotArm], before: Mask
+) -> InlierFit:
+    """Removes new inliers whose reported robot pose contradicts the arm's joint angles."""
+    # They agree with joints and camera, but their reported poses would mislead the next fit.
+    problem, used = inliers.problem, inliers.used.copy()
+    stops = problem.observations.stops
+    for robot, arm in arms.items():
+        by_robot = rows_of(problem, robot)
+        sound = np.isin(np.arange(len(arm.has_pose)), stops[by_robot & before])
+        used &= before | ~by_robot | arm.reports_matching_joints(sound)[stops]
+    if np.array_equal(used, inliers.used):
+        return inliers
+    return replace(inliers, used=used).refitted()
+
+
 def _calibrate_arms(
     cell_fit: CellFit, observed: Observed, final: InlierFit | None
 ) -> tuple[CellFit, Noise]:
@@ -193,7 +210,9 @@ def _calibrate_arms(
         if iteration == _ROUNDS or before is final:
             break
         # Beside errors that repeated views share, the noise is another: each search has its own.
-        inliers = updated_inliers(cell_fit.cell, before.with_noise(noise))
+        inliers = _without_misreported(
+            updated_inliers(cell_fit.cell, before.with_noise(noise)), cell_fit.arms, before.used
+        )
         noise = inliers.fit.noise
         # Other inliers, or other moved frames, may allow another calibration level.
         if (

@@ -13,6 +13,7 @@ from visioncal.calibration.stages.kinematics import ASKED, SelectedArmLevel, sel
 from visioncal.calibration.stages.thermal import HeatedStops, ThermalFit, drift_result, find_drift
 from visioncal.core.choices import Convention
 from visioncal.core.errors import DataError
+from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import (
     LEVER_M,
@@ -35,6 +36,8 @@ from visioncal.robot import Loads
 from visioncal.session import Session, View
 from visioncal.session.table import loads_of
 
+# Rounding of written poses and joints [m, rad].
+_ROUNDING = 1e-5
 # Fewest stops for functions of the joints.
 _FEWEST_FOR_FUNCTIONS = 20
 
@@ -187,6 +190,22 @@ class RobotArm:
         """Looks for errors of its links, by the likelihood at the fit with the nominal arm."""
         errors = find_arm_errors(likelihood, robot, self.basis) if self.is_modelled else None
         return replace(self, errors=errors)
+
+    def reports_matching_joints(self, agrees: Mask) -> Mask:
+        """Mask (s,) of stops whose reported pose matches the joints as at the inlier stops (s,).
+
+        A wrong report says nothing against joints and cameras, but would mislead the fit.
+        """
+        if self.matched is None or self.joints_rad is None:
+            return agrees
+        nominal = self.matched.robot.base_from_flange(self.joints_rad)
+        tools, inliers = invert(nominal) @ self.reported[self.has_pose], agrees[self.has_pose]
+        residuals = distances(tools, mean_transform(tools[inliers]))
+        matches = agrees.copy()
+        matches[self.has_pose] = np.all(
+            [array <= 2.0 * array[inliers].max() + _ROUNDING for array in residuals], axis=0
+        )
+        return matches
 
     def data(
         self,

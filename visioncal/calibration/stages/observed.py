@@ -25,6 +25,9 @@ from visioncal.vision.boards.identify import DESCRIBE_IT
 if TYPE_CHECKING:
     from visioncal.vision.dense import DenseCorners
 
+# Views of one reason that are listed.
+_LISTED = 40
+
 
 @dataclass(frozen=True, eq=False)
 class CameraObservations:
@@ -186,7 +189,7 @@ def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
         views[reason].append(view)
     grouped = sorted(views.items(), key=lambda item: -len(item[1]))
     return tuple(
-        f"view{'s' if len(group) > 1 else ''} {some_of([*map(str, group)])}: {reason}"
+        f"view{'s' if len(group) > 1 else ''} {some_of([*map(str, group)], _LISTED)}: {reason}"
         for reason, group in grouped
     )
 

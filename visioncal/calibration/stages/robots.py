@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from visioncal.calibration.guess.fit import distances
 from visioncal.calibration.guess.joints import (
     JointGuess,
     guess_joints,
@@ -115,8 +116,8 @@ def _label(session: Session, robot: str) -> str:
 def check_joints(observed: T, *, drops: bool) -> T:
     """Refuses joints that only another reading makes fit the cameras' observations.
 
-    With `drops`, views are removed whose pose and joints contradict each other. A lost zero is
-    named.
+    With `drops`, views are removed whose pose and joints contradict each other, where the joints
+    are right. A lost zero is named.
 
     Raises:
         DataError: Joints are misread.
@@ -137,10 +138,9 @@ def check_joints(observed: T, *, drops: bool) -> T:
             continue
         guess = _guessed(matched, joints, seen, {*matched.contradicting, *observed.held_back})
         if drops:
-            wrong = matched.contradicting
-            kept = reported.without(wrong)
-            observed = observed.noting(map(Rejection, wrong, wrong.values()))
-            observed = observed.with_robot(name, kept)
+            lost = tuple(_contradicted_joints(reported, matched, guess, seen))
+            kept = reported.without({rejection.view for rejection in lost})
+            observed = observed.noting(lost).with_robot(name, kept)
         if guess is None or not guess.stands_out:
             continue
         if (zero := guess.zero) is None:
@@ -194,6 +194,28 @@ def _guessed(
         return None
     q, poses = (np.array([by_view[view] for view in views]) for by_view in (joints, seen))
     return guess_joints(matched.robot, q, poses)
+
+
+def _contradicted_joints(
+    reported: RobotReport,
+    matched: MatchedJoints,
+    guess: JointGuess | None,
+    seen: Mapping[int, FloatArray],
+) -> Iterator[Rejection]:
+    """Rejects the views whose pose and angles contradict each other with wrong angles."""
+    for view in [view for view in seen if view in matched.contradicting]:
+        reason = matched.contradicting[view]
+        if guess is None:
+            yield Rejection(view, f"{reason}, and too few views show which of them is right")
+            continue
+        model = guess.best.reading.poses(matched.joints_rad[view][None])[0]
+        reported_pose = reported.base_from_flange[view]
+        pose = reported_pose @ invert(matched.flange_from_reported)
+        fit, flange_from_base = guess.best.fit, np.tile(invert(seen[view]), (2, 1, 1))
+        both = distances(flange_from_base, np.array([model, pose]), fit.lever, (fit.x, fit.z))
+        by_joints, by_pose = both.residuals
+        if by_pose < by_joints:
+            yield Rejection(view, f"{reason}, with which the camera agrees")
 
 
 def _misread(
