@@ -10,6 +10,7 @@ from visioncal.calibration.stages.frame_model import CellFrameModel
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions
 from visioncal.core.errors import ConvergenceError
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.estimation.appearance import Appearance, LensBoardParameters, compress
@@ -23,6 +24,7 @@ from visioncal.estimation.joint import (
     FrameModel,
     diverging,
     fit_jointly,
+    moved_mahalanobis_sq,
 )
 from visioncal.estimation.lens_field import LensLevels, LensSizes
 from visioncal.estimation.lens_levels import estimate_sizes
@@ -201,8 +203,12 @@ def _estimated(
             seen, problem, rows, state, noise, name, uneven
         )
     # Errors of links look like a scale, too, but not like different scales of several boards.
-    has_links = model.has_links and len(optics.printed) == 1
-    holds = bool(model.arms_without_joints) or has_links
+    places = np.array([optics.shape_of(board)[0] for board in optics.printed], dtype=np.int64)
+    is_free = bool(places.size) and bool(np.isin(places, fitted.linearised.free).all())
+    differ = is_free and moved_mahalanobis_sq(fitted, places) > UNEVEN_LINKS**2 * chi2_limit(
+        FALSE_ALARM, len(places)
+    )
+    holds = bool(model.arms_without_joints) or (model.has_links and not differ)
     return fitted.camera_parameters.with_sizes(levels, lenses, boards, holds_scales=holds)
 
 
