@@ -271,6 +271,15 @@ def test_frames_and_their_jacobian_are_those_of_pinocchio(robot):
         np.testing.assert_allclose(gravity[at], torques, atol=1e-11)
 
 
+def test_no_postures_have_arrays_of_no_rows():
+    robot, none = load_robot("ur10e"), np.zeros((0, 6))
+    assert robot.base_from_flange(none).shape == (0, 4, 4)
+    assert robot.placement_jacobian(none).shape == (0, 6, 42)
+    assert robot.joint_jacobian(none).shape == (0, 6, 6)
+    assert robot.function_jacobian(none).shape == (0, 6, 24)
+    assert robot.gravity_torques(none).shape == (0, 6)
+
+
 def test_corrections_are_what_they_say():
     robot = load_robot("ur10e")
     placements, functions = some_changes(robot)

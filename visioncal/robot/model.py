@@ -195,7 +195,7 @@ class Robot:
         placed[:, 0] = self.chain.placements[0]
         placed[:, 1:] = frames[:, :-1] @ self.chain.placements[1:]
         blocks = adjoint(invert(frames[:, -1:]) @ placed)
-        return np.swapaxes(blocks, 1, 2).reshape(len(frames), 6, -1)
+        return np.swapaxes(blocks, 1, 2).reshape(len(frames), 6, 6 * frames.shape[1])
 
     def joint_jacobian(self, q: FloatArray) -> FloatArray:
         """Jacobian (m, 6, n) of the flange over the joint angles, in the flange's frame.
@@ -230,14 +230,14 @@ class Robot:
         A joint's motion commutes with a rotation of its placement about the same axis.
         """
         links = self.placement_jacobian(q)[:, :, :-6]
-        columns = links.reshape(-1, 6, self.joint_count, 6)
+        columns = links.reshape(len(links), 6, self.joint_count, 6)
         return np.asarray(np.einsum("mijk,jk->mij", columns, self.chain.twists))
 
     def gravity_torques(self, q: FloatArray) -> FloatArray:
         """Joint torques (m, n) that hold the links' weight [N m]; zero where masses are unknown."""
-        frames = self.link_frames(q)[:, :-1]
         if self.masses is None:
-            return np.zeros(frames.shape[:2])
+            return np.zeros_like(self._effective(q))
+        frames = self.link_frames(q)[:, :-1]
         rotations, origins = frames[..., :3, :3], frames[..., :3, 3]
         axes, centres = (
             (rotations @ local[:, :, None])[..., 0]
