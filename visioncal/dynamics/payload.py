@@ -133,31 +133,24 @@ def estimate_payload(
             "payload: the motion does not determine all of its inertia.", next_step=_HOW
         ) from error
     # A joint's torques with and without the payload are currents times one gain: its contribution
-    # to the payload has the gain's relative error.
-    count = len(fit.values)
-    information, parts = np.zeros((count, count)), np.zeros((count, fit.blocks[0].y.shape[1]))
-    for stream, block, noise in zip(loaded, fit.blocks, fit.sigmas, strict=True):
-        weights = block.used / noise
+    # to the payload has the gain's relative error. Errors of the arm's predicted torques pass into
+    # the payload through the same least-squares fit.
+    base, count = identified.base, len(fit.values)
+    information, cross = np.zeros((count, count)), np.zeros((count, base.rank))
+    parts = np.zeros((count, fit.blocks[0].y.shape[1]))
+    for stream, block, sigma in zip(loaded, fit.blocks, fit.sigmas, strict=True):
+        weights = block.used / sigma
         rows = block.x * weights[:, :, None]
+        own = stream.filtered(base.regressor) * weights[:, :, None]
         information += np.einsum("kjp,kjq->pq", rows, rows)
+        cross += rows.reshape(-1, count).T @ own.reshape(-1, base.rank)
         parts += stream.of_currents * np.einsum("kjp,kj->pj", rows, block.y * weights)
     by_joint = gain_sigma * np.linalg.solve(information, parts)
     common = by_joint.sum(axis=1, keepdims=True)
     gains_covariance = np.asarray(
         (1.0 - _GAIN_CORRELATION) * by_joint @ by_joint.T + _GAIN_CORRELATION * common @ common.T
     )
-    # Errors of the arm's predicted torques pass into the payload through the least-squares fit.
-    base = identified.base
-    information = np.zeros((len(fit.values), len(fit.values)))
-    cross = np.zeros((len(fit.values), base.rank))
-    for stream, block, sigma in zip(loaded, fit.blocks, fit.sigmas, strict=True):
-        weights = (block.used / sigma)[:, :, None]
-        own = stream.filtered(base.regressor) * weights
-        rows = (block.x * weights).reshape(-1, len(fit.values))
-        information += rows.T @ rows
-        cross += rows.T @ own.reshape(-1, base.rank)
-    sensitivity = np.linalg.solve(information, cross)
-    kept = slice(base.rank)
+    sensitivity, kept = np.linalg.solve(information, cross), slice(base.rank)
     sigmas = np.zeros(10)
     if "gravity_m_s2" not in identified.robot.document:
         # Gravity's relative standard deviation over inhabited places.
