@@ -72,6 +72,8 @@ _TAKES: Mapping[str, frozenset[str]] = {
     ),
     "torques": frozenset(("robot", "payload_kg", "currents", "seed")),
 }
+# Centre of a simulated load in the flange's frame [m].
+_CENTRE_M = (0.0, 0.0, 0.1)
 
 
 def simulate_command(asked: SimulateOptions) -> None:
@@ -97,7 +99,7 @@ def simulate_command(asked: SimulateOptions) -> None:
         wrong_views=asked.wrong_views,
         board_scale=asked.board_scale,
         compliance_rad_per_nm=compliance,
-        payloads=tuple(Payload(kg, (0.0, 0.0, 0.1)) for kg in asked.payload_kg or ()),
+        payloads=tuple(Payload(kg, _CENTRE_M) for kg in asked.payload_kg or ()),
         second=Second() if asked.second_board else None,
         recording=asked.recording,
         camera_moved_m=1e-3 * asked.camera_moved_mm,
@@ -239,6 +241,6 @@ def _exercise_options(options: SimulateOptions, robot: str, seed: int) -> Exerci
         )
     # A cube of 0.1 m a side.
     inertia = loads[0] * 2.0 / 3.0 * 0.05**2 * np.eye(3)
-    load = LinkBody(loads[0], np.array([0.0, 0.0, 0.1]), inertia) if loads[0] else None
+    load = LinkBody(loads[0], np.array(_CENTRE_M), inertia) if loads[0] else None
     senses = Senses(gains_nm_a=(10.0, 10.0, 9.0, 7.0, 7.0, 7.0) if options.currents else ())
     return ExerciseOptions(robot, load, senses, seed=seed)
