@@ -47,6 +47,8 @@ Fault: TypeAlias = Literal[
 ]
 # Starting takes a second, but much longer on a busy computer [s].
 _START_S = 60.0
+# Joint angles at the start [rad]: elbow up, the tool pointing down, clear of every singularity.
+_HOME = (0.0, -1.45, 1.75, -1.9, -1.5708, 0.0)
 # The payload that is set, and its centre of mass in the flange frame [kg, m].
 _PAYLOAD_KG, _PAYLOAD_M = 0.6, (0.0, 0.0, 0.04)
 
@@ -91,14 +93,7 @@ class ControllerOptions:
             dh_sigma_m=3e-4, dh_sigma_rad=3e-4, offset_sigma_rad=5e-4
         )
     )
-    q: tuple[float, ...] = (
-        0.0,
-        -1.45,
-        1.75,
-        -1.9,
-        -1.5708,
-        0.0,
-    )  # Joint angles at the start [rad].
+    q: tuple[float, ...] = _HOME  # Joint angles at the start [rad].
     # Tool offset that is set: x, y, z [m] and a rotation vector [rad].
     tcp: tuple[float, ...] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
     # Sigma of a joint's error relative to its encoder, drawn anew for each motion [rad].
