@@ -284,6 +284,15 @@ def test_a_cell_that_is_the_other_way_round_is_doubted(mount: str) -> None:
         assert verdict.status == "check"
 
 
+def test_poses_in_the_frame_of_the_board_are_no_cell_the_other_way_round() -> None:
+    cell = simulate(CellOptions(views=20))
+    near_board = compose(np.eye(3), np.full(3, 0.01)) @ invert(cell.transforms["base_from_target"])
+    session = pairs_session(
+        "eye-in-hand", near_board @ cell.robot.base_from_flange, cell.cam_from_target
+    )
+    assert "mirrored_cell" not in ids(calibrate(session).verdict)
+
+
 @pytest.mark.parametrize(("freedom", "places", "flat"), [(np.inf, 1, 1.0), (15.0, 7, 0.03)])
 def test_the_chance_is_that_of_drawn_errors(freedom: float, places: int, flat: float) -> None:
     rng, count = np.random.default_rng(places), 200_000

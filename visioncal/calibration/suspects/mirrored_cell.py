@@ -10,6 +10,9 @@ from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Remedy
 
+# What rides on a flange may be so far from it [m], also where the poses are in the board's frame.
+_NEAR_M = 0.3
+
 
 def _found(run: RunState) -> Iterator[Finding]:
     if run.mount not in MOUNTS:
@@ -24,7 +27,7 @@ def _found(run: RunState) -> Iterator[Finding]:
     )
     in_hand = run.mount == MOUNTS[0]
     (carried, carried_m), (placed, placed_m) = (camera, target) if in_hand else (target, camera)
-    if carried_m > CLEAR_RATIO * placed_m:
+    if carried_m > max(_NEAR_M, CLEAR_RATIO * placed_m):
         yield Finding(
             "mirrored_cell",
             f"By this result, {carried} is {carried_m:.2f} m away from the flange that carries it, "
