@@ -260,6 +260,15 @@ def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():
     assert "from view 12 on, the camera, the target or a frame of the controller" in cause.words
 
 
+def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:
+    cell, rng = simulate(CellOptions(views=20)), np.random.default_rng(1)
+    flange = cell.robot.base_from_flange.copy()
+    flange[16:] = flange[16:] @ exp(rng.normal(0.0, [0.3] * 3 + [0.1] * 3, (4, 6)))
+    found = ids(calibrate(session_of(cell, flange)).verdict)
+    assert "something_moved" not in found
+    assert "wrong_views" in found
+
+
 def test_angles_in_an_order_that_no_reading_brings_back_are_named() -> None:
     cell = simulate(CellOptions(views=16))
     poses = cell.robot.base_from_flange

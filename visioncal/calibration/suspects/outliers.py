@@ -11,10 +11,13 @@ from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.suspect import EXCHANGED
-from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg, some_of
-from visioncal.core.transforms import pose_difference
+from visioncal.core.transforms import invert, log, mean_transform, pose_difference
+from visioncal.core.types import IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, exchanging, or_alone
+from visioncal.estimation.arm import TWIST_UNITS
+from visioncal.estimation.outliers import InlierFit
 from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
@@ -118,13 +121,13 @@ def _fault(
 
 
 def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
-    """Outliers that are all views at one end of the session, as where something moved."""
+    """Outliers that are all views at one end of the session and agree, as where something moved."""
     inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
     order = np.argsort(inliers.problem.observations.stops, kind="stable")
     used = np.flatnonzero(inliers.used[order])
     before, after = order[: used[0]], order[used[-1] + 1 :]
     run = max(before, after, key=len)
-    if len(run) < FEWEST_VIEWS:
+    if len(run) < FEWEST_VIEWS or not _agree(inliers, run):
         return
     when = f"from view {rows[int(run[0])].view} on"
     if run is before:
@@ -142,6 +145,33 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         "another one."
     )
     yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
+
+
+def _agree(inliers: InlierFit, rows: IntArray) -> bool:
+    """Whether a step of one frame, or another size of the target, explains most of some outliers.
+
+    Rows with other poses, or of other images, have none in common.
+    """
+    some, state = np.isin(np.arange(len(inliers.problem)), rows), inliers.fit.state
+    part = inliers.problem.subset(some)
+    if not part.observations.has_rotation.all():
+        return False
+    measured, predicted = (
+        poses[:, :3, 3] for poses in (part.measured(state), part.predicted(state))
+    )
+    sizes = np.sum(measured * (predicted - measured), axis=1) / np.sum(measured**2, axis=1)
+    if CLEAR_RATIO * np.ptp(sizes) < abs(float(np.median(sizes))):
+        return True
+    for frame in filter(lambda name: part.observations.involves(name).all(), part.unknown):
+        changes = part.change_of(frame, state)
+        step = mean_transform(changes)
+        left, size = (
+            np.linalg.norm(log(change) / TWIST_UNITS, axis=-1)
+            for change in (invert(step) @ changes, step)
+        )
+        if CLEAR_RATIO * np.median(left) < size:
+            return True
+    return False
 
 
 def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
