@@ -77,7 +77,8 @@ def column_of(name: str) -> Column:
     unit = rate[1] if rate else name.rpartition("_")[2] if is_number(name) else ""
     if unit == "c":
         words = (
-            "{:g} deg C is no temperature of a robot or its air; write degrees Celsius, no kelvin"
+            "{:g} deg C is no temperature of a robot or its air; write degrees Celsius from -60 to "
+            "200, no kelvin"
         )
         return Column(name, -60.0, 200.0, words.format)
     most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is no number that a cell has"))
