@@ -28,8 +28,9 @@ _TURN_LEFT_RAD = float(np.deg2rad(1.0))
 # Weight of a radian against a metre for these arms, near the solution: the rotation error moves the
 # position by its square.
 _ROTATION_WEIGHT = 1e-4
-# Relative gain in the sum of squares at which the final search from the nearest posture ends.
-_POLISH = 1e-9
+# Relative gain in the sum of squares at which a search ends, and the final search from the nearest
+# posture.
+_SEARCH, _POLISH = 1e-3, 1e-9
 _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
 # Half range of random starts for joints without limits [rad or m].
 _SPREAD = float(np.pi)
@@ -123,9 +124,8 @@ class Inverse:
         turns = np.abs(first.positions - wanted)[bounds.turning]
         if first.reached and turns.max(initial=0.0) <= widest_rad:
             return first
-        # The same random postures every time.
-        # Random starts where the given one does not converge to the pose; an arm of six joints has
-        # up to sixteen solutions, and half of the starts find one.
+        # The same random starts every time, where the given one does not converge to the pose; an
+        # arm of six joints has up to sixteen solutions, and half of the starts find one.
         starts = self.starts(40, np.random.default_rng(0), wanted)
         candidates = [first, *(self._descend(goal, start, wanted) for start in starts)]
         reached = [posture for posture in candidates if posture.reached]
@@ -167,7 +167,7 @@ class Inverse:
         start: FloatArray,
         wanted: FloatArray,
         *,
-        settle: float = 1e-3,
+        settle: float = _SEARCH,
     ) -> Posture:
         """Searches from a start; the result is turned by whole turns towards `wanted`."""
         bounds, underactuated = self._bounds, len(start) < 6
@@ -189,7 +189,7 @@ class Inverse:
         error, rotation = self._error(goal, positions, weight)
         size = float(error @ error)
         for _ in range(80):
-            # Another step would be rounding.
+            # Another step would be rounding [m^2 + rad^2].
             if size < 1e-20 or damping > _MOST_DAMPING:
                 break
             jacobian = self._jacobian(rotation, weight)

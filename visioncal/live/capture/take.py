@@ -18,6 +18,8 @@ from visioncal.vision.boards import blur_of
 
 # Tolerance of a frame's stamp before it was requested, or after it arrived [s].
 _EARLY_S = 0.02
+# Window of tracked points, and their least distance [px].
+_WINDOW_PX = 21
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,16 +172,17 @@ def image_motion_px(first: Image, latest: Image) -> float:
     It is zero without features, and infinite where most points are lost.
     """
     low, high = np.percentile(first[::4, ::4], [1, 99])
-    # With less contrast there is only noise to track.
+    # With less contrast there is only noise to track [grey levels].
     if high - low < 20:
         return 0.0
-    points = cv2.goodFeaturesToTrack(first, 80, 0.05, 21)
+    points = cv2.goodFeaturesToTrack(first, 80, 0.05, _WINDOW_PX)
     # With fewer points the image is featureless, and gives no view anyway.
     if points is None or len(points) < 8:
         return 0.0
     moved, status, error = cv2.calcOpticalFlowPyrLK(
-        first, latest, points, np.empty_like(points), winSize=(21, 21)
+        first, latest, points, np.empty_like(points), winSize=(_WINDOW_PX, _WINDOW_PX)
     )
+    # Grey levels of matching windows differ by less, and most points are found again.
     matched = (status[:, 0] == 1) & (error[:, 0] < 25.0)
     if matched.mean() < 0.5:
         return float("inf")
