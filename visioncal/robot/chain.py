@@ -85,6 +85,7 @@ class Chain:
         for _ in range(20):
             error = offset + ratio * q + self._periodic(q, 0) - positions
             q = q - error / (ratio + self._periodic(q, 1))
+            # The next error is its square: rounding.
             if np.abs(error).max(initial=0.0) < 1e-8:
                 break
         return np.asarray(q)

@@ -127,7 +127,7 @@ def _link(robot: Robot, link: int, radius_m: float, offset_m: float) -> list[Bod
     offset = offset_m * robot.chain.axes[link - 1] if link else np.zeros(3)
     knots = [np.zeros(3), offset, end + offset, end] if offset_m else [np.zeros(3), end]
     name = body_name(robot, link)
-    # Shorter links are inside their neighbours.
+    # Shorter links are inside their neighbours [m].
     if np.abs(np.diff(knots, axis=0)).sum() < 0.01:
         return []
     return [
@@ -304,7 +304,8 @@ class Collisions:
         )
         # A cell body that a later link touches in every posture is an error, and must be reported.
         always_near = (near_share == 1.0) & (of_arm | moving | on_first_link)
-        # The joints' limits keep them apart, which the coarse capsules do not show.
+        # Parts that are near in a larger share of postures are so by design: the joints' limits
+        # keep them apart, which the coarse capsules do not show.
         excluded = always_near | (of_arm & (near_share > 0.2))
         left_out = tuple(
             LeftOut(names[a], names[b], f"too near in {100 * share:.0f} % of all postures")

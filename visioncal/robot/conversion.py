@@ -165,7 +165,10 @@ def _described(robot: Robot) -> DHTable | None:
 def _of_table(
     robot: Robot, table: DHTable, gravity: Mapping[str, Any] = MappingProxyType({})
 ) -> Robot:
-    """The robot with the numbers of another table of its convention, and its own link data."""
+    """The robot with the numbers of another table of its convention, and its own link data.
+
+    A mass is stated in the frame in which a joint's row ends, and stays in it.
+    """
     source = str(robot.document.get("source", ""))
     document = table_document(table, source)
     for row, known in zip(document["joint"], robot.document["joint"], strict=True):
@@ -285,7 +288,10 @@ def _near(angle: float, to: float) -> float:
 
 
 def _nearer(theta: float, hint: float, *, forward: bool) -> tuple[float, float]:
-    """Theta or its opposite, whichever is nearer to a hint, and the sign of a and alpha with it."""
+    """Theta or its opposite, whichever is nearer to a hint, and the sign of a and alpha with it.
+
+    Where both are a quarter turn away, `forward` decides.
+    """
     same, opposite = _near(theta, hint), _near(theta + np.pi, hint)
     gain = abs(opposite - hint) - abs(same - hint)
     if abs(gain) < EXACTLY:

@@ -63,6 +63,7 @@ def read_robot_document(
         "schema": 1,
         "name": path.stem,
         "tip": tip or "",
+        # Bytes, far above the size of any arm's URDF.
         "urdf": read_text(path, 10_000_000),
     }
 

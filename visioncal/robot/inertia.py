@@ -165,7 +165,11 @@ class LogCholesky:
 
     @classmethod
     def around(cls, known: Inertias) -> Self:
-        """Builds coordinates that are zero at known bodies; raises DataError."""
+        """Builds coordinates that are zero at known bodies.
+
+        Raises:
+            DataError: One of them is physically inconsistent.
+        """
         pseudo = pseudo_inertias(known.values)
         values, vectors = np.linalg.eigh(pseudo)
         inconsistent = np.flatnonzero(

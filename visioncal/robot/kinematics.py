@@ -33,7 +33,12 @@ class UrdfArm(NamedTuple):
 
 
 def arm_of_urdf(table: DocumentTable) -> UrdfArm:
-    """Reads the arm from a URDF's root to the tip; raises DataError."""
+    """Reads the arm from a URDF's root to the tip.
+
+    Raises:
+        DataError: The URDF cannot be parsed or lacks the tip, or a joint before it has more than
+            one degree of freedom.
+    """
     import pinocchio as pin
 
     text = table.text("urdf")

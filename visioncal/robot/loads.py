@@ -62,7 +62,11 @@ class Loads:
         payload_m: FloatArray | Sequence[float],
         force_n: FloatArray | Sequence[float],
     ) -> Self:
-        """Loads of `count` stops, each value for all or one per stop; raises DataError."""
+        """Loads of `count` stops, each value for all or one per stop.
+
+        Raises:
+            DataError: A mass is negative, a number is not finite, or a shape does not fit.
+        """
         try:
             loads = cls(
                 np.broadcast_to(np.asarray(payload_kg, dtype=float), (count,)),

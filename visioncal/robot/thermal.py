@@ -209,7 +209,11 @@ class ThermalModel:
         return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2)))
 
     def rises(self, links_c: FloatArray) -> FloatArray:
-        """Rise of link temperatures over the reference [K]; raises DataError."""
+        """Rise of link temperatures over the reference [K].
+
+        Raises:
+            DataError: The number of temperatures differs from that of the joints.
+        """
         links_c = np.asarray(links_c, dtype=float)
         if not links_c.ndim or links_c.shape[-1] != self.joint_count:
             raise DataError(
@@ -279,7 +283,11 @@ class OnlineCompensator:
 
     @property
     def links_c(self) -> FloatArray:
-        """(n,) temperatures of the links now [deg C]; raises DataError."""
+        """(n,) temperatures of the links now [deg C].
+
+        Raises:
+            DataError: There is no sample yet.
+        """
         return self._now[:, 0]
 
     @property
