@@ -330,7 +330,7 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
 def _far_priors(declaration: Declaration) -> Iterator[tuple[str, str]]:
     for edge, prior in declaration.prior.items():
         on_flange = any(part.partition("_")[0] == "flange" for part in edge.split("_from_"))
-        # Lengths written in millimetres exceed these.
+        # Lengths that are written in millimetres exceed these [m].
         most, where = (3.0, "on a flange") if on_flange else (100.0, "in a cell")
         for axis in ("x_m", "y_m", "z_m"):
             place = getattr(prior, axis)

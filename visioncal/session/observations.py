@@ -77,7 +77,7 @@ def _still_since(views: Iterable[View]) -> dict[int, int]:
     last_s: float | None = None
     for view in views:
         both = view.stamp_s is not None and last_s is not None
-        # So far apart in time, the robot may have moved in between.
+        # Two minutes apart, the robot may have moved in between.
         is_late = both and abs((view.stamp_s or 0.0) - (last_s or 0.0)) > 120.0
         if first is None or _moved(first, view) or is_late:
             first = view
@@ -96,7 +96,7 @@ def _moved(first: View, second: View) -> bool:
         units = [[value / math.hypot(*pose[3:]) for value in pose[3:]] for pose in (before, after)]
         # Quaternions q and -q are the same rotation; its angle is twice that between quaternions.
         chord = min(math.dist(units[0], [sign * unit for unit in units[1]]) for sign in (1.0, -1.0))
-        # Readings of a robot that stands still are noisy.
+        # Readings of a robot that stands still are noisy [m, rad].
         return math.dist(before[:3], after[:3]) > 1e-4 or 2.0 * chord > 1e-4
     joints = first.joints_rad, second.joints_rad
     if joints[0] is None or joints[1] is None or joints[0].shape != joints[1].shape:
@@ -121,7 +121,11 @@ def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[s
 def _stops(
     declaration: Declaration, views: Sequence[View]
 ) -> list[tuple[Sequence[View], dict[str, View]]]:
-    """Groups rows by stop number; without one, by runs in which their robot stood still."""
+    """Groups rows by stop number; without one, by runs in which their robot stood still.
+
+    Returns:
+        The rows of each stop, and for each robot the row with the pose that most of them agree on.
+    """
     groups: dict[tuple[int, int], list[View]] = {}
     rows_of: dict[str, list[View]] = {}
     for view in views:

@@ -73,7 +73,7 @@ class Stream:
         return self.group(cols.joint_columns(self.columns))
 
     def gaps(self) -> IntArray:
-        """Rows after which samples are missing, by comparison with the median step."""
+        """Rows after which samples are missing: steps beyond 2.5 medians, and 20 ms."""
         steps = np.diff(self.stamps_s)
         if not len(steps):
             return np.zeros(0, dtype=np.int64)
