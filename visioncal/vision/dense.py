@@ -217,7 +217,8 @@ class _Fit:
         cost, values = min(self.starts(used), key=lambda at: at[0])
         if not np.isfinite(cost):
             return values, 0.0
-        # In proportion to the noise, as the prior of what some views leave open.
+        # In proportion to the noise: the prior sigma of the relative radial distortion at the
+        # image's corner, which some views leave open.
         weight = np.sqrt(cost / used.sum()) / 0.3
 
         def residuals(values: FloatArray) -> FloatArray:

@@ -179,6 +179,7 @@ class AprilGrid(Board):
             )
         px = _refined_tags(image, px, target.spacing)
         spacing = _measured_spacing(target, numbers, px)
+        # Shares of a side.
         if abs(spacing - target.spacing) > 0.02:
             return NotFound(
                 f"the tags are {spacing:.2f} of their side apart, and the target says spacing = "
@@ -233,7 +234,7 @@ def _copies(image: Image) -> Iterator[_Copy]:
 def _ordered_tags(
     target: Target, numbers: IntArray, px: FloatArray, own: Mask
 ) -> tuple[FloatArray, float]:
-    """Orders the corners of tags as on the page, and measures the layout's misfit."""
+    """Orders the corners (t, 4, 2) of tags as on the page, and measures the layout's misfit."""
     # Kalibr's pages have the tags upside down; other orientations are recognised by the layout.
     rotated = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
     if own.sum() < 2:

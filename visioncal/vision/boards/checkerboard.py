@@ -171,6 +171,7 @@ def _is_checkered(image: Image, grid: FloatArray) -> bool:
         antidiagonal.min(axis=0) - diagonal.max(axis=0),
         diagonal.min(axis=0) - antidiagonal.max(axis=0),
     )
+    # A share of the local contrast.
     meet = gap > 0.25 * np.ptp(np.concatenate([diagonal, antidiagonal]), axis=0)
     # Glare hides some.
     return all(bool(np.all(meet.mean(axis=axis) >= 0.5)) for axis in (0, 1))

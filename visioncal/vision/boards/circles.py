@@ -219,7 +219,10 @@ class Blobs:
         return np.asarray(4.0 * np.linalg.det(self.moments) ** 0.25)
 
     def alike(self, first: int, second: int) -> bool:
-        """Whether two blobs could be the same shape in a similar view."""
+        """Whether two blobs could be the same shape in a similar view.
+
+        Their widths differ by a factor of 1.6 at most, in any direction.
+        """
         ratios = np.linalg.eigvals(np.linalg.solve(self.moments[first], self.moments[second])).real
         return bool(np.abs(np.log(np.maximum(ratios, 1e-9))).max() < 2.0 * np.log(1.6))
 
@@ -258,6 +261,7 @@ def find_blobs(image: Image) -> Blobs:
     blobs = blobs.at(np.argsort(-blobs.diameters, kind="stable"))
     pairs = cKDTree(blobs.px).query_pairs(2.0) if len(blobs.px) else set()
     widths = blobs.diameters
+    # A blob's inner edge is at least half as wide as its outer one.
     inner = [max(pair) for pair in pairs if widths[max(pair)] > 0.5 * widths[min(pair)]]
     return blobs.at(np.setdiff1d(np.arange(len(blobs.px)), inner))
 

@@ -104,6 +104,7 @@ def _undistorted(
     lens, cost, least, best = np.zeros(4), np.inf, np.inf, None
     for _ in range(6):
         flat, powers, divisor = undistort(px, lens)
+        # The smallest divisor of the distortion model.
         if not np.all(divisor > 0.1):
             break
         homography = np.asarray(cv2.findHomography(flat, board)[0], float)

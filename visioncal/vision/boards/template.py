@@ -168,12 +168,12 @@ class _Windows:
         jacobian_px = np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=2)
         jacobian = np.asarray(np.linalg.inv(jacobian_px), float)
         side_px = np.sqrt(np.abs(np.linalg.det(jacobian)))
-        # A circle needs its whole edge.
         radii = None if pattern.radii is None else pattern.radii[chosen]
+        # Half-width of a patch [px]; a circle needs its whole edge.
         most = 20.0 if radii is None else np.inf
         half = np.clip(pattern.half, _LEAST_PX / side_px, most / side_px)
         if radii is not None:
-            # Text may be near.
+            # Text may be near: a share of the radius, and at least [px].
             around_px = np.maximum(0.35 * radii * side_px, 4.0)
             half = np.minimum(half, radii + around_px / side_px)
         needed_px = float(np.max(half * np.abs(jacobian).sum(axis=2).max(axis=1)))
@@ -385,7 +385,8 @@ def _refine_corners(
         else (_STEP_TOLERANCES_PX, _LAST_STEP_PX)
     )
     no_shift = np.zeros_like(px)
-    # The edges of a lone corner are on one side of it, so that it depends on the maps' directions.
+    # The edges of a lone corner are on one side of it, so that it depends on the maps' directions:
+    # these are updated until corners stay [px].
     for _ in range(4 if is_lone else 1):
         first = _step(windows, pattern, no_shift, blur_px)
         shift, step = _fit_positions(windows, pattern, blur_px, None, first, tolerances_px[0])
@@ -415,7 +416,10 @@ def _refine_corners(
 
 
 def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float]:
-    """(2,) median edge widths of the smoothed image [px], and the growth of circles' radii."""
+    """(2,) median edge widths of the smoothed image [px], and the growth of circles' radii.
+
+    Widths start at 1.5 px, and are at least half a pixel.
+    """
     side_px = 1.0 / np.median(windows.widths)
     # A larger start would exclude all white around a lone corner.
     blur_px = np.full(2, min(1.5, 0.2 * min(pattern.outside, 1.0) * side_px))
@@ -464,6 +468,7 @@ def _fit_positions(
 
 
 def _limited(shift: FloatArray) -> FloatArray:
+    """Steps (n, 2) of a quarter of a square at most."""
     length = np.linalg.norm(shift, axis=1, keepdims=True)
     bounded = shift * np.minimum(1.0, 0.25 / length)
     return np.where(np.isfinite(length), bounded, 0.0)
@@ -519,7 +524,7 @@ def _steps(
     if pattern.radii is not None:
         product, *derivatives = _circle(pattern, x, y, sx, sy)[: None if blurs else 3]
     else:
-        # Next lines matter if any corner is blurred enough.
+        # Next lines matter if any corner's edge is so wide [squares].
         wide = bool(max(sx.max(), sy.max()) > 0.16)
         product, *derivatives = _crossing(pattern, x, y, sx, sy, blurs=blurs, wide=wide)
     columns: list[npt.NDArray[np.floating]] = [product, *derivatives]

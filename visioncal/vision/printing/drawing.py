@@ -130,6 +130,7 @@ def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> 
         position[across] += side - away
         return position
 
+    # Lines of half a point.
     half = 0.5 / _PT_PER_MM / 2
     tip = length + _TIP_MM
     # Lines are filled rectangles, which every renderer positions exactly.

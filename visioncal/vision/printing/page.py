@@ -200,6 +200,7 @@ def _centred(target: Target, pattern: Pattern, page: Page, room: _Room) -> Sheet
 
 def _ruler_mm(room_mm: float) -> float:
     """Length of a ruler that starts at this distance from the paper's edge."""
+    # Whole steps of 10 mm, up to 100.
     whole = 10.0 * ((room_mm - EDGE_MM - ARROW_MM) // 10.0)
     return min(max(whole, 0.0), 100.0)
 
@@ -209,6 +210,7 @@ def _text_width_mm(width_mm: float, page: Page) -> float:
 
 
 def _lines(target: Target, width_mm: float) -> tuple[str, ...]:
+    # A letter's width, rounded up [mm].
     letters = max(int(width_mm / 1.3), 10)
     return tuple(
         line for text in _sentences(target) for line in textwrap.wrap(text, letters) or [""]
