@@ -137,6 +137,7 @@ class Gate:
             self.live.state()
             if not arm.moving():
                 return
+            # Half as long again, and three seconds: then it has failed.
             if elapsed_s > 1.5 * expected_s + 3.0:
                 raise DriverError(
                     f"{arm.name}: still moving after {elapsed_s:.1f} s, where {expected_s:.1f} s "

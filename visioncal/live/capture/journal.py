@@ -260,7 +260,11 @@ class Journal:
         return journal
 
     def append(self, number: int, taken: TakenView) -> View:
-        """Writes a view; when this returns, it is flushed to the disk; raises DataError."""
+        """Writes a view; when this returns, it is flushed to the disk.
+
+        Raises:
+            DataError: It cannot be written; the session is unchanged.
+        """
         image = f"{_IMAGES}/{number:03d}.png"
         view = self._facts.view_of(number, image, taken, self._offset_s)
         # Low compression: noise hardly compresses, and speed matters more.
@@ -315,6 +319,7 @@ class Journal:
 
 
 def _short(value: object) -> str:
+    """A value in a message; digests of 64 letters are shortened."""
     if isinstance(value, str) and len(value) == 64:
         return f"{value[:8]}..."
     return json.dumps(value) if value not in ("", None) else "none"

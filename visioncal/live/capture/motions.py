@@ -72,4 +72,5 @@ def _moves(state: ArmState, name: str) -> bool:
             culprits=[name],
             next_step="See the pendant, and record the motion again from its beginning.",
         )
+    # Slower is noise of a joint at rest [rad/s].
     return state.dq is not None and bool(np.abs(state.dq).max() > 0.005)

@@ -219,6 +219,7 @@ def motion_summary(
     first = checked_path(plan, stops[0], here)
     postures = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
     turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
+    # A stop takes 1.5 s besides the motion to it.
     duration_s = sum(travel_s(options, *ends) for ends in pairwise(postures)) + 1.5 * len(stops)
     return MotionSummary(stops, first, float(turns.max()), duration_s)
 
@@ -274,6 +275,7 @@ def checked_path(plan: PlanFile, stop: Stop, q: FloatArray) -> tuple[FloatArray,
     """
 
     def is_at(posture: FloatArray) -> bool:
+        # Largest joint difference [rad].
         return q.shape == posture.shape and bool(np.abs(q - posture).max() < 5e-3)
 
     if is_at(stop.q):

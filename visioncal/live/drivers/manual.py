@@ -45,7 +45,12 @@ class ManualArm:
         return "poses typed by hand"
 
     def state(self) -> ArmState:
-        """Asks for the pose of the flange, without a timeout; raises DriverError."""
+        """Asks for the pose of the flange, without a timeout.
+
+        Raises:
+            DriverError: The input has ended; or a line of a file is no pose, and skipping it would
+                shift all that follow.
+        """
         if not self.answers:
             while not (line := self._ask("").strip()):
                 pass

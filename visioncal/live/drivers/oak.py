@@ -49,7 +49,8 @@ class OakCamera:
             with _worded(dai, "The OAK", "does not start"):
                 sensor = _sensor(opened)
                 self.name = f"{opened.getDeviceName()} {_SOCKET} ({sensor.sensorName})"
-                # The sensor's whole view that USB can carry, in even numbers of pixels.
+                # The sensor's whole view, divided by a whole number to a width that USB can carry,
+                # in even numbers of pixels.
                 parts = math.ceil(sensor.width / 2048)
                 whole = sensor.width // parts // 2 * 2, sensor.height // parts // 2 * 2
                 self.resolution = requested.resolution or whole

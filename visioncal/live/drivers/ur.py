@@ -314,7 +314,12 @@ class UrArm:
         )
 
     def start_move(self, q: FloatArray, *, speed: float, acceleration: float) -> None:
-        """Starts a motion to a posture and returns; see `MovingArm`; raises DriverError."""
+        """Starts a motion to a posture and returns; see `MovingArm`.
+
+        Raises:
+            DriverError: It was opened to be watched only, is lost or stopped, or the controller
+                refuses.
+        """
         goal = np.asarray(q, dtype=float)
         if goal.shape != (6,) or not np.isfinite(goal).all():
             raise DriverError(
@@ -356,10 +361,16 @@ class UrArm:
         self._motion_timer.restart()
 
     def moving(self) -> bool:
-        """Whether the last motion is still in progress; raises DriverError."""
+        """Whether the last motion is still in progress.
+
+        Raises:
+            DriverError: It was interrupted: the controller is lost, a safety stop, or its program
+                ended.
+        """
         self._check_open()
         self._states.check()
         if self._moves_before is None:
+            # Slower is noise of a joint at rest [rad/s].
             return bool(np.abs(self._states.client.getActualQd()).max() > 1e-3)
         self._check_safety()
         if not self._control.isProgramRunning():
@@ -385,13 +396,13 @@ class UrArm:
         self._moves_before = None
         if self._states.alive:
             with suppress(DriverError):
-                # The call returns when the arm starts to brake.
-                # A joint at 1 rad/s stops within a quarter of a second.
+                # The call returns when the arm starts to brake, by 4 rad/s^2: a joint at 1 rad/s
+                # stops within a quarter of a second.
                 self._line.call(
                     lambda: self._control.stopJ(4.0, True), limit_s=_CALL_S, what="stop"
                 )
                 return
-        # A controller whose states no longer arrive may still receive commands.
+        # A controller whose states no longer arrive may still receive commands, within 0.3 s.
         with suppress(DriverError), Dashboard(self._host, 0.3) as dashboard:
             dashboard.ask("stop")
 

@@ -126,11 +126,12 @@ class UvcCamera:
         """Stamp of the grabbed picture, and earliest possible start of its exposure [s]."""
         reported_s = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
         before_s = self._arrivals_s[-1] if self._arrivals_s else -math.inf
-        # Only V4L2 of Linux reports the kernel's timestamp.
-        # So recent a timestamp is one of this host's clock.
+        # Only V4L2 of Linux reports the kernel's timestamp; one of the last ten seconds is of this
+        # host's clock.
         if now_s - 10.0 < reported_s <= now_s:
             return reported_s, reported_s - self._exposure_s
         # Otherwise it began after the picture before had arrived, unless it waited in a buffer.
+        # Then it comes after a small share of an interval.
         waited = now_s - before_s < 0.3 * self._interval_s()
         return now_s, -math.inf if waited else before_s
 
@@ -257,7 +258,7 @@ def _configure(capture: cv2.VideoCapture, requested: DeviceSetup) -> dict[str, s
     if requested.focus is not None:
         capture.set(cv2.CAP_PROP_FOCUS, requested.focus)
     if requested.exposure_us is not None:
-        # V4L2's value for manual exposure.
+        # V4L2's value for manual exposure, and its unit of 0.1 ms.
         capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1.0)
         capture.set(cv2.CAP_PROP_EXPOSURE, round(1e-6 * requested.exposure_us / 1e-4))
     if requested.gain is not None:

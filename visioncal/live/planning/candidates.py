@@ -91,6 +91,7 @@ def candidates(
     """
     search = _CandidateSearch(cell, count, seed)
     search.run(progress)
+    # A tenth of the requested number, or what a plan needs.
     if len(search.kept) < (least or max(0.1 * count, min(12, count))):
         raise search.error()
     q = _unwind(cell, search.collisions, np.array([posture for posture, _ in search.kept]))

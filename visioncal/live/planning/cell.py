@@ -225,7 +225,7 @@ def cell_of_calibration(
     # Few stops may underestimate the noise by chance.
     noise = replace(noise, robots=np.maximum(noise.robots, 0.5 * TYPICAL_NOISE.robots))
     budget = calibration.budget
-    # Somebody may have touched something since the calibration.
+    # Somebody may have touched something since the calibration: 5 mrad and 2 mm at least.
     return PlanCell(
         calibration.mount,
         arm,
@@ -252,6 +252,7 @@ def collision_model(cell: PlanCell) -> Collisions:
     in_hand = cell.mount == "eye-in-hand"
     flange = cell.robot.chain.placements[-1]
     held, fixed = (cell.x, cell.z) if in_hand else (cell.z, cell.x)
+    # Two standard deviations of the guesses.
     unsure_m = 2.0 * (cell.sigma_m + cell.sigma_rad * 0.5 * board_size_m(cell.target))
     if in_hand:
         carried = camera_body(hand, flange @ held, unsure_m)
@@ -260,6 +261,7 @@ def collision_model(cell: PlanCell) -> Collisions:
         carried = _board(cell.target, hand, flange @ held, unsure_m)
         standing = camera_body(0, fixed, unsure_m)
     middle = carried.link_from_body[:3, 3]
+    # The holder of the camera or the board is 20 mm in radius.
     bodies = [
         *arm_bodies(cell.robot),
         capsule("holder", hand, flange[:3, 3], middle, 0.02, unsure_m=unsure_m),

@@ -60,7 +60,12 @@ class _Detours:
         self._failed_searches = 0
 
     def path(self, start: FloatArray, end: FloatArray) -> FloatArray | int:
-        """Finds a path between joint angles (n,) [rad]: straight in joint space, or a detour."""
+        """Finds a path between joint angles (n,) [rad]: straight in joint space, or a detour.
+
+        Returns:
+            Via postures (j, n), without the ends; or, where no path was found, the index in
+            `Collisions.names` of the pair of bodies that collides on the straight one.
+        """
         blocked = self._collisions.path_contact(start, end)
         if blocked < 0:
             return np.empty((0, len(start)))
@@ -235,6 +240,7 @@ def _short_order(start_q: FloatArray | None, q: FloatArray, first: int) -> list[
             onward = np.where(after >= 0, distance[ends, after] - distance[tour[i], after], 0.0)
             gain = distance[tour[i - 1], tour[i]] - distance[tour[i - 1], ends] + onward
             j = int(gain.argmax())
+            # Less is rounding [rad].
             if gain[j] > 1e-9:
                 tour[i : i + 2 + j] = tour[i : i + 2 + j][::-1].copy()
                 gained = True

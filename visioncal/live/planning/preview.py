@@ -58,7 +58,7 @@ def _note(stop: PlannedStop) -> str:
 def motion_preview(plan: MotionPlan) -> MotionPreview:
     """Builds the preview of a plan of motions."""
     allowed, excitation = plan.allowed, plan.excitation
-    # Sweeps are long, and slow.
+    # Drawn samples a second: sweeps are long, and slow.
     motions = {"excitation": excitation.series.sampled(20.0)}
     if plan.sweeps is not None:
         motions["sweeps"] = plan.sweeps.sampled(5.0)

@@ -96,6 +96,7 @@ def start_from_session(
             start.problem, start.state, start.noise, run.session.mount
         )
     sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
+    # Too uncertain to plan stops [rad, m].
     if sigmas[0] > 0.5 or sigmas[1] > 0.5:
         raise _too_vague_error(run)
     # Up to the frame of the reported poses, calibrated where possible.

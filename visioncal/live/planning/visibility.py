@@ -96,7 +96,10 @@ class BoardViews:
         self.distance_m = cell.limits.distance_m or self._filling_m(float(np.nanmin(tangents)))
 
     def _filling_m(self, half: float) -> tuple[float, float]:
-        """Distances at which the board fills the image of that half width, or has been observed."""
+        """Distances at which the board fills the image of that half width, or has been observed.
+
+        It stays in the image if the guesses are off [m].
+        """
         # At a distance d the board is off by the errors of both positions, by d times the error of
         # the camera's rotation, and by half its own size times the error of its own rotation.
         cell, radius = self._cell, 0.5 * board_size_m(self._cell.target)
@@ -104,6 +107,7 @@ class BoardViews:
         near, far = _NEAREST * full, _NEVER_BEYOND * full
         for d in np.linspace(full, far, 60):
             turned = cell.sigma_rad * np.hypot(d, radius)
+            # Errors of 2.2 standard deviations.
             if half * d > radius + 2.2 * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
                 far = max(_FARTHEST * full, 1.15 * float(d))
                 break
@@ -126,8 +130,9 @@ class BoardViews:
         azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
         distance = rng.uniform(*self.distance_m, size=(count, 1))
         middle = 0.5 * (np.array(camera.resolution) - 1.0)
-        # Least half size of the board in the image, with a margin for uncertainty. A drawn view
-        # need not show the board; this only avoids drawing many that cannot.
+        # Least half size of the board in the image, of which tilt leaves 80 %, with a margin of two
+        # standard deviations. A drawn view need not show the board; this only avoids drawing many
+        # that cannot.
         across = 0.4 * float((self._high - self._low).min())
         doubt = 2.0 * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance, cell.sigma_rad)
         occupied_px = camera.matrix[:2].mean() * (across / distance + doubt)

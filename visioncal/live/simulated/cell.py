@@ -130,6 +130,7 @@ class Bench:
             GUESS_M / per_axis,
             TYPICAL_NOISE,
             TYPICAL_PX,
+            # The floor is 0.1 m below base and board.
             Limits(floor_m=min(0.0, float(z[2, 3])) - 0.1),
         )
         self.views: list[tuple[TakenView, TrueState]] = []

@@ -111,6 +111,7 @@ def _path(preview: Preview) -> tuple[FloatArray, list[int]]:
     path, reached = [[*first.via, first.q][0]], []
     for stop in preview.stops:
         for begin, end in pairwise([path[-1], *stop.via, stop.q]):
+            # Postures in between turn joints by 0.05 rad at most.
             count = int(np.ceil(np.abs(end - begin).max() / 0.05))
             path += [begin + share * (end - begin) for share in np.arange(1, count + 1) / count]
         reached.append(len(path) - 1)
