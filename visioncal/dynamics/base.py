@@ -60,7 +60,8 @@ class BaseModel:
         matrix = _random_regressor(model, rng or np.random.default_rng(0))
         lengths = np.linalg.norm(matrix, axis=0)
         effective = np.flatnonzero(lengths > _RANK * lengths.max())
-        # Breaks ties in favour of earlier parameters.
+        # Equal columns, as those of a rotor and of its link about the first joint, are chosen in
+        # their order whatever rounding says.
         weights = 1.0 - 1e-4 * np.arange(len(effective)) / len(effective)
         upper, order = qr(
             matrix[:, effective] * (weights / lengths[effective]), mode="r", pivoting=True
@@ -90,6 +91,7 @@ class BaseModel:
                 culprits=[model.robot.name],
             )
         coefficients = solve_triangular(upper, projected)
+        # Rounding, between columns of unit length.
         coefficients[np.abs(coefficients) < 1e-9] = 0.0
         norms = np.where(np.isfinite(lengths), lengths, 0.0)
         dependence = coefficients * norms / lengths[independent][:, None]
@@ -125,7 +127,8 @@ def _random_regressor(model: DynamicModel, rng: np.random.Generator) -> FloatArr
 
 def random_motion(model: DynamicModel, rng: np.random.Generator) -> JointMotion:
     """Random states over the full ranges of angle, speed and acceleration."""
-    # Gravity, speed and acceleration contribute about equally to the torques.
+    # Up to 3 rad/s and 10 rad/s^2 gravity, speed and acceleration contribute about equally to the
+    # torques.
     shape = (200, model.robot.joint_count)
     q, dq, ddq = (rng.uniform(-value, value, shape) for value in (np.pi, 3.0, 10.0))
     return JointMotion(np.arange(200.0), q, dq, ddq)
@@ -181,7 +184,7 @@ def check_joints_move(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         [np.abs(piece.measured.motion.dq).max(axis=0) for item in streams for piece in item.pieces],
         axis=0,
     )
-    # A joint that never exceeds this stands still, and its speed is noise.
+    # A joint that never exceeds this stands still, and its speed is noise [rad/s].
     still = np.flatnonzero(fastest < 0.01)
     if not len(still):
         return
@@ -231,7 +234,8 @@ def null_space(base: BaseModel, blocks: Sequence[NoiseBlock]) -> list[int]:
     column_rms = np.sqrt(np.mean(base.regressor(states).reshape(-1, base.rank) ** 2, axis=0))
     relative = information / np.outer(column_rms, column_rms) / max(rows, 1)
     values, vectors = np.linalg.eigh(relative)
-    # Fast multi-sines have 1e-4 in the worst direction, motion about one axis 1e-16.
+    # Of a full motion's information, fast multi-sines have 1e-4 in the worst direction, and motion
+    # about one axis 1e-16. Parameters with a share of such a direction are named with it.
     undetermined = np.flatnonzero(values < 1e-9)
     shares = np.sqrt(np.sum(vectors[:, undetermined] ** 2, axis=1))
     return [int(index) for index in np.flatnonzero(shares > 0.3)]

@@ -79,6 +79,7 @@ class LowPass:
             return self._weighted_sums(values, self.taps)
         axes = (-1,) + (1,) * (values.ndim - 1)
         weights = self._weighted_sums(present.astype(float), self.taps)
+        # Outputs with less weight on present samples are not normalised.
         weights = np.where(np.abs(weights) < 0.1, 1.0, weights)
         return self._weighted_sums(values * present.reshape(axes), self.taps) / weights.reshape(
             axes
@@ -103,6 +104,7 @@ def bandwidth(q: FloatArray, rate_hz: float) -> float:
     frequencies = np.asarray(np.fft.rfftfreq(len(q), 1.0 / rate_hz)[1:], dtype=float)
     spectrum = np.fft.rfft((q - q.mean(axis=0)) * np.hanning(len(q))[:, None], axis=0)[1:]
     speeds = np.sqrt(np.sum(np.abs(spectrum * frequencies[:, None]) ** 2, axis=0))
+    # Joints that move at least this share of the fastest one, in four bins an octave.
     moving = speeds >= 0.05 * speeds.max()
     power = np.abs(spectrum[:, moving] * frequencies[:, None] ** 2) ** 2
     octaves = np.log2(frequencies / frequencies[0])
@@ -167,6 +169,7 @@ def smoothed_motion(
     reported = fitted(dq, 0)
     inner = slice(window // 2, -(window // 2))
     deviation = np.sqrt(np.mean((reported - speeds)[inner] ** 2, axis=0))
+    # Reported speeds may deviate from the angles' derivatives by a tenth, and 5 mrad/s.
     if np.any(deviation > 0.1 * np.sqrt(np.mean(speeds[inner] ** 2, axis=0)) + 0.005):
         return derived, False
     noise = [
@@ -375,6 +378,7 @@ def condition(
 
 def _resting(motion: JointMotion, rate_hz: float) -> Mask:
     """(m, n) where a joint stands still: friction then holds it by any torque up to its bound."""
+    # A mean speed of under 1 mrad/s over 0.1 s, for as long.
     samples = max(round(0.1 * rate_hz), 1)
     slow = np.abs(uniform_filter1d(motion.dq, samples, axis=0)) < 1e-3
     return np.asarray(binary_opening(slow, np.ones((samples, 1), dtype=bool)))
@@ -390,7 +394,7 @@ def _flat_tops(values: FloatArray) -> Mask:
     """(m,) where torques stay at their extremes for longer than anywhere else: saturation."""
     flat = np.zeros(len(values), dtype=bool)
     span = float(np.ptp(values))
-    # Torques that stay at an extreme are saturated.
+    # Within this share of the range they are the same.
     same = np.abs(np.diff(values)) <= 1e-6 * span
     bounds = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
     runs = bounds.reshape(-1, 2)
@@ -399,6 +403,7 @@ def _flat_tops(values: FloatArray) -> Mask:
         return flat
     top = np.minimum(values.max() - values[runs[:, 0]], values[runs[:, 0]] - values.min())
     extreme = top <= 1e-3 * span
+    # At least five samples, and three times as long as anywhere else.
     others = int(lengths[~extreme].max(initial=1))
     for begin, end in runs[extreme & (lengths >= max(5, 3 * others))]:
         flat[begin : end + 1] = True

@@ -192,7 +192,7 @@ class Objective:
 
     def _penalty(self, coefficients: FloatArray) -> tuple[float, list[FloatArray]]:
         """Penalty of exceeded limits and distances, with gradients (m, n)."""
-        # A margin for peaks between samples.
+        # A margin for peaks between samples: 3 % of the limits, 30 mm of the distances.
         allowed, less = self._allowed, 0.97
         q, dq, ddq = (array @ coefficients.T for array in self._limit_basis)
         position, by_q = _hinge(q - allowed.middle, less * allowed.half)
@@ -219,7 +219,7 @@ class Objective:
         """(k,) shortfall of each pair's distance, over its scale; zero for those far apart."""
         collisions = self._allowed.collisions
         left = collisions.distances(posture) - collisions.needed_m() - 0.03
-        # As costly as exceeding a limit by its own size.
+        # A shortfall of 0.1 m is as costly as exceeding a limit by its own size.
         return np.maximum(-left / 0.1, 0.0)
 
 

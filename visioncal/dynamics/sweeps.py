@@ -154,6 +154,7 @@ def _in_posture(
     left_out = []
     for joint, name in enumerate(allowed.robot.joint_names):
         low, high = _checked_range(allowed, home, joint, *ranges[joint].tolist())
+        # Least range of a joint that is swept [rad].
         if high - low < 0.2:
             left_out.append(name)
             continue

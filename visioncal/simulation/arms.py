@@ -449,7 +449,7 @@ class Heat:
         """Draws an arm whose joints warm up by 10 to 35 K within hours."""
         rng = np.random.default_rng([99, seed])
         duty = rng.uniform(1.5, 4.0, _JOINTS)
-        # Expansion of steel and of aluminium.
+        # Rises [K] and time constants [s]; expansion between steel's and aluminium's [1/K].
         return cls(
             duty,
             rng.uniform(10.0, 35.0, _JOINTS) / duty**2,

@@ -101,6 +101,7 @@ def mounted_single(options: CellOptions) -> dict[str, FloatArray]:
             leant = Rotation.from_rotvec(-second.tilt_rad * lean).as_matrix() @ rotation_z
         else:
             aside = rotation_z @ np.array([1.0, 0.0, 0.0])
+            # Beside the first board [m].
             position = middle + 0.10 * aside
             lean = np.cross([0.0, 0.0, 1.0], aside)
             leant = Rotation.from_rotvec(second.tilt_rad * lean).as_matrix()
@@ -127,8 +128,7 @@ def postures_single(options: CellOptions, placed: Mapping[str, FloatArray]) -> F
                 return target @ invert(cam_from_target) @ invert(cam)
             return cam @ cam_from_target @ invert(target)
 
-        # The arm must stay above the table under the board, and above the robot's own.
-        # The links' least height over the table under a board.
+        # The arm must stay 50 mm above the table under the board, and above the robot's own.
         floor_m = min(0.0, float(target[2, 3]) if in_hand else 0.0) + 0.05
         views = _viewpoints(options, board)
         home = home_posture(arm, flange(views.mean()[None]), rng)
@@ -326,6 +326,7 @@ def _aimed(
             stops = stops[: len(views)]
             goals = aim.flanges(stops, views[: len(stops)])
             starts = np.tile(homes[index], (len(stops), 1))
+            # Links stay 20 mm above the base.
             moved, good = _reachable(arm, goals, starts, 0.02)
             joints[stops[good]] = moved[good]
             pending[stops[good]] = False

@@ -71,6 +71,7 @@ class Raster:
 
 def trace(camera: Camera, patch: Patch, samples: int = _SAMPLES) -> Raster:
     """Traces rays over a patch, with `samples` sub-pixels along a pixel's side."""
+    # Knots are 10 mrad apart.
     knot_px = 0.01 * float(camera.matrix[0])
     x, across = _spline(patch.left, patch.right, knot_px, samples)
     y, down = _spline(patch.top, patch.bottom, knot_px, samples)
@@ -194,6 +195,7 @@ def light_on(
         light = np.asarray(
             cv2.GaussianBlur(light, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE), np.float32
         )
+    # Black level.
     light += np.float32(4.0)
     return light
 
@@ -307,7 +309,8 @@ def _board_patch(camera: Camera, board: Sheet, cam_from_target: FloatArray) -> P
     points = outline_m(board, margin_m(board.target))
     points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     width, height = camera.resolution
-    # Points that the lens model folds back, or beside or behind the camera, do not bound the sheet.
+    # Points that the lens model folds back, or beside or behind the camera (over 84 degrees off),
+    # do not bound the sheet.
     ahead = points_cam[:, 2] > 0.1 * np.linalg.norm(points_cam, axis=1)
     if not ahead.all() or not sees(camera, points_cam, -np.inf).all():
         return Patch(0, 0, width, height)
@@ -359,7 +362,7 @@ class LiveView:
         stands for a stationary arm.
         """
         pose = self.cam_from_target(joints[len(joints) // 2, None])[0]
-        # Below the accuracy of corner detection.
+        # Below, a shift is under the accuracy of corner detection [px].
         if self._rest is None or self._moved_px(self._rest[0], pose) > 0.003:
             shows_board = _faces(self._cell, pose)
             self._rest = (pose, light_on(self._scene, pose, shows_board=shows_board))

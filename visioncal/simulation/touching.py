@@ -134,6 +134,7 @@ def _touched(
     rng: np.random.Generator,
 ) -> Touched:
     """Touches points in the base (n, 3) with points of the tool (n, 3) [m], at random tilts."""
+    # Contact error per axis [m].
     contacts = places + 5e-5 * rng.standard_normal(places.shape)
     on_flange = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
     down = Rotation.from_rotvec([np.pi, 0.0, 0.0])
@@ -143,6 +144,7 @@ def _touched(
     pending = np.ones(len(contacts), dtype=bool)
     for _ in range(40):
         count = int(pending.sum())
+        # Within a cone about the vertical [rad].
         tilt = 0.75 * np.sqrt(rng.uniform(0.0, 1.0, count))
         lean, spin = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(-1.0, 1.0, count)
         axes = np.stack([np.cos(lean), np.sin(lean), np.zeros(count)], axis=1)
