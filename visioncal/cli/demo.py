@@ -63,7 +63,7 @@ def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
     # From the begin, so that the next demonstration replaces one that was interrupted.
     write_truth(session, truth_of(bench.truth))
     planned = _planned(bench.known, stops, seed, plan)
-    # As if guided there by hand.
+    # The arm begins so near to the first stop, as if guided there by hand [rad].
     bench.start(planned.stops[0].q + 2e-3)
     with closing(bench):
         host = bench.controller.host

@@ -86,6 +86,7 @@ def plan_command(options: PlanOptions) -> None:
         return
     with shown_progress(quiet=options.as_json) as progress:
         cell, begun = _begin(start, words, (limits, boxes), progress)
+        # Cosine between the z axes of board and base.
         if words.board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > 0.7:
             warn(
                 "this --board lies face down: its z points into the "

@@ -318,7 +318,10 @@ def _fitted(
     centre: FloatArray,
     setting: FitSettings,
 ) -> PointsFit:
-    """The fit with the points' common errors in its covariance."""
+    """The fit with the points' common errors in its covariance.
+
+    Its worst directions are those at the points' `centre` in the fixture [m].
+    """
     fit = agreement.fit
     noise_m = counted_noise_m(fit, setting.expected_m)
     covariance = measured.carried(fit.by_points, np.hypot(noise_m, pairs.nominal_sigma_m))

@@ -166,6 +166,7 @@ def check_lengths(rows: TouchRows) -> None:
             next_step="Say --robot-unit mm, or write metres.",
         )
     farthest = float(np.max(distances, initial=0.0, where=np.isfinite(distances)))
+    # No arm works within 20 mm of its base's origin.
     if 0.0 < farthest < 0.02:
         raise DataError(
             f"{rows.source}: all positions are within {figure(1e3 * farthest)} mm of the base's "
@@ -232,6 +233,7 @@ def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Ma
     both = np.flatnonzero(has_joints & np.isfinite(rows.base_from_flange).all(axis=(1, 2)))
     delta = invert(poses[both]) @ rows.base_from_flange[both]
     off_m, off_rad = np.linalg.norm(delta[:, :3, 3], axis=1), rotation_angle(delta)
+    # Farther apart than any arm errs, the row's pose is of another arm or frame [m, rad].
     odd = np.flatnonzero((off_m > 0.05) | (off_rad > 0.1))
     if len(odd):
         at = odd[0]

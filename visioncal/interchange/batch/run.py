@@ -410,6 +410,7 @@ def _cluster(scheduler: str | None) -> Iterator[Executor]:
     log_level = log.level
     log.setLevel(logging.CRITICAL)
     try:
+        # Seconds that the scheduler has for an answer.
         client = distributed.Client(scheduler, timeout=10, set_as_default=False)
     except (OSError, ValueError) as error:
         raise DataError(

@@ -135,6 +135,7 @@ def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
     form = "quaternion-xyzw"
     if rotations.shape[1] == 3:
         largest = float(np.nanmax(np.abs(rotations), initial=0.0))
+        # Larger numbers than a whole turn in radians are degrees.
         form = "euler-xyz-deg" if largest > 7.0 else "rotation-vector"
     kept = [name for name in columns if name not in names]
     plain = []
