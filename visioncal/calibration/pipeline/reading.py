@@ -23,6 +23,7 @@ from visioncal.calibration.stages.robots import (
     read_robots,
 )
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.core.verdict import NOTE, Finding, Remedy
 from visioncal.session import STREAMS, Session
 from visioncal.session.columns import column_warnings
@@ -72,6 +73,15 @@ def _not_used(run: RunState) -> Iterator[Finding]:
         else:
             continue
         yield Finding("unused", f"[prior.{edge}] was not used: {reason}.", Remedy(step))
+    readings = sum(view.reading_m is not None for view in session.views)
+    if readings and session.mount != "instrument":
+        yield Finding(
+            "unused",
+            f"{counted(readings, 'row', ('has', 'have'))} an instrument's readings (meas_ "
+            "columns), which were not used: where images or measured poses (cft_ columns) are "
+            "there, these are.",
+            Remedy("Calibrate the arm by the instrument with a session of the readings alone."),
+        )
 
 
 def _suspicious(session: Session) -> Iterator[Finding]:
