@@ -202,14 +202,19 @@ def _estimated(
         levels[name], lenses[name], boards = estimate_sizes(
             seen, problem, rows, state, noise, name, uneven
         )
-    # Errors of links look like a scale, too, but not like different scales of several boards.
-    places = np.array([optics.shape_of(board)[0] for board in optics.printed], dtype=np.int64)
-    is_free = bool(places.size) and bool(np.isin(places, fitted.linearised.free).all())
-    differ = is_free and moved_mahalanobis_sq(fitted, places) > UNEVEN_LINKS**2 * chi2_limit(
-        FALSE_ALARM, len(places)
-    )
-    holds = bool(model.arms_without_joints) or (model.has_links and not differ)
+    # Errors of links look like a scale, too: beside them, boards are sized where that is clear.
+    holds = bool(model.arms_without_joints) or (model.has_links and not _have_other_sizes(fitted))
     return fitted.camera_parameters.with_sizes(levels, lenses, boards, holds_scales=holds)
+
+
+def _have_other_sizes(fitted: ConvergedFit) -> bool:
+    """Whether all boards have free scales, which differ from the stated ones beside link errors."""
+    optics = fitted.camera_parameters
+    places = np.array([optics.shape_of(board)[0] for board in optics.printed], dtype=np.int64)
+    if not len(places) or not np.isin(places, fitted.linearised.free).all():
+        return False
+    limit = UNEVEN_LINKS**2 * chi2_limit(FALSE_ALARM, len(places))
+    return bool(moved_mahalanobis_sq(fitted, places) > limit)
 
 
 def recompute_poses(
