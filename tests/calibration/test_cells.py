@@ -247,6 +247,16 @@ def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_
     assert "read points on a robot's flange" in remedy
 
 
+def test_a_camera_and_a_board_that_see_each_other_alone_are_told_what_would_tie_them():
+    cell = simulate(replace(PLAIN, stops=8))
+    kept = [one for one in cell.sights if (one.camera == "left") == (one.board == "floor")]
+    untied = solved(replace(cell, sights=tuple(kept))).cell.untied
+    assert {value.frame: value.remedy for value in untied} == {
+        "cam_left": "To tie cam_left: let it see a board that is tied, at 5 stops or more.",
+        "target_floor": "To tie target_floor: let a camera that is tied see it, at 5 stops or more.",
+    }
+
+
 @pytest.mark.slow
 def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for():
     robots = tuple(replace(robot, offset_sigma_rad=1e-3) for robot in ROBOTS)

@@ -69,10 +69,12 @@ def connection_advice(frame: str, how: str = "") -> str:
             f"To tie {frame}: let an instrument read points on a robot's flange at 5 stops or "
             "more, or three points that an instrument reads which is tied."
         )
-    return (
-        f"To tie {frame}: let a camera see a board, one of both on {frame} or on its robot and the "
-        f"other one tied, at 5 stops or more{how}."
-    )
+    look = f"a camera see a board, one of both on {frame} or on its robot and the other one tied,"
+    if frame.startswith("cam"):
+        look = "it see a board that is tied,"
+    elif frame.startswith("target"):
+        look = "a camera that is tied see it,"
+    return f"To tie {frame}: let {look} at 5 stops or more{how}."
 
 
 def ambiguous_error(cell: Cell, frames: Sequence[str]) -> DegenerateError:
