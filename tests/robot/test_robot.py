@@ -12,6 +12,7 @@ from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.robot import Robot, load_robot, read_robot_document, robot_file, robot_names
+from visioncal.robot.chain import chain_document
 from visioncal.robot.loads import Masses
 from visioncal.robot.writing import (
     corrected_urdf,
@@ -278,6 +279,17 @@ def test_no_postures_have_arrays_of_no_rows():
     assert robot.joint_jacobian(none).shape == (0, 6, 6)
     assert robot.function_jacobian(none).shape == (0, 6, 24)
     assert robot.gravity_torques(none).shape == (0, 6)
+
+
+def test_an_axis_of_few_digits_turns_rigidly():
+    document = chain_document("rounded", "tip", load_robot("ur10e").chain)
+    document["joint"][0]["axis"] = [0.577, 0.577, 0.577]
+    robot = Robot.from_document(document)
+    rotation = robot.base_from_flange(np.full((1, 6), 0.5))[0, :3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+    turn = robot.link_frames(np.array([[0.5, 0, 0, 0, 0, 0]]))[0, 0, :3, :3]
+    start = robot.link_frames(np.zeros((1, 6)))[0, 0, :3, :3]
+    assert np.arccos((np.trace(start.T @ turn) - 1) / 2) == pytest.approx(0.5, abs=1e-12)
 
 
 def test_corrections_are_what_they_say():

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
-from visioncal.core.transforms import exp
+from visioncal.core.transforms import exp, skew
 from visioncal.core.types import FloatArray, Mask
 
 # Columns of a joint's function: offset, ratio, sine, cosine.
@@ -51,6 +51,20 @@ class Chain:
         turning = np.where(self.prismatic[:, None], 0.0, self.axes)
         moving = np.where(self.prismatic[:, None], self.axes, 0.0)
         return np.concatenate([turning, moving], axis=1)
+
+    def steps(self, positions: FloatArray) -> FloatArray:
+        """Each joint's frame, after its motion, in the previous joint's: (m, n, 4, 4) [m].
+
+        With the generator G of a joint's twist, its motion is `I + sin(s) G + (1 - cos(s)) G^2` at
+        the effective position s (Rodrigues), and `I + s G` if it is prismatic, whose G^2 is zero.
+        """
+        generators = np.zeros((len(self), 4, 4))
+        generators[:, :3, :3], generators[:, :3, 3] = skew(self.twists[:, :3]), self.twists[:, 3:]
+        placed = self.placements[:-1]
+        first, second = placed @ generators, placed @ generators @ generators
+        sine = np.where(self.prismatic, positions, np.sin(positions))[:, :, None, None]
+        versine = (1.0 - np.cos(positions))[:, :, None, None]
+        return np.asarray(placed + sine * first + versine * second)
 
     def function_basis(self, q: FloatArray) -> FloatArray:
         """Derivatives of the effective positions over the joint function coefficients.
@@ -236,9 +250,10 @@ def joint_function(row: DocumentTable, keys: Sequence[str]) -> list[float]:
 
 def _axis(row: DocumentTable) -> FloatArray:
     axis = np.array(row.numbers("axis", 3))
-    if abs(np.linalg.norm(axis) - 1.0) > _ROTATION_TOLERANCE:
+    length = float(np.linalg.norm(axis))
+    if abs(length - 1.0) > _ROTATION_TOLERANCE:
         raise row.refuse("axis", axis.tolist(), "a vector of length 1")
-    return axis
+    return axis / length
 
 
 def _placement(row: DocumentTable) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
-from visioncal.core.transforms import adjoint, exp, invert
+from visioncal.core.transforms import adjoint, exp, invert, skew
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables
 from visioncal.robot.inertia import INERTIA_KEY, Inertias, inertias_of_rows
@@ -169,13 +169,12 @@ class Robot:
 
     def link_frames(self, q: FloatArray) -> FloatArray:
         """Frames (m, n + 1, 4, 4) of the joints, after their motion, and of the flange [m]."""
-        motions = exp(self._effective(q)[:, :, None] * self.chain.twists)
-        *placements, last = self.chain.placements
-        frames = np.empty((len(motions), self.joint_count + 1, 4, 4))
-        here = np.eye(4)
-        for place, placement in enumerate(placements):
-            here = frames[:, place] = here @ placement @ motions[:, place]
-        frames[:, -1] = here @ last
+        steps = self.chain.steps(self._effective(q))
+        frames = np.empty((len(steps), self.joint_count + 1, 4, 4))
+        frames[:, 0] = steps[:, 0]
+        for place in range(1, self.joint_count):
+            frames[:, place] = frames[:, place - 1] @ steps[:, place]
+        frames[:, -1] = frames[:, -2] @ self.chain.placements[-1]
         return frames
 
     def placement_jacobian(self, q: FloatArray) -> FloatArray:
@@ -243,14 +242,12 @@ class Robot:
             (rotations @ local[:, :, None])[..., 0]
             for local in (self.chain.axes, self.masses.centres_m)
         )
-        weights = np.broadcast_to(self.masses.kg[:, None] * self.gravity, axes.shape)
-        # Each joint holds all links from its own on.
-        forces, moments = (
-            np.cumsum(each[:, ::-1], axis=1)[:, ::-1]
-            for each in (weights, np.cross(origins + centres, weights))
-        )
-        held = np.where(self.chain.prismatic[:, None], forces, moments - np.cross(origins, forces))
-        return np.asarray(-np.sum(axes * held, axis=2))
+        # Each joint holds all links from its own on: their mass, first moments about its origin.
+        kg = np.cumsum(self.masses.kg[::-1])[::-1]
+        moments = self.masses.kg[:, None] * (origins + centres)
+        moments = np.cumsum(moments[:, ::-1], axis=1)[:, ::-1] - kg[:, None] * origins
+        turning = np.sum(moments * (axes @ skew(self.gravity).T), axis=2)
+        return -np.where(self.chain.prismatic, kg * (axes @ self.gravity), turning)
 
     def weight_jacobian(self, q: FloatArray) -> FloatArray:
         """Derivatives of the joint torques by weight over masses and first moments.
