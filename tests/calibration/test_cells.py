@@ -251,9 +251,12 @@ def test_a_camera_and_a_board_that_see_each_other_alone_are_told_what_would_tie_
     cell = simulate(replace(PLAIN, stops=8))
     kept = [one for one in cell.sights if (one.camera == "left") == (one.board == "floor")]
     untied = solved(replace(cell, sights=tuple(kept))).cell.untied
-    assert {value.frame: value.remedy for value in untied} == {
-        "cam_left": "To tie cam_left: let it see a board that is tied, at 5 stops or more.",
-        "target_floor": "To tie target_floor: let a camera that is tied see it, at 5 stops or more.",
+    steps = {value.frame: value.remedy for value in untied}
+    assert steps.pop("cam_left") == (
+        "To tie cam_left: let it see a board that is tied, at 5 stops or more."
+    )
+    assert steps == {
+        "target_floor": "To tie target_floor: let a camera that is tied see it, at 5 stops or more."
     }
 
 
