@@ -49,6 +49,8 @@ from visioncal.estimation.steps import find_steps, frames_of
 
 # Share of the earliest stops with which the search begins.
 EARLY_SHARE = 0.4
+# Moves that are fitted: a drift would become a move at every stop, each of which takes a search.
+_MOST_MOVES = 8
 # Limit of an observation's distance from its prediction: in metres, and over the median.
 _NEAR_M, _FAR = 0.04, 6.0
 # Multiple of the median distance beyond which an observation is an outlier even without a
@@ -139,7 +141,7 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
     used, fit = _trimmed_core(problem, state, _early(problem))
     moves: list[Move] = []
     used, fit = widened(_ObservationSearch(problem), used, fit)
-    while True:
+    while len(moves) < _MOST_MOVES:
         relative_squares = _ObservationSearch(problem).distances(used, fit).beyond
         found = find_move(problem, fit, relative_squares < 1.0, movable)
         if found is None:
@@ -167,7 +169,7 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
     if not movable:
         return find_inliers(problem, agreed.fit.state, agreed.used, agreed.fit.noise)
     used, fit = _refined(problem, *_widened(problem, agreed.used, agreed.fit))
-    while True:
+    while len(moves) < _MOST_MOVES:
         part = problem.subset(used)
         if not (slight := find_steps(part, fit, frames_of(part, movable))):
             break

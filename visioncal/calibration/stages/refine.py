@@ -202,13 +202,14 @@ def _estimated(
         levels[name], lenses[name], boards = estimate_sizes(
             seen, problem, rows, state, noise, name, uneven
         )
-    # Errors of links look like a scale, too: beside them, boards are sized where that is clear.
-    holds = bool(model.arms_without_joints) or (model.has_links and not _have_other_sizes(fitted))
+    # Errors of an arm look like a scale, too: beside them, boards are sized where that is clear.
+    is_doubtful = bool(model.arms_without_joints) or model.has_links
+    holds = is_doubtful and not _have_other_sizes(fitted)
     return fitted.camera_parameters.with_sizes(levels, lenses, boards, holds_scales=holds)
 
 
 def _have_other_sizes(fitted: ConvergedFit) -> bool:
-    """Whether all boards have free scales, which differ from the stated ones beside link errors."""
+    """Whether all boards have free scales, which differ from the stated ones beside arm errors."""
     optics = fitted.camera_parameters
     places = np.array([optics.shape_of(board)[0] for board in optics.printed], dtype=np.int64)
     if not len(places) or not np.isin(places, fitted.linearised.free).all():
