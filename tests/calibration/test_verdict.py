@@ -27,6 +27,7 @@ from visioncal.core.types import MOUNTS, Need, Rejection
 from visioncal.core.verdict import (
     CALIBRATE,
     GUESS,
+    GUESS_AND_CALIBRATE,
     PLAN,
     READ_AGAIN,
     Finding,
@@ -230,6 +231,8 @@ def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     # An apostrophe of a sentence is no quotation.
     assert with_paths("Look at the camera's driver.", folder) == "Look at the camera's driver."
     assert with_paths(GUESS, folder) == f"visioncal convert {folder} {folder}-fixed --guess --yes"
+    needed = with_paths(GUESS_AND_CALIBRATE, "s", "out", need=("--need-mm", "0.5"))
+    assert needed.endswith("&& visioncal calibrate s-fixed -o out --need-mm 0.5")
     again = with_paths("visioncal calibrate SESSION -o NEW", folder, tmp_path / "out.2")
     assert again.endswith(f"-o {tmp_path}/out.2-new")
     recording = tmp_path / "cell.rrd"

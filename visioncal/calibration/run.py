@@ -46,9 +46,9 @@ class Run:
     # more of the images was used.
     searches: Mapping[int, Searched] = field(default_factory=dict)
 
-    def with_paths(self, session: Path | str, out: Path | str) -> "Run":
-        """Fills the paths of session and output into the verdict's commands."""
-        verdict = self.calibration.verdict.with_paths(session, out)
+    def with_paths(self, session: Path | str, out: Path | str, need: Sequence[str] = ()) -> "Run":
+        """Fills the paths of session and output, and the need, into the verdict's commands."""
+        verdict = self.calibration.verdict.with_paths(session, out, need=need)
         return replace(self, calibration=replace(self.calibration, verdict=verdict))
 
 

@@ -34,7 +34,7 @@ def calibrate_command(options: CalibrateOptions) -> None:
     with with_run_paths(session, options.out), shown_progress(quiet=options.as_json) as progress:
         result = run(loaded, **(asked | {"progress": progress}))
         progress("write", 0, 1)
-        result = result.with_paths(session, options.out)
+        result = result.with_paths(session, options.out, _need_words(options))
         if left is not None:
             left.keep()
         written = write_outputs(
@@ -47,3 +47,10 @@ def calibrate_command(options: CalibrateOptions) -> None:
     if left is not None:
         say(left.words)
     report_written(written, quiet=options.as_json, status=exit_status(result.calibration.verdict))
+
+
+def _need_words(options: CalibrateOptions) -> list[str]:
+    """The need as it was typed: a calibration that is repeated has to meet it, too."""
+    needs = (("--need-mm", options.need_mm), ("--need-deg", options.need_deg))
+    typed = [word for name, value in needs if value for word in (name, f"{value:g}")]
+    return [*typed, *["--corrected"] * options.corrected]

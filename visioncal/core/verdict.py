@@ -39,6 +39,8 @@ CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
 # Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"
 _PATH = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
+# A calibration's output, after which the need stands that was asked for.
+_OUTPUT = re.compile(r"-o (OUT|NEW)\b")
 
 
 @dataclass(frozen=True)
@@ -209,21 +211,29 @@ class Verdict:
         return tuple(steps.values())[:_SHOWN]
 
     def with_paths(
-        self, session: Path | str, out: Path | str = "", again: Sequence[str] = ()
+        self,
+        session: Path | str,
+        out: Path | str = "",
+        again: Sequence[str] = (),
+        need: Sequence[str] = (),
     ) -> Self:
-        """Fills session, output and typed command line into the commands of remedies."""
+        """Fills session, output, command line and need, as typed, into the remedies' commands."""
 
         def filled(finding: Finding) -> Finding:
             if finding.do is None:
                 return finding
-            command = with_paths(finding.do.command, session, out, again)
+            command = with_paths(finding.do.command, session, out, again, need)
             return replace(finding, do=replace(finding.do, command=command))
 
         return replace(self, findings=tuple(map(filled, self.findings)))
 
 
 def with_paths(
-    command: str, session: Path | str, out: Path | str = "", again: Sequence[str] = ()
+    command: str,
+    session: Path | str,
+    out: Path | str = "",
+    again: Sequence[str] = (),
+    need: Sequence[str] = (),
 ) -> str:
     """Fills the paths of a run into a command; see `Verdict.with_paths`."""
     folder, result = Path(session), Path(out or "out")
@@ -236,4 +246,5 @@ def with_paths(
     words = {name: shlex.quote(path) for name, path in paths.items()}
     # Of an option that is typed twice, the last one counts.
     words[AGAIN] = shlex.join(again)
+    command = _OUTPUT.sub(lambda found: " ".join([found[0], *need]), command)
     return _PATH.sub(lambda found: words[found[0]], command)
