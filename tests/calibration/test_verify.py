@@ -161,6 +161,27 @@ def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     assert visioncal("verify", pairs / "later").status == 2
 
 
+def test_poses_of_another_unit_and_a_bad_calibration_are_named(pairs, tmp_path):
+    session, joints = Session.load(pairs / "later"), {f"q{at}_rad" for at in range(1, 7)}
+    in_mm = tuple(
+        replace(view, numbers={
+            name: value * (1e3 if name in ("x_m", "y_m", "z_m") else 1.0)
+            for name, value in view.numbers.items() if name not in joints
+        })
+        for view in session.views
+    )  # fmt: skip
+    columns = tuple(name for name in session.columns if name not in joints)
+    replace(session, columns=columns, views=in_mm).save(tmp_path / "mm")
+    done = visioncal("verify", tmp_path / "mm", "--against", pairs / "out")
+    assert done.status == 3
+    assert f"visioncal doctor {tmp_path / 'mm'}" in done.out
+    document = json.loads((pairs / "out/calibration.json").read_text("utf-8"))
+    document["verdict"] |= {"status": "bad"}
+    (tmp_path / "calibration.json").write_text(json.dumps(document), "utf-8")
+    done = visioncal("verify", pairs / "later", "--against", tmp_path / "calibration.json")
+    assert "The calibration itself is bad" in done.out
+
+
 @pytest.fixture
 def place():
     return usual("eye-in-hand")

@@ -98,12 +98,23 @@ def verdict_of(check: Check) -> Verdict:
         words = f"{_stops(check)} can hardly tell one change from another."
         step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
         doubts = (Finding("few_stops", words, step),)
+    if check.calibration.verdict.status == "bad":
+        words = f"The calibration itself is bad: {check.calibration.verdict.top[0]}"
+        step = Remedy("Correct that first, and calibrate again: changes from it say little.")
+        doubts = (Finding("bad_calibration", words, step), *doubts)
     if check.passed:
         findings = (Finding(AGREEMENT, _agreement(check)), *doubts)
         return Verdict("check" if doubts else "good", findings)
     likeliest, *others = check.named
     kind, words = likeliest.cause.kind, _sentence(change_words(check, likeliest))
     step = _runnable(check, _KINDS[kind][1])
+    found = _estimates(check, likeliest)
+    if found.get(CAMERA, found).get("moved_mm", 0.0) > 5e3:
+        step = Remedy(
+            "Nothing in a cell moves by metres unseen: look whether the poses of these stops have "
+            "the unit and the form of the calibrated ones, which doctor finds.",
+            "visioncal doctor SESSION",
+        )
     # Where something else has changed, too, its probability among those compared says little.
     share, is_alone = likeliest.probability, check.explained
     reasons = [Finding(kind, words, step, probability=share, by_limit=not is_alone)]
@@ -113,7 +124,9 @@ def verdict_of(check: Check) -> Verdict:
         words = "Alone it does not explain the stops: something else has changed too."
         anew = _runnable(check, Remedy(_sentence(_ANEW), CALIBRATE_ANEW))
         reasons.append(Finding("unexplained", words, anew))
-    return Verdict("bad", (*reasons, *(doubts if others else ())))
+    first = [doubt for doubt in doubts if doubt.kind == "bad_calibration"]
+    last = [doubt for doubt in doubts if doubt not in first] if others else []
+    return Verdict("bad", (*first, *reasons, *last))
 
 
 def _runnable(check: Check, step: Remedy) -> Remedy:
