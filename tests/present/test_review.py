@@ -169,6 +169,9 @@ def test_reruns_own_server_answers_this_machine_alone_and_ends_with_the_command(
         assert [is_open("127.0.0.1", port) for port in ports] == [True, True]
         # A server on all addresses would answer at the other loopback addresses, too.
         assert not any(is_open("127.0.0.2", port) for port in ports)
+        # The browser, which starts once the address is printed, ends at once: Ctrl-C is for what
+        # waits after it, and Python warns of a process that it leaves.
+        time.sleep(1.0)
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=60) == 0
         # The kernel may close a server's connections after its process has ended.
