@@ -31,6 +31,7 @@ from visioncal.present.recording.reader import chunks
 from visioncal.present.viewer import blueprint
 from visioncal.results import to_document
 from visioncal.session import MemoryImages, Session
+from visioncal.session.corners import parse_corners
 
 pytestmark = pytest.mark.usefixtures("strict_rerun")
 
@@ -98,6 +99,13 @@ def test_odd_facts_survive(tmp_path):
     ]
     session = Session.assemble(document, columns, cells, MemoryImages({}))
     assert_same(session, read_session(write_session(tmp_path / "odd.rrd", session)))
+
+
+def test_views_without_rows_of_corners_csv_survive(sample, tmp_path):
+    table = parse_corners("view,point,u_px,v_px\n0,1,310.5,220\n")
+    session = replace(sample.session, corner_table=table).only([1, 2])
+    assert len(session.corner_table) == 0
+    assert_same(session, read_session(write_session(tmp_path / "some.rrd", session)))
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,10 @@ def session_record(
         digests: SHA-256 of each view's image; empty without an image.
         searches: What was found in images, by their names and those of their boards.
     """
-    table = session.corner_table
+    corners, table = None, session.corner_table
+    # Of some views alone, a table may have no rows.
+    if table is not None:
+        corners = table.views, table.points, table.px, table.targets, table.sigmas_px
     return {
         "session_toml": tomli_w.dumps(session.document),
         "target": session.target_document,
@@ -111,7 +114,7 @@ def session_record(
         "streams": {
             name: (samples.columns, samples.values) for name, samples in session.streams.items()
         },
-        "corners": table and (table.views, table.points, table.px, table.targets, table.sigmas_px),
+        "corners": corners,
         "searches": [
             (*key, search.size, search.misfit, _found(search.found))
             for key, search in searches.items()
