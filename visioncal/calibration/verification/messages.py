@@ -31,6 +31,8 @@ from visioncal.vision.targets import corner_positions
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 # Changes of a smaller probability are not listed.
 _LISTED_SHARE = 1e-3
+# No camera or board moves farther [mm]; poses in another unit seem to.
+_FARTHEST_MM = 5e3
 _ANEW = "calibrate again; these stops make a first result, and more a good one."
 _SIZE_WORDS = (
     "the {board} is {percent} % {larger} (sigma {sigma}) than it was: it was printed again or "
@@ -40,6 +42,11 @@ _ANOTHER_BOARD = Remedy(
     "Verify with the board that was calibrated with; or measure the squares of this one, and "
     f"{_ANEW}",
     CALIBRATE_ANEW,
+)
+_OTHER_POSES = Remedy(
+    "Nothing in a cell moves by metres unseen: look whether the poses of these stops have the unit "
+    "and the convention of the calibrated ones, which doctor finds.",
+    "visioncal doctor SESSION",
 )
 # Words for each kind of change, a part of a sentence, and the advice on it.
 _KINDS = {
@@ -93,30 +100,23 @@ _KINDS = {
 
 def verdict_of(check: Check) -> Verdict:
     """Verdict of a check: whether the calibration holds, what changed, and what to do."""
-    doubts: tuple[Finding, ...] = ()
-    if check.predicted.stops < CheckLimits.stops:
-        words = f"{_stops(check)} can hardly tell one change from another."
-        step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
-        doubts = (Finding("few_stops", words, step),)
+    bad, few = list[Finding](), list[Finding]()
     if check.calibration.verdict.status == "bad":
         words = f"The calibration itself is bad: {check.calibration.verdict.top[0]}"
         step = Remedy("Correct that first, and calibrate again: changes from it say little.")
-        doubts = (Finding("bad_calibration", words, step), *doubts)
+        bad.append(Finding("bad_calibration", words, step))
+    if check.predicted.stops < CheckLimits.stops:
+        words = f"{_stops(check)} can hardly tell one change from another."
+        step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
+        few.append(Finding("few_stops", words, step))
     if check.passed:
-        findings = (Finding(AGREEMENT, _agreement(check)), *doubts)
-        return Verdict("check" if doubts else "good", findings)
+        findings = (Finding(AGREEMENT, _agreement(check)), *bad, *few)
+        return Verdict("check" if bad or few else "good", findings)
     likeliest, *others = check.named
     kind, words = likeliest.cause.kind, _sentence(change_words(check, likeliest))
-    step = _runnable(check, _KINDS[kind][1])
-    found = _estimates(check, likeliest)
-    if found.get(CAMERA, found).get("moved_mm", 0.0) > 5e3:
-        step = Remedy(
-            "Nothing in a cell moves by metres unseen: look whether the poses of these stops have "
-            "the unit and the form of the calibrated ones, which doctor finds.",
-            "visioncal doctor SESSION",
-        )
     # Where something else has changed, too, its probability among those compared says little.
     share, is_alone = likeliest.probability, check.explained
+    step = _remedy(check, likeliest)
     reasons = [Finding(kind, words, step, probability=share, by_limit=not is_alone)]
     if others:
         reasons.append(_rivals(check, likeliest, others))
@@ -124,9 +124,15 @@ def verdict_of(check: Check) -> Verdict:
         words = "Alone it does not explain the stops: something else has changed too."
         anew = _runnable(check, Remedy(_sentence(_ANEW), CALIBRATE_ANEW))
         reasons.append(Finding("unexplained", words, anew))
-    first = [doubt for doubt in doubts if doubt.kind == "bad_calibration"]
-    last = [doubt for doubt in doubts if doubt not in first] if others else []
-    return Verdict("bad", (*first, *reasons, *last))
+    return Verdict("bad", (*bad, *reasons, *(few if others else ())))
+
+
+def _remedy(check: Check, change: PossibleChange) -> Remedy:
+    """Advice on a change."""
+    found = _estimates(check, change)
+    if found.get(CAMERA, found).get("moved_mm", 0.0) > _FARTHEST_MM:
+        return _OTHER_POSES
+    return _runnable(check, _KINDS[change.cause.kind][1])
 
 
 def _runnable(check: Check, step: Remedy) -> Remedy:
