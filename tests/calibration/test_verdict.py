@@ -19,7 +19,7 @@ from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.board import scale_finding
 from visioncal.calibration.suspects.judge import in_reading_order, judge
-from visioncal.calibration.suspects.ranking import MEASURE_BOARD
+from visioncal.calibration.suspects.ranking import MEASURE_BOARD, correcting
 from visioncal.core.codec import read, write
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import compose, exp, invert
@@ -33,6 +33,7 @@ from visioncal.core.verdict import (
     Finding,
     Remedy,
     Verdict,
+    need_options,
     remarks,
     with_paths,
 )
@@ -233,6 +234,10 @@ def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     assert with_paths(GUESS, folder) == f"visioncal convert {folder} {folder}-fixed --guess --yes"
     needed = with_paths(GUESS_AND_CALIBRATE, "s", "out", need=("--need-mm", "0.5"))
     assert needed.endswith("&& visioncal calibrate s-fixed -o out --need-mm 0.5")
+    command = correcting(Need(mm=0.5)).command
+    needed = with_paths(command, "s", "out", need=need_options(0.5, None))
+    assert needed.startswith("visioncal calibrate s -o out --need-mm 0.5 --corrected && ")
+    assert need_options(None, 0.1, corrected=True) == ("--need-deg", "0.1", "--corrected")
     again = with_paths("visioncal calibrate SESSION -o NEW", folder, tmp_path / "out.2")
     assert again.endswith(f"-o {tmp_path}/out.2-new")
     recording = tmp_path / "cell.rrd"

@@ -8,6 +8,7 @@ from visioncal.cli.console import exit_status, report_written, say, with_run_pat
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import CalibrateOptions
 from visioncal.cli.summary import print_summary
+from visioncal.core.verdict import need_options
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import frames_to_keep
 from visioncal.session import Session
@@ -34,7 +35,8 @@ def calibrate_command(options: CalibrateOptions) -> None:
     with with_run_paths(session, options.out), shown_progress(quiet=options.as_json) as progress:
         result = run(loaded, **(asked | {"progress": progress}))
         progress("write", 0, 1)
-        result = result.with_paths(session, options.out, _need_words(options))
+        need = need_options(options.need_mm, options.need_deg, corrected=options.corrected)
+        result = result.with_paths(session, options.out, need)
         if left is not None:
             left.keep()
         written = write_outputs(
@@ -47,10 +49,3 @@ def calibrate_command(options: CalibrateOptions) -> None:
     if left is not None:
         say(left.words)
     report_written(written, quiet=options.as_json, status=exit_status(result.calibration.verdict))
-
-
-def _need_words(options: CalibrateOptions) -> list[str]:
-    """The need as it was typed: a calibration that is repeated has to meet it, too."""
-    needs = (("--need-mm", options.need_mm), ("--need-deg", options.need_deg))
-    typed = [word for name, value in needs if value for word in (name, f"{value:g}")]
-    return [*typed, *["--corrected"] * options.corrected]

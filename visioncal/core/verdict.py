@@ -38,9 +38,8 @@ REVIEW = "visioncal show OUT --viewer"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
 # Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"
-_PATH = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
-# A calibration's output, after which the need stands that was asked for.
-_OUTPUT = re.compile(r"-o (OUT|NEW)\b")
+# After a calibration's output stands the need that was typed.
+_PATH = re.compile(r"-o (?:OUT|NEW)\b|\b(?:SESSION|FIXED|OUT|NEW|AGAIN)\b")
 
 
 @dataclass(frozen=True)
@@ -228,6 +227,15 @@ class Verdict:
         return replace(self, findings=tuple(map(filled, self.findings)))
 
 
+def need_options(
+    mm: float | None, deg: float | None, *, corrected: bool = False
+) -> tuple[str, ...]:
+    """The options that state a need, for `with_paths`: a repeated calibration has to meet it."""
+    limits = (("--need-mm", mm), ("--need-deg", deg))
+    typed = [word for name, at in limits if at is not None for word in (name, f"{at:g}")]
+    return (*typed, *["--corrected"] * corrected)
+
+
 def with_paths(
     command: str,
     session: Path | str,
@@ -246,5 +254,5 @@ def with_paths(
     words = {name: shlex.quote(path) for name, path in paths.items()}
     # Of an option that is typed twice, the last one counts.
     words[AGAIN] = shlex.join(again)
-    command = _OUTPUT.sub(lambda found: " ".join([found[0], *need]), command)
+    words |= {f"-o {name}": " ".join(["-o", words[name], *need]) for name in ("OUT", "NEW")}
     return _PATH.sub(lambda found: words[found[0]], command)

@@ -80,11 +80,9 @@ def correcting(need: Need | None) -> Remedy:
     correct = "visioncal correct targets.csv --against OUT -o corrected.csv"
     if need is None:
         return Remedy(f"{words}.", correct)
-    limits = (("mm", need.mm), ("deg", need.deg))
-    options = "".join(f" --need-{unit} {limit:g}" for unit, limit in limits if limit is not None)
     return Remedy(
         f"{words}; with --corrected, the verdict is about them.",
-        f"{CALIBRATE} --corrected{options} && {correct}",
+        f"{CALIBRATE} --corrected && {correct}",
     )
 
 

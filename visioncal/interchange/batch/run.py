@@ -30,6 +30,7 @@ from visioncal.core.extras import client_library
 from visioncal.core.files import natural, read_text, write_atomically
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Progress
+from visioncal.core.verdict import need_options
 from visioncal.core.version import __version__
 from visioncal.interchange.outputs import CALIBRATION, RECORDING, REPORT, Written, write_outputs
 from visioncal.results import Calibration
@@ -183,7 +184,8 @@ def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
     with ONE_OPENCV_THREAD.held():
         pictures = RECORDING not in job.options.without
         result = run(session, level=job.options.level, threads=1, pictures=pictures)
-    result = result.with_paths(job.session, job.folder)
+    need = need_options(job.options.need_mm, job.options.need_deg)
+    result = result.with_paths(job.session, job.folder, need)
     written = write_outputs(job.folder, session, result, without=job.options.without)
     return result.calibration, written
 
