@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import expit, log_ndtr, logit
 
-from visioncal.calibration.stages.need import CONTROLLER, Picks
+from visioncal.calibration.stages.need import CONTROLLER, Picks, least_precise
 from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, FACT, UNEXPLAINED
@@ -212,8 +212,10 @@ def is_negligible(found: Finding, picks: Sequence[Picks]) -> bool:
 def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -> Iterator[Finding]:
     """Dominant error sources of the worst pair of camera and robot."""
     need = None if met is None else met.need
-    worst = max(
-        picks, key=lambda pick: pick.good_for_mm if need is None else -pick.probability(need)
+    worst = (
+        least_precise(picks)
+        if need is None
+        else min(picks, key=lambda pick: pick.probability(need))
     )
     in_mm = need is None or need.mm is not None
     budget, unit = (worst.budget_mm, "mm") if in_mm else (worst.budget_deg, "deg")
