@@ -116,12 +116,14 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         print_json({"error": document})
     say(error.message, "error: ", "bold red")
     other_culprits = [culprit for culprit in error.culprits if culprit not in error.message]
+    # Short ones share a line.
     if all(len(name) < 12 for name in other_culprits):
         other_culprits = [", ".join(other_culprits)] if other_culprits else []
-    for culprit in other_culprits[:10]:
+    shown = other_culprits[:10]
+    for culprit in shown:
         say(f"  - {culprit}")
-    if len(other_culprits) > 10:
-        say(f"  - and {len(other_culprits) - 10} more")
+    if more := len(other_culprits) - len(shown):
+        say(f"  - and {more} more")
     if next_step:
         say(next_step)
 

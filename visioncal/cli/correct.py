@@ -56,7 +56,7 @@ def correct_command(options: CorrectOptions) -> None:
     flange_from_tool = _tool(calibration, options.tool)
     base_from_flange = targets.base_from_tool @ invert(flange_from_tool)
     corrected = correct(
-        calibration,
+        arm,
         base_from_flange,
         _seeds(targets.q_seed, options.seed_joints),
         widest_rad=np.deg2rad(options.widest_deg),

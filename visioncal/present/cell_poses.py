@@ -50,6 +50,7 @@ def robot_states(
         for flange, name in result_parts.frames(calibration).robots.items():
             by_view = {view: by_robot[name] for view, by_robot in rows.items() if name in by_robot}
             known = {view: _state(row, models.get(name)) for view, row in by_view.items()}
+            # Without a pose at a stop it stands as before, and before its first pose as in that.
             current = next((state for state in known.values() if state is not None), None)
             filled: dict[int, RobotState] = {}
             for view in session.views:

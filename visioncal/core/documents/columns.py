@@ -16,6 +16,8 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import READ_AGAIN
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
+# Lines of a message at most.
+_SHOWN = 10
 
 _T = TypeVar("_T")
 
@@ -201,11 +203,11 @@ def as_whole(cell: str) -> int:
 def problems_error(problems: Sequence[TableProblem], next_step: str = "") -> DataError:
     """Error that lists the problems of a table, of many the first of each column."""
     steps = {problem.step for problem in problems}
-    each = len(problems) <= 10 and steps == {""}
+    each = len(problems) <= _SHOWN and steps == {""}
     groups: dict[str, list[TableProblem]] = defaultdict(list)
     for problem in problems:
         groups[problem.place if each else problem.place.partition(", column ")[2]].append(problem)
-    shown = list(groups.values())[:10]
+    shown = list(groups.values())[:_SHOWN]
     where = problems[0].place.partition(", column ")[0]
     step = "" if len(problems) > 1 else f"Correct it, or delete {where}."
     lines = [

@@ -25,7 +25,7 @@ from visioncal.vision.targets import closed_outline
 
 # Sizes as shares of the cell's size, which is the distance of flanges from their bases.
 _AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
-# Lengths of axes relative to the flange's: of other frames, and of tools.
+# Lengths of axes relative to the flange's; those of tools and of other frames are shorter.
 _AXES = {paths.BASE_FRAME: 2.0, paths.FLANGE_FRAME: 1.0}
 
 

@@ -79,7 +79,7 @@ def cell_picture(
 
 
 def _projection(points: FloatArray, named: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Parallel projection of points (n, 3) [m] to the drawing."""
+    """Parallel projection of points (n, 3) [m], from where the named (k, 3) are farthest apart."""
     angles = np.linspace(0.0, 2.0 * np.pi, _SIDES, endpoint=False)
     cos, sin, level = np.cos(angles), np.sin(angles), np.zeros(_SIDES)
     rise = np.sin(_ELEVATION_RAD)
