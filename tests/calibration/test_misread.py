@@ -26,6 +26,7 @@ from support.refusals import raised
 
 import visioncal
 from visioncal.calibration.guess import Guess, guess_reading
+from visioncal.calibration.guess.fit import STARTS, robust_fits
 from visioncal.calibration.guess.joints import guess_joints
 from visioncal.calibration.guess.readings import changes
 from visioncal.calibration.run import STAGES
@@ -134,6 +135,15 @@ def test_a_mount_that_nothing_tells_is_asked_for():
     guess = guess_reading(numbers(robot), poses.camera, None, chain=poses.true_robot)
     assert guess.best is guess.declared
     assert guess.best.hypothesis.mount == "eye-in-hand"
+
+
+def test_three_tenths_of_the_views_may_be_wrong_and_are_not_fitted():
+    poses, wrong = cell_poses(views=20), np.arange(3, 20, 3)
+    robot = poses.true_robot.copy()
+    robot[wrong] = robot[np.roll(wrong, 1)]
+    (fit,) = robust_fits(robot[None], poses.camera.poses()[None], STARTS)
+    assert len(wrong) == 6
+    assert sorted(fit.kept) == [at for at in range(20) if at not in wrong]
 
 
 def test_a_long_recording_takes_no_more_memory_than_what_is_looked_at():

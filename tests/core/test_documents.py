@@ -190,6 +190,8 @@ TABLES = {
     "tab": "a\tb\n1\t2\n3\t4\n",
     "blanks": "a  b\n1   2\n 3 4\n",
     "comment as header": "# a b\n1 2\n\n# in between\n3 4\n",
+    "comment of another kind": "// a b\n1 2\n3 4\n",
+    "comment with words before its header": "% of the robot: a, b\n1,2\n3,4\n",
     "mark and line ends of Windows": "\ufeffa,b\r\n1,2\r\n3,4\r\n",
     "quoted": '"a", "b"\n"1", 2\n3,"4"\n',
     "empty rows and columns": "a;b;;\n1;2;;\n;;;\n3;4;;\n;;;\n",
@@ -203,10 +205,14 @@ def test_tables(file, text):
     assert [[float(name) for name in row] for row in table.rows] == [[1, 2], [3, 4]]
 
 
-def test_a_table_without_a_header_has_numbered_columns(file):
-    table = read_table(file("a.txt", "1 nan\n3 4\n"))
-    assert table.columns == ("1", "2")
-    assert table.place(1) == "a.txt, line 2"
+def test_columns_without_names_are_numbered(file):
+    for text in ("1 nan\n3 4\n", "left 2\n3 4\n", "# of three words\n3 4\n", "# 1 2\n3 4\n"):
+        table = read_table(file("a.txt", text))
+        assert (table.columns, table.has_header) == (("1", "2"), False)
+        assert table.rows[-1] == ("3", "4")
+        assert table.place(len(table.rows) - 1) == "a.txt, line 2"
+    table = read_table(file("b.csv", "a,,c\n1,2,3\n"))
+    assert (table.columns, table.has_header) == (("a", "column_2", "c"), True)
 
 
 @pytest.mark.parametrize(

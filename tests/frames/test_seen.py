@@ -132,6 +132,28 @@ def test_places_follow_their_stated_covariance():
     assert 0.4 < np.mean(surprises) < 2.0
 
 
+def test_what_images_share_is_no_scatter_and_what_one_has_alone_leaves_it_out():
+    cell, calibration = calibrated(IN_HAND, 0)
+    rng, name = np.random.default_rng(0), "flange_from_cam"
+    place, edge = place_of(cell, "base", rng), calibration.edges[name]
+    sights = sights_of(cell, "base", place, rng)
+    # The camera is off by what its transform allows: by 3 mm or 1 mm, otherwise at every stop.
+    for off in np.outer([1.0, 0.3], [4e-3, -3e-3, 5e-3, 2e-3, 1e-3, -2e-3]):
+        covariance = edge.covariance + np.diag(off**2)
+        unsure = replace(edge, matrix=edge.matrix @ exp(off), covariance=covariance)
+        loose = replace(calibration, edges={**calibration.edges, name: unsure})
+        found = place_seen(loose, sights, BOARD, "base")
+        assert found.away_mm.max() > 1.0
+        assert found.inliers.all()
+        assert found.scatter == 1.0
+    # Levels of noise that are known by eight degrees of freedom put the limit at 11 sigma, 0.4 mm;
+    # an image that is not yet left out widens it by what the six scatter.
+    for off_mm, agrees in ((0.45, True), (0.7, False)):
+        moved = sights[2].base_from_flange @ exp(np.array([0.0, 0.0, 0.0, 1e-3 * off_mm, 0.0, 0.0]))
+        others = [*sights[:2], replace(sights[2], base_from_flange=moved), *sights[3:]]
+        assert place_seen(calibration, others, BOARD, "base").inliers[2] == agrees
+
+
 def test_images_of_one_stop_share_the_robots_error(cell):
     made, calibration = cell
     parent = "base" if made.options.mount == IN_HAND else "flange"
