@@ -4,7 +4,6 @@ Joint angles are those of the encoders, torques are about the joints' axes, with
 """
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,9 +11,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.robot.inertia import Inertias, parameter_transform
 from visioncal.robot.model import Robot
-
-if TYPE_CHECKING:
-    import pinocchio as pin
 
 
 def torque_regressor(
@@ -46,7 +42,7 @@ def torque_regressor(
     wanted = np.arange(count) if columns is None else columns
     rows = np.empty((len(q), len(wanted), robot.joint_count)) if out is None else out
     rows = rows[:, : len(wanted)]
-    matrices = _regressors(robot.pinocchio_model, robot.gravity, states)
+    matrices = _regressors(robot, states)
     for row, values in zip(rows, matrices, strict=True):
         # For every sample: a copy with bounds checking would take as long as the dynamics.
         values.take(wanted, 0, row, "clip")
@@ -65,7 +61,7 @@ def joint_torques(
     """
     states = effective_states(robot, q, dq, ddq)
     parameters = inertias.values.ravel()
-    matrices = _regressors(robot.pinocchio_model, robot.gravity, states)
+    matrices = _regressors(robot, states)
     return np.array([parameters @ array for array in matrices]).reshape(np.shape(q))
 
 
@@ -111,13 +107,12 @@ def effective_states(
 
 
 def _regressors(
-    model: "pin.Model", gravity: FloatArray, states: tuple[FloatArray, FloatArray, FloatArray]
+    robot: Robot, states: tuple[FloatArray, FloatArray, FloatArray]
 ) -> Iterator[FloatArray]:
     """Iterates over the torque regressors of states, for the bodies' inertial parameters.
 
     Args:
-        model: Of the arm.
-        gravity: (3,) in the base's frame [m/s^2].
+        robot: The arm.
         states: (m, n) effective positions, speeds and accelerations.
 
     Yields:
@@ -125,8 +120,8 @@ def _regressors(
     """
     import pinocchio as pin
 
-    model.gravity.linear = gravity
-    data, compute = model.createData(), pin.computeJointTorqueRegressor
+    model, compute = robot.pinocchio_model, pin.computeJointTorqueRegressor
+    data = model.createData()
     # The function's return value is a copy of this array.
     regressor = data.jointTorqueRegressor.T
     for q, dq, ddq in zip(*states, strict=True):
