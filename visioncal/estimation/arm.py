@@ -96,9 +96,8 @@ def link_basis(robot: Robot, joints_rad: FloatArray) -> FloatArray:
     Right perturbations of `base_from_flange`, for a link's rotation by 1 rad and its translation by
     0.5 m.
     """
-    links = robot.link_frames(joints_rad)[:, :-1]
-    flange_from_base = invert(robot.base_from_flange(joints_rad))
-    twists = adjoint(flange_from_base[:, None] @ links) * TWIST_UNITS
+    frames = robot.link_frames(joints_rad)
+    twists = adjoint(invert(frames[:, -1:]) @ frames[:, :-1]) * TWIST_UNITS
     return np.concatenate(list(np.moveaxis(twists, 1, 0)), axis=2)
 
 

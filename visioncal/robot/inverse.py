@@ -240,13 +240,14 @@ def _moved(
 ) -> FloatArray:
     """One damped step within the bounds; joints that would leave them from a limit are held."""
     for _ in range(len(positions)):
-        # LAPACK directly: numpy's overhead would double the time of a step.
+        # The smaller of two equivalent systems, by LAPACK directly: numpy's overhead would double
+        # the time of a step.
         rows, columns = jacobian.shape
         long = columns > rows
         gram = jacobian @ jacobian.T if long else jacobian.T @ jacobian
         gram.flat[:: len(gram) + 1] += damping
-        solved = dposv(gram, error if long else error @ jacobian)[1]
-        wanted = positions - np.asarray(solved @ jacobian if long else solved)
+        solution = dposv(gram, error if long else error @ jacobian)[1]
+        wanted = positions - np.asarray(solution @ jacobian if long else solution)
         moved = np.minimum(np.maximum(wanted, bounds.lower), bounds.upper)
         limited = moved != wanted
         if not limited.any():
