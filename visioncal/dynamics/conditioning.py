@@ -24,8 +24,7 @@ from visioncal.dynamics.reading import (
 _TORQUE_BAND, _LEAST_HZ, _MOST_HZ, _WIDEST = 10.0, 4.0, 10.0, 3.0
 # Samples whose regressors are held in memory at a time.
 _SAMPLES_AT_ONCE = 20_000
-
-# Half the length of a filter with that attenuation, by Kaiser's design, over rate and cut-off.
+# Half the length of the low-pass, over its rate and cut-off.
 _SPAN = 1.81
 # Polynomials of fourth order pass a sixth of their own bandwidth to a few parts in ten thousand.
 _ORDER, WIDER = 4, 6.0
@@ -48,7 +47,7 @@ class LowPass:
         step = max(int(rate_hz / (2.0 * band_hz)), 1)
         half = step * int(np.ceil(_SPAN * rate_hz / band_hz / step))
         at = np.arange(-half, half + 1)
-        # Kaiser's design (1974): 60 dB of attenuation from 1.5 times the cut-off on.
+        # Kaiser's design (1974): with this length, 60 dB of attenuation from 1.5 times the cut-off.
         taps = np.sinc(2.0 * band_hz / rate_hz * at) * np.kaiser(len(at), 5.65)
         return cls(taps / taps.sum(), step)
 

@@ -79,7 +79,7 @@ def _check_conventions(base: BaseModel, label: str, measured: Measured, *, known
 
 
 def _unexplained(base: BaseModel, measured: Measured, *, known: bool) -> FloatArray:
-    """(n,) share of the power of each joint's torques that is left."""
+    """(n,) share of each joint's torque power left by the `known` inertias, or by the best fit."""
     robot, torques = base.model.robot, measured.torques_nm
     if known:
         predicted, joints = _predicted(robot, measured.motion), range(robot.joint_count)
@@ -148,7 +148,7 @@ def _joint_fit(measured: Measured, predicted: FloatArray, joint: int) -> tuple[F
     sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
     factors, left = nnls(columns / sizes, centred)
     power = max(float(centred @ centred), 1e-24)
-    # Noise, and wrong inertias.
+    # Noise and wrong inertias leave at least a hundredth.
     return factors / sizes, max(left**2 / power, 0.01)
 
 

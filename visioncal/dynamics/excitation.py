@@ -127,7 +127,8 @@ class Objective:
         """Prepares the samples; weights (n,) are the inverse of each joint's torque noise."""
         self.harmonics = harmonics
         self._allowed, self._weights = allowed, weights
-        # Smooth, so that the objective is.
+        # Dry friction is smoothed over a share of the greatest speed, so that the objective is
+        # smooth.
         terms = replace(base.model.terms, slow_rad_s=0.03 * float(allowed.speed.max()))
         self._base = replace(base, model=DynamicModel(base.model.robot, terms))
         count = _SAMPLES * harmonics.count
