@@ -66,7 +66,6 @@ class Board(BoardKind):
     def _refined(self, image: Image, target: Target, seen: DetectedCorners) -> DetectedCorners:
         refined = self.refine(image, target, seen.ids, seen.px)
         fitted = refined.fitted
-        # Otherwise all corners of the detector are used.
         if fitted.sum() < max(min(6, len(fitted)), 0.5 * len(fitted)):
             return replace(seen, weights=np.full(len(fitted), DETECTED_WEIGHT))
         return DetectedCorners(

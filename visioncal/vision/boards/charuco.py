@@ -131,8 +131,8 @@ class Charuco(Board):
         document = super().requested(request, square_mm)
         marker_mm = request.marker_mm
         if marker_mm is None:
-            # Below ten millimetres whole numbers are too coarse; rounded to a nanometre.
-            # At least one module of white on every side; whole millimetres where squares are large.
+            # At least one module of white on every side; whole millimetres, but where squares are
+            # too small for that: rounded to a nanometre.
             marker_mm = round(0.75 * square_mm, 6)
             marker_mm = float(int(marker_mm)) if square_mm >= 10 else marker_mm
         needed = (request.columns or 0) * (request.rows or 0) // 2

@@ -147,7 +147,7 @@ class CircleGrid(Board):
             scale = np.linalg.norm(px - px.mean(axis=0)) / np.linalg.norm(
                 places - places.mean(axis=0)
             )
-            # Circles of a larger diameter are fitted at half the image size.
+            # Circles of a larger diameter are fitted at half the image size [px].
             if scale * target.diameter_m > 40.0:
                 # Half of the size has edges of enough pixels.
                 half = self.refine(shrunk(image, 2), target, ids, (px - 0.5) / 2)

@@ -134,8 +134,8 @@ def genuine(markers: Sequence[Marker]) -> list[Marker]:
             for other in kept
         )
         short = modules(marker.family) <= 6
-        # Strong lens distortion lowers it to 0.55. Codes of sixteen bits occur by chance in other
-        # markers' squares, with up to 0.8; longer codes do not.
+        # Strong lens distortion lowers the likeness to 0.55. Codes of sixteen bits occur by chance
+        # in other markers' squares, with up to 0.8; longer codes do not.
         if marker.likeness > (0.83 if short else 0.5) and apart:
             kept.append(marker)
     return kept

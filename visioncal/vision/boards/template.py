@@ -72,6 +72,7 @@ _NODES = 6
 # lock at each of about a thousand operations, and switching threads takes longer than these.
 _FEW, _ONE_IMAGE = 100, Lock()
 # Convergence: change of the blur as a logarithm, and steps for the maps and for the result [px].
+# Lone corners converge slowly or not at all, and depend on the blur.
 _LONE_BLUR_TOLERANCE = 0.01
 _STEP_TOLERANCES_PX, _LONE_STEP_TOLERANCES_PX = (0.1, 0.02), (0.004, 0.004)
 # Smaller exponents count as minus infinity: single precision would have denormal numbers there,
@@ -424,7 +425,6 @@ def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float
     # A larger start would exclude all white around a lone corner.
     blur_px = np.full(2, min(1.5, 0.2 * min(pattern.outside, 1.0) * side_px))
     shift, total = np.zeros((len(windows.px), 2)), 0.0
-    # Lone corners converge slowly or not at all, and depend on the blur.
     for _ in range(8):
         step = _step(windows, pattern, shift, blur_px, blurs=True)
         shift = shift + _limited(step.shift)
@@ -531,7 +531,8 @@ def _steps(
     if pattern.lone is not None:
         # Gradients apply to white, where the product is 0; in the dark it is 4.
         columns += [(1 - product / 4) * array for array in (x, y)]
-        # A tag under 115 px a side does not determine how lens distortion bends its sides.
+        # The corners of a single tag do not determine how lens distortion bends its sides: these
+        # may bend from 115 px on; on shorter ones noise exceeds the bending.
         if windows.neighbours.shape[1] == MIN_CORNERS and np.median(windows.widths) * 115.0 < 1.0:
             columns += [y * derivatives[0], x * derivatives[1]]
     unknowns = len(columns) + 1

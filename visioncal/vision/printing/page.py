@@ -206,6 +206,7 @@ def _ruler_mm(room_mm: float) -> float:
 
 
 def _text_width_mm(width_mm: float, page: Page) -> float:
+    # Below a narrow board the text is wider.
     return min(max(width_mm, 170.0), page.width_mm - 2 * EDGE_MM)
 
 
