@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.calibration.stages.pnp import measure_poses
 from visioncal.core.errors import VisioncalError
-from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.transforms import distances, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Mask, Target
 from visioncal.live.drivers.protocols import ArmState
 from visioncal.live.planning.design import Accuracy
@@ -47,7 +47,7 @@ class Coach:
             return
         try:
             by_view = {corners.view: corners}
-            # Assumed corner noise; advice needs no better.
+            # Assumed corner noise [px]; advice needs no better.
             views = measure_poses(by_view, (self.target,), self.camera, 0.2)
         except VisioncalError:
             return
@@ -118,9 +118,8 @@ class JointPoseCheck:
         # With a tool on the flange, `invert(model) @ pose` is constant; with another base,
         # `pose @ invert(model)` is.
         for constant in (invert(model) @ pose, pose @ invert(model)):
-            differences = invert(constant[1:]) @ constant[0]
-            shifts = np.linalg.norm(differences[:, :3, 3], axis=1)
-            found += zip(shifts.tolist(), rotation_angle(differences).tolist(), strict=True)
+            shifts, angles = distances(constant[1:], constant[0])
+            found += zip(shifts.tolist(), angles.tolist(), strict=True)
         shift_m, angle = min(found, key=lambda pair: pair[0] / _SAME_M + pair[1] / _SAME_RAD)
         if shift_m <= _SAME_M and angle <= _SAME_RAD:
             self._states.append(state)

@@ -49,7 +49,7 @@ class Picking:
 
         That is the required one, or nearly that of all of them.
         """
-        # Stops that together add less to the probability are not worth taking.
+        # Stops that together add less to the probability are left out.
         share = min(NeedLimits.probability[0], self.chance(rows) - 0.01)
         # The probability rises with each stop: bisection.
         least, most = 0, len(rows)
@@ -124,7 +124,11 @@ def check_need(need: Need, judged: str) -> None:
 def _pick_covariances(
     cell: PlanCell, covariance: FloatArray, noise: FloatArray, q: FloatArray
 ) -> FloatArray:
-    """Covariances (k, 6, 6) of picks at the target, in the axes of what carries the camera."""
+    """Covariances (k, 6, 6) of picks at the target, from (k, n) postures [rad].
+
+    All are in the axes of what carries the camera: the flange, or the base. The covariance (6, 6)
+    is that of the camera's pose, a right perturbation; the noise (6,) is variances of the flange.
+    """
     middle = corner_positions(cell.target).mean(axis=0)
     points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
     turn = cell.x[:3, :3]

@@ -170,7 +170,7 @@ class _Planning:
     begun: SessionStart | None  # Session to which the stops are added; None for none.
 
     def drivable_design(self, progress: Progress) -> tuple[Design, Route, tuple[str, ...]]:
-        """Chooses stops that a safe path connects."""
+        """Stops that a safe path connects, the path, and what blocked the stops left out for it."""
         remaining = np.arange(len(self.found.q))
         blockers: list[str] = []
         for attempt in range(_ROUNDS):

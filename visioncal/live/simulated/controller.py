@@ -272,7 +272,6 @@ class _Machine:
     def tick(self, now_s: float) -> None:
         """Executes what is due, once a cycle."""
         registers = self.registers
-        # This computer has stalled.
         if now_s - self._last_tick_s > 0.1:
             # After a stall of this computer, commands may have arrived that are not read yet.
             self.heard_s = now_s
