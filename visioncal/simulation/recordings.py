@@ -476,7 +476,7 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
         seen = partial(before, robot.options.jitter(1, rng))
         exact = passage.frame(taken_s, seen, camera, board, first_view + len(sights))
         middle = seen(passage.path([taken_s]))[0]
-        if len(exact.ids) < min_corners or middle[2, 2] < 0.5:
+        if len(exact.ids) < min_corners or middle[2, 2] < _LEAST_COSINE:
             continue
         corners = detected(board, exact, options.pixel_sigma_px, rng)
         ahead_s = swept.camera_minus_robot_s + swept.jitter_s * stamp_noise.standard_normal()
