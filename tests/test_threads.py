@@ -1,6 +1,7 @@
 """Several threads calibrate and write at once, and leave the process as it was."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Barrier
@@ -13,6 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from visioncal.calibration.run import calibrate, run
 from visioncal.calibration.stages import detect
 from visioncal.core.errors import DataError
+from visioncal.core.threads import SharedSetting
 from visioncal.dynamics import run as dynamics
 from visioncal.interchange.outputs import write_outputs
 from visioncal.present.recording import read_evidence
@@ -76,6 +78,24 @@ def test_threads_change_no_digit(tmp_path, monkeypatch):
     assert to_document(one) == to_document(three)
     with pytest.raises(DataError, match="threads is 0; at least 1"):
         calibrate(tmp_path / "cell", threads=0)
+
+
+def test_a_shared_setting_is_made_by_the_first_and_undone_by_the_last():
+    log = []
+
+    @contextmanager
+    def setting():
+        log.append("made")
+        yield
+        log.append("undone")
+
+    shared = SharedSetting(setting)
+    for _ in range(2):
+        log.clear()
+        with ExitStack() as first, shared.held():
+            first.enter_context(shared.held())
+            assert log == ["made"]
+        assert log == ["made", "undone"]
 
 
 def test_dynamics_are_identified_on_one_thread(monkeypatch):

@@ -131,8 +131,10 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     pushes = (Moved("target_floor", 9), Moved("cam_right", 12))
     cell = simulate(replace(PLAIN, moved=pushes, swapped_rows=1, stray_images=3, seed=3))
     found = solved(cell)
-    moved = [(value.frame, value.first_stop) for value in found.cell.moved]
-    assert moved == [("target_floor", 9), ("cam_right", 12)]
+    moved = [(value.before, value.last_stop, value.first_stop) for value in found.cell.moved]
+    assert moved == [("target_floor_until_stop_8", 8, 9), ("cam_right_until_stop_11", 11, 12)]
+    assert [value.frame for value in found.cell.moved] == ["target_floor", "cam_right"]
+    assert {f"cell_from_{before}" for before, *_ in moved} < set(found.edges)
     # A pushed frame's own place is known to 0.1 mm.
     assert [value.shift_mm for value in found.cell.moved] == pytest.approx([5.0] * 2, abs=0.4)
     reasons = {view.view: view.reason for view in found.views if not view.used}

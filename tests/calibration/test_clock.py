@@ -327,23 +327,31 @@ def test_at_rest_the_clocks_do_not_matter():
 SCREW = np.array([0.05, 0.1, 0.2, 0.01, 0.02, 0.005])
 
 
-def screwed() -> Session:
-    """A flange that turns evenly about one axis, which no offset changes."""
-    rng, times_s, frames_s = (
-        np.random.default_rng(5),
-        np.arange(0, 20, 0.02),
-        np.arange(1, 19, 1 / 30),
-    )
+def going(way=lambda times_s: np.outer(times_s, SCREW)) -> Session:
+    """A flange that goes a way: evenly about one axis, which no offset changes, or another one."""
+    rng, times_s = np.random.default_rng(5), np.arange(0, 20, 0.02)
+    frames_s = np.arange(3, 17, 1 / 30)
     x, z = exp(rng.normal(size=(2, 6)))
     noise = exp(1e-4 * rng.normal(size=(len(frames_s), 6)))
-    seen = invert(exp(np.outer(frames_s, SCREW)) @ x) @ z @ noise
-    return streamed((frames_s, seen), (times_s, exp(np.outer(times_s, SCREW))))
+    seen = invert(exp(way(frames_s)) @ x) @ z @ noise
+    return streamed((frames_s, seen), (times_s, exp(way(times_s))))
+
+
+def test_motion_that_repeats_itself_is_refused_unless_the_offset_is_stated():
+    """Every two seconds."""
+    turns, sizes = np.pi * np.array([1, 2, 1, 2, 1, 2]), np.array([0.4, 0.5, 0.3, 0.1, 0.1, 0.1])
+    again = going(lambda times_s: np.sin(np.outer(times_s, turns) + np.arange(6)) * sizes)
+    words = "the motion repeats itself: offsets of .* ms explain it alike"
+    raised(DegenerateError, words, clocked_of, again)
+    # A period off, which is for whoever stated it, to 1 ms, to know.
+    clock = clocked_of(stating(again, 2.05)).clock
+    assert abs(clock.camera_minus_robot_s - 2.0) < 1e-3
 
 
 def test_motion_that_does_not_tell_the_offset_is_refused_unless_it_is_stated():
-    with pytest.raises(DegenerateError, match=r"is left open by 540 views, of which 0 .* at rest"):
-        calibrate(screwed())
-    clocked = clocked_of(stating(screwed(), 0.02))
+    with pytest.raises(DegenerateError, match=r"is left open by 420 views, of which 0 .* at rest"):
+        calibrate(going())
+    clocked = clocked_of(stating(going(), 0.02))
     assert (clocked.clock.method, clocked.clock.sigma_s) == ("stated", 1e-3)
     assert "is taken as stated, +20 ms, to 1 ms" in clocked.warnings[0].words
     view = clocked.views[0]

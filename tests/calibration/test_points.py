@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tomli_w
 from scipy.spatial.transform import Rotation
 from support.boards import any_page, printed
 from support.commands import visioncal
@@ -235,6 +236,7 @@ def test_a_table_of_corners_that_was_cut_off_is_named(folder):
     (found,) = (found for found in most.verdict.findings if found.kind == "lost_views")
     assert found.views == tuple(lost)
     assert found.words.startswith("5 of 15 rows of views.csv have neither an image nor rows in")
+    assert "it has neither image nor rows in corners.csv" in most.views[10].reason
     assert doctor(folder).findings[0].kind == "lost_views"
 
 
@@ -264,12 +266,7 @@ def test_one_image_of_two_targets_is_two_views_and_rows_name_their_targets(tmp_p
     )
     seen(both)[1].save(tmp_path / "cell")
     folder = tmp_path / "cell"
-    board = target_document(CHARUCO)
-    lines = (
-        f"{key} = {str(value).lower() if isinstance(value, bool) else repr(value)}\n"
-        for key, value in board.items()
-    )
-    (folder / "board.toml").write_text("".join(lines))
+    (folder / "board.toml").write_text(tomli_w.dumps(target_document(CHARUCO)))
     text = (folder / "session.toml").read_text().replace('target = "target.toml"\n', "")
     (folder / "session.toml").write_text(
         f'{text}\n[targets]\nboard = "board.toml"\nsame = "board.toml"\n'
@@ -391,8 +388,10 @@ def test_corners_outside_the_stated_image_are_refused(folder):
     assert "Correct resolution" in refused.next_step
     (found,) = (item for item in doctor(folder).findings if item.words == refused.message)
     assert found.do.words == refused.next_step
-    text = (folder / "session.toml").read_text()
-    (folder / "session.toml").write_text(text.partition("[camera]")[0])
+    text = (folder / "session.toml").read_text().partition("[camera]")[0]
+    (folder / "session.toml").write_text(f"{text}[camera]\n")
+    raised(DataError, "the camera's resolution is missing, and none of 0", calibrate, folder)
+    (folder / "session.toml").write_text(text)
     raised(DataError, "camera is missing, but view 0 has rows in corners", calibrate, folder)
 
 
@@ -523,7 +522,7 @@ def with_column(name: str, value: str):
             lambda rows: [*with_column("sigma_px", "1")(rows), ["0", "0", "10", "10", ""]],
             "it is empty; all rows state it, or none",
         ),
-        # A rig whose table counts from 1, and its corners from 0.
+        # Corners that are counted from 0, of a rig that is not.
         (
             "corners",
             lambda rows: [

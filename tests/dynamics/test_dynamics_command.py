@@ -9,6 +9,7 @@ from support.commands import visioncal
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.dynamics import ArmDynamics, BaseModel, FrictionTerms, Identified, estimate_payload
+from visioncal.dynamics.identified import Lag, judge
 from visioncal.dynamics.identify import Options
 from visioncal.dynamics.run import IdentificationRequest, conditioned_streams, identify_session
 from visioncal.interchange.outputs import write_dynamics
@@ -154,6 +155,30 @@ def test_torques_are_fed_forward(world, run):
     assert share.max() < 0.02
     # Links weigh 20 % otherwise than the maker says.
     assert np.sqrt(np.mean(before[:, 1] ** 2)) > 10.0 * np.sqrt(np.mean(away[:, 1] ** 2))
+
+
+def test_what_a_result_is_doubted_for_is_named(run):
+    """But for the first: a lag that is a small share of the torques is a remark."""
+    known, checked = run.identified, run.identified.validation
+    assert judge(known).status == "good"
+    for changes, status, words in (
+        ({"lag": Lag(0.01, 1e-4, 0.05)}, "good", "The torques lag the angles by 10 ms"),
+        ({"lag": Lag(-0.08, 1e-4, 0.4)}, "check", "Record angles and torques by one clock"),
+        ({"validation": None}, "check", "Nothing was left to predict"),
+        (
+            {"validation": replace(checked, consistent_rms_nm=2.0 * checked.rms_nm)},
+            "check",
+            "Check whether it is the robot that was recorded",
+        ),
+        (
+            {"covariance": 1e4 * known.covariance},
+            "check",
+            "this motion was too slow, too small or too short",
+        ),
+    ):
+        verdict = judge(replace(known, **changes))
+        assert verdict.status == status
+        assert words in " ".join(map(str, verdict.findings))
 
 
 def test_a_payload_is_weighed(world, run):

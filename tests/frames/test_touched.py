@@ -334,6 +334,12 @@ def test_features_need_their_kinds(tmp_path, tool_file):
     run(("",) * 7).refused("there is no kind; one of origin, x, xy is needed", "--cad")
     run(("orgin", *KINDS[1:])).refused("line 2: kind is 'orgin'", "Did you mean origin?")
     run(KINDS[:3]).refused("no touch of kind xy")
+    on_a_line = 0.1 * np.outer([0.0, 1.0, 3.0], [1.0, 0.0, 0.0])
+    poses = touching(on_a_line, np.random.default_rng(2), NOISE_M)
+    run(("origin", "x", "xy")).refused(
+        "the fixture's rotation about its x is not determined at all", "at a noise of 0.1 mm"
+    )
+    poses = touching(ON_FEATURES, np.random.default_rng(1), NOISE_M)
     run(KINDS, "--cad", cad_file(tmp_path / "cad.csv")).refused("Leave --cad away")
 
 

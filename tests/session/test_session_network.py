@@ -253,25 +253,31 @@ def test_points_are_on_what_moves_while_they_are_read(tmp_path):
     ]
 
 
-def test_rows_say_which_board_they_show(tmp_path):
-    (tmp_path / "session.toml").write_text(
-        'schema = 1\nname = "cell"\nmount = "eye-in-hand"\n[camera]\nresolution = [1280, 800]\n'
-        '[targets]\nwall = "checkerboard_9x6_25mm"\n[targets.floor]\ntarget = "floor.toml"\n'
-    )
+def test_rows_say_which_board_they_show_whose_file_comes_along(tmp_path):
     board = 'kind = "charuco"\ncolumns = 5\nrows = 7\nsquare_m = 0.04\nmarker_m = 0.03\n'
     (tmp_path / "floor.toml").write_text(f'{board}dictionary = "DICT_5X5_100"\n')
-    (tmp_path / "views.csv").write_text(
+    folder = tmp_path / "cell"
+    folder.mkdir()
+    (folder / "session.toml").write_text(
+        'schema = 1\nname = "cell"\nmount = "eye-in-hand"\n[camera]\nresolution = [1280, 800]\n'
+        '[targets]\nwall = "checkerboard_9x6_25mm"\n[targets.floor]\ntarget = "../floor.toml"\n'
+    )
+    (folder / "views.csv").write_text(
         "view,stop,target,image,x_m,y_m,z_m,qx,qy,qz,qw\n"
         f"0,0,floor,a.png,{POSE}\n1,0,wall,a.png,{POSE}\n2,1,wall,b.png,{POSE}\n"
     )
     for name in ("a.png", "b.png"):
-        (tmp_path / name).write_bytes(b"\x89PNG " + name.encode())
-    session = Session.load(tmp_path)
+        (folder / name).write_bytes(b"\x89PNG " + name.encode())
+    session = Session.load(folder)
     kinds = {name: board.kind for name, board in session.boards.items()}
     assert kinds == {"wall": "checkerboard", "floor": "charuco"}
     assert [session.board_of(view) for view in session.views] == ["floor", "wall", "wall"]
     # Two rows of one image that show two boards are no mistake.
-    assert session.warnings == ()
+    (said,) = session.warnings
+    assert "'../floor.toml' lies outside of the session's folder" in said
+    session.save(tmp_path / "far" / "copy")
+    assert (tmp_path / "far" / "copy" / "target_floor.toml").is_file()
+    assert Session.load(tmp_path / "far" / "copy").digest() == session.digest()
 
 
 def test_rows_without_a_robot_are_named_before_frames_that_hang_on_nothing(tmp_path):
