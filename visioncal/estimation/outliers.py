@@ -21,22 +21,11 @@ from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.estimation.moves import (
-    Move,
-    explained_by_noise,
-    find_move,
-    moved,
-)
+from visioncal.estimation.moves import Move, explained_by_noise, find_move, moved
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import UNEVEN, Noise, State
-from visioncal.estimation.robust import (
-    Distances,
-    half_of,
-    settled,
-    trimmed_start,
-    widened,
-)
+from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
 from visioncal.estimation.solve import (
     Solution,
     estimate_noise,
@@ -152,8 +141,7 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
         involved = problem.observations.involves(move.twin)
         used = np.where(involved, explained_by_noise(problem, fit, len(problem)), used)
         used, fit = _widened(problem, used, fit)
-    fit = _ObservationSearch(problem).fit_from(used, fit.state, fit.noise)
-    return _inlier_fit(problem, used, fit, moves)
+    return _converged(problem, used, fit, moves)
 
 
 def all_as_inliers(problem: Problem, state: State) -> InlierFit:
@@ -177,8 +165,7 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
         movable = (*movable, move.twin)
         moves.append(move)
         used, fit = _refined(problem, *_widened(problem, used, fit))
-    fit = _ObservationSearch(problem).fit_from(used, fit.state, fit.noise)
-    return _inlier_fit(problem, used, fit, moves)
+    return _converged(problem, used, fit, moves)
 
 
 def find_inliers(
@@ -196,11 +183,10 @@ def find_inliers(
             if used is None
             else (used, fit_problem(problem.subset(used), state, noise))
         )
-        mask, fit = _refined(problem, mask, fit)
-        fit = _ObservationSearch(problem).fit_from(mask, fit.state, fit.noise)
-        is_noise = bool(np.all(fit.noise.robots < _MOST_NOISE))
-        if mask.sum() >= max(_LEAST_SHARE * len(problem), FEWEST_COMPARED) and is_noise:
-            return _inlier_fit(problem, mask, fit, ())
+        found = _converged(problem, *_refined(problem, mask, fit), ())
+        is_noise = bool(np.all(found.fit.noise.robots < _MOST_NOISE))
+        if found.used.sum() >= max(_LEAST_SHARE * len(problem), FEWEST_COMPARED) and is_noise:
+            return found
     fit = fit_problem(problem, state)
     near = _near(problem, fit.state, all_rows, _GROSS)
     if not FEWEST_COMPARED <= near.sum() < len(problem):
@@ -288,6 +274,12 @@ def _widened(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solutio
 
 def _refined(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:
     return settled(_ObservationSearch(problem), used, fit, FEWEST_COMPARED, _SUSPECT_SHARE)
+
+
+def _converged(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> InlierFit:
+    """The inliers of a search, fitted until the noise levels change no more."""
+    fit = _ObservationSearch(problem).fit_from(used, fit.state, fit.noise)
+    return _inlier_fit(problem, used, fit, moves)
 
 
 def _inlier_fit(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> InlierFit:

@@ -19,10 +19,7 @@ from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import ROUNDING, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
-from visioncal.estimation.moves import (
-    fitted_change,
-    moved,
-)
+from visioncal.estimation.moves import fitted_change, moved
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
