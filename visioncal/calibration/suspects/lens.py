@@ -1,4 +1,4 @@
-"""Lenses: stated ones that do not fit, errors beyond their models, and changes during a session."""
+"""Lenses: stated ones that do not fit, errors beyond their models, and changes of focus."""
 
 from collections.abc import Iterator
 
