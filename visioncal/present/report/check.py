@@ -26,12 +26,12 @@ def render_check(check: Check, triggers: Sequence[Trigger], verdict: Verdict) ->
     stops = [str(view) for view in check.predicted.views]
     before, after = _lengths(check.residuals), _lengths(check.remaining)
     rows = []
-    for change in [] if check.passed else listed_changes(check):
-        share, is_found = 100.0 * change.probability, change in check.named
+    for listed in [] if check.passed else listed_changes(check):
+        share, is_found = 100.0 * listed.probability, listed in check.named
         cells = (
             f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %",
             "found" if is_found else "ruled out",
-            change_words(check, change),
+            change_words(check, listed),
         )
         rows.append(TableRow(cells, "left-out" if is_found else "rejected"))
     return template("check.html.j2").render(
