@@ -31,14 +31,14 @@ def wished(usual: int, quick: int = 1) -> int:
     return int(WORDS[0]) if WORDS else few(usual, quick)
 
 
-def write_section(name: str, command: str, text: str, path: Path = RESULTS) -> None:
+def write_section(name: str, command: str, text: str) -> None:
     """Replaces the section called `name`, or appends it; not with `--quick`."""
     if QUICK:
         return
     begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->\n"
-    before, _, rest = path.read_text(encoding="utf-8").partition(begin)
+    before, _, rest = RESULTS.read_text(encoding="utf-8").partition(begin)
     section = f"{begin}## {name}\n\n`{command}`, {_machine()}\n\n{text.strip()}\n{end}"
-    path.write_text(before + section + rest.partition(end)[2], encoding="utf-8")
+    RESULTS.write_text(before + section + rest.partition(end)[2], encoding="utf-8")
 
 
 def _machine() -> str:

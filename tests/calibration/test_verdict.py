@@ -559,9 +559,9 @@ def test_rows_that_were_shuffled_are_named(options, order, status, words):
     assert ("poses are not those of the images" in verdict.top[0]) == (status == "bad")
 
 
-def drawn_misses_m(known: RunState, mount: str, count: int = 20_000) -> np.ndarray:
+def drawn_misses_m(known: RunState, mount: str) -> np.ndarray:
     """(n, 3) by how much picks miss, drawn one by one and seen through the chain [m]."""
-    answer, rng = known.assessment, np.random.default_rng(0)
+    answer, rng, count = known.assessment, np.random.default_rng(0), 20_000
     problem, (camera, target) = answer.problem, answer.state.edges[:2]
     views = rng.integers(len(known.used), size=count)
     (poses,) = problem.poses.values()

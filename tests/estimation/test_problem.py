@@ -413,8 +413,8 @@ def seen_as(problem, measured):
     return replace(problem, observations=replace(problem.observations, measured=measured))
 
 
-def belief_of(state, freedom=np.inf, sigma=1e-5):
-    return CalibrationPosterior(state, sigma**2 * np.eye(12), NOISE, freedom)
+def belief_of(state, freedom=np.inf):
+    return CalibrationPosterior(state, 1e-10 * np.eye(12), NOISE, freedom)
 
 
 def test_misfit_and_evidence_follow_their_distributions():

@@ -71,10 +71,10 @@ def drawing(points_m, names=NAMES):
     return NominalPoints("cad.csv", names[: len(points_m)], points_m, np.zeros(len(points_m)))
 
 
-def touching(points_m, rng, noise_m=0.0, tip=TOOL_TIP):
+def touching(points_m, rng, noise_m=0.0):
     """Poses that touch points (n, 3) of the fixture, each tilted its way."""
     met = placed(FRAME, points_m) + noise_m * rng.normal(size=points_m.shape)
-    return turned_poses(rng, met, tip, FRAME[:3, :3])
+    return turned_poses(rng, met, TOOL_TIP, FRAME[:3, :3])
 
 
 def drawn(points_mm, names, *, seed=1, noise_m=NOISE_M, cad_mm=CAD_MM, cad_names=NAMES, **options):

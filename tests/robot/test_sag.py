@@ -16,8 +16,8 @@ LOAD = Payload(5.0, (0.03, -0.02, 0.11), (12.0, -30.0, 4.0))
 COMPLIANCE = (5e-5, 1e-4, 8e-5, 1.5e-4, 1.2e-4, 2e-4)
 
 
-def postures(count=12, seed=0):
-    return np.random.default_rng(seed).uniform(-2.5, 2.5, (count, 6))
+def postures(count=12):
+    return np.random.default_rng(0).uniform(-2.5, 2.5, (count, 6))
 
 
 def loads_of(payload, count):

@@ -12,8 +12,7 @@ HUNG = tuple(Payload(kg=load / GRAVITY) for load in LOADS_N)
 NOMINAL = arm_named("generic-6r-1800")
 
 
-def loaded_postures(count: int, seed: int = 0) -> FloatArray:
+def loaded_postures(count: int) -> FloatArray:
     """So many postures, each as often as there are loads: it is loaded where it stands."""
-    return np.repeat(
-        random_postures(NOMINAL, count, np.random.default_rng(seed)), len(LOADS_N), axis=0
-    )
+    drawn = random_postures(NOMINAL, count, np.random.default_rng(0))
+    return np.repeat(drawn, len(LOADS_N), axis=0)

@@ -14,7 +14,6 @@ from visioncal.core.transforms import compose, exp
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.results import Calibration
 from visioncal.simulation import SimulatedCell, project, rays
-from visioncal.simulation.boards import Sheet, corners_m
 from visioncal.vision.targets import corner_positions
 
 
@@ -71,18 +70,10 @@ def before_camera(cell: SimulatedCell, target: Target, rng: np.random.Generator)
 
 
 def seen_corners(
-    cell: SimulatedCell,
-    cam_from_target: FloatArray,
-    target: Target,
-    rng: np.random.Generator,
-    scale: float = 1.0,
+    cell: SimulatedCell, cam_from_target: FloatArray, target: Target, rng: np.random.Generator
 ) -> Corners:
-    """The noisy corners, in the image, of a target that is printed so many times too large."""
-    camera = cell.options.camera
-    stated = corner_positions(target)
-    real = (
-        scale * stated if target.kind == "marker" else corners_m(Sheet(target=target, scale=scale))
-    )
+    """The noisy corners, in the image, of a target."""
+    camera, real = cell.options.camera, corner_positions(target)
     px = project(camera, real @ cam_from_target[:3, :3].T + cam_from_target[:3, 3])
     ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
     px = px[ids] + cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))
