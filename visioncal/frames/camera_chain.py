@@ -266,7 +266,7 @@ def point_jacobian(a_from_b: FloatArray, point_b: FloatArray) -> FloatArray:
 
 
 def checked_pose(pose: FloatArray, name: str) -> None:
-    """Checks that a matrix is a pose in metres; raises DataError."""
+    """Checks that a matrix is a (4, 4) pose in metres; raises DataError."""
     if fault := rigid_fault(pose):
         raise DataError(f"{name}: not a (4, 4) rigid transform: {fault}.", culprits=[name])
     length = float(np.linalg.norm(pose[:3, 3]))
