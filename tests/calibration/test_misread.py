@@ -346,8 +346,8 @@ Q, POSES = CELL.robot.joints, CELL.robot.base_from_flange
 LOST = np.deg2rad([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
 
 
-def told(joints=Q, poses=POSES, robot=ROBOT.document, *, with_poses=True) -> Session:
-    """The session of the cell, of whose robot this is told."""
+def session_with(joints=Q, poses=POSES, robot=ROBOT.document, *, with_poses=True) -> Session:
+    """The session of the cell with these joints, poses and model of its robot."""
     session = Session.from_corners(
         [(seen.ids, seen.px) for seen in CELL.corners],
         poses,
@@ -404,7 +404,7 @@ SLIPS = {
 @pytest.mark.parametrize("name", SLIPS)
 def test_slips_are_named(name):
     changes, words = SLIPS[name]
-    assert words in str(visioncal.doctor(told(**changes)))
+    assert words in str(visioncal.doctor(session_with(**changes)))
 
 
 # A model of an earlier calibration, where the controller computes with the nominal one.
@@ -423,12 +423,12 @@ IDENTIFIED = ROBOT.corrected(
     ids=["in the world", "identified", "as built"],
 )
 def test_sound_sessions_raise_no_alarm(changes):
-    found = visioncal.doctor(told(**changes))
+    found = visioncal.doctor(session_with(**changes))
     assert found.is_sound, str(found)
 
 
 def test_joints_alone_that_are_misread_are_refused_with_the_fix():
-    session = told(Q * [1, 1, -1, 1, 1, 1], with_poses=False)
+    session = session_with(Q * [1, 1, -1, 1, 1, 1], with_poses=False)
     error = raised(DataError, "opposite sign, they fit", visioncal.calibrate, session)
     assert "not those of ur5e" in error.message
     assert error.culprits == ("views.csv: q3_rad",)
@@ -436,7 +436,7 @@ def test_joints_alone_that_are_misread_are_refused_with_the_fix():
 
 
 def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
-    session = told(np.rad2deg(Q))
+    session = session_with(np.rad2deg(Q))
     views = list(session.views)
     views[3] = without_pose(views[3])
     session = replace(session, views=tuple(views))
@@ -456,7 +456,7 @@ def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
 
 def test_a_lost_encoder_is_named_and_estimated_with_the_arm():
     joints = Q - LOST
-    result = visioncal.calibrate(told(joints, ROBOT.base_from_flange(joints)))
+    result = visioncal.calibrate(session_with(joints, ROBOT.base_from_flange(joints)))
     nominal, found = result.arm.levels
     assert nominal.held_out_mm > 10.0
     assert found.held_out_mm < 0.5
@@ -473,7 +473,7 @@ def test_a_lost_encoder_is_named_and_estimated_with_the_arm():
 def test_one_row_of_wrong_joints_costs_its_view_alone():
     joints = Q.copy()
     joints[5, 1] += 0.3
-    result = visioncal.calibrate(told(joints))
+    result = visioncal.calibrate(session_with(joints))
     assert [view.view for view in result.arm.left_out] == [at for at in range(16) if at != 5]
     assert result.arm.level == "geometry"
     assert result.views[5].reason.endswith("with which the camera agrees")
@@ -538,8 +538,9 @@ def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
     assert "Look at an image first: where it is mirrored" in done.said
     assert "--mirror-poses" in done.said
     assert not any("--guess" in command for command in printed_commands(done.said))
-    told = converted(tmp_path / "cell", tmp_path / "fixed", "--yes")
-    told.refused("mirrored images are the usual cause")
+    converted(tmp_path / "cell", tmp_path / "fixed", "--yes").refused(
+        "mirrored images are the usual cause"
+    )
     assert not (tmp_path / "fixed").exists()
     converted(tmp_path / "cell", tmp_path / "fixed", "--yes", "--mirror-poses").good()
     fixed = Session.load(tmp_path / "fixed")

@@ -387,7 +387,7 @@ def test_what_cannot_be_exported_is_refused(source, name, chosen, words):
     assert words in str(caught.value)
 
 
-def test_a_frame_has_its_own_origin_worth_and_verdict():
+def test_a_frame_has_its_own_origin_sigma_and_verdict():
     # The calibration itself comes from another file, of another day, with another verdict.
     bad = Verdict.of("bad", "Touch 4 is off by 7 mm.")
     frames = tool(verdict=bad) | fixture(source="points.csv", verdict=Verdict("good"))
@@ -395,8 +395,8 @@ def test_a_frame_has_its_own_origin_worth_and_verdict():
     notes = export(cell, "text", Selection(FIXTURE)).splitlines()
     origin = f"# calibrated by visioncal from 'points.csv', {placed.CREATED}: pivot over 10 touches"
     edge = frames[FIXTURE].edge
-    worth = f"# verdict good; sigma {edge.sigma_mm:.2g} mm and {edge.sigma_deg:.2g} deg"
-    assert notes[:2] == [origin, worth]
+    quality = f"# verdict good; sigma {edge.sigma_mm:.2g} mm and {edge.sigma_deg:.2g} deg"
+    assert notes[:2] == [origin, quality]
     assert SAMPLE.session_name in export(cell, "text")
     assert document(cell, "ur-tcp").verdict == bad
     assert document(cell, "ur-feature").verdict == frames[FIXTURE].verdict

@@ -158,8 +158,8 @@ def test_joints_are_known_by_their_names_and_sizes(rows, name, count, degrees, n
         written = np.rad2deg(joints).tolist()
 
     def fields(at):
-        told = dict(zip(names, written[at], strict=True)) if count else {name: written[at]}
-        return told | {"robot": BASE_FROM_FLANGE[at].tolist()}
+        angles = dict(zip(names, written[at], strict=True)) if count else {name: written[at]}
+        return angles | {"robot": BASE_FROM_FLANGE[at].tolist()}
 
     found = read_foreign(rows(fields), HAND)
     assert any("are no radians, and are taken" in note for note in found.notes) == noted

@@ -159,7 +159,7 @@ def test_stale_joint_angles_are_no_view(plan, tmp_path):
 
 def test_joints_and_poses_of_other_moments_disagree(plan):
     arm, _ = fake_devices(plan)
-    told, states = JointPoseCheck(plan.cell.robot), []
+    check, states = JointPoseCheck(plan.cell.robot), []
     # Another base than the model's, and a tool on its flange, are no disagreement.
     offset = compose(np.diag([-1.0, -1.0, 1.0]), np.array([0.1, 0.0, 0.2]))
     for stop in plan.stops[:3]:
@@ -167,11 +167,11 @@ def test_joints_and_poses_of_other_moments_disagree(plan):
         state = arm.state()
         states.append(replace(state, base_from_flange=offset @ state.base_from_flange))
     first, second, third = states
-    assert told.why_not(first) == told.why_not(second) == ""
+    assert check.why_not(first) == check.why_not(second) == ""
     for stale in ({"q": second.q}, {"base_from_flange": second.base_from_flange}):
-        assert "one of them is stale" in told.why_not(replace(third, **stale))
-    assert told.why_not(third) == ""
-    assert "4 joints, and ur5e has 6" in told.why_not(replace(first, q=np.zeros(4)))
+        assert "one of them is stale" in check.why_not(replace(third, **stale))
+    assert check.why_not(third) == ""
+    assert "4 joints, and ur5e has 6" in check.why_not(replace(first, q=np.zeros(4)))
 
 
 def test_an_arm_that_hangs_or_ends_elsewhere_is_told(plan, tmp_path):

@@ -147,8 +147,8 @@ def test_the_native_viewer_ends_with_all_that_it_started(out, stub, tmp_path):
 )
 def test_a_viewer_that_cannot_open_says_what_else_can(out, stub, more, script, words):
     environment = ENVIRONMENT | stub(script)
-    told = {"capture_output": True, "text": True, "env": environment}
-    done = subprocess.run(command(out, *more), check=False, **told)
+    options = {"capture_output": True, "text": True, "env": environment}
+    done = subprocess.run(command(out, *more), check=False, **options)
     assert (done.returncode, done.stdout) == (2, "")
     assert all(word in done.stderr for word in words)
 
