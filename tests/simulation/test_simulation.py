@@ -17,11 +17,9 @@ from visioncal.simulation import (
     BoardAt,
     CameraAt,
     CellOptions,
-    InstrumentAt,
     Moved,
     NetworkOptions,
     Payload,
-    PointAt,
     RobotAt,
     Second,
     cell_session,
@@ -373,37 +371,17 @@ def test_mistaken_intrinsics_are_off_by_what_was_asked_for():
         assert np.sqrt(np.mean(np.sum(away**2, axis=1))) == pytest.approx(0.3, rel=0.25)
 
 
-EVEN = replace(BOARDS["checkerboard"], name="even", columns=8, rows=6)
-OPTIONS = NetworkOptions(
-    cameras=(*NetworkOptions().cameras, CameraAt("hand", "a")),
-    boards=(*NetworkOptions().boards[1:], BoardAt("even", target=EVEN)),
-    instruments=(InstrumentAt("tracker", (1.0, -1.5, 0.5), 0.3),),
-    points=(PointAt("nest", "cell", (0.2, 0.1, 0.0)), PointAt("ball", "b", (0.0, 0.05, 0.1))),
-    stops=8,
-    lens_views=3,
-)
-
-
 STOPS = 8
 ONE_ARM = NetworkOptions(
     robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate", "a"),), stops=STOPS
 )
 
 
-@pytest.fixture(scope="module")
-def cell():
-    return simulate(OPTIONS)
-
-
-def test_faults_are_where_the_truth_says(cell):
-    faulty = simulate(
-        replace(
-            OPTIONS,
-            swapped_rows=1,
-            stray_images=2,
-            moved=(Moved("target_plate_b"), Moved("cam_left", 6, 0.02)),
-        )
-    )
+def test_faults_are_where_the_truth_says():
+    options = NetworkOptions(stops=STOPS)
+    moves = (Moved("target_plate_b"), Moved("cam_left", 6, 0.02))
+    cell = simulate(options)
+    faulty = simulate(replace(options, swapped_rows=1, stray_images=2, moved=moves))
     assert len(faulty.wrong_views) == 4
     other = {
         new.view
@@ -420,6 +398,17 @@ def test_faults_are_where_the_truth_says(cell):
     early = {sight.view for sight in cell.sights if 0 <= sight.stop < 4}
     assert other & early == set(faulty.wrong_views) & early
     assert other & moved & {sight.view for sight in cell.sights if sight.stop == 4}
+
+
+def test_a_whole_cell_is_written_with_pictures_of_its_stops_and_of_its_lens(tmp_path):
+    low = CameraAt("low", place_m=(0.0, -0.5, 0.7), state_intrinsics=False)
+    cell = simulate(replace(ONE_ARM, cameras=(low,), stops=1, lens_views=1))
+    session = Session.load(write_session(cell, tmp_path / "cell"))
+    assert session.digest() == cell_session(cell, "cell").digest()
+    assert all(session.images.exists(view.image) for view in session.views)
+    of_lens = [view.image for view in session.views if view.is_of_lens]
+    assert of_lens == [f"lens_low/{cell.sights[-1].view:04d}.png"]
+    assert session.cameras["low"].matrix is None
 
 
 def test_robots_of_a_whole_cell_give_way_and_carry_what_rows_say():
