@@ -101,6 +101,14 @@ def test_odd_facts_survive(tmp_path):
     assert_same(session, read_session(write_session(tmp_path / "odd.rrd", session)))
 
 
+def test_the_date_of_a_boards_description_is_kept_as_text(sample, tmp_path):
+    board = {**sample.session.target_document, "printed": datetime.date(2026, 11, 20)}
+    session = replace(sample.session, target_document=board)
+    read = read_session(write_session(tmp_path / "dated.rrd", session))
+    assert read.target_document["printed"] == "2026-11-20"
+    assert read.digest() == session.digest()
+
+
 def test_views_without_rows_of_corners_csv_survive(sample, tmp_path):
     table = parse_corners("view,point,u_px,v_px\n0,1,310.5,220\n")
     session = replace(sample.session, corner_table=table).only([1, 2])

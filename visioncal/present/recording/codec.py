@@ -8,6 +8,7 @@ entity that shows them; their digests are in the session's record.
 import json
 from base64 import b64decode, b64encode
 from collections.abc import Mapping, Sequence
+from datetime import date, time
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -74,9 +75,12 @@ def _text(batch: pa.RecordBatch, name: str) -> str:
     return str(batch.column(name)[0].values[0]) if name in batch.schema.names else ""
 
 
-def _packed(array: np.ndarray) -> dict[str, object]:
-    content = b64encode(array.tobytes()).decode()
-    return {"dtype": array.dtype.str, "shape": array.shape, "base64": content}
+def _packed(value: np.ndarray | date | time) -> object:
+    """An array as a table, and a date of a TOML file as text, which has the same digest."""
+    if isinstance(value, date | time):
+        return value.isoformat()
+    content = b64encode(value.tobytes()).decode()
+    return {"dtype": value.dtype.str, "shape": value.shape, "base64": content}
 
 
 def _unpacked(table: dict[str, Any]) -> object:
