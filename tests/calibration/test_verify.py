@@ -24,7 +24,7 @@ from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, Second, simulate, write_session
+from visioncal.simulation import CellOptions, Second, cell_session, simulate, write_session
 from visioncal.vision.targets import corner_positions
 
 BUMP = np.array([0.0, 0.0, 0.0, 1e-3, 0.0, 0.0])
@@ -295,6 +295,14 @@ def test_one_of_two_boards_that_moved_is_named():
     assert verdict_of(found).findings[0].words.endswith(words)
     refused = raised(DataError, "several boards", check, seen, prior, board_placed_anew=True)
     assert "the one that moved is named" in refused.next_step
+    # A session's only board needs no name: it is that with an equal print.
+    both = cell_session(cell, "both", seen="poses")
+    document = {key: value for key, value in both.document.items() if key != "targets"}
+    for name, board in both.targets.items():
+        views = [replace(view, text={}) for view in both.views if view.text["target"] == name]
+        alone = replace(both, document=document, target=board, targets={}, views=tuple(views))
+        later = predict_stops(alone, prior)
+        assert {view.text["target"] for view in later.observed.session.views} == {name}
 
 
 def test_other_cells_are_refused_by_what_differs(place):
