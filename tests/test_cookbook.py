@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from support.recipes import FOLDER, run, run_example
+from support.recipes import FOLDER, match, run, run_example
 
 PACKAGES = Path(__file__).parents[1] / "visioncal"
 # Blocks of a package's page that begin with a simulation.
@@ -49,3 +49,11 @@ def test_an_example_prints_what_its_page_shows(page, tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", PAGES, ids=lambda value: value.stem)
 def test_a_recipe_is_a_page(page):
     assert len(page.read_text(encoding="utf-8").splitlines()) <= 60
+
+
+def test_what_was_not_said_is_noticed():
+    said = "bad b\nview 4 is wrong, sigma 0.048 mm"
+    match("view 4 is wrong, ... 0.049 mm", said, "a page")
+    for expected in ("good b", "view 5 is wrong", "sigma 0.051 mm", "sigma 0.048 ... view 4"):
+        with pytest.raises(AssertionError, match="is not in what was said"):
+            match(expected, said, "a page")

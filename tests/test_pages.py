@@ -124,6 +124,9 @@ def test_commands_can_be_typed(page):
     for words in mentions_of(page):
         if words[0] != "COMMAND":
             parse(words, whole=False)
+    for wrong in ("calibate session", "calibrate session --neeed-mm 1", "simulate a --views many"):
+        with pytest.raises(AssertionError, match=f"visioncal {wrong}"):
+            parse(tuple(wrong.split()), whole=True)
 
 
 @every_page
