@@ -23,14 +23,7 @@ from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import fit_problem, solve_problem
 from visioncal.session import Session
-from visioncal.simulation import (
-    BOARDS,
-    CellOptions,
-    measured_poses,
-    project,
-    simulate,
-    wide_camera,
-)
+from visioncal.simulation import BOARDS, CellOptions, measured_poses, project, simulate, wide_camera
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions, rotations
 

@@ -15,13 +15,7 @@ from support.advice import printed_commands
 from support.cells import known_of, pairs_session
 from support.commands import visioncal as typed
 from support.edited import rewritten
-from support.fuzz.mistakes import (
-    HALF_TURNS,
-    MISTAKES,
-    Poses,
-    numbers,
-    sound,
-)
+from support.fuzz.mistakes import HALF_TURNS, MISTAKES, Poses, numbers, sound
 from support.refusals import raised
 
 import visioncal
@@ -43,19 +37,10 @@ from visioncal.interchange.formats import (
     reread,
 )
 from visioncal.results import Calibration
-from visioncal.robot import (
-    load_robot,
-    with_base,
-)
+from visioncal.robot import load_robot, with_base
 from visioncal.session import Session
 from visioncal.session.columns import POSE
-from visioncal.simulation import (
-    CellOptions,
-    SimulatedCell,
-    fine_camera,
-    simulate,
-    write_session,
-)
+from visioncal.simulation import CellOptions, SimulatedCell, fine_camera, simulate, write_session
 
 
 def seen_in(cell: SimulatedCell) -> Poses:

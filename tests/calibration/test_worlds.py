@@ -18,13 +18,7 @@ from visioncal.calibration.run import calibrate
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.results import Calibration
-from visioncal.simulation import (
-    CellOptions,
-    SimulatedCell,
-    cell_session,
-    fine_camera,
-    simulate,
-)
+from visioncal.simulation import CellOptions, SimulatedCell, cell_session, fine_camera, simulate
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions
 

@@ -218,18 +218,9 @@ def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
     assert {"current6_a", "ambient_c"} < set(session.streams["heat"].columns)
     heat = json.loads((tmp_path / "warm.truth.json").read_text())["heat"]
     assert len(heat["growth_per_k"]) == 6
-    bent = (
-        "--stiffness-knm",
-        10,
-        "--no-images",
-        "--views",
-        4,
-        "--payload-kg",
-        0,
-        "--payload-kg",
-        5,
-    )
-    visioncal("simulate", tmp_path / "bent", *bent, "--mount", "eye-to-hand").good()
+    bent = ("--stiffness-knm", 10, "--no-images", "--views", 4, "--mount", "eye-to-hand")
+    loads = ("--payload-kg", 0, "--payload-kg", 5)
+    visioncal("simulate", tmp_path / "bent", *bent, *loads).good()
     carried = [view.numbers["payload_kg"] for view in Session.load(tmp_path / "bent").views]
     assert carried == [0.0, 5.0, 0.0, 5.0]
     # The truth lies beside it.

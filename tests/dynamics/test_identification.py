@@ -22,13 +22,7 @@ from visioncal.dynamics import (
 )
 from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.identified import Identified
-from visioncal.dynamics.identify import (
-    SLOW_RAD_S,
-    Options,
-    identify,
-    predict,
-    validate,
-)
+from visioncal.dynamics.identify import SLOW_RAD_S, Options, identify, predict, validate
 from visioncal.dynamics.reading import RecordedSamples
 from visioncal.dynamics.regression import NoiseBlock, regress
 from visioncal.robot import (

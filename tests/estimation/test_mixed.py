@@ -11,13 +11,7 @@ from support.problems import world
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
-from visioncal.estimation.appearance import (
-    BOARD_NAMES,
-    SCALE,
-    Appearance,
-    board_basis,
-    compress,
-)
+from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
 from visioncal.estimation.arm import (
     LEVER_M,
     ArmErrors,

@@ -17,15 +17,7 @@ from support.parts import (
     some_drawing,
     some_frame,
 )
-from support.touched import (
-    POINTS,
-    TIP,
-    TURN,
-    Job,
-    error_of,
-    relabelled,
-    slipped,
-)
+from support.touched import POINTS, TIP, TURN, Job, error_of, relabelled, slipped
 from support.touched import touched as touches_of
 
 from visioncal.core.errors import DataError, DegenerateError

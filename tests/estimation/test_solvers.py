@@ -12,13 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.types import FloatArray, Mount
-from visioncal.estimation.closed_form import (
-    SOLVERS,
-    HandEye,
-    Solver,
-    lone_axis,
-    rotation_pairs,
-)
+from visioncal.estimation.closed_form import SOLVERS, HandEye, Solver, lone_axis, rotation_pairs
 
 BOARD_CENTRE_M = np.array([0.12, 0.08, 0.0])
 # OpenCV's calibrateRobotWorldHandEye has these; calibrateHandEye has the others.

@@ -24,13 +24,7 @@ from visioncal.frames.camera_chain import Plane
 from visioncal.frames.locate import Located, locate, locate_target
 from visioncal.results import Calibration, Edge, FrameFile, Verdict, to_document
 from visioncal.session import Session
-from visioncal.simulation import (
-    BOARDS,
-    CellOptions,
-    project,
-    simulate,
-    write_session,
-)
+from visioncal.simulation import BOARDS, CellOptions, project, simulate, write_session
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 BOARD = BOARDS["charuco"]
