@@ -203,6 +203,7 @@ def test_cameras_whose_wrong_lenses_are_held_leave_out_few_views():
     assert found.verdict.status == "bad"
     left_out = {view.view for view in found.views if not view.used}
     assert set(cell.wrong_views) <= left_out
+    # An eighth is wrong, and the lenses make as many more doubtful at the most.
     assert len(left_out) < 0.25 * len(found.views)
 
 
