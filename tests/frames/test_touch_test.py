@@ -24,7 +24,7 @@ from visioncal.results import Calibration, Edge
 from visioncal.results.frame import Frame
 from visioncal.robot.collision import camera_body
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.simulation import CellOptions, cell_session, simulate, write_session
 from visioncal.vision.targets import corner_positions
 
 # Longer than the camera reaches beyond the flange.
@@ -130,6 +130,18 @@ def test_targets_are_printed_and_gaps_join_the_result(proved):
     visioncal("touch-test", look, "-c", out, "--tool", "gripper").refused(
         "the calibration has no tool", f"visioncal tcp TOUCHES -c {out} --name gripper"
     )
+
+
+def test_points_out_of_reach_of_a_calibrated_arm_are_refused(tmp_path):
+    options = replace(CELL, views=25, offset_sigma_rad=1e-3, branches=True)
+    for name, each in (("fit", options), ("look", replace(options, views=3, recording=1))):
+        cell_session(simulate(each), name, seen="corners").save(tmp_path / name)
+    done = visioncal("calibrate", tmp_path / "fit", "-o", tmp_path / "out", "--no-report")
+    assert done.status == 0
+    words = ("touch-test", tmp_path / "look", "-c", tmp_path / "out", *GAUGE, "--height-mm")
+    assert visioncal(*words, 50).status == 0
+    # A metre above a board that lies 0.7 m beside the base, an arm of 1.3 m cannot hover.
+    visioncal(*words, 1000).refused("is out of reach within the joints' limits")
 
 
 def test_what_touches_is_the_only_tool_or_the_flange(proved):

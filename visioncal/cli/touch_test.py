@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.cli.console import (
@@ -20,7 +21,7 @@ from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import TouchTestOptions
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.frames.touch_test import (
     TouchPoint,
     TouchTargets,
@@ -105,6 +106,15 @@ def _target(
     }
     if calibration.arm_is_calibrated:
         corrected = correct(calibration, [hover, touch])
+        if not corrected.reached.all():
+            left = mm_and_deg(1e3 * corrected.off_m.max(), np.rad2deg(corrected.off_rad.max()))
+            raise DataError(
+                f"{point.name} cannot be touched from above: it or the place over it is out of "
+                f"reach within the joints' limits, and the nearest posture leaves {left}.",
+                culprits=[point.name],
+                next_step="Put the board where the arm reaches all of it with this tool, take a "
+                "view of it there, and name that session; or hover lower with --height-mm.",
+            )
         (hover, touch), document["q_rad"] = corrected.base_from_flange, corrected.q[1].tolist()
     for name, pose in (("hover", hover), ("touch", touch)):
         transform = RigidTransform.from_matrix(pose)
