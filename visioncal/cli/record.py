@@ -29,7 +29,7 @@ from visioncal.live.capture.recording import (
     motion_summary,
     record,
 )
-from visioncal.live.drivers.protocols import DeviceSetup, MovingArm
+from visioncal.live.drivers.protocols import DeviceSetup, MovingArm, RequestingArm
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.plan_file import PlanFile, read_plan
 from visioncal.robot import load_robot
@@ -74,7 +74,7 @@ def record_command(options: RecordOptions) -> None:
             lens = cell.camera.factory or (None if plan is None else plan.cell.camera)
             target, robot = recorded.target, recorded.robot
             capture = Capture(cell, target, robot, lens, journal, taking, None, say_line)
-            steps = _guided(capture, options.views, asked if sys.stdin.isatty() else None)
+            steps = _guided(capture, options.views)
     if drives:
         check_all(journal, steps)
     _finish(journal, steps, as_json=options.as_json)
@@ -119,14 +119,15 @@ def _check_resolution(planned: tuple[int, int], given: tuple[int, int]) -> None:
         )
 
 
-def _guided(capture: Capture, views: int, ask: Callable[[str], str] | None) -> list[CaptureEvent]:
-    """Records an arm that a person moves."""
-    if isinstance(capture.cell.arm, MovingArm):
+def _guided(capture: Capture, views: int) -> list[CaptureEvent]:
+    """Records an arm that a person or its own program moves."""
+    arm = capture.cell.arm
+    if not isinstance(arm, RequestingArm):
         say("Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends.")
         return follow(capture, views)
-    if ask is None:
-        say("Poses are read from stdin, one a line, and no question is asked; q ends.")
-    return ask_and_take(capture, capture.cell.arm, views, ask)
+    if arm.invitation:
+        say(arm.invitation)
+    return ask_and_take(capture, arm, views)
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Recording of views: driven to the stops of a plan, guided by hand, or on request."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -18,12 +18,16 @@ from visioncal.live.capture.gate import Consent, Gate, check_same_arm, clear_pat
 from visioncal.live.capture.journal import Journal, state_of
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import Missed, TakenView, take, why_arm_moves
-from visioncal.live.drivers.protocols import Arm, ArmState
+from visioncal.live.drivers.protocols import ArmState, RequestingArm
 from visioncal.live.planning.design import Accuracy
 from visioncal.live.planning.plan import Stop
 from visioncal.live.planning.plan_file import PlanFile
 from visioncal.robot import Robot
+from visioncal.session import View
 from visioncal.vision.boards.imaging import decode_image
+
+# An arm that returns to a taught stop is nearer to it than this [mm, deg]; other stops are farther.
+_SAME_STOP_MM, _SAME_STOP_DEG = 0.5, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +59,22 @@ class CaptureEvent:
             f"{view.corners.blur_px:.1f} px, {view.motion_px:.2f} px still; {self.covered}"
             f"{sigma}{next_words}"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldArm:
+    """An arm that stays at a given pose."""
+
+    name: str
+    reported: ArmState  # Its state when it was read.
+    clock: Clock  # Clock of the state's stamps.
+
+    def state(self) -> ArmState:
+        """The state, stamped now."""
+        return replace(self.reported, stamp_s=self.clock.now())
+
+    def close(self) -> None:
+        """Holds no resources."""
 
 
 class Capture:
@@ -135,6 +155,15 @@ class Capture:
         self.watch(self.steps[-1])
         self._check_missed_in_a_row()
         return self.steps[-1]
+
+    def view_at(self, state: ArmState, number: int, place: int, count: int) -> CaptureEvent:
+        """Takes a view of an arm that stays at a given state; otherwise as `view`."""
+        cell = self.cell
+        self.cell = replace(cell, arm=_HeldArm(cell.arm.name, state, cell.clock))
+        try:
+            return self.view(number, place, count)
+        finally:
+            self.cell = cell
 
     def _check_missed_in_a_row(self) -> None:
         recent = self.steps[-self.options.missed_in_a_row :] if self.options.missed_in_a_row else []
@@ -328,52 +357,74 @@ def follow(capture: Capture, count: int) -> list[CaptureEvent]:
     return capture.steps
 
 
-@dataclass(frozen=True, eq=False)
-class _HeldArm:
-    """An arm that stays at a given pose."""
+def take_requested(capture: Capture, arm: RequestingArm, count: int, wait_s: float = 1.0) -> bool:
+    """Waits for a requested view, takes it, and replies once it is on the disk.
 
-    name: str
-    reported: ArmState  # Its state when it was read.
-    clock: Clock  # Clock of the state's stamps.
-
-    def state(self) -> ArmState:
-        """The state, stamped now."""
-        return replace(self.reported, stamp_s=self.clock.now())
-
-    def close(self) -> None:
-        """Holds no resources."""
-
-
-def ask_and_take(
-    capture: Capture, arm: Arm, count: int, ask: Callable[[str], str] | None
-) -> list[CaptureEvent]:
-    """Takes a view whenever a person requests it, and asks for its pose.
+    A stop with a number is the view of that number. If that is recorded, no second view is taken:
+    the answer to it was lost.
 
     Args:
         capture: The recording.
-        arm: The arm that asks for the pose.
-        count: Number of views; 0 until `q`.
-        ask: Asks a question and returns the line that was typed; None where the poses are read from
-            a file.
+        arm: The arm that requests views.
+        count: Number of views; 0 for any.
+        wait_s: Longest time to wait for a request [s]; then nothing is taken.
+
+    Returns:
+        Whether more views are wanted.
 
     Raises:
-        DriverError: The camera failed, or Ctrl-C was pressed.
+        EOFError: No more are requested.
+        DriverError: The arm or the camera failed.
         DataError: A view cannot be written, or too many in a row gave none.
     """
-    cell = capture.cell
-    with capture.halting():
+    number, place = capture.next_numbers()
+    wish = capture.coach.advice()
+    state = arm.request(wait_s, f"View {number}{f' ({wish})' if wish else ''}")
+    if state is None:
+        return True
+    number = number if state.stop is None else state.stop
+    recorded = next((view for view in capture.journal.views if view.number == number), None)
+    if recorded is None:
+        found = capture.view_at(state, number, place, count).found
+        if isinstance(found, Missed):
+            arm.reply("again", found.reason)
+            return True
+    elif reason := _why_another_stop(recorded, state):
+        arm.reply("error", reason)
+        return True
+    is_last = 0 < count <= len(capture.journal.views)
+    arm.reply("done" if is_last else "next")
+    return not is_last
+
+
+def _why_another_stop(recorded: View, state: ArmState) -> str:
+    """States why a stop is not that of a recorded view of its number; empty where it is."""
+    pose = recorded.base_from_flange()
+    if pose is None:
+        return f"view {recorded.number} is recorded without a pose"
+    mm, deg = pose_difference(np.asarray(pose.as_matrix()), state.base_from_flange)
+    if mm <= _SAME_STOP_MM and deg <= _SAME_STOP_DEG:
+        return ""
+    return (
+        f"stop {recorded.number} is recorded {figure(mm)} mm and {figure(deg)} deg from here: "
+        "count on, or record into a new folder"
+    )
+
+
+def ask_and_take(capture: Capture, arm: RequestingArm, count: int) -> list[CaptureEvent]:
+    """Takes a view whenever a person or the robot's own program requests it.
+
+    Args:
+        capture: The recording.
+        arm: The arm that requests views.
+        count: Number of views; 0 for as many as are requested.
+
+    Raises:
+        DriverError: The arm or the camera failed, or Ctrl-C was pressed.
+        DataError: A view cannot be written, or too many in a row gave none.
+    """
+    with capture.halting(), suppress(EOFError):
         while not count or len(capture.journal.views) < count:
-            number, place = capture.next_numbers()
-            wish = capture.coach.advice()
-            hint = f" ({wish})" if wish else ""
-            try:
-                question = f"View {number}{hint}: Enter takes it, q ends: "
-                if ask is not None and ask(question).strip().lower() == "q":
-                    break
-                held = _HeldArm(arm.name, arm.state(), cell.clock)
-            except EOFError:
-                # End of a file of answers, or of poses.
+            if not take_requested(capture, arm, count):
                 break
-            capture.cell = replace(cell, arm=held)
-            capture.view(number, place, count)
     return capture.steps

@@ -11,7 +11,7 @@ from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import rotation_angle
 from visioncal.core.types import FloatArray
-from visioncal.live.drivers.protocols import ArmState
+from visioncal.live.drivers.protocols import Answer, ArmState
 
 # Visioncal's own form is that of ROS.
 _OURS = {"ours": "ros"}
@@ -43,6 +43,27 @@ class ManualArm:
     def name(self) -> str:
         """Name in messages."""
         return "poses typed by hand"
+
+    @property
+    def invitation(self) -> str:
+        """How poses are given where no question is asked."""
+        reads = "Poses are read from stdin, one a line, and no question is asked; q ends."
+        return "" if self.answers else reads
+
+    def request(self, timeout_s: float, wanted: str = "") -> ArmState:  # noqa: ARG002
+        """Asks whether a view is to be taken, and for its pose, without a timeout.
+
+        Raises:
+            EOFError: The person types `q`, or the input has ended.
+            DriverError: As for `state`.
+        """
+        question = f"{wanted}: Enter takes it, q ends: "
+        if self.answers and self._ask(question).strip().lower() == "q":
+            raise EOFError
+        return self.state()
+
+    def reply(self, answer: Answer, reason: str = "") -> None:
+        """Nothing: the person reads the view's report."""
 
     def state(self) -> ArmState:
         """Asks for the pose of the flange, without a timeout.

@@ -12,6 +12,9 @@ from visioncal.core.types import Camera, FloatArray, Image
 
 # Whether the arm may move; `reduced` still moves, slowly.
 Safety = Literal["normal", "reduced", "protective-stop", "emergency-stop", "fault"]
+# What became of a requested view: go on to the next stop; none was taken, request it again; it was
+# the last; it cannot be taken so, and requesting it again would not help.
+Answer = Literal["next", "again", "done", "error"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +33,7 @@ class ArmState:
     temperatures_c: FloatArray | None = None  # (n,) joint temperatures [C].
     safety: Safety = "normal"  # Whether it may move.
     controller_s: float = 0.0  # Time on the controller's own clock, where it has one [s].
+    stop: int | None = None  # Number of the stop by the robot's own program, where it counts them.
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +83,33 @@ class MovingArm(Arm, Protocol):
 
     def halt(self) -> None:
         """Brakes at once; harmless where nothing moves or the connection is lost."""
+
+
+@runtime_checkable
+class RequestingArm(Arm, Protocol):
+    """An arm of which a person, or the robot's own program, says when it has arrived."""
+
+    @property
+    def invitation(self) -> str:
+        """How views are requested, to be shown at the beginning; empty where that is plain."""
+
+    def request(self, timeout_s: float, wanted: str = "") -> ArmState | None:
+        """Waits until the arm stands at a stop that waits for its view.
+
+        Args:
+            timeout_s: Longest time [s]; a person is waited for without a timeout.
+            wanted: Which view is wanted, in words for a person: `View 3 (another distance)`.
+
+        Returns:
+            The arm's state there; None where nothing was requested in time.
+
+        Raises:
+            EOFError: There are no more stops.
+            DriverError: Nothing is to be expected any more.
+        """
+
+    def reply(self, answer: Answer, reason: str = "") -> None:
+        """Says what became of the stop of the last `request`; each gets one reply."""
 
 
 @runtime_checkable
