@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.refusals import raised
 from support.rotations import CASES
@@ -92,9 +94,76 @@ def test_what_is_exported_can_be_pasted_back(form):
         assert np.abs(found.pose - matrix).max() < 2e-9
 
 
+OF_OTHER_PENS = {
+    "X 512,34 Y -12,5 Z 800,0 A 10,1 B 0,5 C 180,0": None,
+    # All with three decimals: an angle has no thousands.
+    "{X 512,340, Y -12,500, Z 800,000, A 10,100, B 0,500, C 180,000}": None,
+    "X 512,34\N{NO-BREAK SPACE}mm Y \N{MINUS SIGN}12,5 mm Z 800 mm A 10,1\N{DEGREE SIGN} "
+    "B 0,5\N{MASCULINE ORDINAL INDICATOR} C 180\N{RING ABOVE}": None,
+    "512,34; -12,5; 800,0; 10,1; 0,5; 180,0": "kuka",
+    "512,34 -12,5\t800,0 10,1 0,5 180,0": "kuka",
+    "512,34, -12,5, 800, 10,1, 0,5, 180": "kuka",
+    "Ｘ　５１２．３４　Ｙ　－１２．５　Ｚ　８００　Ａ　１０．１　Ｂ　０．５　Ｃ　１８０": None,  # noqa: RUF001
+    "５１２．３４、－１２．５、８００、１０．１、０．５、１８０": "kuka",  # noqa: RUF001
+    "X ٥١٢٫٣٤ Y \N{RIGHT-TO-LEFT MARK}\N{MINUS SIGN}١٢٫٥ Z ٨٠٠ A ١٠٫١ B ٠٫٥ C ١٨٠": None,  # noqa: RUF001
+}
+
+
+@pytest.mark.parametrize("line", OF_OTHER_PENS)
+def test_digits_and_decimal_signs_of_other_languages_mean_the_same(line):
+    found = read_pose(line, "the line", OF_OTHER_PENS[line])
+    assert found.form.name == "kuka"
+    expected = Rotation.from_euler("ZYX", [10.1, 0.5, 180.0], degrees=True).as_matrix()
+    # To rounding.
+    assert np.abs(found.pose - compose(expected, np.array([0.51234, -0.0125, 0.8]))).max() < 1e-12
+
+
+WRITTEN = st.integers(-900_000, 900_000).map(lambda thousandths: f"{thousandths / 1e3:.3f}")
+FORMATS = (
+    "X {} Y {} Z {} A {} B {} C {}",
+    "{{X {},Y {},Z {},A {},B {},C {}}}",
+    "{} {} {} {} {} {}",
+    "{};{};{};{};{};{}",
+    "{},{},{},{},{},{}",
+    "{}, {}, {}, {}, {}, {}",
+    "posx({},{},{},{},{},{})",
+)
+
+
+@given(numbers=st.lists(WRITTEN, min_size=6, max_size=6), form=st.sampled_from(FORMATS))
+def test_points_are_understood_as_ever_and_commas_as_points_or_not_at_all(numbers, form):
+    stated = "doosan" if form.startswith("posx") else "kuka"
+    order = "ZYZ" if form.startswith("posx") else "ZYX"
+    values = [float(number) for number in numbers]
+    rotation = Rotation.from_euler(order, values[3:], degrees=True).as_matrix()
+    expected = compose(rotation, 1e-3 * np.array(values[:3]))
+    found = read_pose(form.format(*numbers), "the line", stated)
+    assert np.abs(found.pose - expected).max() < 1e-12
+    line = form.format(*(number.replace(".", ",") for number in numbers))
+    digits = {ord(str(digit)): chr(0xFF10 + digit) for digit in range(10)}
+    for text in (line, line.translate(digits)):
+        try:
+            found = read_pose(text, "the line", stated)
+        except DataError:
+            # Only where commas separate without blanks, too.
+            assert "posx" in form or "{},{}" in form
+        else:
+            assert np.abs(found.pose - expected).max() < 1e-12
+
+
 @pytest.mark.parametrize(
     ("line", "form", "words"),
     [
+        ("512,34,-12,5,800,0", "kuka", "may be decimal, or separate numbers"),
+        ("512,34 -12,5 800,0", "kuka", "may be decimal, or separate numbers"),
+        # Seven numbers, or six with one comma.
+        ("512,34 -12 800 10 0 180", "kuka", "may be decimal, or separate numbers"),
+        ("1.234,5 12,5 800,0", "kuka", "may be decimal, or separate numbers"),
+        ("X 1,234 Y 2,500 Z 800 A 10 B 0 C 180", None, "1,234 may be decimal, or group thousands"),
+        ("X 512,3 Y -12.5 Z 800 A 1 B 2 C 3", None, "decimal commas and decimal points"),
+        ("X 1.234,5 Y 2 Z 3 A 1 B 2 C 3", None, "is no pose"),
+        # A soft hyphen may be a minus, or nothing.
+        ("X 1 Y \N{SOFT HYPHEN}2 Z 3 A 1 B 2 C 3", None, "is no pose"),
         ("1 2 3", None, "is no pose"),
         # Such a line must not take for ever.
         (40 * "1" + "x", None, "is no pose"),

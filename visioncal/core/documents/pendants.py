@@ -3,24 +3,47 @@
 Recognised are URScript's `p[..]`, Doosan's `posx(..)`, RAPID's `[[..],[..]]` and robtargets, and
 named values: X, Y, Z and A, B, C (KUKA), W, P, R (FANUC), q1 to q4 (ABB), Rx, Ry, Rz (several
 manufacturers), qx to qw. Bare numbers are classified by their count alone.
+
+Digits may be those of any script, and named or bare numbers may have decimal commas; where a comma
+may as well separate numbers or thousands, the line is refused.
 """
 
 import re
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.core.conventions import POSE_FORMS, UNITS_M, PoseForm, PoseNumbers, Reading
+from visioncal.core.documents.values import DECIMAL_COMMA
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _UNIT = r"(?:mm|m|deg|rad)"
 _NAMED = re.compile(
-    rf"(?<![\w.])([Qq][1-4]|[A-Za-z]+)(?:_m)?\s*[:=]?\s*\"?({_NUMBER})\s*({_UNIT})?(?![\w.])"
+    rf"(?<![\w.])([Qq][1-4]|[A-Za-z]+)(?:_m)?\s*[:=]?\s*\"?({DECIMAL_COMMA}|{_NUMBER})\s*({_UNIT})?"
+    r"(?![\w.]|,[0-9])"
 )
 _BETWEEN = re.compile(r"[\s\[\]{}(),;]+")
+# The same, but for commas within a number; and a comma that may be in one.
+_BETWEEN_COMMAS = re.compile(r"(?:[\s\[\]{}();]|,(?![0-9])|(?<![0-9]),)+")
+_INNER_COMMA = re.compile(r"[0-9],[0-9]")
+# A number that groups its thousands, by commas or by points.
+_THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}(?:,[0-9]{3})+|[+-]?[0-9]{1,3}(?:\.[0-9]{3})+,[0-9]+")
+# Typographic signs; soft hyphens are not among them, because they may be minus or nothing.
+_SIGNS = str.maketrans(
+    dict.fromkeys("\N{DEGREE SIGN}\N{MASCULINE ORDINAL INDICATOR}\N{RING ABOVE}", " deg")
+    | dict.fromkeys("\N{MINUS SIGN}\N{EN DASH}\N{HYPHEN}\N{NON-BREAKING HYPHEN}", "-")
+    | {
+        "\N{ARABIC DECIMAL SEPARATOR}": ".",
+        "\N{IDEOGRAPHIC COMMA}": " ; ",
+        "\N{ARABIC COMMA}": " ; ",
+    }
+    # Marks of the direction of writing.
+    | dict.fromkeys("\N{LEFT-TO-RIGHT MARK}\N{RIGHT-TO-LEFT MARK}\N{ARABIC LETTER MARK}")
+)
 # Notations around the numbers of a pose, with their forms.
 _MARKED = (
     ("ur", re.compile(r"(?<!\w)p\s*\[([^\[\]]*)\]")),
@@ -65,6 +88,7 @@ class _PendantNumbers:
     forms: tuple[str, ...]
     length: str = ""
     angle: str = ""
+    doubt: str = ""  # Why its commas may mean several things; empty where they do not.
 
 
 def is_marked_pose(line: str) -> bool:
@@ -76,7 +100,13 @@ def is_marked_pose(line: str) -> bool:
 def possible_forms(line: str) -> tuple[str, ...]:
     """Possible forms of a line, as names of `POSE_FORMS`; none for no pose."""
     written = _written(line)
-    return () if written is None else written.forms
+    return () if written is None or written.doubt else written.forms
+
+
+def line_numbers(line: str) -> tuple[float, ...]:
+    """Numbers between blanks or semicolons, with either decimal sign; none if it has more."""
+    words = [word for word in _BETWEEN_COMMAS.split(_plain(line)) if word]
+    return _values(words) or ()
 
 
 def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
@@ -98,6 +128,13 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
             next_step="Needed is a line as p[x, y, z, rx, ry, rz], {X .., Y .., Z .., A .., B .., "
             "C ..}, [[x, y, z], [q1, q2, q3, q4]], X .. Y .. Z .. W .. P .. R .., or x_m y_m z_m "
             "qx qy qz qw.",
+        )
+    if written.doubt:
+        raise DataError(
+            f"{where}: {written.doubt}.",
+            culprits=[where],
+            next_step="Write decimal points, or name the numbers, as X 512,34 Y -12,5 Z 800,0 "
+            "A 10,1 B 0,5 C 180,0; thousands are not grouped.",
         )
     chosen = POSE_FORMS[_form(written, form, where)]
     rotation = chosen.rotation
@@ -123,7 +160,19 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
 
 
 def _plain(line: str) -> str:
-    return line.replace("°", " deg").replace("\N{MINUS SIGN}", "-")
+    """A line with ASCII digits, signs and blanks."""
+
+    def plain(letter: str) -> str:
+        if letter.isascii():
+            return letter
+        if "\N{FULLWIDTH EXCLAMATION MARK}" <= letter <= "\N{FULLWIDTH TILDE}":
+            return chr(ord(letter) - 0xFEE0)
+        if letter.isspace():
+            return " "
+        digit = unicodedata.decimal(letter, None)
+        return letter if digit is None else str(digit)
+
+    return "".join(map(plain, line.translate(_SIGNS)))
 
 
 def _written(line: str) -> _PendantNumbers | None:
@@ -155,7 +204,7 @@ def _named(line: str) -> _PendantNumbers | None:
         # Two poses in a line are ambiguous.
         if any(there.count(name) != 1 for name in needed):
             continue
-        cells = {name: (float(number), unit) for name, number, unit in entries}
+        cells = {name: (number, unit) for name, number, unit in entries}
         lengths = {cells[name][1] for name in "xyz"} - {None}
         angles = {cells[name][1] for name in names} - {None}
         # One unit for each, and of the right kind.
@@ -164,15 +213,49 @@ def _named(line: str) -> _PendantNumbers | None:
         # Of the manufacturers with Rx, Ry, Rz only Universal Robots uses radians.
         likely = ("ur",) if angles == {"rad"} and "ur" in forms else forms
         units = (next(iter(found), "") for found in (lengths, angles))
-        return _PendantNumbers(tuple(cells[name][0] for name in needed), likely, *units)
+        words = [cells[name][0] for name in needed]
+        values = _values(words)
+        if values is None:
+            return _PendantNumbers((), likely, doubt="it has decimal commas and decimal points")
+        with_commas = [word for word in words[:3] if "," in word]
+        # No angle has thousands.
+        if (
+            with_commas
+            and all(map(_THOUSANDS.fullmatch, with_commas))
+            and "," not in "".join(words[3:])
+        ):
+            doubt = f"the comma of {with_commas[0]} may be decimal, or group thousands"
+            return _PendantNumbers((), likely, doubt=doubt)
+        return _PendantNumbers(values, likely, *units)
     return None
 
 
+def _values(words: list[str]) -> tuple[float, ...] | None:
+    """Numbers with one kind of decimal sign; None where they are none, or have both."""
+    with_commas = [re.fullmatch(DECIMAL_COMMA, word) is not None for word in words]
+    for word, has_comma in zip(words, with_commas, strict=True):
+        if not has_comma and (
+            re.fullmatch(_NUMBER, word) is None or (any(with_commas) and "." in word)
+        ):
+            return None
+    return tuple(float(word.replace(",", ".")) for word in words)
+
+
 def _bare(line: str) -> _PendantNumbers | None:
-    found = _numbers(line, ())
-    if found is None or len(found.numbers) not in _BARE_FORMS:
+    words = [word for word in _BETWEEN_COMMAS.split(line) if word]
+    found, values = _numbers(line, ()), _values(words)
+    count = 0 if found is None else len(found.numbers)
+    if _INNER_COMMA.search(line):
+        # Lists without blanks have points, unless all is whole.
+        is_list = values is None and "." in line and not any(map(_THOUSANDS.fullmatch, words))
+        if count in _BARE_FORMS and not is_list:
+            doubt = f"the commas of {line.strip()[:40]!r} may be decimal, or separate numbers"
+            return _PendantNumbers((), _BARE_FORMS[count], doubt=doubt)
+        if values is not None:
+            found, count = _PendantNumbers(values, ()), len(values)
+    if found is None or count not in _BARE_FORMS:
         return None
-    return replace(found, forms=_BARE_FORMS[len(found.numbers)])
+    return replace(found, forms=_BARE_FORMS[count])
 
 
 def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:

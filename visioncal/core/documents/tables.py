@@ -12,12 +12,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from visioncal.core.documents.values import DECIMAL, read_plain_text
+from visioncal.core.documents.values import DECIMAL, DECIMAL_COMMA, read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import MAX_VALUES, too_many
 
 _NUMBER = re.compile(rf"{DECIMAL}|[+-]?(nan|inf)", re.I)
-_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
+_DECIMAL_COMMA = re.compile(DECIMAL_COMMA)
 # Excel's declaration of the separator in the first line.
 _SEPARATOR = re.compile(r"sep=([;\t,])\s*", re.I)
 # Characters of an empty row.

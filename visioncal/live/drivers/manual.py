@@ -37,7 +37,7 @@ class ManualArm:
         self, ask: Callable[[str], str], form: str | None = None, *, answers: bool = True
     ) -> None:
         self._ask, self.answers = ask, answers
-        self._form = None if form is None else _form_name(form)
+        self._form = None if form is None else form_name(form)
 
     @property
     def name(self) -> str:
@@ -136,7 +136,8 @@ def pose_words(pose: FloatArray) -> str:
     )
 
 
-def _form_name(form: str) -> str:
+def form_name(form: str) -> str:
+    """Name among `POSE_FORMS` of a form that the user states; raises DriverError."""
     name = _OURS.get(form, form)
     if name not in POSE_FORMS:
         names = (*_OURS, *POSE_FORMS)
