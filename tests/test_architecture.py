@@ -141,7 +141,11 @@ CALIBRATING = (
         "visioncal.present.recording, visioncal.cli.summary",
         {"visioncal.dynamics", "visioncal.live", "visioncal.simulation"},
     ),
-    ("visioncal.cli.record", {"depthai", "rtde_control", "rtde_receive"}),
+    (
+        "visioncal.cli.record",
+        {"depthai", "rtde_control", "rtde_receive", "harvesters", "genicam", "pypylon"}
+        | {"pyrealsense2"},
+    ),
 )
 
 

@@ -54,9 +54,17 @@ def record_command(options: RecordOptions) -> None:
         speed=options.speed,
         frames=options.frames,
         still=Stillness(image_px=options.still_px, quiet_s=options.settle_s),
+        single=options.camera.partition(":")[0] == "folder",
         missed_in_a_row=CaptureOptions.missed_in_a_row if drives else 0,
     )
     with signals_as_interrupts(), _opened(options, is_moved=drives and not options.dry_run) as cell:
+        if taking.single and (options.resume or not isinstance(cell.arm, RequestingArm)):
+            raise DataError(
+                "record: pictures of a folder belong to poses by their order alone, from the first "
+                "on: neither a followed arm, a driven one nor --resume can keep it.",
+                culprits=["--camera", "--resume" if options.resume else "--arm"],
+                next_step="Record all of it into a new session, with poses that are typed or sent.",
+            )
         if driven is not None:
             _check_resolution(driven.cell.camera.resolution, cell.camera.resolution)
         if options.dry_run and driven is not None:

@@ -29,6 +29,7 @@ from visioncal.core.choices import (
     CameraMount,
     Mount,
 )
+from visioncal.live.capture.devices import CAMERAS
 from visioncal.live.capture.options import Stillness
 from visioncal.live.planning.purposes import PURPOSES
 
@@ -263,7 +264,11 @@ class RecordOptions:
     arm: str = option(
         "A UR by its address, or typed poses.", default=REQUIRED, metavar="ur:HOST|manual"
     )
-    camera: str = option("OAK, webcam or stream.", default=REQUIRED, metavar="oak|uvc:N|uvc:URL")
+    camera: str = option(
+        "A camera by its kind, with its address where there are several.",
+        default=REQUIRED,
+        metavar=f"{'|'.join(CAMERAS)}[:ADDRESS]",
+    )
     target: str | None = _record_cell(_BOARD)
     robot: str | None = _record_cell("The robot's model: a built-in name, a .urdf or .toml.")
     mount: CameraMount | None = _record_cell("Where the camera is; by default eye-in-hand.")

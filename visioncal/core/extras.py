@@ -9,6 +9,9 @@ from visioncal.core.errors import DriverError
 _PACKAGES = {
     "ur": "ur-rtde>=1.6.5,<2",
     "oak": "depthai>=3.12,<4",
+    "genicam": "harvesters>=1.4.3,<2",
+    "basler": "pypylon>=26.9",
+    "realsense": "pyrealsense2>=2.59,<3",
     "cluster": "distributed>=2025.1",
     "ros": "rosbags>=0.11,<0.12",
     "lerobot": "pyarrow>=18",

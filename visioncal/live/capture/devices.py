@@ -1,11 +1,17 @@
 """Devices by the names that a user gives: `ur:192.168.0.10`, `oak`, `uvc:0`."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from importlib import import_module
+from typing import TYPE_CHECKING, TypeVar
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
-from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
+
+if TYPE_CHECKING:
+    # Help on the command line names the kinds, without what they need.
+    from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
 
 _Opener = TypeVar("_Opener")
 
@@ -82,11 +88,23 @@ def _oak(address: str, requested: DeviceSetup) -> CameraDevice:
     return OakCamera(requested, device=address or None)
 
 
-def _uvc(address: str, requested: DeviceSetup) -> CameraDevice:
-    from visioncal.live.drivers.uvc import UvcCamera
+def _driver(module: str, name: str) -> Callable[[str, DeviceSetup], CameraDevice]:
+    """Opener of a camera by its driver's class, which takes the address and what is requested."""
 
-    return UvcCamera(int(address or 0) if (address or "0").isdecimal() else address, requested)
+    def opener(address: str, requested: DeviceSetup) -> CameraDevice:
+        driver = getattr(import_module(f"visioncal.live.drivers.{module}"), name)
+        camera: CameraDevice = driver(address, requested)
+        return camera
+
+    return opener
 
 
 ARMS: Mapping[str, Callable[..., Arm]] = {"ur": _ur, "manual": _manual}
-CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {"oak": _oak, "uvc": _uvc}
+CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {
+    "oak": _oak,
+    "uvc": _driver("uvc", "UvcCamera"),
+    "genicam": _driver("genicam", "GenicamCamera"),
+    "basler": _driver("basler", "BaslerCamera"),
+    "realsense": _driver("realsense", "RealsenseCamera"),
+    "folder": _driver("folder", "FolderCamera"),
+}

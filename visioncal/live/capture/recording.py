@@ -202,6 +202,8 @@ class Capture:
             if not count:
                 stored = f"No view was taken; {folder} is no session yet."
             resume = "Go on with --resume."
+            if self.options.single:
+                resume = "Record all into a new session: a folder begins with its first picture."
             if isinstance(error, KeyboardInterrupt):
                 raise DriverError(
                     f"stopped by Ctrl-C or a signal; the arm was halted. {stored}",

@@ -84,6 +84,8 @@ def take(cell: LiveCell, target: Target, view: int, options: CaptureOptions) -> 
     Raises:
         DriverError: A device fails, or the arm is stopped.
     """
+    if options.single:
+        return _selected([_StillFrame.of(cell)], target, view, 0.0)
     reason = ""
     # Frames during which something moved are discarded.
     for _ in range(3):

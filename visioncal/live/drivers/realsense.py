@@ -1,0 +1,106 @@
+"""The colour stream of Intel's RealSense cameras through librealsense."""
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import numpy as np
+
+from visioncal.core.extras import client_library
+from visioncal.core.types import Camera, Image
+from visioncal.live.drivers.extras import Handle
+from visioncal.live.drivers.protocols import DeviceSetup
+from visioncal.live.drivers.stream import (
+    Arrival,
+    Opened,
+    StreamingCamera,
+    being_opened,
+    camera_error,
+    chosen,
+    refuse_settings,
+)
+
+# Of rates that a resolution has, the nearest is taken: a resting arm needs no more [Hz].
+_RATE_HZ = 15
+
+
+class RealsenseCamera(StreamingCamera):
+    """Camera device of a RealSense's colour stream, by its serial number.
+
+    By default the largest resolution is taken. Exposure and gain stay automatic, or as its viewer
+    set them: their unit differs between models.
+    """
+
+    def _open(self, address: str, requested: DeviceSetup, closing: ExitStack) -> Opened:
+        rs = client_library("pyrealsense2", "realsense")
+        infos = (rs.camera_info.serial_number, rs.camera_info.name)
+        devices = rs.context().query_devices()
+        found = [(tuple(device.get_info(info) for info in infos), device) for device in devices]
+        device = chosen("realsense", found, address, "realsense-viewer")
+        name = f"{device.get_info(infos[1])} {device.get_info(infos[0])}"
+        refuse_settings(name, requested, "in realsense-viewer")
+        sensor, profile = _colour(rs, device, name, requested.resolution)
+        queue = rs.frame_queue(2)
+        with being_opened(name, RuntimeError):
+            sensor.open(profile)
+            closing.callback(sensor.close)
+            sensor.start(queue)
+            closing.callback(sensor.stop)
+        self.factory, source = factory_intrinsics(rs, profile.get_intrinsics())
+        settings = {"rate_hz": profile.fps(), "factory_intrinsics": source}
+        return name, _arrivals(rs, device, queue), settings
+
+
+def _colour(
+    rs: Handle, device: Handle, name: str, resolution: tuple[int, int] | None
+) -> tuple[Handle, Handle]:
+    """The sensor with a colour stream, and its profile of a resolution, by default the largest."""
+    streams = [
+        (sensor, profile.as_video_stream_profile())
+        for sensor in device.query_sensors()
+        for profile in sensor.get_stream_profiles()
+        if (profile.stream_type(), profile.format()) == (rs.stream.color, rs.format.bgr8)
+    ]
+    sizes = sorted({(profile.width(), profile.height()) for _, profile in streams})
+    size = resolution or max(sizes, default=None)
+    fitting = [s for s in streams if (s[1].width(), s[1].height()) == size]
+    if not fitting:
+        why = f"gives no colour pictures of {size} pixels; it has {sizes}"
+        step = "Ask for a resolution that it has; on USB 2 it has fewer."
+        raise camera_error(name, why, step, "--resolution")
+    return min(fitting, key=lambda stream: abs(stream[1].fps() - _RATE_HZ))
+
+
+def factory_intrinsics(rs: Handle, intrinsics: Handle) -> tuple[Camera | None, str]:
+    """Factory intrinsics, and where they are from or why they are not used.
+
+    Librealsense's Brown-Conrady model is that of OpenCV. Most colour streams are said to be of its
+    inverse, which the documentation has undistort a picture (Projection in librealsense, Distortion
+    Models), but the library's own projection distort it: coefficients have no certain meaning.
+    """
+    matrix = np.array([intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy])
+    distortion, model = np.array(intrinsics.coeffs, dtype=float), intrinsics.model
+    if not matrix[0] or (distortion.any() and model != rs.distortion.brown_conrady):
+        return None, f"not used: f {matrix[0]:.6g}, {model.name} {distortion.round(6).tolist()}"
+    size = (intrinsics.width, intrinsics.height)
+    return Camera("brown", size, matrix, distortion), "read from the device"
+
+
+def _arrivals(rs: Handle, device: Handle, queue: Handle) -> Iterator[Arrival | None]:
+    metadata = rs.frame_metadata_value
+    moments = (metadata.sensor_timestamp, metadata.frame_timestamp)
+
+    def decode() -> Image:
+        return np.array(frame.as_video_frame().get_data(), dtype=np.uint8)
+
+    while device.is_connected():
+        came, frame = queue.try_wait_for_frame(100)
+        now_s, exposed_s = time.monotonic(), None
+        is_global = came and frame.get_frame_timestamp_domain() == rs.timestamp_domain.global_time
+        if is_global and all(frame.supports_frame_metadata(moment) for moment in moments):
+            # Middle of the exposure and begin of readout, which is not before its end; the host's
+            # time is of the latter.
+            middle_s, readout_s = (1e-6 * frame.get_frame_metadata(moment) for moment in moments)
+            half_s, since_s = readout_s - middle_s, time.time() - 1e-3 * frame.get_timestamp()
+            exposed_s = now_s - since_s - 2.0 * half_s, now_s - since_s - half_s
+        yield Arrival(now_s, decode, exposed_s) if came else None

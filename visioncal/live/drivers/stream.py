@@ -1,0 +1,241 @@
+"""What streaming cameras share: a thread that reads them, and the first picture that is new enough.
+
+Unread pictures wait in a driver's or a network's buffers and get old. A thread therefore takes all
+of them as they come, and notes the time.
+"""
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TypeAlias, TypeVar
+
+from visioncal.core.errors import DriverError, VisioncalError
+from visioncal.core.types import Camera, Image
+from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
+
+_Device = TypeVar("_Device")
+
+# The longest wait, in intervals between this camera's pictures: one under way at the request, the
+# requested one, and one more for network jitter; and the pictures of which the mean counts.
+_INTERVALS, _PACED = 3.0, 50
+
+
+_RESUME = "Look at its cable, its power and its network; then go on with --resume."
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """A picture that has come."""
+
+    arrived_s: float  # When it came, on the host's monotonic clock [s].
+    # Its pixels, as in `Frame`; None where it is cut short. Valid until the next picture is read.
+    decode: Callable[[], Image | None]
+    # Begin and middle of its exposure by that clock, where the camera reports them [s].
+    exposed_s: tuple[float, float] | None = None
+
+
+# What a driver opens: a camera's name in messages; its pictures, which end where the camera does,
+# with None where there was none for a while; and the settings that it reports.
+Opened: TypeAlias = tuple[str, Iterator[Arrival | None], dict[str, str | float]]
+
+
+class StreamingCamera:
+    """Camera device whose pictures a thread reads as they come.
+
+    Args:
+        address: Which camera, in the kind's own form; empty for the only one.
+        requested: Requested settings.
+
+    Raises:
+        DriverError: Its library or the camera is missing, it is held by another program, gives no
+            picture, or refuses a requested setting.
+    """
+
+    # Intrinsics that the device itself reports.
+    factory: Camera | None = None
+
+    def __init__(self, address: str | int = "", requested: DeviceSetup | None = None) -> None:
+        requested = requested or DeviceSetup()
+        with ExitStack() as opening:
+            self.name, arrivals, settings = self._open(str(address), requested, opening)
+            closing = opening.pop_all()
+        self.settings = MappingProxyType(settings)
+        # 0 where it is not known.
+        self._exposure_s = 1e-6 * float(settings.get("exposure_us", requested.exposure_us or 0))
+        self._arrivals_s: deque[float] = deque(maxlen=_PACED)
+        self._news = threading.Condition()
+        # The moment after which the exposure of a requested picture begins, how many were too old
+        # for it, and the picture with its stamp.
+        self._request_s: float | None = -math.inf
+        self._too_old = 0
+        self._answer: tuple[float, Image] | None = None
+        self._error: Exception | None = None
+        self._is_closing = False
+        read, name = (arrivals, closing), f"pictures of {self.name}"
+        self._thread = threading.Thread(target=self._read, args=read, name=name, daemon=True)
+        self._thread.start()
+        try:
+            first = self._wait(5.0)
+            self._check_resolution(first, requested.resolution, "gives")
+        except BaseException:
+            self.close()
+            raise
+        height, width = first.image.shape[:2]
+        self.resolution = (width, height)
+
+    def _open(self, address: str, requested: DeviceSetup, closing: ExitStack) -> Opened:
+        """Opens the camera, to be released by `closing`; what drivers differ in."""
+        raise NotImplementedError
+
+    def frame(self, *, timeout_s: float = 1.0) -> Frame:
+        """Returns a picture whose exposure began after the call, as far as can be known.
+
+        Where the camera does not report when it exposed, that is the second picture after the call;
+        a delay of more than one picture within the camera remains unknown. The stamp is then the
+        time of arrival, minus half the exposure where it is known.
+
+        Raises:
+            DriverError: None came in time, or it has another resolution than before.
+        """
+        with self._news:
+            self._request_s, self._too_old, self._answer = time.monotonic(), 0, None
+        frame = self._wait(timeout_s)
+        self._check_resolution(frame, self.resolution, "now gives")
+        return frame
+
+    def close(self) -> None:
+        """Ends the thread, which releases the camera; may be called twice."""
+        self._is_closing = True
+        # One that hangs in a driver ends with the process.
+        self._thread.join(2.0)
+
+    def _wait(self, timeout_s: float) -> Frame:
+        waiting = Stopwatch()
+        with self._news:
+            while self._answer is None:
+                if self._error is not None:
+                    raise self._error
+                limit_s = max(timeout_s, _INTERVALS * self._interval_s())
+                if waiting.read() > limit_s:
+                    raise self._timeout_error(waiting.read())
+                self._news.wait(0.05)
+            stamp_s, image = self._answer
+        return Frame(image, stamp_s, self._exposure_s or None)
+
+    def _read(self, arrivals: Iterator[Arrival | None], closing: ExitStack) -> None:
+        ended = "gives no picture: it is unplugged, or closed its stream"
+        error: VisioncalError = camera_error(self.name, ended, _RESUME)
+        with closing:
+            try:
+                for arrival in arrivals:
+                    if self._is_closing:
+                        break
+                    if arrival is not None:
+                        self._handle(arrival)
+            except VisioncalError as caught:
+                error = caught
+            except Exception as caught:  # noqa: BLE001
+                error = camera_error(self.name, f"{ended} ({caught})", _RESUME)
+                error.__cause__ = caught
+        # Raised to whoever waits for a picture.
+        with self._news:
+            self._error = error
+            self._news.notify_all()
+
+    def _handle(self, arrival: Arrival) -> None:
+        """Answers a request with a picture if it is new enough."""
+        before_s = self._arrivals_s[-1] if self._arrivals_s else -math.inf
+        now_s, exposure_s = arrival.arrived_s, self._exposure_s
+        if arrival.exposed_s is not None:
+            began_s, middle_s = arrival.exposed_s
+        else:
+            # It began after the picture before had arrived, unless it waited in a buffer. Then it
+            # comes after a small share of an interval.
+            waited = now_s - before_s < 0.3 * self._interval_s()
+            began_s = -math.inf if waited else min(before_s, now_s - exposure_s)
+            middle_s = now_s - 0.5 * exposure_s
+        self._arrivals_s.append(now_s)
+        request_s = self._request_s
+        if request_s is None:
+            return
+        # Not under the lock: it may take long, and a waiting caller must be able to time out.
+        image = None if began_s < request_s else arrival.decode()
+        if image is None:
+            # The next one may be newer, or whole.
+            self._too_old += 1
+            return
+        with self._news:
+            if self._request_s == request_s:
+                self._request_s, self._answer = None, (middle_s, image)
+                self._news.notify_all()
+
+    def _interval_s(self) -> float:
+        """Mean interval between recent pictures [s]; 0 where it is not known."""
+        recent = list(self._arrivals_s)
+        return (recent[-1] - recent[0]) / (len(recent) - 1) if len(recent) > 1 else 0.0
+
+    def _check_resolution(self, frame: Frame, needed: tuple[int, int] | None, how: str) -> None:
+        height, width = frame.image.shape[:2]
+        if needed is not None and needed != (width, height):
+            why = f"{how} {width}x{height} pixels, not {needed[0]}x{needed[1]}"
+            step = "Ask for a resolution that it has: its maker's viewer or page lists them (of a "
+            raise camera_error(
+                self.name, why, f"{step}webcam on Linux: v4l2-ctl --list-formats-ext)."
+            )
+
+    def _timeout_error(self, waited_s: float) -> DriverError:
+        if self._too_old > _INTERVALS:
+            why = f"gives no fresh pictures: {self._too_old} that came were older than the request"
+            step = "It sends more than can be carried or decoded: set it to a lower rate or "
+            return camera_error(self.name, f"{why}, or cut short", f"{step}resolution.")
+        why = f"stalls: no picture has come for {waited_s:.1f} s"
+        return camera_error(self.name, why, _RESUME)
+
+
+def camera_error(name: str, why: str, step: str, *culprits: str) -> DriverError:
+    """The error of a camera; by default it is itself the culprit."""
+    return DriverError(f"The {name} {why}.", culprits=culprits or [name], next_step=step)
+
+
+@contextmanager
+def being_opened(name: str, *errors: type[Exception]) -> Iterator[None]:
+    """Words what a library raises where it cannot open a camera; raises DriverError."""
+    try:
+        yield
+    except errors as error:
+        step = "Look at whether another program holds it, as its maker's viewer; at its cable and "
+        step += "its power; and at whether this user may use it."
+        raise camera_error(name, f"cannot be opened: {error}", step) from error
+
+
+def chosen(
+    kind: str, found: Sequence[tuple[tuple[str, ...], _Device]], wanted: str, viewer: str
+) -> _Device:
+    """The one camera that is meant, of those that are connected, each with its names.
+
+    Raises:
+        DriverError: There is none, or several and none of them is named.
+    """
+    matching = [device for names, device in found if not wanted or wanted in names]
+    if len(matching) == 1:
+        return matching[0]
+    step = f"Look at whether {viewer} shows it: its cable, its power, its network."
+    why = "is not connected"
+    if matching:
+        why, step = "may be any of several", f"Say which: --camera {kind}:{found[0][0][0]}."
+    there = ", ".join(" ".join(names) for names, _ in found) or "none"
+    name = f"{kind}:{wanted}".rstrip(":")
+    raise camera_error(f"camera {name}", f"{why}; connected: {there}", step)
+
+
+def refuse_settings(name: str, requested: DeviceSetup, where: str) -> None:
+    """Refuses exposure, gain and focus that only another program can set; raises DriverError."""
+    if (requested.exposure_us, requested.gain, requested.focus) != (None, None, None):
+        step = f"Leave them out, and hold exposure and focus {where}."
+        options = ("--exposure-us", "--gain", "--focus")
+        raise camera_error(name, "gives nothing but pictures, and cannot be set", step, *options)
