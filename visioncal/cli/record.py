@@ -15,7 +15,7 @@ from visioncal.core.number_format import counted, figure
 from visioncal.core.threads import signals_as_interrupts
 from visioncal.interchange.formats.intrinsics import target_named
 from visioncal.live.capture.cell import HostClock, LiveCell
-from visioncal.live.capture.devices import open_arm, open_camera
+from visioncal.live.capture.devices import REQUESTING, open_arm, open_camera
 from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
@@ -39,7 +39,7 @@ def record_command(options: RecordOptions) -> None:
     """Runs `visioncal record`."""
     plan = None if options.plan is None else read_plan(options.plan)
     recorded = _recorded(plan, options)
-    drives = not options.follow and options.arm.partition(":")[0] != "manual"
+    drives = not options.follow and options.arm.partition(":")[0] not in REQUESTING
     if drives and plan is None:
         raise DataError(
             "record: an arm is driven by a plan, and none is given.",

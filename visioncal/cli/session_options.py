@@ -262,7 +262,9 @@ class RecordOptions:
 
     out: Path = out_folder("The session's folder; a new one.", default=REQUIRED, metavar="SESSION")
     arm: str = option(
-        "A UR by its address, or typed poses.", default=REQUIRED, metavar="ur:HOST|manual"
+        "A UR by its address, typed poses, or the robot's own program: socket listens for it.",
+        default=REQUIRED,
+        metavar="ur:HOST|manual|socket:PORT|socket:HOST:PORT",
     )
     camera: str = option(
         "A camera by its kind, with its address where there are several.",
@@ -273,7 +275,7 @@ class RecordOptions:
     robot: str | None = _record_cell("The robot's model: a built-in name, a .urdf or .toml.")
     mount: CameraMount | None = _record_cell("Where the camera is; by default eye-in-hand.")
     pose_form: str | None = _record_cell(
-        "How poses are typed.", metavar="|".join(("ours", *POSE_FORMS))
+        "How poses are written that are bare numbers.", metavar="|".join(("ours", *POSE_FORMS))
     )
     frames: int = _taking("Frames a view.", default=3, min=1, max=100)
     still_px: float = _taking(
@@ -289,7 +291,7 @@ class RecordOptions:
     focus: int | None = _device("Lens position, in the device's own unit.")
     plan: Path | None = option("What visioncal plan wrote: a folder, or its plan.json.")
     follow: bool = flag("Move nothing: take a view whenever the arm, guided by hand, rests.")
-    views: int = option("With --follow or a manual arm: end after this number.", default=0, min=0)
+    views: int = option("With --follow, manual or socket: end after this number.", default=0, min=0)
     resume: bool = flag("Go on with a recording that was ended or cut off.")
     dry_run: bool = flag("Only say what would be driven; nothing moves.")
     yes: bool = yes_flag()

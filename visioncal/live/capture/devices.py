@@ -1,4 +1,4 @@
-"""Devices by the names that a user gives: `ur:192.168.0.10`, `oak`, `uvc:0`."""
+"""Devices by the names that a user gives: `ur:192.168.0.10`, `socket:30100`, `oak`, `uvc:0`."""
 
 from __future__ import annotations
 
@@ -82,6 +82,20 @@ def _manual(
     return ManualArm(ask, form, answers=answers)
 
 
+def _socket(address: str, *, form: str | None, **__: object) -> Arm:
+    from visioncal.live.drivers.pose_socket import SocketArm
+
+    host, _, port = address.rpartition(":")
+    if not (port.isascii() and port.isdecimal() and len(port) < 6 and int(port) < 1 << 16):
+        raise DataError(
+            f"--arm: {address[:80]!r} is no port; socket needs one to listen at.",
+            culprits=["--arm"],
+            next_step="Give a port, as socket:30100 for programs on this computer, or with the "
+            "address of this computer in the robot's network, as socket:192.168.0.2:30100.",
+        )
+    return SocketArm(host or "127.0.0.1", int(port), form)
+
+
 def _oak(address: str, requested: DeviceSetup) -> CameraDevice:
     from visioncal.live.drivers.oak import OakCamera
 
@@ -99,7 +113,9 @@ def _driver(module: str, name: str) -> Callable[[str, DeviceSetup], CameraDevice
     return opener
 
 
-ARMS: Mapping[str, Callable[..., Arm]] = {"ur": _ur, "manual": _manual}
+ARMS: Mapping[str, Callable[..., Arm]] = {"ur": _ur, "manual": _manual, "socket": _socket}
+# Those that request views, and are not driven.
+REQUESTING = ("manual", "socket")
 CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {
     "oak": _oak,
     "uvc": _driver("uvc", "UvcCamera"),

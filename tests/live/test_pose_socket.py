@@ -1,0 +1,357 @@
+"""The robot's own program over TCP: what it says, what breaks, and that each view has its pose."""
+
+import contextlib
+import random
+import select
+import socket
+import struct
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.refusals import raised
+
+from visioncal.core.errors import DataError, DriverError
+from visioncal.live.capture.devices import open_arm
+from visioncal.live.capture.recording import ask_and_take, take_requested
+from visioncal.live.capture.take import Missed
+from visioncal.live.drivers import pose_socket
+from visioncal.live.drivers.pose_socket import SocketArm
+from visioncal.live.drivers.protocols import RequestingArm
+from visioncal.session import View
+from visioncal.session.columns import pose_row
+
+COUNT = 4
+
+
+def line_of(stop, more=""):
+    """What a program says at a stop: no other stop is within 100 mm."""
+    return f"{stop} | X {100 * stop}.25 Y -12.5 Z 800 A 10 B {stop} C 180{more}"
+
+
+class FakeCapture:
+    """Keeps what would be recorded; `meanwhile` happens during the exposures of a view."""
+
+    def __init__(self, meanwhile=lambda _: False):
+        self.journal = SimpleNamespace(views=[])
+        self.coach = SimpleNamespace(advice=lambda: "")
+        self.steps, self.meanwhile = [], meanwhile
+        self.halting = contextlib.nullcontext
+
+    def next_numbers(self):
+        """Numbers of the next view."""
+        return len(self.journal.views) + 1, len(self.journal.views) + 1
+
+    def view_at(self, state, number, *_):
+        """Keeps a pose, as if an image were there."""
+        if self.meanwhile(number):
+            return SimpleNamespace(found=Missed("no board in the image"))
+        numbers = pose_row(state.base_from_flange)
+        self.journal.views.append(View(number, numbers=numbers))
+        return SimpleNamespace(found=None)
+
+
+class Robot:
+    """A client, and what it does in the same thread as the server that is asked step by step."""
+
+    def __init__(self, rng, capture):
+        self.rng, self.capture = rng, capture
+        self.arm, self.link, self.answers = SocketArm("127.0.0.1", 0), None, b""
+        self.sent = set()
+
+    def connect(self):
+        """Opens a new link."""
+        self.hang_up()
+        self.link = socket.create_connection(("127.0.0.1", self.arm.port))
+        # Otherwise a second piece waits for the first one's receipt.
+        self.link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.answers = b""
+
+    def hang_up(self, *, hard=False):
+        """Closes the link."""
+        if self.link is not None:
+            if hard:
+                # A reset, as of a controller that lost its power.
+                option = struct.pack("ii", 1, 0)
+                self.link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, option)
+            self.link.close()
+        self.link = None
+
+    def step(self):
+        """The server looks once; its errors would be the test's."""
+        take_requested(self.capture, self.arm, 0, 0.0)
+
+    def say(self, data):
+        """Sends, in pieces or at once; the server may close the link in between."""
+        cut = self.rng.randrange(len(data))
+        with contextlib.suppress(OSError):
+            for piece in (data[:cut], data[cut:]) if self.rng.random() < 0.5 else (data,):
+                self.link.sendall(piece)
+                self.step()
+
+    def answer(self):
+        """The first line of what came back; empty where the link was closed."""
+        for _ in range(3):
+            self.step()
+        self.link.setblocking(False)
+        with contextlib.suppress(OSError):
+            while data := self.link.recv(1000):
+                self.answers += data
+        self.link.setblocking(True)
+        first, _, self.answers = self.answers.partition(b"\n")
+        return first.decode("ascii")
+
+    def say_stop(self, stop):
+        """Sends a whole line, as a robot ends it."""
+        data = (line_of(stop) + self.rng.choice(["\n", "\r\n", "\r", "\0\n"])).encode()
+        self.sent.add(stop)
+        self.say(data)
+
+
+def half_a_line(robot, stop):
+    whole = line_of(stop).encode()
+    robot.say(whole[: robot.rng.randrange(1, len(whole))])
+
+
+def garbage(robot, _):
+    robot.say(robot.rng.randbytes(robot.rng.randrange(1, 400)) + b"\n")
+    assert not robot.answer().startswith(("next", "done"))
+
+
+def an_endless_line(robot, _):
+    robot.say(b"7" * robot.rng.randrange(600, 3000))
+
+
+def two_stops_at_once(robot, stop):
+    # The arm waits at none of them, unless they come in pieces.
+    robot.sent |= {stop, stop + 1}
+    robot.say(f"{line_of(stop)}\n{line_of(stop + 1)}\n".encode())
+
+
+def another_client(robot, _):
+    with socket.create_connection(("127.0.0.1", robot.arm.port)) as other:
+        robot.step()
+        robot.step()
+        # One is told to go, or one that said nothing is let go.
+        assert select.select([other, robot.link], [], [], 0)[0]
+
+
+def another_encoding(robot, stop):
+    robot.say(
+        line_of(stop).replace("X", "\N{LATIN CAPITAL LETTER A WITH DIAERESIS}").encode("cp1252")
+    )
+    robot.say(b"\n")
+    assert robot.answer().startswith("error the line is no text")
+
+
+def the_same_stop_elsewhere(robot, _):
+    if robot.capture.journal.views:
+        done = robot.capture.journal.views[-1].number
+        robot.say(line_of(done).replace(".25", ".95").encode() + b"\n")
+        assert robot.answer().startswith("error stop")
+
+
+def no_wait_for_the_answer(robot, stop):
+    robot.sent.add(stop)
+    robot.link.sendall(f"{line_of(stop)}\n".encode())
+    robot.hang_up(hard=True)
+
+
+def a_lost_answer(robot, stop):
+    robot.say_stop(stop)
+    robot.hang_up(hard=robot.rng.random() < 0.5)
+
+
+def a_killed_server(robot, stop):
+    robot.say_stop(stop)
+    robot.arm.close()
+    robot.arm = SocketArm("127.0.0.1", 0)
+
+
+MISHAPS = (
+    *(half_a_line, garbage, an_endless_line, two_stops_at_once, another_client, another_encoding),
+    *(the_same_stop_elsewhere, no_wait_for_the_answer, a_lost_answer, a_killed_server),
+)
+
+
+def in_a_conversation(rng):
+    """What was recorded and what was acknowledged, by a program that repeats what is not."""
+
+    def meanwhile(stop):
+        chance = rng.random()
+        if chance < 0.05:
+            robot.hang_up(hard=chance < 0.02)
+        elif chance < 0.1 and robot.link is not None:
+            # A program that does not wait for its answer.
+            with contextlib.suppress(OSError):
+                robot.link.sendall(f"{line_of(stop + 1)}\n".encode())
+        return chance > 0.8
+
+    def acknowledged(stop):
+        if rng.random() < 0.6:
+            robot.connect()
+            rng.choice(MISHAPS)(robot, stop)
+            if rng.random() < 0.3:
+                robot.hang_up(hard=True)
+            robot.step()
+        if robot.link is None or rng.random() < 0.5:
+            robot.connect()
+        robot.say_stop(stop)
+        answer = robot.answer() if robot.link is not None else ""
+        assert answer.split(" ")[0] in ("next", "again", "error", "busy", "")
+        if answer != "next":
+            robot.hang_up()
+            robot.step()
+        return answer == "next"
+
+    capture = FakeCapture(meanwhile)
+    robot = Robot(rng, capture)
+    for stop in range(1, COUNT + 1):
+        assert any(acknowledged(stop) for _ in range(40))
+        # Acknowledged only once it is on the disk.
+        assert stop in [view.number for view in capture.journal.views]
+    robot.hang_up()
+    robot.arm.close()
+    return capture.journal.views, robot.sent
+
+
+@pytest.mark.parametrize("first_seed", range(0, 500, 100))
+def test_after_500_broken_conversations_each_view_has_its_pose(first_seed, monkeypatch):
+    monkeypatch.setattr(pose_socket, "_SLICE_S", 0.0)
+    monkeypatch.setattr(pose_socket, "_MUTE_S", 0.0)
+    for seed in range(first_seed, first_seed + 100):
+        views, sent = in_a_conversation(random.Random(seed))
+        numbers = [view.number for view in views]
+        assert len(numbers) == len(set(numbers)), seed
+        assert set(numbers) <= sent, seed
+        for view in views:
+            x = view.base_from_flange().translation[0]
+            assert abs(x - (0.1 * view.number + 0.25e-3)) < 1e-9, seed
+
+
+@pytest.fixture
+def arm():
+    opened = open_arm("socket:0", None, moves=False)
+    yield opened
+    opened.close()
+
+
+def asked(arm, words):
+    """The answer to one line of a new client."""
+    with socket.create_connection(("127.0.0.1", arm.port)) as link:
+        link.sendall(words)
+        state = arm.request(0.0)
+        if state is not None:
+            arm.reply("next")
+        return link.recv(300).decode("ascii"), state
+
+
+@pytest.mark.parametrize(
+    ("line", "answer"),
+    [
+        ("1 | p[0.4, 0, 0.3, 0, 3.1, 0]", "next\n"),
+        ("1 | [[400,-100,300],[0.5,-0.5,0.5,0.5]] | 0 -90 90 0 45 10,5 deg", "next\n"),
+        ("1 | 400 0 300 0 180 0", "error the pose may be of ur, kuka, fanuc"),
+        ("1 | 512,34,-12,5,800,0", "error the pose: the commas of"),
+        ("1 | X 400 Y 0 Z 300", "error the pose: 'X 400 Y 0 Z 300' is no pose"),
+        ("0 | p[0.4, 0, 0.3, 0, 3.1, 0]", "error '0' is no number of a stop"),
+        ("p[0.4, 0, 0.3, 0, 3.1, 0]", "error 'p[0.4, 0, 0.3, 0, 3'"),
+        ("1", "error stop 1 has 0 parts"),
+        ("1 | p[0.4, 0, 0.3, 0, 3.1, 0] | 0 -90 90 0 45 0", "error '0 -90 90 0 45 0' are no joint"),
+        ("1 | p[0.4, 0, 0.3, 0, 3.1, 0] | 0 -90 90 0 45 0 rad", "error a joint angle of 90 rad"),
+    ],
+)
+def test_a_line_is_understood_or_its_programmer_learns_why(arm, line, answer):
+    got, state = asked(arm, line.encode() + b"\n")
+    assert got.startswith(answer.partition("'p[")[0]), got
+    assert got.endswith("\n")
+    assert (state is not None) == (answer == "next\n")
+
+
+def test_joints_are_sent_at_all_stops_or_at_none(arm):
+    _, state = asked(arm, line_of(1, " | 0 -90 90 0 45 10.5 deg\n").encode())
+    assert np.allclose(np.rad2deg(state.q), [0, -90, 90, 0, 45, 10.5])
+    assert state.stop == 1
+    assert asked(arm, line_of(2, "\n").encode())[0].startswith("error 0 joints, and 6")
+
+
+def test_the_last_view_is_answered_done_even_where_that_answer_is_lost(arm):
+    capture, answers = FakeCapture(), []
+
+    def program():
+        for stop in (1, 2, 2):
+            with socket.create_connection(("127.0.0.1", arm.port)) as link:
+                link.sendall(line_of(stop, "\n").encode())
+                # The first answer to stop 2 is not waited for.
+                while capture.next_numbers()[0] <= stop:
+                    time.sleep(0.001)
+                if len(answers) != 1 or stop == 1:
+                    answers.append(link.recv(100))
+                else:
+                    answers.append(b"")
+
+    robot = threading.Thread(target=program)
+    robot.start()
+    assert isinstance(arm, RequestingArm)
+    ask_and_take(capture, arm, 2)
+    robot.join(5.0)
+    assert answers in ([b"next\n", b"", b"done\n"], [b"next\n", b"", b""])
+    assert [view.number for view in capture.journal.views] == [1, 2]
+
+
+def test_a_program_ends_the_recording_and_learns_that_it_ended(arm):
+    link = socket.create_connection(("127.0.0.1", arm.port))
+    link.sendall(b"end\n")
+    # It hangs up once it has its answer.
+    threading.Thread(target=lambda: (link.recv(100), link.close())).start()
+    with pytest.raises(EOFError):
+        arm.request(5.0)
+    idle = open_arm("socket:0", None, moves=False)
+    with socket.create_connection(("127.0.0.1", idle.port)) as link:
+        idle.request(0.0)
+        idle.close()
+        assert link.recv(10) == b""
+
+
+def test_a_robot_that_does_not_come_back_ends_the_recording():
+    arm = SocketArm("127.0.0.1", 0, patience_s=0.05)
+    asked(arm, b"hello\n")
+    raised(DriverError, "no stop .* was last refused: 'hello' is no number", arm.request, 5.0)
+    raised(DriverError, "cannot be listened at", SocketArm, "127.0.0.1", arm.port)
+    arm.close()
+    for words in ("socket:", "socket:127.0.0.1", "socket:70000"):
+        raised(DataError, "is no port", open_arm, words, None, form=None, moves=False)
+
+
+def test_a_dead_peer_gives_way_within_seconds(arm):
+    link = socket.create_connection(("127.0.0.1", arm.port))
+    arm.request(0.0)
+    served = arm._link.peer
+    probed = [
+        served.getsockopt(socket.IPPROTO_TCP, option)
+        for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+    ]
+    assert served.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    assert probed[0] + probed[1] * probed[2] <= 5
+    # What is not confirmed is not waited for longer [ms].
+    assert served.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) <= 5000
+    link.close()
+
+
+def test_a_client_that_reads_nothing_is_let_go_rather_than_waited_for(arm):
+    link = socket.socket()
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    link.connect(("127.0.0.1", arm.port))
+    arm.request(0.0)
+    served = arm._link.peer
+    served.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
+    for _ in range(1000):
+        if served.fileno() == -1:
+            break
+        link.sendall(b"x\n")
+        arm.request(0.0)
+    link.close()
+    assert served.fileno() == -1

@@ -1,0 +1,350 @@
+"""Arm that the robot's own program drives, and reports over TCP.
+
+The protocol is a line of text for each stop, and a line as its answer: `live/clients/README.md`.
+Visioncal listens, because a robot's controller is the easier client.
+"""
+
+import re
+import select
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from visioncal.core.documents.pendants import line_numbers, possible_forms, read_pose
+from visioncal.core.errors import DataError, DriverError
+from visioncal.core.types import FloatArray
+from visioncal.live.drivers.manual import form_name
+from visioncal.live.drivers.protocols import Answer, ArmState, Stopwatch
+
+# The programs for robots, beside which the protocol is described.
+CLIENTS = Path(__file__).parents[1] / "clients"
+# How long no stop may come [s]: a robot stands still in a break, or while somebody looks at it.
+PATIENCE_S = 900.0
+# Silence after which a peer that answers no probe is lost [s]; a robot connects again after it.
+_DEAD_S = 4
+# A client that said nothing for so long gives way to another [s].
+_MUTE_S = 5.0
+# How long a robot may take to read `done` and to close the link [s].
+_LINGER_S = 3.0
+_SLICE_S = 0.05
+# Longest line in, and longest answer out [bytes].
+_MAX_LINE, _MAX_ANSWER = 500, 200
+# Largest number of a stop: the columns of a session have no more views.
+_MAX_STOP = 20_000
+_ENDS = re.compile(rb"[\r\n]")
+# What a client may add to a line without meaning: blanks, and the zeros of a character array.
+_FILL = b" \t\r\n\0"
+_ALL = ("", "0.0.0.0", "::")
+
+
+@dataclass(eq=False)
+class _Link:
+    """A connection to the robot's program."""
+
+    peer: socket.socket
+    received: bytes = b""  # What is not yet read of its lines.
+    has_spoken: bool = False  # Whether it has ever sent a whole line.
+    age: Stopwatch = field(default_factory=Stopwatch)
+
+
+class _LostError(Exception):
+    """The link is closed or broken."""
+
+
+class SocketArm:
+    """Arm whose program says by a line of text that it stands at a stop, and where.
+
+    Nothing is read from a link on which an answer is due, so that no pose is taken for another: a
+    program that sends more than the one line gets `error`, and its link is closed. Whatever
+    breaks, a view is acknowledged only after it is on the disk, and a stop that is sent again after
+    a lost answer has the number of its view (`take_requested`).
+
+    Args:
+        host: Address of this computer at which it listens; `0.0.0.0` for all its networks.
+        port: Port; 0 for any that is free.
+        form: Form of poses that are bare numbers, as for `ManualArm`; None to recognise it.
+        patience_s: How long no stop may come [s].
+
+    Raises:
+        DriverError: It cannot listen there, or there is no such form.
+    """
+
+    name = "the robot's own program"
+
+    def __init__(
+        self, host: str, port: int, form: str | None = None, *, patience_s: float = PATIENCE_S
+    ) -> None:
+        self._form = None if form is None else form_name(form)
+        try:
+            self._server = socket.create_server((host, port), backlog=4)
+        except OSError as error:
+            raise DriverError(
+                f"{host}:{port} cannot be listened at: {error.strerror}.",
+                culprits=[f"{host}:{port}"],
+                next_step="Another program, or an earlier visioncal, may listen there: end it, or "
+                "name another port and set that in the robot's program, too. The address is one "
+                "of this computer.",
+            ) from error
+        self._server.setblocking(False)
+        self.host, self.port = host, int(self._server.getsockname()[1])
+        self._link: _Link | None = None
+        self._asking: _Link | None = None
+        self._stop: ArmState | None = None
+        self._joints: int | None = None
+        self._patience_s, self._idle = patience_s, Stopwatch()
+        self._refused, self._is_done = "", False
+
+    @property
+    def invitation(self) -> str:
+        """Where it listens, and where the robot's programs are."""
+        shared = (
+            " Every computer that reaches this one can send poses." if self.host in _ALL else ""
+        )
+        return (
+            f"Waiting for the robot's own program at {self.host}:{self.port}.{shared} Programs for "
+            f"KUKA, ABB and FANUC are in {CLIENTS}; a line as "
+            "'1 | X 512.3 Y -12.5 Z 800 A 10 B 0 C 180' says where it stands."
+        )
+
+    def state(self) -> ArmState:
+        """The stop of the last request, stamped now; raises DriverError before the first."""
+        if self._stop is None:
+            raise DriverError("The robot's own program has not said where it stands.")
+        return replace(self._stop, stamp_s=time.monotonic())
+
+    def request(self, timeout_s: float, wanted: str = "") -> ArmState | None:  # noqa: ARG002
+        """Waits for a stop; what cannot be understood is answered `error` meanwhile.
+
+        Raises:
+            EOFError: The program said `end`.
+            DriverError: No stop came for `patience_s`.
+        """
+        waited = Stopwatch()
+        while True:
+            line = self._next_line()
+            if line is not None:
+                self._asking = self._link
+                if line.strip().lower() == "end":
+                    self.reply("done")
+                if self._is_done:
+                    raise EOFError
+                try:
+                    self._stop = self._understood(line)
+                except DataError as error:
+                    self._refused = error.message
+                    self.reply("error", f"{error.message} {error.next_step}")
+                else:
+                    self._idle.restart()
+                    return self._stop
+            if self._idle.read() > self._patience_s:
+                refused = f" It was last refused: {self._refused}" if self._refused else ""
+                raise DriverError(
+                    f"{self.name} has sent no stop to {self.host}:{self.port} for "
+                    f"{self._patience_s:.0f} s.{refused}",
+                    culprits=[f"{self.host}:{self.port}"],
+                    next_step="Start it again on the pendant, and go on with --resume; see whether "
+                    "it has this computer's address and port, and whether a firewall is between.",
+                )
+            if waited.read() > timeout_s:
+                return None
+            self._wait()
+
+    def reply(self, answer: Answer, reason: str = "") -> None:
+        """Answers the last line, if its link still stands; waits for the link's end after `done`.
+
+        The stop is answered again when the program connects again and sends it again.
+        """
+        link, self._asking = self._asking, None
+        if link is None:
+            return
+        words = " ".join(f"{answer} {reason}".split()).encode("ascii", "replace")
+        with self._dropped_if_lost(link):
+            # What came before the answer did not wait for it.
+            self._receive(link)
+            self._send(link, words[: _MAX_ANSWER - 1])
+            if link.received.strip(_FILL):
+                self._send(link, b"error more than one line before its answer")
+                raise _LostError
+        self._idle.restart()
+        if answer == "done":
+            self._is_done = True
+            self._linger(is_answered=self._link is link)
+
+    def close(self) -> None:
+        """Closes link and port, by which the robot's program learns that nothing listens."""
+        if self._link is not None:
+            self._drop(self._link)
+        self._server.close()
+
+    def _understood(self, line: str) -> ArmState:
+        """Reads a stop; raises DataError."""
+        number, *parts = (part.strip() for part in line.split("|"))
+        is_number = number.isascii() and number.isdecimal() and len(number) < 6
+        if not (is_number and 1 <= int(number) <= _MAX_STOP):
+            raise DataError(
+                f"{number[:20]!r} is no number of a stop.",
+                next_step=f"Needed is: number (1 to {_MAX_STOP}) | pose, or number | pose | "
+                "joints deg.",
+            )
+        if len(parts) not in (1, 2):
+            raise DataError(
+                f"stop {number} has {len(parts)} parts after its number.",
+                next_step="Needed is: number | pose, or number | pose | joints deg.",
+            )
+        if self._form is None and len(forms := possible_forms(parts[0])) > 1:
+            raise DataError(
+                f"the pose may be of {', '.join(forms)}.",
+                next_step=f"Name its numbers, or start visioncal with --pose-form {forms[0]}.",
+            )
+        pose = read_pose(parts[0], "the pose", self._form).pose
+        joints = _joints(parts[1]) if len(parts) == 2 else None
+        count = 0 if joints is None else len(joints)
+        if self._joints not in (None, count):
+            raise DataError(
+                f"{count} joints, and {self._joints} at the first stop.",
+                next_step="Send the same joints at all stops, or none at any.",
+            )
+        self._joints = count
+        return ArmState(time.monotonic(), pose, joints, stop=int(number))
+
+    def _next_line(self) -> str | None:
+        """Whole line that the client waits for an answer to; None where there is none."""
+        self._accept()
+        link = self._link
+        if link is None:
+            return None
+        with self._dropped_if_lost(link):
+            self._receive(link)
+            link.received = link.received.lstrip(_FILL)
+            first, *rest = _ENDS.split(link.received, maxsplit=1)
+            if len(first) > _MAX_LINE:
+                self._send(link, b"error a line of more than %d bytes" % _MAX_LINE)
+                raise _LostError
+            if not rest:
+                return None
+            link.received, link.has_spoken = rest[0], True
+            # A program that went away does not wait at its stop.
+            self._receive(link)
+            if link.received.strip(_FILL):
+                self._send(link, b"error more than one line before its answer")
+                raise _LostError
+            try:
+                return first.strip(_FILL).decode("utf-8")
+            except UnicodeDecodeError:
+                self._send(link, b"error the line is no text in ASCII or UTF-8")
+        return None
+
+    def _accept(self) -> None:
+        """Takes the client that connects, or refuses it while there is another."""
+        try:
+            peer, _ = self._server.accept()
+        except OSError:
+            return
+        peer.setblocking(False)
+        if self._link is not None:
+            # The same program may have hung up, and connects again.
+            with self._dropped_if_lost(self._link):
+                self._receive(self._link)
+        now = self._link
+        if now is not None and not now.has_spoken and now.age.read() > _MUTE_S:
+            self._drop(now)
+        if self._link is None:
+            _set_keepalive(peer)
+            self._link = _Link(peer)
+            return
+        with suppress(OSError):
+            peer.send(b"busy another program is connected\n")
+        peer.close()
+
+    @staticmethod
+    def _receive(link: _Link) -> None:
+        """Adds what has come to a link's text; raises _LostError."""
+        # More than this is refused anyway.
+        while len(link.received) <= 2 * _MAX_LINE:
+            try:
+                data = link.peer.recv(_MAX_LINE)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                raise _LostError from error
+            if not data:
+                raise _LostError
+            link.received += data
+
+    @staticmethod
+    def _send(link: _Link, words: bytes) -> None:
+        """Sends a line; raises _LostError, also where the client reads nothing."""
+        try:
+            if link.peer.send(words + b"\n") <= len(words):
+                raise _LostError
+        except OSError as error:
+            raise _LostError from error
+
+    @contextmanager
+    def _dropped_if_lost(self, link: _Link) -> Iterator[None]:
+        try:
+            yield
+        except _LostError:
+            self._drop(link)
+
+    def _drop(self, link: _Link) -> None:
+        with suppress(OSError):
+            # Unread bytes would reset the link, and take the last answer away.
+            link.peer.shutdown(socket.SHUT_WR)
+            for _ in range(20):
+                link.peer.recv(_MAX_LINE)
+        link.peer.close()
+        if self._link is link:
+            self._link = None
+
+    def _linger(self, *, is_answered: bool) -> None:
+        """Answers `done` to whatever comes, until a program that was told has closed its link."""
+        lingering = Stopwatch()
+        while lingering.read() < _LINGER_S and not (is_answered and self._link is None):
+            if self._next_line() is not None and self._link is not None:
+                with self._dropped_if_lost(self._link):
+                    self._send(self._link, b"done")
+                    is_answered = True
+            self._wait()
+
+    def _wait(self) -> None:
+        links = [self._server] if self._link is None else [self._server, self._link.peer]
+        select.select(links, [], [], _SLICE_S)
+
+
+def _joints(text: str) -> FloatArray:
+    """Reads joint angles with their unit behind them (n,) [rad]; raises DataError."""
+    *numbers, unit = text.split() or [""]
+    values = line_numbers(" ".join(numbers))
+    if unit not in ("deg", "rad") or not values:
+        raise DataError(
+            f"{text[:40]!r} are no joint angles.",
+            next_step="Needed are numbers and their unit, as 10.5 -20 30 0 45 90 deg.",
+        )
+    angles = np.array(values)
+    angles = np.deg2rad(angles) if unit == "deg" else angles
+    # No joint turns farther from its zero [rad].
+    if not np.abs(angles).max() < 50.0:
+        raise DataError(f"a joint angle of {np.abs(angles).max():.4g} rad is too large.")
+    return angles
+
+
+def _set_keepalive(peer: socket.socket) -> None:
+    """Has the system probe a silent peer, and break the link where it does not answer."""
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    # An answer that is not confirmed counts, too; not all systems have all names.
+    for name, value in (
+        ("TCP_KEEPIDLE", 1),
+        ("TCP_KEEPINTVL", 1),
+        ("TCP_KEEPCNT", _DEAD_S - 1),
+        ("TCP_USER_TIMEOUT", 1000 * _DEAD_S),
+    ):
+        if hasattr(socket, name):
+            with suppress(OSError):
+                peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
