@@ -9,8 +9,7 @@ from support.refusals import raised
 
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers import oak
-from visioncal.live.drivers.extras import depthai
-from visioncal.live.drivers.oak import OakCamera
+from visioncal.live.drivers.oak import OakCamera, depthai
 from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
 
 try:

@@ -2,8 +2,12 @@
 
 from importlib import import_module
 from types import ModuleType
+from typing import Any, TypeAlias
 
 from visioncal.core.errors import DriverError
+
+# An object of a library whose classes exist only where it is installed.
+Handle: TypeAlias = Any
 
 # Packages of the extras, by their names in pyproject.toml.
 _PACKAGES = {

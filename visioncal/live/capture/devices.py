@@ -102,15 +102,11 @@ def _oak(address: str, requested: DeviceSetup) -> CameraDevice:
     return OakCamera(requested, device=address or None)
 
 
-def _driver(module: str, name: str) -> Callable[[str, DeviceSetup], CameraDevice]:
-    """Opener of a camera by its driver's class, which takes the address and what is requested."""
-
-    def opener(address: str, requested: DeviceSetup) -> CameraDevice:
-        driver = getattr(import_module(f"visioncal.live.drivers.{module}"), name)
-        camera: CameraDevice = driver(address, requested)
-        return camera
-
-    return opener
+def _driver(name: str) -> Callable[[str, DeviceSetup], CameraDevice]:
+    """Opener of a camera by its driver, `module.Class` of an address and what is requested."""
+    module, _, kind = f"visioncal.live.drivers.{name}".rpartition(".")
+    # The import waits for the call.
+    return lambda address, requested: getattr(import_module(module), kind)(address, requested)  # noqa: PLW0108
 
 
 ARMS: Mapping[str, Callable[..., Arm]] = {"ur": _ur, "manual": _manual, "socket": _socket}
@@ -118,9 +114,9 @@ ARMS: Mapping[str, Callable[..., Arm]] = {"ur": _ur, "manual": _manual, "socket"
 REQUESTING = ("manual", "socket")
 CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {
     "oak": _oak,
-    "uvc": _driver("uvc", "UvcCamera"),
-    "genicam": _driver("genicam", "GenicamCamera"),
-    "basler": _driver("basler", "BaslerCamera"),
-    "realsense": _driver("realsense", "RealsenseCamera"),
-    "folder": _driver("folder", "FolderCamera"),
+    "uvc": _driver("uvc.UvcCamera"),
+    "genicam": _driver("genicam.GenicamCamera"),
+    "basler": _driver("basler.BaslerCamera"),
+    "realsense": _driver("realsense.RealsenseCamera"),
+    "folder": _driver("folder.FolderCamera"),
 }

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from visioncal.core.extras import Handle
 from visioncal.core.types import Image
-from visioncal.live.drivers.extras import Handle
 from visioncal.live.drivers.protocols import DeviceSetup
 from visioncal.live.drivers.stream import Arrival, camera_error
 
@@ -69,7 +69,8 @@ class Features:
         if sent not in _FORMATS and all(self._why_not(name, "PixelFormat") for name in _FORMATS):
             why = f"sends {sent}; one of {', '.join(_FORMATS)} is needed"
             raise camera_error(self.name, why, "Set its PixelFormat in its maker's viewer.")
-        free: dict[str, str | float] = {"AcquisitionMode": "Continuous", "TriggerMode": "Off"}
+        free: dict[str, str | float] = {"AcquisitionMode": "Continuous"}
+        free |= {"TriggerSelector": "FrameStart", "TriggerMode": "Off"}
         if requested.resolution is not None:
             free |= {"OffsetX": 0, "OffsetY": 0}
         if requested.exposure_us is not None:
@@ -97,7 +98,7 @@ class Features:
         automatic = [name for name in names if self.get(name) not in (None, "Off")]
         until = time.monotonic() + _SETTLE_S
         while automatic and time.monotonic() < until:
-            next(arrivals)
+            next(arrivals, None)
         for name in automatic:
             self._why_not("Off", name)
         asked = {"exposure_us": _EXPOSURE, "gain": _GAIN, "pixel_format": ("PixelFormat",)}

@@ -6,7 +6,7 @@ from pathlib import Path
 from visioncal.core.files import MOST_IMAGE_BYTES, natural, read_bytes
 from visioncal.core.types import Camera, Image
 from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
-from visioncal.live.drivers.stream import camera_error, refuse_settings
+from visioncal.live.drivers.stream import camera_error, check_resolution, refuse_settings
 from visioncal.session.images import IMAGE_ENDINGS
 from visioncal.vision.boards.imaging import decode_image
 
@@ -47,12 +47,7 @@ class FolderCamera:
         """
         del timeout_s
         path, image = self._next()
-        if image.shape[::-1] != self.resolution:
-            found, needed = (
-                f"{size[0]}x{size[1]}" for size in (image.shape[::-1], self.resolution)
-            )
-            why = f"holds {path.name} of {found} pixels; needed are {needed}"
-            raise camera_error(self.name, why, "Remove it: all must be of one camera.")
+        check_resolution(f"{self.name}: {path.name}", image, self.resolution, "has")
         self._given.add(path)
         return Frame(image, time.monotonic())
 

@@ -3,35 +3,28 @@
 import os
 import time
 from collections.abc import Generator
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
-from visioncal.core.extras import client_library
+from visioncal.core.extras import Handle, client_library
 from visioncal.core.types import Image
-from visioncal.live.drivers.extras import Handle
+from visioncal.live.drivers import stream
 from visioncal.live.drivers.features import Features, bgr_or_grey
 from visioncal.live.drivers.protocols import DeviceSetup
-from visioncal.live.drivers.stream import (
-    Arrival,
-    Opened,
-    StreamingCamera,
-    being_opened,
-    camera_error,
-    chosen,
-)
 
-# Folders in which makers' installers put their producers (GenTL 1.6, section 6.1.3).
+# Folders in which makers' installers put their producers, by the standard GenTL.
 _VARIABLE = "GENICAM_GENTL64_PATH"
+_NAMES = ("id_", "serial_number", "user_defined_name", "model")
 
 
-class GenicamCamera(StreamingCamera):
+class GenicamCamera(stream.StreamingCamera):
     """Camera device through a GenTL producer.
 
     Its address is `ID`, `PATH.cti` or `PATH.cti:ID`: the producer, by default all of those in
     GENICAM_GENTL64_PATH, and the camera's id, serial number or user's name.
     """
 
-    def _open(self, address: str, requested: DeviceSetup, closing: ExitStack) -> Opened:
+    def _open(self, address: str, requested: DeviceSetup, closing: ExitStack) -> stream.Opened:
         core = client_library("harvesters.core", "genicam")
         apis = (client_library(f"genicam.{api}", "genicam") for api in ("genapi", "gentl"))
         errors = (AttributeError, *(api.GenericException for api in apis))
@@ -44,39 +37,32 @@ class GenicamCamera(StreamingCamera):
         if not producers:
             why = f"there is no file {path}.cti" if suffix else f"{_VARIABLE} names no .cti file"
             step = "Install its maker's software, and give the file: --camera genicam:PATH.cti."
-            raise camera_error("camera genicam", f"has no GenTL producer: {why}", step)
+            raise stream.camera_error("camera genicam", f"has no GenTL producer: {why}", step)
         harvester = core.Harvester()
         closing.callback(harvester.reset)
-        for producer in producers:
-            harvester.add_file(str(producer))
-        harvester.update()
-        infos = harvester.device_info_list
-        found = [(_names(info, errors), index) for index, info in enumerate(infos)]
-        index = chosen(kind, found, wanted, "its maker's viewer")
-        name = f"camera {' '.join(found[index][0])}"
-        with being_opened(name, *errors):
+        with stream.being_opened(kind, *errors):
+            for producer in producers:
+                harvester.add_file(str(producer))
+            harvester.update()
+            # What a producer does not tell of a device is None.
+            infos = [info.property_dict for info in harvester.device_info_list]
+        named = [tuple(str(info[key]) for key in _NAMES if info.get(key)) for info in infos]
+        index = stream.chosen(kind, named, wanted, "its maker's viewer")
+        name = f"camera {' '.join(named[index])}"
+        with stream.being_opened(name, *errors):
             acquirer = harvester.create(index)
-        closing.callback(acquirer.destroy)
-        nodes = acquirer.remote_device.node_map
-        features = Features(name, lambda feature: getattr(nodes, feature), "value", errors)
-        features.configure(requested)
-        acquirer.start()
-        arrivals = _arrivals(acquirer)
-        # Before the rest: it holds a buffer of the camera.
-        closing.callback(arrivals.close)
-        return name, arrivals, features.held(arrivals)
+            closing.callback(acquirer.destroy)
+            nodes = acquirer.remote_device.node_map
+            features = Features(name, lambda feature: getattr(nodes, feature), "value", errors)
+            features.configure(requested)
+            acquirer.start()
+            arrivals = _arrivals(acquirer)
+            # Before the rest: it holds a buffer of the camera.
+            closing.callback(arrivals.close)
+            return name, arrivals, features.held(arrivals)
 
 
-def _names(info: Handle, errors: tuple[type[Exception], ...]) -> tuple[str, ...]:
-    """Id, serial number, user's name and model of a device, as far as it has them."""
-    names = []
-    for name in ("id_", "serial_number", "user_defined_name", "model"):
-        with suppress(*errors):
-            names.append(str(getattr(info, name)))
-    return tuple(filter(None, names))
-
-
-def _arrivals(acquirer: Handle) -> Generator[Arrival | None, None, None]:
+def _arrivals(acquirer: Handle) -> Generator[stream.Arrival | None, None, None]:
     def decode() -> Image:
         part = buffer.payload.components[0]
         channels = int(part.num_components_per_pixel)
@@ -88,4 +74,4 @@ def _arrivals(acquirer: Handle) -> Generator[Arrival | None, None, None]:
     while True:
         buffer = acquirer.try_fetch(timeout=0.1)
         with buffer or nullcontext():
-            yield Arrival(time.monotonic(), decode) if buffer else None
+            yield stream.Arrival(time.monotonic(), decode) if buffer else None

@@ -1,6 +1,7 @@
 """Luxonis' OAK cameras through depthai: held focus and exposure, factory intrinsics, timestamps."""
 
 import math
+import os
 import time
 import weakref
 from collections.abc import Iterator
@@ -12,8 +13,8 @@ from types import MappingProxyType, ModuleType
 import numpy as np
 
 from visioncal.core.errors import DriverError
+from visioncal.core.extras import Handle, client_library
 from visioncal.core.types import Camera
-from visioncal.live.drivers.extras import Handle, depthai
 from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
 
 # The camera that every OAK has: the colour camera, or the only one.
@@ -23,6 +24,22 @@ _RATE_HZ = 10.0
 # Time for automatic exposure and focus before they are held [s].
 _SETTLE_S = 1.5
 _UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"'
+
+
+def depthai() -> ModuleType:
+    """Imports depthai.
+
+    It reads its environment once, on import; by default it sends telemetry.
+
+    Raises:
+        DriverError: It is not installed, with the command that installs it.
+    """
+    os.environ["DEPTHAI_TELEMETRY"] = "0"
+    # Hides warnings about USB in containers.
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")
+    # By default it searches for a device for 10 s; one that is connected is found within one.
+    os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", "3000")
+    return client_library("depthai", "oak")
 
 
 class OakCamera:

@@ -6,69 +6,59 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from visioncal.core.extras import client_library
+from visioncal.core.extras import Handle, client_library
 from visioncal.core.types import Camera, Image
-from visioncal.live.drivers.extras import Handle
+from visioncal.live.drivers import stream
 from visioncal.live.drivers.protocols import DeviceSetup
-from visioncal.live.drivers.stream import (
-    Arrival,
-    Opened,
-    StreamingCamera,
-    being_opened,
-    camera_error,
-    chosen,
-    refuse_settings,
-)
 
 # Of rates that a resolution has, the nearest is taken: a resting arm needs no more [Hz].
 _RATE_HZ = 15
 
 
-class RealsenseCamera(StreamingCamera):
+class RealsenseCamera(stream.StreamingCamera):
     """Camera device of a RealSense's colour stream, by its serial number.
 
     By default the largest resolution is taken. Exposure and gain stay automatic, or as its viewer
     set them: their unit differs between models.
     """
 
-    def _open(self, address: str, requested: DeviceSetup, closing: ExitStack) -> Opened:
+    def _open(self, address: str, requested: DeviceSetup, closing: ExitStack) -> stream.Opened:
         rs = client_library("pyrealsense2", "realsense")
-        infos = (rs.camera_info.serial_number, rs.camera_info.name)
-        devices = rs.context().query_devices()
-        found = [(tuple(device.get_info(info) for info in infos), device) for device in devices]
-        device = chosen("realsense", found, address, "realsense-viewer")
-        name = f"{device.get_info(infos[1])} {device.get_info(infos[0])}"
-        refuse_settings(name, requested, "in realsense-viewer")
-        sensor, profile = _colour(rs, device, name, requested.resolution)
-        queue = rs.frame_queue(2)
-        with being_opened(name, RuntimeError):
+        serial, model = rs.camera_info.serial_number, rs.camera_info.name
+        devices = list(rs.context().query_devices())
+        found = [(device.get_info(serial), device.get_info(model)) for device in devices]
+        index = stream.chosen("realsense", found, address, "realsense-viewer")
+        device, name = devices[index], " ".join(reversed(found[index]))
+        stream.refuse_settings(name, requested, "in realsense-viewer")
+        with stream.being_opened(name, RuntimeError):
+            sensor, profile = _colour(rs, device, name, requested.resolution)
+            queue = rs.frame_queue(2)
             sensor.open(profile)
             closing.callback(sensor.close)
             sensor.start(queue)
             closing.callback(sensor.stop)
-        self.factory, source = factory_intrinsics(rs, profile.get_intrinsics())
-        settings = {"rate_hz": profile.fps(), "factory_intrinsics": source}
-        return name, _arrivals(rs, device, queue), settings
+            self.factory, source = factory_intrinsics(rs, profile.get_intrinsics())
+            settings = {"rate_hz": profile.fps(), "factory_intrinsics": source}
+            return name, _arrivals(rs, device, queue), settings
 
 
 def _colour(
     rs: Handle, device: Handle, name: str, resolution: tuple[int, int] | None
 ) -> tuple[Handle, Handle]:
     """The sensor with a colour stream, and its profile of a resolution, by default the largest."""
-    streams = [
-        (sensor, profile.as_video_stream_profile())
-        for sensor in device.query_sensors()
-        for profile in sensor.get_stream_profiles()
-        if (profile.stream_type(), profile.format()) == (rs.stream.color, rs.format.bgr8)
-    ]
-    sizes = sorted({(profile.width(), profile.height()) for _, profile in streams})
-    size = resolution or max(sizes, default=None)
-    fitting = [s for s in streams if (s[1].width(), s[1].height()) == size]
-    if not fitting:
-        why = f"gives no colour pictures of {size} pixels; it has {sizes}"
+    profiles: dict[tuple[int, int], list[tuple[float, Handle, Handle]]] = {}
+    for sensor in device.query_sensors():
+        for profile in sensor.get_stream_profiles():
+            if (profile.stream_type(), profile.format()) == (rs.stream.color, rs.format.bgr8):
+                video = profile.as_video_stream_profile()
+                ranked = abs(video.fps() - _RATE_HZ), sensor, video
+                profiles.setdefault((video.width(), video.height()), []).append(ranked)
+    size = resolution or max(profiles, default=(0, 0))
+    if size not in profiles:
+        why = f"gives no colour pictures of {size} pixels; it has {sorted(profiles)}"
         step = "Ask for a resolution that it has; on USB 2 it has fewer."
-        raise camera_error(name, why, step, "--resolution")
-    return min(fitting, key=lambda stream: abs(stream[1].fps() - _RATE_HZ))
+        raise stream.camera_error(name, why, step, "--resolution")
+    return min(profiles[size], key=lambda ranked: ranked[0])[1:]
 
 
 def factory_intrinsics(rs: Handle, intrinsics: Handle) -> tuple[Camera | None, str]:
@@ -86,7 +76,7 @@ def factory_intrinsics(rs: Handle, intrinsics: Handle) -> tuple[Camera | None, s
     return Camera("brown", size, matrix, distortion), "read from the device"
 
 
-def _arrivals(rs: Handle, device: Handle, queue: Handle) -> Iterator[Arrival | None]:
+def _arrivals(rs: Handle, device: Handle, queue: Handle) -> Iterator[stream.Arrival | None]:
     metadata = rs.frame_metadata_value
     moments = (metadata.sensor_timestamp, metadata.frame_timestamp)
 
@@ -103,4 +93,4 @@ def _arrivals(rs: Handle, device: Handle, queue: Handle) -> Iterator[Arrival | N
             middle_s, readout_s = (1e-6 * frame.get_frame_metadata(moment) for moment in moments)
             half_s, since_s = readout_s - middle_s, time.time() - 1e-3 * frame.get_timestamp()
             exposed_s = now_s - since_s - 2.0 * half_s, now_s - since_s - half_s
-        yield Arrival(now_s, decode, exposed_s) if came else None
+        yield stream.Arrival(now_s, decode, exposed_s) if came else None

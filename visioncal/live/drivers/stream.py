@@ -12,19 +12,15 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
-from visioncal.core.errors import DriverError, VisioncalError
+from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, Image
 from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
-
-_Device = TypeVar("_Device")
 
 # The longest wait, in intervals between this camera's pictures: one under way at the request, the
 # requested one, and one more for network jitter; and the pictures of which the mean counts.
 _INTERVALS, _PACED = 3.0, 50
-
-
 _RESUME = "Look at its cable, its power and its network; then go on with --resume."
 
 
@@ -81,7 +77,7 @@ class StreamingCamera:
         self._thread.start()
         try:
             first = self._wait(5.0)
-            self._check_resolution(first, requested.resolution, "gives")
+            check_resolution(self.name, first.image, requested.resolution, "gives")
         except BaseException:
             self.close()
             raise
@@ -105,7 +101,7 @@ class StreamingCamera:
         with self._news:
             self._request_s, self._too_old, self._answer = time.monotonic(), 0, None
         frame = self._wait(timeout_s)
-        self._check_resolution(frame, self.resolution, "now gives")
+        check_resolution(self.name, frame.image, self.resolution, "now gives")
         return frame
 
     def close(self) -> None:
@@ -129,7 +125,7 @@ class StreamingCamera:
 
     def _read(self, arrivals: Iterator[Arrival | None], closing: ExitStack) -> None:
         ended = "gives no picture: it is unplugged, or closed its stream"
-        error: VisioncalError = camera_error(self.name, ended, _RESUME)
+        error = camera_error(self.name, ended, _RESUME)
         with closing:
             try:
                 for arrival in arrivals:
@@ -137,8 +133,6 @@ class StreamingCamera:
                         break
                     if arrival is not None:
                         self._handle(arrival)
-            except VisioncalError as caught:
-                error = caught
             except Exception as caught:  # noqa: BLE001
                 error = camera_error(self.name, f"{ended} ({caught})", _RESUME)
                 error.__cause__ = caught
@@ -179,27 +173,27 @@ class StreamingCamera:
         recent = list(self._arrivals_s)
         return (recent[-1] - recent[0]) / (len(recent) - 1) if len(recent) > 1 else 0.0
 
-    def _check_resolution(self, frame: Frame, needed: tuple[int, int] | None, how: str) -> None:
-        height, width = frame.image.shape[:2]
-        if needed is not None and needed != (width, height):
-            why = f"{how} {width}x{height} pixels, not {needed[0]}x{needed[1]}"
-            step = "Ask for a resolution that it has: its maker's viewer or page lists them (of a "
-            raise camera_error(
-                self.name, why, f"{step}webcam on Linux: v4l2-ctl --list-formats-ext)."
-            )
-
     def _timeout_error(self, waited_s: float) -> DriverError:
-        if self._too_old > _INTERVALS:
-            why = f"gives no fresh pictures: {self._too_old} that came were older than the request"
-            step = "It sends more than can be carried or decoded: set it to a lower rate or "
-            return camera_error(self.name, f"{why}, or cut short", f"{step}resolution.")
-        why = f"stalls: no picture has come for {waited_s:.1f} s"
-        return camera_error(self.name, why, _RESUME)
+        if self._too_old <= _INTERVALS:
+            why = f"stalls: no picture has come for {waited_s:.1f} s"
+            return camera_error(self.name, why, _RESUME)
+        why = f"gives no fresh pictures: {self._too_old} that came were older than the request, or "
+        step = "It sends more than can be carried or decoded: set a lower rate or resolution."
+        return camera_error(self.name, f"{why}cut short", step)
 
 
 def camera_error(name: str, why: str, step: str, *culprits: str) -> DriverError:
     """The error of a camera; by default it is itself the culprit."""
     return DriverError(f"The {name} {why}.", culprits=culprits or [name], next_step=step)
+
+
+def check_resolution(name: str, image: Image, needed: tuple[int, int] | None, how: str) -> None:
+    """Checks the (width, height) that a picture of a camera must have [px]; raises DriverError."""
+    height, width = image.shape[:2]
+    if needed is not None and needed != (width, height):
+        why = f"{how} {width}x{height} pixels, not {needed[0]}x{needed[1]}"
+        step = "Ask for a resolution that its maker's viewer or page shows (on Linux: v4l2-ctl)."
+        raise camera_error(name, why, step)
 
 
 @contextmanager
@@ -213,22 +207,20 @@ def being_opened(name: str, *errors: type[Exception]) -> Iterator[None]:
         raise camera_error(name, f"cannot be opened: {error}", step) from error
 
 
-def chosen(
-    kind: str, found: Sequence[tuple[tuple[str, ...], _Device]], wanted: str, viewer: str
-) -> _Device:
-    """The one camera that is meant, of those that are connected, each with its names.
+def chosen(kind: str, found: Sequence[tuple[str, ...]], wanted: str, viewer: str) -> int:
+    """Index of the one camera that is meant among those that are connected, by their names.
 
     Raises:
         DriverError: There is none, or several and none of them is named.
     """
-    matching = [device for names, device in found if not wanted or wanted in names]
+    matching = [index for index, names in enumerate(found) if not wanted or wanted in names]
     if len(matching) == 1:
         return matching[0]
     step = f"Look at whether {viewer} shows it: its cable, its power, its network."
     why = "is not connected"
     if matching:
-        why, step = "may be any of several", f"Say which: --camera {kind}:{found[0][0][0]}."
-    there = ", ".join(" ".join(names) for names, _ in found) or "none"
+        why, step = "may be any of several", f"Say which: --camera {kind}:{found[matching[0]][0]}."
+    there = ", ".join(" ".join(names) for names in found) or "none"
     name = f"{kind}:{wanted}".rstrip(":")
     raise camera_error(f"camera {name}", f"{why}; connected: {there}", step)
 

@@ -9,21 +9,15 @@ import cv2
 import numpy as np
 
 from visioncal.core.types import Image
+from visioncal.live.drivers import stream
 from visioncal.live.drivers.protocols import DeviceSetup
-from visioncal.live.drivers.stream import (
-    Arrival,
-    Opened,
-    StreamingCamera,
-    camera_error,
-    refuse_settings,
-)
 from visioncal.vision.boards.imaging import decode_image
 
 # OpenCV's format of packets as they come, and the code of JPEG files.
 _UNDECODED, _JPEG = -1, cv2.VideoWriter.fourcc(*"MJPG")
 
 
-class UvcCamera(StreamingCamera):
+class UvcCamera(stream.StreamingCamera):
     """Camera device through OpenCV's VideoCapture.
 
     Requested settings are set where the camera supports them; `settings` are what it then reports.
@@ -32,7 +26,7 @@ class UvcCamera(StreamingCamera):
     its device, or a URL.
     """
 
-    def _open(self, address: str, requested: DeviceSetup, closing: ExitStack) -> Opened:
+    def _open(self, address: str, requested: DeviceSetup, closing: ExitStack) -> stream.Opened:
         source = int(address or 0) if (address or "0").isdecimal() else address
         name = f"camera {without_password(str(source))}"
         capture = _open_capture(source, name, requested)
@@ -41,7 +35,7 @@ class UvcCamera(StreamingCamera):
         return name, _arrivals(capture, 1e-6 * (requested.exposure_us or 0)), settings
 
 
-def _arrivals(capture: cv2.VideoCapture, exposure_s: float) -> Iterator[Arrival]:
+def _arrivals(capture: cv2.VideoCapture, exposure_s: float) -> Iterator[stream.Arrival]:
     # JPEG files of a network camera are decoded only when they are asked for: at a high resolution
     # they come faster than they could be decoded.
     is_jpeg = capture.get(cv2.CAP_PROP_FORMAT) == _UNDECODED
@@ -63,9 +57,9 @@ def _arrivals(capture: cv2.VideoCapture, exposure_s: float) -> Iterator[Arrival]
         # host's clock.
         if now_s - 10.0 < reported_s <= now_s:
             exposed_s = reported_s - exposure_s, reported_s - 0.5 * exposure_s
-            yield Arrival(now_s, decode, exposed_s)
+            yield stream.Arrival(now_s, decode, exposed_s)
         else:
-            yield Arrival(now_s, decode)
+            yield stream.Arrival(now_s, decode)
 
 
 def without_password(url: str) -> str:
@@ -79,7 +73,7 @@ def _open_capture(source: int | str, name: str, requested: DeviceSetup) -> cv2.V
     scheme, separator, _ = str(source).partition("://")
     is_url = bool(separator) and "!" not in scheme
     if is_url:
-        refuse_settings(name, requested, "on the camera's own page")
+        stream.refuse_settings(name, requested, "on the camera's own page")
         # The default timeout is half a minute, and decoding in n threads delays by n pictures.
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000]
         limits += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1500, cv2.CAP_PROP_N_THREADS, 1]
@@ -108,7 +102,7 @@ def _open_capture(source: int | str, name: str, requested: DeviceSetup) -> cv2.V
         step = "Extract them into a folder, and record with --camera folder:PATH."
     if why:
         capture.release()
-        raise camera_error(name, why, step)
+        raise stream.camera_error(name, why, step)
     return capture
 
 
