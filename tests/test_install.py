@@ -37,5 +37,6 @@ def test_a_wheel_carries_its_data_and_finds_it(tmp_path):
         "present/report/report.css",
         "robot/models/ur10e.toml",
         "py.typed",
+        *(f"live/clients/visioncal.{end}" for end in ("src", "dat", "xml", "mod", "kl", "script")),
     ):
         assert f"visioncal/{data}" in names

@@ -2,25 +2,33 @@
 
 import contextlib
 import random
+import re
 import select
 import socket
 import struct
 import threading
 import time
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from support.commands import visioncal
+from support.live_cell import fake_devices, fake_plan
 from support.refusals import raised
 
+import visioncal.cli.record as record_module
 from visioncal.core.errors import DataError, DriverError
+from visioncal.core.transforms import pose_difference
+from visioncal.live.capture import devices
 from visioncal.live.capture.devices import open_arm
 from visioncal.live.capture.recording import ask_and_take, take_requested
 from visioncal.live.capture.take import Missed
 from visioncal.live.drivers import pose_socket
-from visioncal.live.drivers.pose_socket import SocketArm
+from visioncal.live.drivers.pose_socket import CLIENTS, SocketArm
 from visioncal.live.drivers.protocols import RequestingArm
-from visioncal.session import View
+from visioncal.session import Session, View
 from visioncal.session.columns import pose_row
 
 COUNT = 4
@@ -355,3 +363,118 @@ def test_a_client_that_reads_nothing_is_let_go_rather_than_waited_for(arm):
         arm.request(0.0)
     link.close()
     assert served.fileno() == -1
+
+
+# Numbers that a client's own expressions mean, by their names without prefixes.
+def _named(stop, pose):
+    x, y, z = 1e3 * pose[:3, 3]
+    turned = Rotation.from_matrix(pose[:3, :3])
+    a, b, c = turned.as_euler("ZYX", degrees=True)
+    w, p, r = turned.as_euler("xyz", degrees=True)
+    q2, q3, q4, q1 = turned.as_quat(canonical=True)
+    kuka = {"number": stop, "x": x, "y": y, "z": z, "a": a, "b": b, "c": c}
+    return kuka | {"w": w, "p": p, "r": r, "q1": q1, "q2": q2, "q3": q3, "q4": q4}
+
+
+def said_by_krl(text, values):
+    """The line that SWRITE builds, by its formats."""
+    swrites = re.findall(r'SWRITE\(\w+\[\], \w+, \w+, "([^"]*\|?[^"]*%[^"]*)", ([^)]*)\)', text)
+    line = "".join(
+        form % tuple(values[name.lower().rpartition(".")[2].strip()] for name in names.split(","))
+        for form, names in swrites
+    )
+    root = ElementTree.parse(CLIENTS / "visioncal.xml").getroot()
+    (element,) = root.iter("ELEMENT")
+    # What the program reads by, and the end of a line.
+    assert f'"{element.get("Tag")}"' in text
+    assert f"$FLAG[{element.get('Set_Flag')}]" in text
+    assert f"$FLAG[{root.find('CONFIGURATION/INTERNAL/ALIVE').get('Set_Flag')}]" in text
+    end = int(re.search(r"LINE\[LENGTH \+ 1\] = (\d+)", text)[1])
+    assert element.get("EOS") == str(end)
+    return [line + chr(end)]
+
+
+def said_by_rapid(text, values):
+    """Strings that SocketSend sends, none of which may be longer than RAPID's."""
+
+    def piece(word):
+        number = re.fullmatch(r"NumToStr\(([\w.]+),(\d)\)", word)
+        if number is None:
+            return word.strip('"').replace("\\0A", "\n")
+        return f"{values[number[1].rpartition('.')[2]]:.{number[2]}f}"
+
+    sent = re.findall(r"SocketSend \w+ \\Str:=(NumToStr.*);", text)
+    return ["".join(map(piece, words.split(" + "))) for words in sent]
+
+
+def said_by_karel(text, values):
+    """What WRITE sends, each number in its field."""
+
+    def piece(word):
+        if word.startswith("'"):
+            return word.strip("'")
+        if word == "CHR(10)":
+            return "\n"
+        name, width, *digits = word.split("::")
+        value = values[name.rpartition(".")[2]]
+        return f"{value:{width}.{digits[0]}f}" if digits else f"{value:{width}d}"
+
+    sent = re.findall(r"WRITE vc_link\((.*(?:number|here).*)\)", text)
+    return ["".join(map(piece, words.split(", "))) for words in sent]
+
+
+DIALECTS = {
+    "visioncal.src": (said_by_krl, 200),
+    "visioncal.mod": (said_by_rapid, 80),
+    "visioncal.kl": (said_by_karel, 254),
+}
+
+
+@pytest.mark.parametrize("program", DIALECTS)
+def test_a_robot_program_of_each_maker_records_a_good_session(program, tmp_path, monkeypatch):
+    say, longest = DIALECTS[program]
+    text = (CLIENTS / program).read_text(encoding="ascii")
+    plan = fake_plan(12)
+    body, camera = fake_devices(plan)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
+    monkeypatch.setattr(record_module, "HostClock", lambda: body.clock)
+    answers = []
+
+    def drive():
+        link = None
+        while link is None:
+            with contextlib.suppress(ConnectionRefusedError):
+                link = socket.create_connection(("127.0.0.1", port))
+        with link:
+            for stop in plan.stops:
+                # It drives itself, and stands before it says so.
+                body.q0, body.motion = stop.q, None
+                pose = body.true_flange(body.clock.now())
+                pieces = say(text, _named(stop.view, pose))
+                assert max(map(len, pieces)) <= longest
+                for piece in pieces:
+                    link.sendall(piece.encode("ascii"))
+                answers.append(link.recv(200).decode("ascii"))
+
+    robot = threading.Thread(target=drive, daemon=True)
+    robot.start()
+    session = tmp_path / "live"
+    words = ("--arm", f"socket:{port}", "--camera", "fake", "--target", "charuco_9x6_30mm")
+    quick = ("--frames", 1, "--settle-s", 0.03, "--views", 12)
+    done = visioncal("record", "-o", session, *words, *quick).good()
+    robot.join(5.0)
+    assert answers == ["next\n"] * 11 + ["done\n"]
+    assert str(CLIENTS) in done.err
+    for view, stop in zip(Session.load(session).views, plan.stops, strict=True):
+        shift, turn = pose_difference(
+            np.asarray(view.base_from_flange().as_matrix()),
+            plan.cell.robot.base_from_flange(stop.q[None])[0],
+        )
+        # Micrometres and ten-thousandths of a degree are what the programs send.
+        assert shift < 1e-3
+        assert turn < 2e-4
+    found = visioncal("calibrate", session, "-o", tmp_path / "out")
+    assert found.status == 0, found.said
+    assert "good" in found.said.splitlines()[0]
