@@ -80,6 +80,8 @@ def test_a_folder_that_still_grows_gives_each_picture_to_its_pose(seen, tmp_path
     record([*lines, lines[0]], camera, tmp_path / "more").refused(
         "has no further picture (3 were given)", "3 views are safe", "into a new session"
     )
+    # All of them were there.
+    assert np.array_equal(recorded(tmp_path / "more"), pictures)
     (inbox / "shot9.png").write_bytes(files[1][:20_000])
     record(lines, camera, tmp_path / "cut").refused("shot9.png: unreadable")
     small = open_camera(camera, DeviceSetup((320, 200)))
@@ -173,7 +175,11 @@ def test_a_basler_that_is_not_there_refuses_or_leaves_is_told(pylon):
         assert pylon.device.ExposureAuto.Value == "Off"
         assert camera.settings["pixel_format"] == "Mono8"
         assert camera.settings["gain"] == pytest.approx(3.0, abs=1e-3)
+        # As where packets are lost: the next whole one is taken.
+        pylon.device.ForceFailedBufferCount.Value = 50
+        pylon.device.ForceFailedBuffer.Execute()
         frame = camera.frame(timeout_s=PATIENT_S)
+        assert camera._too_old > 40
         assert frame.exposure_s == pytest.approx(1e-6 * camera.settings["exposure_us"])
         pylon.is_removed = True
         camera._thread.join(PATIENT_S)

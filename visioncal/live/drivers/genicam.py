@@ -1,5 +1,6 @@
 """Cameras of any maker that brings a GenTL producer, by harvesters."""
 
+import logging
 import os
 import time
 from collections.abc import Generator
@@ -38,7 +39,10 @@ class GenicamCamera(stream.StreamingCamera):
             why = f"there is no file {path}.cti" if suffix else f"{_VARIABLE} names no .cti file"
             step = "Install its maker's software, and give the file: --camera genicam:PATH.cti."
             raise stream.camera_error("camera genicam", f"has no GenTL producer: {why}", step)
-        harvester = core.Harvester()
+        # What fails is raised, too, and worded for who reads it.
+        logger = logging.getLogger("harvesters")
+        logger.addHandler(logging.NullHandler())
+        harvester = core.Harvester(logger=logger)
         closing.callback(harvester.reset)
         with stream.being_opened(kind, *errors):
             for producer in producers:
