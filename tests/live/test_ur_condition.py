@@ -3,8 +3,10 @@
 import socket
 import sys
 import threading
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from support.refusals import raised
 
@@ -104,6 +106,22 @@ def test_closed_ports_and_unknown_names_are_told_apart():
     raised(DriverError, r"port 29999 \(the dashboard\) is closed", read_condition, free_host())
     with pytest.raises(DriverError, match=r"no-such-robot\.invalid cannot be reached"):
         read_condition("no-such-robot.invalid")
+
+
+def test_polyscope_x_is_watched_without_a_dashboard_and_not_driven():
+    with spawn(replace(OPTIONS, polyscope=(10, 7, 0, 1000))) as running:
+        raised(DriverError, "PolyScope X 10.7.0.*not driven.*--arm socket", UrArm, running.host)
+        with closing(UrArm(running.host, watch_only=True)) as arm:
+            state = arm.state()
+            assert "PolyScope X 10.7.0" in arm.name
+        truth = running.state([state.stamp_s])
+        # The controller's model of the arm is off by what its errors are, about a millimetre.
+        assert np.abs(state.q - truth.q[0]).max() < 5e-3
+        assert state.flange_from_tool[2, 3] == pytest.approx(OPTIONS.tcp[2])
+        assert state.payload_kg is not None
+        running.inject("power-off")
+        with pytest.raises(DriverError, match="does not know where its joints are"):
+            UrArm(running.host, watch_only=True)
 
 
 def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monkeypatch):

@@ -49,8 +49,8 @@ _SILENCE_S = 0.8
 # The client library's limits [rad/s, rad/s^2].
 _SPEED_LIMIT, _ACCELERATION_LIMIT = 3.14, 40.0
 
-# State rates of CB3 and e-Series, by PolyScope's major version.
-_RATES_HZ = {3: 125.0, 5: 500.0}
+# State rates of CB3 and all later ones, by PolyScope's major version.
+_RATES_HZ, _LATER_HZ = {3: 125.0}, 500.0
 # Only names in the client's own table of variables: an unknown one would silently shift all that
 # follow.
 _VARIABLES = (
@@ -68,6 +68,8 @@ _VARIABLES = (
 # Variables of newer controllers, and the first version, by major version.
 _PAYLOAD = ("payload", "payload_cog")
 _REPORTS_PAYLOAD = {3: (3, 11, 0), 5: (5, 5, 1)}
+# RTDE's `robot_mode` in which joints report their positions: idle, backdrive, running.
+_REPORTING = (5, 6, 7)
 T = TypeVar("T")
 # Python exceptions for the C++ ones that the library throws.
 _THROWN = (RuntimeError, ValueError)
@@ -143,7 +145,7 @@ class StateStream:
         self, library: ModuleType, host: str, version: tuple[int, int, int], rate_hz: float
     ) -> None:
         self._host = host
-        self.reports_payload = version >= _REPORTS_PAYLOAD[version[0]]
+        self.reports_payload = version >= _REPORTS_PAYLOAD.get(version[0], ())
         names = [*_VARIABLES, *(_PAYLOAD if self.reports_payload else ())]
         try:
             self.client: Any = library.RTDEReceiveInterface(host, rate_hz, names)
@@ -242,13 +244,20 @@ class UrArm:
         self._host = host
         condition = check_controller(self._host, moves=not watch_only)
         self._name, self._model = f"{condition.model} at {host}", condition.model.lower()
-        self.rate_hz = _RATES_HZ[condition.version[0]] if full_rate else _RATE_HZ
+        self.rate_hz = _RATES_HZ.get(condition.version[0], _LATER_HZ) if full_rate else _RATE_HZ
         self._states = StateStream(receive, self._host, condition.version, self.rate_hz)
         self._control: Any = None
         self._line: CallThread | None = None
         self._moves_before: int | None = None
         self._motion_timer = Stopwatch()
         self._closed = False
+        if condition.is_polyscope_x and self._states.client.getRobotMode() not in _REPORTING:
+            self.close()
+            raise DriverError(
+                f"The {self._name} does not know where its joints are: it is not switched on.",
+                culprits=[host],
+                next_step="Switch it on at the pendant, and release its brakes.",
+            )
         if control is None:
             self._flange_from_tool = _matrix(read_tool_offset(self._host))
             return

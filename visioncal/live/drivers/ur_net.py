@@ -24,8 +24,10 @@ _ANSWER_S = 1.0
 _WAIT_S = 1.0
 _BANNER = "Universal Robots Dashboard Server"
 _HEADER = struct.Struct(">HB")
-# Types of RTDE's frames: request of a version, output recipe, start, state.
-_PROTOCOL, _OUTPUTS, _START, _DATA = b"VOSU"
+# Types of RTDE's frames: request of its version, of the controller's, output recipe, start, state.
+_PROTOCOL, _VERSION_OF, _OUTPUTS, _START, _DATA = b"VvOSU"
+# First major version of PolyScope X: RTDE and the primary interface, but no dashboard.
+_POLYSCOPE_X = 10
 # Primary interface: the read-only port is open where the other may not be.
 PRIMARY_PORTS = (30011, 30001)
 _PRIMARY_HEADER = struct.Struct(">IB")
@@ -223,7 +225,7 @@ def read_tool_offset(host: str) -> list[float]:
 
 @dataclass(frozen=True)
 class Condition:
-    """The dashboard's answers."""
+    """The dashboard's answers; of PolyScope X, which has none, only the version is known."""
 
     host: str
     version: tuple[int, int, int]  # PolyScope's version: major, minor, bug fix.
@@ -232,8 +234,19 @@ class Condition:
     safety: str  # The state of the safety system, such as `NORMAL`.
     remote: bool  # Whether it is in remote control; True where it does not report it.
 
+    @property
+    def is_polyscope_x(self) -> bool:
+        """Whether it runs PolyScope X."""
+        return self.version[0] >= _POLYSCOPE_X
+
     def check_moves(self) -> None:
         """Checks that it can be moved from outside; raises DriverError."""
+        if self.is_polyscope_x:
+            raise self._refuse(
+                "is not driven: nothing is driven on PolyScope X until its interface is known",
+                "Guide it by hand with --follow, or let its own program drive with --arm socket "
+                "(see live/clients/visioncal.script), or type its poses with --arm manual.",
+            )
         if self.safety not in ("NORMAL", "REDUCED"):
             raise self._refuse(
                 f"is stopped by its safety system: {self.safety}",
@@ -251,7 +264,7 @@ class Condition:
 
     def check_reports(self) -> None:
         """Checks that it reports its joint positions; raises DriverError."""
-        if self.mode not in _REPORTING_MODES:
+        if not self.is_polyscope_x and self.mode not in _REPORTING_MODES:
             raise self._refuse(f"does not know where its joints are: its mode is {self.mode}")
 
     def _refuse(self, why: str, step: str = "") -> DriverError:
@@ -264,8 +277,16 @@ class Condition:
 
 
 def read_condition(host: str) -> Condition:
-    """Reads the condition from the dashboard; raises DriverError."""
-    with Dashboard(host) as dashboard:
+    """Reads the condition from the dashboard, or that there is none; raises DriverError."""
+    try:
+        opened = Dashboard(host)
+    except DriverError:
+        version = _version_by_rtde(host)
+        if version is None or version[0] < _POLYSCOPE_X:
+            raise
+        words = ".".join(map(str, version))
+        return Condition(host, version, f"UR with PolyScope X {words}", "", "", remote=False)
+    with opened as dashboard:
         version = _read_version(host, dashboard.ask("PolyscopeVersion"))
         model = dashboard.ask("get robot model")
         mode = dashboard.ask("robotmode").rpartition(":")[2].strip()
@@ -275,6 +296,25 @@ def read_condition(host: str) -> Condition:
         remote = version < (5, 6) or "true" in dashboard.ask("is in remote control").lower()
     series = "e" if version[0] == 5 and model in _MODELS_OF_TWO_SERIES else ""
     return Condition(host, version, f"{model}{series}", mode, safety, remote)
+
+
+def _version_by_rtde(host: str) -> tuple[int, int, int] | None:
+    """Version of the controller by RTDE; None where it does not say it.
+
+    Source: Universal Robots, Real-Time Data Exchange (RTDE) Guide, "Get URControl version".
+    """
+    with (
+        suppress(DriverError, OSError, struct.error),
+        connect(host, RTDE_PORT, "RTDE") as link,
+        link.makefile("rb") as file,
+    ):
+        link.sendall(_frame(_PROTOCOL, struct.pack(">H", 2)) + _frame(_VERSION_OF))
+        _read(file)
+        kind, payload = _read(file)
+        if kind == _VERSION_OF:
+            major, minor, patch, _ = struct.unpack(">4I", payload)
+            return major, minor, patch
+    return None
 
 
 def safety_of(bits: int) -> Safety:

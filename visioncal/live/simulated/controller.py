@@ -65,7 +65,6 @@ _HEADER = struct.Struct(">HB")
 # Types of frames.
 _PROTOCOL, _VERSION, _DATA, _OUTPUTS, _INPUTS, _START, _PAUSE = b"VvUOISP"
 _YES = b"\x01"
-_POLYSCOPE = (5, 11, 6, 1010000)
 _SAFETY = {
     "normal": ("NORMAL", 1 << 0),
     "protective-stop": ("PROTECTIVE_STOP", 1 << 2),
@@ -99,6 +98,8 @@ class ControllerOptions:
     # Sigma of a joint's error relative to its encoder, drawn anew for each motion [rad].
     repeatability_rad: float = 1e-5
     rate_hz: float = 125.0  # States per second.
+    # Its software; PolyScope X, from 10 on, has no dashboard.
+    polyscope: tuple[int, int, int, int] = (5, 11, 6, 1010000)
 
     @property
     def believed_arm(self) -> DhArm:
@@ -334,7 +335,7 @@ class _Server:
 
     def __init__(self, options: ControllerOptions, host: str) -> None:
         self.machine = _Machine(options)
-        self._host, self._rate_hz = host, options.rate_hz
+        self._host, self._rate_hz, self._polyscope = host, options.rate_hz, options.polyscope
         self._clients: list[_Client] = []
         # While it is clear, the controller keeps its connections open but stays silent.
         self._awake = threading.Event()
@@ -351,6 +352,8 @@ class _Server:
         with ExitStack() as servers:
             ports = RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORTS[0]
             for port, handler in zip(ports, handlers, strict=True):
+                if port == DASHBOARD_PORT and self._polyscope[0] >= 10:
+                    continue
                 server = await asyncio.start_server(_tolerant(handler), self._host, port)
                 servers.callback(server.close)
             ready()
@@ -392,7 +395,7 @@ class _Server:
     def _answer_rtde(self, client: _Client, kind: int, payload: bytes) -> bytes:
         """Content of the answer to a frame."""
         if kind == _VERSION:
-            return struct.pack(">4I", *_POLYSCOPE)
+            return struct.pack(">4I", *self._polyscope)
         if kind in (_START, _PAUSE):
             client.due_s = 0.0 if kind == _START else np.inf
         if kind not in (_OUTPUTS, _INPUTS):
@@ -440,7 +443,7 @@ class _Server:
         while line := await reader.readline():
             machine, question = self.machine, line.decode("utf-8", "replace").strip().lower()
             answers = {
-                "polyscopeversion": "URSoftware " + ".".join(map(str, _POLYSCOPE)),
+                "polyscopeversion": "URSoftware " + ".".join(map(str, self._polyscope)),
                 "get serial number": "20235500001",
                 # The model's name without its series, as from a real controller.
                 "get robot model": machine.options.robot.removesuffix("e").upper(),
