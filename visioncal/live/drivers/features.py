@@ -69,28 +69,26 @@ class Features:
         if sent not in _FORMATS and all(self._why_not(name, "PixelFormat") for name in _FORMATS):
             why = f"sends {sent}; one of {', '.join(_FORMATS)} is needed"
             raise camera_error(self.name, why, "Set its PixelFormat in its maker's viewer.")
-        free: dict[str, str | float] = {"AcquisitionMode": "Continuous"}
-        free |= {"TriggerSelector": "FrameStart", "TriggerMode": "Off"}
-        if requested.resolution is not None:
-            free |= {"OffsetX": 0, "OffsetY": 0}
-        if requested.exposure_us is not None:
-            free["ExposureAuto"] = "Off"
-        if requested.gain is not None:
-            free["GainAuto"] = "Off"
-        for name, value in free.items():
+        for name, value in (
+            ("AcquisitionMode", "Continuous"),
+            ("TriggerSelector", "FrameStart"),
+            ("TriggerMode", "Off"),
+        ):
             self._why_not(value, name)
         width, height = requested.resolution or (None, None)
-        for option, number, names in (
-            ("--resolution", width, ("Width",)),
-            ("--resolution", height, ("Height",)),
-            ("--exposure-us", requested.exposure_us, _EXPOSURE),
-            ("--gain", requested.gain, _GAIN),
-            ("--focus", requested.focus, ("FocusPosition",)),
+        # What keeps a feature from being set, and its value that does not.
+        for option, number, names, (guard, free) in (
+            ("--resolution", width, ("Width",), ("OffsetX", 0)),
+            ("--resolution", height, ("Height",), ("OffsetY", 0)),
+            ("--exposure-us", requested.exposure_us, _EXPOSURE, ("ExposureAuto", "Off")),
+            ("--gain", requested.gain, _GAIN, ("GainAuto", "Off")),
+            ("--focus", requested.focus, ("FocusPosition",), ("FocusAuto", "Off")),
         ):
-            why = "" if number is None else self._why_not(number, *names).rstrip(".")
-            if why:
-                step = f"Give one that it takes, or leave {option} out."
-                raise camera_error(self.name, f"does not take {option} {number}: {why}", step)
+            if number is not None:
+                self._why_not(free, guard)
+                if why := self._why_not(number, *names).rstrip("."):
+                    step = f"Give one that it takes, or leave {option} out."
+                    raise camera_error(self.name, f"does not take {option} {number}: {why}", step)
 
     def held(self, arrivals: Iterator[Arrival | None]) -> dict[str, str | float]:
         """Lets automatic functions that are on settle, and holds what they found: the settings."""
