@@ -19,7 +19,7 @@ from visioncal.interchange.formats import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.columns import foreign_from
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.live.drivers.manual import ManualArm
-from visioncal.live.drivers.protocols import Arm
+from visioncal.live.drivers.protocols import Arm, RequestingArm
 from visioncal.results import Edge
 
 SAMPLE = made_up(5).calibration
@@ -240,6 +240,17 @@ def test_a_pose_is_shown_back_and_taken_when_the_person_agrees():
     assert "KUKA" in questions[1]
     assert "x 400.00, y -100.00, z 300.00 mm" in questions[1]
     raised(DriverError, "at their end", arm.state)
+
+
+def test_a_person_is_asked_for_each_view_until_it_is_enough():
+    ask, questions = asked(["", "p[0.4,0,0,0,0,0]", "", " Q"])
+    arm: RequestingArm = ManualArm(ask)
+    assert isinstance(arm, RequestingArm)
+    assert arm.request(0.0, "View 3 (tilt the camera)").base_from_flange[0, 3] == 0.4
+    assert questions[0] == "View 3 (tilt the camera): Enter takes it, q ends: "
+    for _ in ("q", "the end of the input"):
+        with pytest.raises(EOFError):
+            arm.request(0.0, "View 4")
 
 
 def test_lines_of_a_file_are_a_pose_each_and_none_is_passed_over():

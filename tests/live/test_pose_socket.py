@@ -423,6 +423,33 @@ def said_by_karel(text, values):
     return ["".join(map(piece, words.split(", "))) for words in sent]
 
 
+def _recorded(session, *options, body, stops, pieces):
+    """A recording, and the answers that a program got at each of its stops."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port, answers = free.getsockname()[1], []
+
+    def drive():
+        link = None
+        while link is None:
+            with contextlib.suppress(ConnectionRefusedError):
+                link = socket.create_connection(("127.0.0.1", port))
+        with link:
+            for stop in stops:
+                # It drives itself, and stands before it says so.
+                body.q0, body.motion = stop.q, None
+                for piece in pieces(stop.view, body.true_flange(body.clock.now())):
+                    link.sendall(piece.encode("ascii"))
+                answers.append(link.recv(200).decode("ascii"))
+
+    robot = threading.Thread(target=drive, daemon=True)
+    robot.start()
+    named = ("--arm", f"socket:{port}", "--camera", "fake", "--target", "charuco_9x6_30mm")
+    quick = ("--frames", 1, "--settle-s", 0.03)
+    done = visioncal("record", "-o", session, *named, *quick, *options).good()
+    robot.join(5.0)
+    return done, answers
+
+
 DIALECTS = {
     "visioncal.src": (said_by_krl, 200),
     "visioncal.mod": (said_by_rapid, 80),
@@ -436,35 +463,16 @@ def test_a_robot_program_of_each_maker_records_a_good_session(program, tmp_path,
     text = (CLIENTS / program).read_text(encoding="ascii")
     plan = fake_plan(12)
     body, camera = fake_devices(plan)
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
     monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
     monkeypatch.setattr(record_module, "HostClock", lambda: body.clock)
-    answers = []
 
-    def drive():
-        link = None
-        while link is None:
-            with contextlib.suppress(ConnectionRefusedError):
-                link = socket.create_connection(("127.0.0.1", port))
-        with link:
-            for stop in plan.stops:
-                # It drives itself, and stands before it says so.
-                body.q0, body.motion = stop.q, None
-                pose = body.true_flange(body.clock.now())
-                pieces = say(text, _named(stop.view, pose))
-                assert max(map(len, pieces)) <= longest
-                for piece in pieces:
-                    link.sendall(piece.encode("ascii"))
-                answers.append(link.recv(200).decode("ascii"))
+    def pieces(stop, pose):
+        sent = say(text, _named(stop, pose))
+        assert max(map(len, sent)) <= longest
+        return sent
 
-    robot = threading.Thread(target=drive, daemon=True)
-    robot.start()
     session = tmp_path / "live"
-    words = ("--arm", f"socket:{port}", "--camera", "fake", "--target", "charuco_9x6_30mm")
-    quick = ("--frames", 1, "--settle-s", 0.03, "--views", 12)
-    done = visioncal("record", "-o", session, *words, *quick).good()
-    robot.join(5.0)
+    done, answers = _recorded(session, "--views", 12, body=body, stops=plan.stops, pieces=pieces)
     assert answers == ["next\n"] * 11 + ["done\n"]
     assert str(CLIENTS) in done.err
     for view, stop in zip(Session.load(session).views, plan.stops, strict=True):
@@ -478,3 +486,25 @@ def test_a_robot_program_of_each_maker_records_a_good_session(program, tmp_path,
     found = visioncal("calibrate", session, "-o", tmp_path / "out")
     assert found.status == 0, found.said
     assert "good" in found.said.splitlines()[0]
+
+
+def test_a_resumed_recording_takes_no_stop_twice(tmp_path, monkeypatch):
+    plan = fake_plan(3)
+    body, camera = fake_devices(plan)
+    monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
+    monkeypatch.setattr(record_module, "HostClock", lambda: body.clock)
+
+    def pieces(stop, pose):
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_rotvec()]
+        return [f"{stop} | p[{', '.join(f'{number:.6f}' for number in numbers)}]\n"]
+
+    cell = {"body": body, "pieces": pieces}
+    session = tmp_path / "live"
+    _, answers = _recorded(session, "--views", 2, stops=plan.stops[:2], **cell)
+    assert answers == ["next\n", "done\n"]
+    before = (session / "views.csv").read_bytes()
+    # At another port, and from its first stop on.
+    _, answers = _recorded(session, "--views", 3, "--resume", stops=plan.stops, **cell)
+    assert answers == ["next\n", "next\n", "done\n"]
+    assert (session / "views.csv").read_bytes().startswith(before)
+    assert [view.number for view in Session.load(session).views] == [1, 2, 3]

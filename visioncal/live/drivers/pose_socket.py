@@ -341,6 +341,7 @@ def _set_keepalive(peer: socket.socket) -> None:
     # An answer that is not confirmed counts, too; not all systems have all names.
     for name, value in (
         ("TCP_KEEPIDLE", 1),
+        ("TCP_KEEPALIVE", 1),
         ("TCP_KEEPINTVL", 1),
         ("TCP_KEEPCNT", _DEAD_S - 1),
         ("TCP_USER_TIMEOUT", 1000 * _DEAD_S),
