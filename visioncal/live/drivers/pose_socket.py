@@ -59,10 +59,9 @@ class _LostError(Exception):
 class SocketArm:
     """Arm whose program says by a line of text that it stands at a stop, and where.
 
-    Nothing is read from a link on which an answer is due, so that no pose is taken for another: a
-    program that sends more than the one line gets `error`, and its link is closed. Whatever
-    breaks, a view is acknowledged only after it is on the disk, and a stop that is sent again after
-    a lost answer has the number of its view (`take_requested`).
+    A program that sends more than one line before an answer gets `error`, and its link is closed,
+    so that no pose is taken for another. A stop that is sent again after a lost answer has the
+    number of its view (`take_requested`).
 
     Args:
         host: Address of this computer at which it listens; `0.0.0.0` for all its networks.
@@ -167,9 +166,7 @@ class SocketArm:
             # What came before the answer did not wait for it.
             self._receive(link)
             self._send(link, words[: _MAX_ANSWER - 1])
-            if link.received.strip(_FILL):
-                self._send(link, b"error more than one line before its answer")
-                raise _LostError
+            self._refuse_more(link)
         self._idle.restart()
         if answer == "done":
             self._is_done = True
@@ -185,16 +182,11 @@ class SocketArm:
         """Reads a stop; raises DataError."""
         number, *parts = (part.strip() for part in line.split("|"))
         is_number = number.isascii() and number.isdecimal() and len(number) < 6
-        if not (is_number and 1 <= int(number) <= _MAX_STOP):
+        if len(parts) not in (1, 2) or not (is_number and 1 <= int(number) <= _MAX_STOP):
             raise DataError(
-                f"{number[:20]!r} is no number of a stop.",
+                f"{line[:20]!r} is no stop.",
                 next_step=f"Needed is: number (1 to {_MAX_STOP}) | pose, or number | pose | "
                 "joints deg.",
-            )
-        if len(parts) not in (1, 2):
-            raise DataError(
-                f"stop {number} has {len(parts)} parts after its number.",
-                next_step="Needed is: number | pose, or number | pose | joints deg.",
             )
         if self._form is None and len(forms := possible_forms(parts[0])) > 1:
             raise DataError(
@@ -230,9 +222,7 @@ class SocketArm:
             link.received, link.has_spoken = rest[0], True
             # A program that went away does not wait at its stop.
             self._receive(link)
-            if link.received.strip(_FILL):
-                self._send(link, b"error more than one line before its answer")
-                raise _LostError
+            self._refuse_more(link)
             try:
                 return first.strip(_FILL).decode("utf-8")
             except UnicodeDecodeError:
@@ -284,6 +274,11 @@ class SocketArm:
                 raise _LostError
         except OSError as error:
             raise _LostError from error
+
+    def _refuse_more(self, link: _Link) -> None:
+        if link.received.strip(_FILL):
+            self._send(link, b"error more than one line before its answer")
+            raise _LostError
 
     @contextmanager
     def _dropped_if_lost(self, link: _Link) -> Iterator[None]:
@@ -338,14 +333,9 @@ def _set_keepalive(peer: socket.socket) -> None:
     """Has the system probe a silent peer, and break the link where it does not answer."""
     peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    # An answer that is not confirmed counts, too; not all systems have all names.
-    for name, value in (
-        ("TCP_KEEPIDLE", 1),
-        ("TCP_KEEPALIVE", 1),
-        ("TCP_KEEPINTVL", 1),
-        ("TCP_KEEPCNT", _DEAD_S - 1),
-        ("TCP_USER_TIMEOUT", 1000 * _DEAD_S),
-    ):
-        if hasattr(socket, name):
-            with suppress(OSError):
-                peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    seconds = dict.fromkeys(("TCP_KEEPIDLE", "TCP_KEEPALIVE", "TCP_KEEPINTVL"), 1)
+    # An answer that is not confirmed counts, too [ms]; not all systems have all names.
+    limits = {"TCP_KEEPCNT": _DEAD_S - 1, "TCP_USER_TIMEOUT": 1000 * _DEAD_S}
+    for name, value in (seconds | limits).items():
+        with suppress(AttributeError, OSError):
+            peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
