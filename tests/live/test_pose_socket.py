@@ -332,6 +332,20 @@ def test_a_robot_that_does_not_come_back_ends_the_recording():
         raised(DataError, "is no port", open_arm, words, None, form=None, moves=False)
 
 
+def test_one_that_says_nothing_gives_way_and_one_that_speaks_does_not(arm):
+    with socket.create_connection(("127.0.0.1", arm.port)) as mute:
+        arm.request(0.0)
+        assert asked(arm, line_of(1, "\n").encode())[0].startswith("busy ")
+        arm._link.since_s -= 6.0
+        with socket.create_connection(("127.0.0.1", arm.port)) as link:
+            link.sendall(line_of(1, "\n").encode())
+            assert arm.request(0.0).stop == 1
+            arm.reply("next")
+            assert (mute.recv(99), link.recv(99)) == (b"", b"next\n")
+            arm._link.since_s -= 6.0
+            assert asked(arm, line_of(2, "\n").encode())[0].startswith("busy ")
+
+
 def test_a_dead_peer_gives_way_within_seconds(arm):
     link = socket.create_connection(("127.0.0.1", arm.port))
     arm.request(0.0)

@@ -49,7 +49,7 @@ class _Link:
     peer: socket.socket
     received: bytes = b""  # What is not yet read of its lines.
     has_spoken: bool = False  # Whether it has ever sent a whole line.
-    age: Stopwatch = field(default_factory=Stopwatch)
+    since_s: float = field(default_factory=time.monotonic)  # When it was taken [s].
 
 
 class _LostError(Exception):
@@ -81,9 +81,9 @@ class SocketArm:
         self._form = None if form is None else form_name(form)
         try:
             self._server = socket.create_server((host, port), backlog=4)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
             raise DriverError(
-                f"{host}:{port} cannot be listened at: {error.strerror}.",
+                f"{host}:{port} cannot be listened at: {error}.",
                 culprits=[f"{host}:{port}"],
                 next_step="Another program, or an earlier visioncal, may listen there: end it, or "
                 "name another port and set that in the robot's program, too. The address is one "
@@ -168,6 +168,8 @@ class SocketArm:
             self._send(link, words[: _MAX_ANSWER - 1])
             self._refuse_more(link)
         self._idle.restart()
+        if answer in ("next", "done") and self._stop is not None:
+            self._joints = 0 if self._stop.q is None else len(self._stop.q)
         if answer == "done":
             self._is_done = True
             self._linger(is_answered=self._link is link)
@@ -201,7 +203,6 @@ class SocketArm:
                 f"{count} joints, and {self._joints} at the first stop.",
                 next_step="Send the same joints at all stops, or none at any.",
             )
-        self._joints = count
         return ArmState(time.monotonic(), pose, joints, stop=int(number))
 
     def _next_line(self) -> str | None:
@@ -241,7 +242,7 @@ class SocketArm:
             with self._dropped_if_lost(self._link):
                 self._receive(self._link)
         now = self._link
-        if now is not None and not now.has_spoken and now.age.read() > _MUTE_S:
+        if now is not None and not now.has_spoken and time.monotonic() > now.since_s + _MUTE_S:
             self._drop(now)
         if self._link is None:
             _set_keepalive(peer)
@@ -249,7 +250,7 @@ class SocketArm:
             return
         with suppress(OSError):
             peer.send(b"busy another program is connected\n")
-        peer.close()
+        self._drop(_Link(peer))
 
     @staticmethod
     def _receive(link: _Link) -> None:
