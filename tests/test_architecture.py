@@ -32,6 +32,7 @@ HOMES = {
     "depthai": {"live.drivers"},
     "rtde_control": {"live.drivers"},
     "rtde_receive": {"live.drivers"},
+    "nicegui": {"live.page"},
     "dask": {"interchange.batch"},
     "distributed": {"interchange.batch"},
 }

@@ -5,7 +5,7 @@ from dataclasses import MISSING, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from visioncal.cli.parsing import numbers_in, size_in
+from visioncal.cli.parsing import address_in, numbers_in, size_in
 from visioncal.core.choices import ImagesKept
 from visioncal.interchange.outputs import RECORDING, REPORT
 
@@ -85,6 +85,19 @@ class PartOptions:
         from visioncal.session.selecting import Choice
 
         return Choice(self.camera, self.robot, self.target)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PageOptions:
+    """Whether a page in a browser asks and shows."""
+
+    page: bool = flag("On a page in a browser (extra page), which also asks what is not given.")
+    address: tuple[str, int] | None = option(
+        "With --page: where it listens; else on 127.0.0.1:8321, for this machine alone.",
+        parse=address_in,
+        metavar="HOST:PORT",
+        needs="page",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

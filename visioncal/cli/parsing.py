@@ -71,6 +71,14 @@ def size_in(words: str, option: str = "--resolution") -> tuple[int, int]:
     return numbers[0], numbers[1]
 
 
+def address_in(words: str, option: str) -> tuple[str, int]:
+    """Parses the address of a server, written as 0.0.0.0:8321."""
+    host, _, port = words.rpartition(":")
+    is_right = bool(host) and port.isdecimal() and 0 < int(port) < 1 << 16
+    _check(is_right, words, option, "a host and a port up to 65535 are needed, as 0.0.0.0:8321")
+    return host, int(port)
+
+
 def names_in(words: str, option: str) -> tuple[str, ...]:
     """Parses an option of names separated by commas."""
     names = tuple(part.strip() for part in words.split(","))

@@ -11,7 +11,7 @@ from visioncal.cli.console import asked, print_json, say
 from visioncal.cli.parsing import refuse_given
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.errors import DataError, DriverError
-from visioncal.core.number_format import counted, figure
+from visioncal.core.number_format import counted, figure, listed
 from visioncal.core.threads import signals_as_interrupts
 from visioncal.interchange.formats.intrinsics import target_named
 from visioncal.live.capture.cell import HostClock, LiveCell
@@ -29,7 +29,7 @@ from visioncal.live.capture.recording import (
     motion_summary,
     record,
 )
-from visioncal.live.drivers.protocols import DeviceSetup, MovingArm, RequestingArm
+from visioncal.live.drivers.protocols import Arm, DeviceSetup, MovingArm, RequestingArm
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.plan_file import PlanFile, read_plan
 from visioncal.robot import load_robot
@@ -37,9 +37,15 @@ from visioncal.robot import load_robot
 
 def record_command(options: RecordOptions) -> None:
     """Runs `visioncal record`."""
+    if options.page:
+        # NiceGUI comes with an extra.
+        from visioncal.cli.page import record_on_page
+
+        record_on_page(options)
+        return
     plan = None if options.plan is None else read_plan(options.plan)
-    recorded = _recorded(plan, options)
-    drives = not options.follow and options.arm.partition(":")[0] not in REQUESTING
+    recorded = recorded_cell(plan, options)
+    drives = not options.follow and str(options.arm).partition(":")[0] not in REQUESTING
     if drives and plan is None:
         raise DataError(
             "record: an arm is driven by a plan, and none is given.",
@@ -50,21 +56,16 @@ def record_command(options: RecordOptions) -> None:
         is_dry = {"--dry-run": options.dry_run or None}
         refuse_given(is_dry, "a guided arm is not driven, so there is nothing to say of it")
     driven = plan if drives else None
-    taking = CaptureOptions(
-        speed=options.speed,
-        frames=options.frames,
-        still=Stillness(image_px=options.still_px, quiet_s=options.settle_s),
-        single=options.camera.partition(":")[0] == "folder",
-        missed_in_a_row=CaptureOptions.missed_in_a_row if drives else 0,
-    )
-    with signals_as_interrupts(), _opened(options, is_moved=drives and not options.dry_run) as cell:
-        if taking.single and (options.resume or not isinstance(cell.arm, RequestingArm)):
-            raise DataError(
-                "record: pictures of a folder belong to poses by their order alone, from the first "
-                "on: neither a followed arm, a driven one nor --resume can keep it.",
-                culprits=["--camera", "--resume" if options.resume else "--arm"],
-                next_step="Record all of it into a new session, with poses that are typed or sent.",
-            )
+    taking = taking_of(options, is_driven=drives)
+    missing = [f"--{name}" for name in ("arm", "camera") if getattr(options, name) is None]
+    if missing:
+        raise DataError(
+            f"record: {listed(missing)} {'is' if len(missing) == 1 else 'are'} missing.",
+            culprits=missing,
+            next_step="Name them, as --arm manual --camera uvc:0; --page asks for them.",
+        )
+    with signals_as_interrupts(), opened(options, is_moved=drives and not options.dry_run) as cell:
+        check_order(taking, cell, is_resumed=options.resume)
         if driven is not None:
             _check_resolution(driven.cell.camera.resolution, cell.camera.resolution)
         if options.dry_run and driven is not None:
@@ -88,7 +89,30 @@ def record_command(options: RecordOptions) -> None:
     _finish(journal, steps, as_json=options.as_json)
 
 
-def _recorded(plan: PlanFile | None, described: RecordOptions) -> RecordedCell | PlanCell:
+def taking_of(options: RecordOptions, *, is_driven: bool) -> CaptureOptions:
+    """How views are taken."""
+    return CaptureOptions(
+        speed=options.speed,
+        frames=options.frames,
+        still=Stillness(image_px=options.still_px, quiet_s=options.settle_s),
+        single=str(options.camera).partition(":")[0] == "folder",
+        # Where a person sees them, missed views end nothing.
+        missed_in_a_row=CaptureOptions.missed_in_a_row if is_driven else 0,
+    )
+
+
+def check_order(taking: CaptureOptions, cell: LiveCell, *, is_resumed: bool) -> None:
+    """Refuses what would part a folder's pictures from their poses; raises DataError."""
+    if taking.single and (is_resumed or not isinstance(cell.arm, RequestingArm)):
+        raise DataError(
+            "record: pictures of a folder belong to poses by their order alone, from the first on: "
+            "neither a followed arm, a driven one nor --resume can keep it.",
+            culprits=["--camera", "--resume" if is_resumed else "--arm"],
+            next_step="Record all of it into a new session, with poses that are typed or sent.",
+        )
+
+
+def recorded_cell(plan: PlanFile | None, described: RecordOptions) -> RecordedCell | PlanCell:
     """What is recorded, by the plan or by options."""
     target, robot, mount = described.target, described.robot, described.mount
     found: RecordedCell | PlanCell
@@ -139,20 +163,24 @@ def _guided(capture: Capture, views: int) -> list[CaptureEvent]:
 
 
 @contextmanager
-def _opened(options: RecordOptions, *, is_moved: bool) -> Iterator[LiveCell]:
-    """Opens both devices, and closes them at the end of the block."""
+def opened(
+    options: RecordOptions, *, is_moved: bool, given: Arm | None = None
+) -> Iterator[LiveCell]:
+    """Opens both devices, the arm unless it is given, and closes them at the end of the block."""
     requested = DeviceSetup(options.resolution, options.exposure_us, options.gain, options.focus)
-    opened = open_arm(
-        options.arm, asked, options.pose_form, moves=is_moved, answers=sys.stdin.isatty()
+    chosen = given or open_arm(
+        *(str(options.arm), asked, options.pose_form),
+        moves=is_moved,
+        answers=sys.stdin.isatty(),
     )
-    with closing(opened) as arm:
+    with closing(chosen) as arm:
         if is_moved and not isinstance(arm, MovingArm):
             raise DriverError(
                 f"{arm.name} cannot be driven.",
                 culprits=[arm.name],
                 next_step="Guide it by hand: --follow.",
             )
-        with closing(open_camera(options.camera, requested)) as camera:
+        with closing(open_camera(str(options.camera), requested)) as camera:
             yield LiveCell(arm, camera, HostClock())
 
 

@@ -10,6 +10,7 @@ import typer
 from visioncal.cli.options import (
     REQUIRED,
     NeedOptions,
+    PageOptions,
     PartOptions,
     WorkOptions,
     against_option,
@@ -118,9 +119,11 @@ class ShowOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifyOptions(PartOptions):
+class VerifyOptions(PartOptions, PageOptions):
     """Check whether a calibration still holds, and what has changed if it does not.
 
+    With --page SESSION is a folder of checks: a browser leads through five stops of one of the
+    calibrations in --against, and shows the answer and those before.
     Exit status 0: it holds; 3: it does not; 2: that cannot be decided, for the reason given.
     """
 

@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias
 from visioncal.cli.options import (
     REQUIRED,
     SIZE,
+    PageOptions,
     argument,
     flag,
     force_flag,
@@ -253,22 +254,22 @@ class PlanOptions(ClearanceOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordOptions:
+class RecordOptions(PageOptions):
     """Record a session: drive the stops of a plan, or follow an arm guided by hand.
 
-    Every view is on the disk before the next is taken. Exit status 0: all views are there; 2: the
-    recording ended early, the arm stands still, and --resume continues it.
+    With --page a browser shows the live picture and the next pose, takes typed poses, and gives
+    the verdict; no arm is driven from it. Every view is on the disk before the next is taken. Exit
+    status 0: all views are there; 2: the recording ended early, the arm stands still, and --resume
+    continues it.
     """
 
     out: Path = out_folder("The session's folder; a new one.", default=REQUIRED, metavar="SESSION")
-    arm: str = option(
+    arm: str | None = option(
         "A UR by its address, typed poses, or the robot's own program: socket listens for it.",
-        default=REQUIRED,
         metavar="ur:HOST|manual|socket:PORT|socket:HOST:PORT",
     )
-    camera: str = option(
+    camera: str | None = option(
         "A camera by its kind, with its address where there are several.",
-        default=REQUIRED,
         metavar=f"{'|'.join(CAMERAS)}[:ADDRESS]",
     )
     target: str | None = _record_cell(_BOARD)

@@ -26,6 +26,12 @@ _TRIGGERED = {
 def verify_command(options: VerifyOptions) -> None:
     """Runs `visioncal verify`."""
     against = options.against
+    if options.page:
+        # NiceGUI comes with an extra.
+        from visioncal.cli.page import verify_on_page
+
+        verify_on_page(options)
+        return
     if options.output is not None:
         refuse_calibration(options.output)
     loaded, calibration = select_matching(

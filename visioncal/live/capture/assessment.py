@@ -21,6 +21,14 @@ _ACROSS, _DOWN = 8, 5
 # Greatest deviation of a controller's calibrated arm from the nominal model [m, rad].
 _SAME_M, _SAME_RAD = 1e-2, 2e-2
 
+
+def usual_lens(resolution: tuple[int, int]) -> Camera:
+    """A lens with a horizontal field of 53 degrees, for pictures (width, height) of an unknown."""
+    width, height = resolution
+    matrix = np.array([width, width, 0.5 * (width - 1), 0.5 * (height - 1)], dtype=float)
+    return Camera("brown", resolution, matrix, np.zeros(5))
+
+
 # Accuracy predicted with some views, by their numbers; None while there is no prediction.
 Prediction: TypeAlias = Callable[[Sequence[int]], Accuracy | None]
 
@@ -32,40 +40,47 @@ class Coach:
     target: Target
     resolution: tuple[int, int]  # (width, height) of the images [px].
     camera: Camera | None  # Intrinsics for tilt and distance; None where they are not known.
-    _covered_cells: Mask = field(default_factory=lambda: np.zeros((_DOWN, _ACROSS), dtype=bool))
-    _normals: list[FloatArray] = field(default_factory=list)
-    _distances: list[float] = field(default_factory=list)
+    # (rows, columns) parts of the image in which a view shows the board.
+    covered: Mask = field(default_factory=lambda: np.zeros((_DOWN, _ACROSS), dtype=bool))
+    # (4, 4) `cam_from_target` of the views; through a usual lens, where it is not known [m].
+    poses: list[FloatArray] = field(default_factory=list)
     _views: int = 0
+
+    @property
+    def lens(self) -> Camera:
+        """Intrinsics, or where they are not known those of a usual lens."""
+        return self.camera or usual_lens(self.resolution)
 
     def add(self, corners: Corners) -> None:
         """Takes a view into account."""
         self._views += 1
         cells = np.floor(corners.px * [_ACROSS, _DOWN] / self.resolution).astype(int)
         columns, rows = np.clip(cells, 0, [_ACROSS - 1, _DOWN - 1]).T
-        self._covered_cells[rows, columns] = True
-        if self.camera is None:
-            return
+        self.covered[rows, columns] = True
         try:
             by_view = {corners.view: corners}
             # Assumed corner noise [px]; advice needs no better.
-            views = measure_poses(by_view, (self.target,), self.camera, 0.2)
+            views = measure_poses(by_view, (self.target,), self.lens, 0.2)
         except VisioncalError:
             return
-        for view in views:
-            # The target's z axis points into the board, away from the camera.
-            self._normals.append(-view.cam_from_target[0, :3, 2])
-            self._distances.append(float(np.linalg.norm(view.cam_from_target[0, :3, 3])))
+        self.poses += [view.cam_from_target[0] for view in views]
 
     @property
     def _tilts(self) -> FloatArray:
         """Angles between the optical axis and the board's normal [deg]."""
-        along = [-normal[2] for normal in self._normals]
+        # The target's z axis points into the board, away from the camera.
+        along = [pose[2, 2] for pose in self.poses]
         return np.asarray(np.rad2deg(np.arccos(np.clip(along, -1.0, 1.0))))
+
+    @property
+    def _distances(self) -> list[float]:
+        """Distances of the camera from the board [m]."""
+        return [float(np.linalg.norm(pose[:3, 3])) for pose in self.poses]
 
     def words(self) -> str:
         """States the coverage: `coverage 45 %, tilts to 32 deg, 0.4 to 0.7 m away`."""
-        words = [f"coverage {100 * self._covered_cells.mean():.0f} %"]
-        if self._normals:
+        words = [f"coverage {100 * self.covered.mean():.0f} %"]
+        if self.poses and self.camera is not None:
             words.append(f"tilts to {self._tilts.max():.0f} deg")
             words.append(f"{min(self._distances):.2f} to {max(self._distances):.2f} m away")
         return ", ".join(words)
@@ -78,14 +93,14 @@ class Coach:
         if self._views < 3:
             yield "another place, with the board large in the image"
             return
-        if self._normals:
+        if self.poses and self.camera is not None:
             tilts = self._tilts
             # Tilted views separate the board's distance from the focal length.
             if tilts.max() < 20.0:
                 yield f"tilt the camera: the steepest view leans by {tilts.max():.0f} deg only"
             if max(self._distances) < 1.25 * min(self._distances):
                 yield f"another distance: all views are about {self._distances[0]:.2f} m away"
-        if self._covered_cells.mean() < 0.8:
+        if self.covered.mean() < 0.8:
             yield "bring the board to where it was not yet in the image, near the edges too"
 
 

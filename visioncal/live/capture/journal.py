@@ -281,6 +281,20 @@ class Journal:
         self.views, self._columns = views, columns
         return view
 
+    def undo(self) -> View:
+        """Removes the last view, of at least one, from the disk and returns it; raises DataError.
+
+        If the process is killed meanwhile, at most its image remains, which the next view replaces.
+        """
+        *views, last = self.views
+        if views:
+            self._write(_TABLE, write_csv(self._columns, views))
+        for name in (last.image, *(() if views else (_TABLE,))):
+            with named_errors(self.folder / name):
+                (self.folder / name).unlink(missing_ok=True)
+        self.views, self._columns = tuple(views), self._columns if views else ()
+        return last
+
     def check_room(self) -> None:
         """Checks that the disk has room for one more view; raises DataError."""
         width, height = self._facts.resolution

@@ -16,7 +16,7 @@ from visioncal.live.capture.assessment import Coach, JointPoseCheck, Prediction,
 from visioncal.live.capture.cell import Clock, LiveCell
 from visioncal.live.capture.gate import Consent, Gate, check_same_arm, clear_path, travel_s
 from visioncal.live.capture.journal import Journal, state_of
-from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.take import Missed, TakenView, take, why_arm_moves
 from visioncal.live.drivers.protocols import ArmState, RequestingArm
 from visioncal.live.planning.design import Accuracy
@@ -43,22 +43,27 @@ class CaptureEvent:
     advice: str  # What comes next, in words.
 
     @property
+    def words(self) -> str:
+        """What became of it: `view 2: 54 corners, edges 0.8 px, 0.01 px still`."""
+        view = self.found
+        if isinstance(view, Missed):
+            return f"view {self.view}: not taken: {view.reason}"
+        return (
+            f"view {self.view}: {len(view.corners.ids)} corners, edges {view.corners.blur_px:.1f} "
+            f"px, {view.motion_px:.2f} px still"
+        )
+
+    @property
     def line(self) -> str:
         """A report: `[3/30] view 2: 54 corners, ...; coverage 45 % -> next: ...`."""
-        view, place = self.found, f"[{self.place}{f'/{self.count}' if self.count else ''}]"
-        next_words = f" -> next: {self.advice}" if self.advice else ""
-        if isinstance(view, Missed):
-            return f"{place} view {self.view}: not taken: {view.reason}{next_words}"
         sigma = ""
         if self.accuracy is not None:
             is_open = self.accuracy.is_open
             mm = ": not determined yet" if is_open else f" {figure(self.accuracy.mm)} mm"
             sigma = f"; predicted sigma{mm}"
-        return (
-            f"{place} view {self.view}: {len(view.corners.ids)} corners, edges "
-            f"{view.corners.blur_px:.1f} px, {view.motion_px:.2f} px still; {self.covered}"
-            f"{sigma}{next_words}"
-        )
+        place = f"[{self.place}{f'/{self.count}' if self.count else ''}]"
+        covered = "" if isinstance(self.found, Missed) else f"; {self.covered}{sigma}"
+        return f"{place} {self.words}{covered}{f' -> next: {self.advice}' if self.advice else ''}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,6 +323,39 @@ def checked_path(plan: PlanFile, stop: Stop, q: FloatArray) -> tuple[FloatArray,
     return clear_path(plan.cell, q, stop.q, f"view {stop.view}")
 
 
+class RestWatch:
+    """Waits for an arm that is guided by hand to rest where no view was taken."""
+
+    def __init__(self, journal: Journal, still: Stillness) -> None:
+        self._journal, self._still = journal, still
+        self._first: ArmState | None = None
+        # (4, 4) where it rested last, until it leaves [m].
+        self._tried: FloatArray | None = None
+
+    def begins(self, state: ArmState) -> bool:
+        """Whether by its newest state the arm has come to rest at a new pose."""
+        still, here = self._still, state.base_from_flange
+        if self._first is None or why_arm_moves(self._first, state, still):
+            self._first = state
+        if self._tried is not None and _is_elsewhere(self._tried, here):
+            self._tried = None
+        poses = (view.base_from_flange() for view in self._journal.views)
+        known = [np.asarray(pose.as_matrix()) for pose in poses if pose is not None]
+        if (
+            state.stamp_s - self._first.stamp_s < still.quiet_s
+            or self._tried is not None
+            or not all(_is_elsewhere(pose, here) for pose in known)
+        ):
+            return False
+        self._first, self._tried = None, here
+        return True
+
+
+def _is_elsewhere(pose: FloatArray, here: FloatArray) -> bool:
+    mm, deg = pose_difference(pose, here)
+    return mm >= 20.0 or deg >= 5.0
+
+
 def follow(capture: Capture, count: int) -> list[CaptureEvent]:
     """Takes `count` views (0: until Ctrl-C), one whenever a guided arm rests at a new pose.
 
@@ -325,30 +363,13 @@ def follow(capture: Capture, count: int) -> list[CaptureEvent]:
         DriverError: A device failed, or the arm is stopped.
         DataError: A view cannot be written, or too many rests in a row gave none.
     """
-    cell, still, views = capture.cell, capture.options.still, capture.journal.views
-    poses = [view.base_from_flange() for view in views]
-    visited = [np.asarray(pose.as_matrix()) for pose in poses if pose is not None]
-
-    def is_new(state: ArmState) -> bool:
-        apart = (pose_difference(pose, state.base_from_flange) for pose in visited)
-        return all(mm >= 20.0 or deg >= 5.0 for mm, deg in apart)
-
+    cell, rest = capture.cell, RestWatch(capture.journal, capture.options.still)
     with capture.halting():
         try:
             while not count or len(capture.journal.views) < count:
-                first = cell.state()
-                while True:
+                while not rest.begins(cell.state()):
                     cell.clock.sleep(0.05)
-                    state = cell.state()
-                    if why_arm_moves(first, state, still):
-                        first = state
-                    elif state.stamp_s - first.stamp_s >= still.quiet_s and is_new(state):
-                        break
-                visited.append(state.base_from_flange)
-                step = capture.view(*capture.next_numbers(), count)
-                if isinstance(step.found, TakenView):
-                    # The arm may have been moved on while the rest was waited for.
-                    visited.append(step.found.state.base_from_flange)
+                capture.view(*capture.next_numbers(), count)
         except KeyboardInterrupt:
             # Ctrl-C is the regular end of a recording without a number of views.
             if not capture.journal.views:

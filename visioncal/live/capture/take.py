@@ -67,7 +67,7 @@ class _StillFrame:
         reason = reason or why_arm_moves(self.before, latest.after, still)
         if reason:
             return reason, 0.0
-        motion_px = image_motion_px(_grey(self.frame.image), _grey(latest.frame.image))
+        motion_px = image_motion_px(grey_of(self.frame.image), grey_of(latest.frame.image))
         if motion_px <= still.image_px:
             return "", motion_px
         if not np.isfinite(motion_px):
@@ -123,7 +123,7 @@ def _selected(
     """The view of the sharpest frame."""
 
     def detected(still: _StillFrame) -> TakenView | Missed:
-        corners, _ = find_corners(_grey(still.frame.image), target, view)
+        corners, _ = find_corners(grey_of(still.frame.image), target, view)
         if isinstance(corners, Rejection):
             return Missed(corners.reason)
         # The state nearer to the middle of the exposure.
@@ -137,12 +137,12 @@ def _selected(
         return first
     # Image and arm are still: the corners of one frame hold for all.
     ids, px = first.corners.ids, first.corners.px
-    blurs = [blur_of(_grey(frame.frame.image), target, ids, px) for frame in frames]
+    blurs = [blur_of(grey_of(frame.frame.image), target, ids, px) for frame in frames]
     sharpest = int(np.argmin(blurs))
     return first if sharpest == 0 else detected(frames[sharpest])
 
 
-def _grey(image: Image) -> Image:
+def grey_of(image: Image) -> Image:
     """Grey image (h, w) of an image that may be coloured."""
     if image.ndim == 2:
         return image

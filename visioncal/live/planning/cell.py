@@ -154,15 +154,11 @@ class PlanCell:
 
     def seen_from(self, base_from_flange: FloatArray) -> FloatArray:
         """Predicts (k, 4, 4) `cam_from_target` at (k, 4, 4) poses of the flange [m]."""
-        if self.mount == "eye-in-hand":
-            return np.asarray(invert(base_from_flange @ self.x) @ self.z)
-        return np.asarray(invert(self.x) @ base_from_flange @ self.z)
+        return seen_from(self.mount, self.x, self.z, base_from_flange)
 
     def flange_at(self, cam_from_target: FloatArray) -> FloatArray:
         """Poses (k, 4, 4) `base_from_flange` for views (k, 4, 4) `cam_from_target` [m]."""
-        if self.mount == "eye-in-hand":
-            return np.asarray(self.z @ invert(cam_from_target) @ invert(self.x))
-        return np.asarray(self.x @ cam_from_target @ invert(self.z))
+        return flange_at(self.mount, self.x, self.z, cam_from_target)
 
     def guesses(self, count: int, seed: int) -> tuple["PlanCell", ...]:
         """Draws cells from the uncertainty of both edges, perturbed on the right."""
@@ -175,6 +171,24 @@ class PlanCell:
             twists = draws @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
         moves = exp(twists.reshape(count, 2, 6))
         return tuple(replace(self, x=self.x @ by_x, z=self.z @ by_z) for by_x, by_z in moves)
+
+
+def flange_at(
+    mount: Mount, x: FloatArray, z: FloatArray, cam_from_target: FloatArray
+) -> FloatArray:
+    """Poses `base_from_flange` (..., 4, 4) of views `cam_from_target` [m], by a cell's edges."""
+    if mount == "eye-in-hand":
+        return np.asarray(z @ invert(cam_from_target) @ invert(x))
+    return np.asarray(x @ cam_from_target @ invert(z))
+
+
+def seen_from(
+    mount: Mount, x: FloatArray, z: FloatArray, base_from_flange: FloatArray
+) -> FloatArray:
+    """Predicts `cam_from_target` (..., 4, 4) [m], the inverse of `flange_at`."""
+    if mount == "eye-in-hand":
+        return np.asarray(invert(base_from_flange @ x) @ z)
+    return np.asarray(invert(x) @ base_from_flange @ z)
 
 
 def _check_pose(what: str, pose: FloatArray) -> None:

@@ -1,0 +1,213 @@
+"""The page in headless Chromium: a calibration by typed poses alone, and checks of it."""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support import played
+from support.browser import CHROMIUM
+from support.commands import visioncal as command
+
+import visioncal
+from visioncal import Calibration, Session
+from visioncal.vision.boards.imaging import read_image
+
+pytest.importorskip("nicegui")
+sync_api = pytest.importorskip("playwright.sync_api")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser")
+# Longer than anything takes that comes at all [ms].
+PATIENT_MS = 30_000
+POSE = "Pose of the flange"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_api.sync_playwright() as play:
+        flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+        opened = play.chromium.launch(executable_path=CHROMIUM, args=flags)
+        yield opened
+        opened.close()
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@contextmanager
+def served(*words: object):
+    """The page of a command: its address, and its process."""
+    url = f"127.0.0.1:{free_port()}"
+    words = [sys.executable, played.__file__, *map(str, words), "--page", "--address", url]
+    # NiceGUI would take the process for a test of itself.
+    own = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+    process = subprocess.Popen(
+        words, env=own, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        for _ in range(300):
+            assert process.poll() is None, process.stdout.read()
+            try:
+                urllib.request.urlopen(f"http://{url}/live.jpg").close()
+                break
+            except OSError:
+                time.sleep(0.1)
+        yield f"http://{url}", process
+    finally:
+        process.kill()
+        said = process.communicate()[0]
+        assert "Traceback" not in said, said
+
+
+def opened(browser, url: str):
+    """A page with a short patience, whose own errors fail the test."""
+    page = browser.new_page(viewport={"width": 1300, "height": 1000})
+    page.set_default_timeout(PATIENT_MS)
+    page.on("pageerror", lambda error: pytest.fail(str(error)))
+    page.goto(url)
+    return page
+
+
+def kuka(pose, *, comma: bool = False) -> str:
+    """A pose as a KUKA's pendant shows it, or as a German types it."""
+    matrix = np.asarray(pose.as_matrix())
+    angles = Rotation.from_matrix(matrix[:3, :3]).as_euler("ZYX", degrees=True)
+    numbers = [*(1e3 * matrix[:3, 3]), *angles]
+    line = " ".join(f"{name} {value:.5f}" for name, value in zip("XYZABC", numbers, strict=True))
+    return line.replace(".", ",") if comma else line
+
+
+def typed(page, folder: Path, view, line: str, place: int) -> None:
+    """Shows a view to the camera, and types its pose."""
+    (folder / "shown").write_text(str(view.number))
+    page.wait_for_timeout(500)
+    field = page.get_by_label(POSE)
+    field.fill(line)
+    page.get_by_text("Read as KUKA").wait_for()
+    field.press("Enter")
+    field.press("Enter")
+    page.get_by_text(f"view {place}:").wait_for()
+    # Pressed twice, it is one view.
+    assert page.get_by_text(f"view {place + 1}:").count() == 0
+
+
+def choose(page, label: str, words: str) -> None:
+    field = page.get_by_label(label, exact=True)
+    field.click()
+    field.fill(words)
+    field.press("Enter")
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory) -> Path:
+    """A cell's images, and those of two later days: on the second the camera has moved."""
+    folder = tmp_path_factory.mktemp("page")
+    own = ["--robot", "generic-6r-1800", "--seed", "4"]
+    for words in (
+        ["seen", "--views", "12", "--with-intrinsics"],
+        ["monday", "--views", "5", "--recording", "1"],
+        ["tuesday", "--views", "5", "--recording", "2", "--camera-moved-mm", "1.5"],
+    ):
+        command("simulate", folder / words[0], *words[1:], *own)
+        (folder / words[0] / "shown").write_text("0")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def calibrated(cell, browser) -> Path:
+    """A calibration made by the page alone, which survives what may befall it."""
+    seen, out = cell / "seen", cell / "cell"
+    views = Session.load(seen).views
+    with served("record", "-o", out) as (url, process):
+        page = opened(browser, url)
+        choose(page, "Camera", "uvc")
+        page.get_by_role("button", name="Start").click()
+        page.get_by_role("alert").get_by_text("cannot be opened").wait_for()
+        choose(page, "Camera", f"played:{seen}")
+        page.get_by_role("button", name="Start").click()
+        page.get_by_label(POSE).fill("400 20 300 10 20 30")
+        page.get_by_text("It may be a pose of").wait_for()
+        for place, view in enumerate(views[:4], 1):
+            typed(page, seen, view, kuka(view.base_from_flange(), comma=place % 2 == 0), place)
+        page.get_by_role("button", name="Undo last").click()
+        page.get_by_text("view 4:").wait_for(state="detached")
+        page.reload()
+        page.get_by_text("view 3:").wait_for()
+        second = opened(browser, url)
+        typed(second, seen, views[3], kuka(views[3].base_from_flange()), 4)
+        page.get_by_text("view 4:").wait_for()
+        (seen / "shown").unlink()
+        page.get_by_text("gives no picture").wait_for()
+        (seen / "shown").write_text("4")
+        page.get_by_role("button", name="Start").click()
+        for place, view in enumerate(views[4:8], 5):
+            typed(page, seen, view, kuka(view.base_from_flange()), place)
+        process.kill()
+    with served("record", "-o", out) as (url, _):
+        page = opened(browser, url)
+        # What was chosen is still there.
+        page.get_by_role("button", name="Start").click()
+        page.get_by_text("view 8:").wait_for()
+        for place, view in enumerate(views[8:], 9):
+            typed(page, seen, view, kuka(view.base_from_flange()), place)
+        page.get_by_text("good so far").wait_for()
+        assert page.get_by_text("X ").count() > 0
+        page.get_by_role("button", name="Calibrate").click()
+        page.get_by_role("status").get_by_text("good", exact=True).wait_for()
+    return cell / "cell-result"
+
+
+def test_a_calibration_by_typed_poses_is_that_of_their_session(cell, calibrated):
+    taken, seen = Session.load(cell / "cell"), Session.load(cell / "seen")
+    for view, wanted in zip(taken.views, seen.views, strict=True):
+        poses = [np.asarray(one.base_from_flange().as_matrix()) for one in (view, wanted)]
+        # The typed numbers have 1e-5 mm and 1e-5 deg, at a reach of about 1 m.
+        assert np.abs(poses[0] - poses[1]).max() < 1e-6
+        assert np.array_equal(
+            *(
+                read_image(folder / one.image)
+                for folder, one in ((cell / "cell", view), (cell / "seen", wanted))
+            )
+        )
+    # What the button did is what the command does.
+    result = Calibration.load(calibrated)
+    assert result.session_sha256 == visioncal.calibrate(taken).session_sha256
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_a_check_passes_and_fails_and_is_remembered(cell, browser):
+    with served("verify", cell / "checks", "--against", cell) as (url, _):
+        for day, answer in (("monday", "valid"), ("tuesday", "not valid")):
+            page = opened(browser, url)
+            choose(page, "Camera", f"played:{cell / day}")
+            page.get_by_role("button", name="Start").click()
+            # Where to stand, in the form of the last typed pose or the default.
+            page.get_by_text("the board then fills the orange outline").wait_for()
+            for place, view in enumerate(Session.load(cell / day).views, 1):
+                typed(page, cell / day, view, kuka(view.base_from_flange()), place)
+            page.get_by_role("status").get_by_text(answer, exact=True).wait_for()
+            page.get_by_role("button", name="Close").click()
+        page.get_by_text("The camera moved by").first.wait_for()
+        assert page.get_by_text("Next: Fasten the camera").count() == 1
+        history = page.get_by_text(re.compile(r"^\d{4}-\d\d-\d\d-cell-result")).all_inner_texts()
+    assert ["agree" in line for line in history] == [False, True]
+
+
+def test_other_sites_are_refused(cell):
+    with served("record", "-o", cell / "alone") as (url, _):
+        for headers in ({"Origin": "http://elsewhere.example"}, {"Host": "elsewhere.example"}):
+            asked = urllib.request.Request(f"{url}/live.jpg", headers=headers)
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(asked)
+        own = urllib.request.Request(f"{url}/live.jpg", headers={"Origin": url})
+        assert urllib.request.urlopen(own).status == 200

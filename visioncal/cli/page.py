@@ -1,0 +1,256 @@
+"""`--page` of `record` and `verify`: what a page asks, and the task that its answers make."""
+
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict, replace
+from datetime import date
+from functools import partial
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from visioncal.cli.console import say
+from visioncal.cli.parsing import refuse_given
+from visioncal.cli.record import check_order, opened, recorded_cell, taking_of
+from visioncal.cli.result_options import VerifyOptions
+from visioncal.cli.session_options import RecordOptions
+from visioncal.core.choices import CameraMount
+from visioncal.core.conventions import POSE_FORMS
+from visioncal.core.errors import DataError
+from visioncal.core.extras import client_library
+from visioncal.core.files import write_atomically
+from visioncal.core.limits import CheckLimits
+from visioncal.core.number_format import counted
+from visioncal.interchange.outputs import CALIBRATION, VERIFY
+from visioncal.interchange.result_files import load_calibration
+from visioncal.live.capture.cell import LiveCell
+from visioncal.live.capture.devices import ARMS, CAMERAS
+from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.drivers.uvc import without_password
+from visioncal.live.page.outcome import Light
+from visioncal.live.page.station import PageText, Setup, Station, Task, TypedPoses
+from visioncal.live.page.suggestion import NextPose
+from visioncal.live.planning.cell import PlanCell, seen_from
+from visioncal.live.planning.plan_file import PlanFile, read_plan
+from visioncal.live.planning.repeated import stops_to_repeat
+from visioncal.robot import robot_names
+from visioncal.vision.targets import target_from_document, target_names
+
+# What was chosen last, beside the views.
+_REMEMBERED = "page.json"
+# Labels of the setup's fields, and what may be chosen; anything else may be typed.
+_FIELDS: Mapping[str, tuple[str, Sequence[str]]] = {
+    "target": ("Board (a name, or its .toml)", target_names()),
+    "mount": ("Where the camera is", get_args(CameraMount)),
+    "robot": ("Robot's model, where it is known", robot_names()),
+    "arm": ("Its poses: typed, or by address", [*ARMS]),
+    "camera": ("Camera", [*CAMERAS]),
+    "pose_form": ("The pendant's form of poses", [*POSE_FORMS]),
+}
+_DEVICES = ("arm", "camera", "pose_form")
+
+
+def record_on_page(options: RecordOptions) -> None:
+    """Runs `visioncal record --page`."""
+    driven = {"--dry-run": options.dry_run or None, "--yes": options.yes or None}
+    refuse_given({**driven, "--json": options.as_json or None}, "a page moves no arm")
+    plan = None if options.plan is None else read_plan(options.plan)
+    described = () if plan else ("target", "mount", "robot")
+
+    def prepare(setup: Setup) -> Task:
+        chosen = _with_devices(options, setup)
+        if plan is None:
+            mounts: dict[str, CameraMount] = {mount: mount for mount in get_args(CameraMount)}
+            if setup.mount not in mounts:
+                raise DataError(f"The camera is {' or '.join(mounts)}, not {setup.mount!r}.")
+            robot, mount = setup.robot or None, mounts[setup.mount]
+            chosen = replace(chosen, target=setup.target or None, mount=mount, robot=robot)
+        recorded, out = recorded_cell(plan, chosen), options.out
+        stops = () if plan is None else _planned(plan)
+
+        def command(folder: Path, is_trial: bool) -> Sequence[str]:
+            drawn = ("--no-report", "--no-recording") if is_trial else ()
+            return ("calibrate", str(out), "-o", str(folder), *drawn)
+
+        taking = taking_of(chosen, is_driven=False)
+        return Task(
+            partial(_begin, out, recorded, plan, taking),
+            *(recorded.target, recorded.robot, recorded.mount),
+            None if plan is None else plan.cell.camera,
+            stops,
+            options.views or len(stops),
+            taking,
+            command,
+            out.with_name(f"{out.name}-result"),
+        )
+
+    words = (*described, *_DEVICES)
+    given = {name: value for name in words if (value := getattr(options, name)) is not None}
+    is_known = {"arm", "camera"} <= given.keys() and (plan is not None or "target" in given)
+    text = PageText(
+        f"Record {options.out.name}", {name: _FIELDS[name] for name in words}, "Calibrate"
+    )
+    setup = replace(_remembered(options.out), **given)
+    _serve(options.address, prepare, options, setup, text, begins=is_known)
+
+
+def verify_on_page(options: VerifyOptions) -> None:
+    """Runs `visioncal verify --page`."""
+    checks, found = options.session, _calibrations(options.against)
+
+    def prepare(setup: Setup) -> Task:
+        against = Path(setup.against)
+        calibration = load_calibration(against, options.choice)
+        fit, lens = calibration.joint_fit, calibration.camera
+        boards = {} if fit is None else fit.targets
+        if lens is None or len(boards) != 1:
+            raise DataError(
+                f"{against}: a page checks the calibration of a camera with one board; this one "
+                f"has {counted(len(boards), 'board')}.",
+                culprits=[str(against)],
+                next_step="Record stops, and check them with visioncal verify.",
+            )
+        (board,) = boards.values()
+        target = target_from_document(board, "board")
+        recorded = RecordedCell(calibration.mount, target, calibration.robot)
+        x, z = (edge.matrix for edge in calibration.edges.values())
+        poses = stops_to_repeat(calibration, None, 2 * CheckLimits.stops).poses
+        stops = tuple(
+            NextPose(
+                "Stand where the calibration stood: the board then fills the orange outline.",
+                seen_from(calibration.mount, x, z, pose),
+                pose,
+            )
+            for pose in poses
+        )
+        # An unfinished check of this day goes on.
+        name = f"{date.today().isoformat()}-{against.resolve().name}"
+        names = (name if at == 1 else f"{name}-{at}" for at in range(1, 1000))
+        out = next(checks / name for name in names if not _result(checks / name).exists())
+        moved = ("--board-moved",) if options.board_moved else ()
+
+        def command(folder: Path, _: bool) -> Sequence[str]:
+            return ("verify", str(out), "--against", str(against), "-o", str(folder), *moved)
+
+        taking = taking_of(_with_devices(RecordOptions(out=out), setup), is_driven=False)
+        return Task(
+            partial(_begin, out, recorded, None, taking),
+            *(target, calibration.robot, calibration.mount, lens.camera, stops, CheckLimits.stops),
+            taking,
+            command,
+            _result(out),
+        )
+
+    asked = {"against": ("Cell", found), **{name: _FIELDS[name] for name in _DEVICES}}
+    text = PageText(f"Check {checks.name}", asked, "Check", partial(_history, checks))
+    last = _remembered(checks)
+    setup = last if last.against in found else replace(last, against=found[0])
+    _serve(options.address, prepare, RecordOptions(out=checks), setup, text)
+
+
+def _serve(
+    address: tuple[str, int] | None,
+    prepare: Callable[[Setup], Task],
+    recording: RecordOptions,
+    setup: Setup,
+    text: PageText,
+    *,
+    begins: bool = False,
+) -> None:
+    """Serves a page until Ctrl-C; what it asks last is remembered in the recording's folder."""
+    client_library("nicegui", "page")
+    # It imports NiceGUI, which an extra brings.
+    from visioncal.live.page.server import serve
+
+    def devices(setup: Setup, typed: TypedPoses) -> AbstractContextManager[LiveCell]:
+        given = typed if setup.arm == "manual" else None
+        return opened(_with_devices(recording, setup), is_moved=False, given=given)
+
+    def remember(setup: Setup) -> None:
+        # Of a camera's URL without its user and password.
+        kept = replace(setup, camera=without_password(setup.camera))
+        recording.out.mkdir(parents=True, exist_ok=True)
+        write_atomically(recording.out / _REMEMBERED, json.dumps(asdict(kept), indent=2))
+
+    host, port = address or ("127.0.0.1", 8321)
+    say(f"The page is at http://{host}:{port}; Ctrl-C ends. Views are on the disk at any moment.")
+    station = Station(prepare, devices, setup, begins=begins, remember=remember)
+    try:
+        serve(station, text, host, port, opens=sys.stdin.isatty())
+    finally:
+        station.close()
+
+
+def _with_devices(recording: RecordOptions, setup: Setup) -> RecordOptions:
+    form = setup.pose_form or None
+    return replace(recording, arm=setup.arm, camera=setup.camera, pose_form=form)
+
+
+def _remembered(folder: Path) -> Setup:
+    """What was chosen last; the defaults where nothing is remembered that can be read."""
+    try:
+        content = json.loads((folder / _REMEMBERED).read_text(encoding="utf-8"))
+        return Setup(**{name: str(value) for name, value in content.items()})
+    except (OSError, ValueError, TypeError, AttributeError):
+        return Setup()
+
+
+def _begin(
+    out: Path,
+    recorded: RecordedCell | PlanCell,
+    plan: PlanFile | None,
+    taking: CaptureOptions,
+    cell: LiveCell,
+) -> Journal:
+    facts = CaptureFacts.of(cell, out.name, recorded, plan)
+    journal = Journal.resume(out, facts, cell.clock.unix_offset_s(), 0)
+    check_order(taking, cell, is_resumed=bool(journal.views))
+    return journal
+
+
+def _planned(plan: PlanFile) -> tuple[NextPose, ...]:
+    """The stops of a plan, in their order."""
+    q = np.array([stop.q for stop in plan.stops])
+    poses, seen = plan.cell.robot.base_from_flange(q), plan.cell.cam_from_target(q)
+    joints = (", ".join(f"{angle:.2f}" for angle in np.rad2deg(stop.q)) for stop in plan.stops)
+    return tuple(
+        NextPose(f"Stop {stop.view} of the plan; its joints: {angles} deg.", view, pose)
+        for stop, angles, view, pose in zip(plan.stops, joints, seen, poses, strict=True)
+    )
+
+
+def _calibrations(against: Path) -> list[str]:
+    """The calibration in a folder, or those in the folders in it."""
+    found = [against] if (against / CALIBRATION).is_file() or against.suffix else []
+    found = found or sorted(path.parent for path in against.glob(f"*/{CALIBRATION}"))
+    if not found:
+        raise DataError(
+            f"{against} holds no {CALIBRATION}, nor does a folder in it.",
+            culprits=[str(against)],
+            next_step="Name an output folder of visioncal calibrate, or the folder that has them.",
+        )
+    return [str(path) for path in found]
+
+
+def _result(check: Path) -> Path:
+    return check.with_name(f"{check.name}-verified")
+
+
+def _history(checks: Path) -> list[tuple[Light, str, str]]:
+    """The checks of a folder, the newest first: light, name, first reason."""
+    lines: list[tuple[Light, str, str]] = []
+    found = checks.glob(f"*-verified/{VERIFY}")
+    for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True):
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+            light: Light = "green" if document["passed"] else "red"
+            lines.append(
+                (light, path.parent.name.removesuffix("-verified"), document["sentences"][0])
+            )
+        except (OSError, ValueError, KeyError, IndexError):
+            continue
+    return lines

@@ -1,0 +1,59 @@
+"""What a calibration or a check says of the views so far, by the command that a user would run."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+# Colours of a traffic light; grey: no result yet.
+Light = Literal["green", "yellow", "red", "grey"]
+_OF_VERDICTS: dict[str, Light] = {"good": "green", "check": "yellow", "bad": "red"}
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The answer of `calibrate` or `verify`."""
+
+    light: Light
+    title: str  # The verdict in a word or two.
+    reasons: tuple[str, ...]  # The likeliest first.
+    next_step: str  # What to do; empty for nothing.
+    folder: Path  # Where its files are.
+    views: int  # Number of views of which it is.
+    document: dict[str, Any]  # What the command printed; empty where it failed.
+
+
+def ask_command(words: Sequence[str], folder: Path, views: int) -> Outcome:
+    """Runs a command of visioncal with `--json` as a process of its own, and reads its answer.
+
+    Args:
+        words: The command and its options.
+        folder: Where it writes.
+        views: Number of views of the session.
+    """
+    command = [sys.executable, "-m", "visioncal", *words, "--json"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        document = json.loads(ended.stdout)
+    except ValueError:
+        reasons = (ended.stderr.strip()[-2000:] or f"exit status {ended.returncode}",)
+        return Outcome("red", "failed", reasons, "", folder, views, {})
+    if "error" in document:
+        error = document["error"]
+        return Outcome("grey", "no result", (error["message"],), error["next"], folder, views, {})
+    if "verdict" in document:
+        status, findings = document["verdict"]["status"], document["verdict"]["findings"]
+        reasons = tuple(finding["words"] for finding in findings)
+        steps = (finding["do"] for finding in findings if "do" in finding)
+        title, light = status, _OF_VERDICTS[status]
+    else:
+        passed = document["passed"]
+        title, light = ("valid", "green") if passed else ("not valid", "red")
+        reasons, steps = tuple(document["sentences"]), iter(document["next"])
+    step = next(steps, "")
+    if isinstance(step, dict):
+        step = " ".join(filter(None, (step.get("words"), step.get("command"))))
+    return Outcome(light, title, reasons, step, folder, views, document)

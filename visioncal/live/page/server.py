@@ -1,0 +1,260 @@
+"""The page itself (NiceGUI): what a station shows, and what a person may ask of it.
+
+Every browser has a page of its own of the one station, redrawn from its snapshot; a reload loses
+nothing.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from urllib.parse import urlsplit
+
+from fastapi import Response
+from nicegui import app, ui
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from visioncal.core.conventions import POSE_FORMS, pendant_words
+from visioncal.core.documents.pendants import PendantPose, possible_forms, read_pose
+from visioncal.core.errors import DataError
+from visioncal.live.drivers.manual import pose_words
+from visioncal.live.page.outcome import Outcome
+from visioncal.live.page.station import PageText, Snapshot, Station
+
+_COLOURS = {"green": "#2e9e2e", "yellow": "#e0a800", "red": "#c62828", "grey": "#777777"}
+_PICTURE = "/live.jpg"
+
+
+class _SameOrigin:
+    """Refuses requests of other sites' pages, which a browser on this machine may have open.
+
+    A page's own requests name its address as their host, and as their origin where they name one.
+    """
+
+    def __init__(self, asgi: ASGIApp, hosts: Sequence[str]) -> None:
+        self._asgi, self._hosts = asgi, hosts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = {key.lower(): value.decode("latin-1") for key, value in scope.get("headers", ())}
+        host = headers.get(b"host", "")
+        is_known = not self._hosts or urlsplit(f"//{host}").hostname in self._hosts
+        origin = headers.get(b"origin")
+        is_own = origin is None or urlsplit(origin).netloc == host
+        if scope["type"] == "lifespan" or (is_known and is_own):
+            await self._asgi(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            await Response("Not from here.", 403)(scope, receive, send)
+
+
+def serve(station: Station, text: PageText, host: str, port: int, *, opens: bool) -> None:
+    """Serves the page until Ctrl-C.
+
+    Args:
+        station: The recording.
+        text: What the page asks and says.
+        host: Address to listen on.
+        port: Its port.
+        opens: Whether to open a browser.
+    """
+    loopback = ("127.0.0.1", "localhost", "::1")
+    # By another address a page may have any name.
+    app.add_middleware(_SameOrigin, hosts=loopback if host in loopback else ())
+
+    def live_picture() -> Response:
+        headers = {"Cache-Control": "no-store"}
+        return Response(station.snapshot.picture, 200, headers, "image/jpeg")
+
+    app.get(_PICTURE)(live_picture)
+    ui.page("/", title=text.title)(lambda: _Page(station, text) and None)
+    app.on_shutdown(station.close)
+    ui.run(
+        host=host, port=port, title=text.title, reload=False, show=opens, show_welcome_message=False
+    )
+
+
+class _Page:
+    """The page in one browser."""
+
+    def __init__(self, station: Station, text: PageText) -> None:
+        self._station, self._text = station, text
+        self._shown: Snapshot | None = None
+        self._inputs: dict[str, ui.select] = {}
+        with ui.row().classes("w-full items-center gap-4"):
+            ui.label(text.title).classes("text-2xl")
+            self._light = ui.html("", sanitize=False)
+            self._status = ui.label("").props("aria-live=polite")
+        self._problem = ui.label("").classes("text-red-700 text-lg").props("role=alert")
+        with ui.card().classes("w-full") as self._setup:
+            self._build_setup()
+        self._outcome = ui.card().classes("w-full gap-1")
+        with ui.row().classes("w-full gap-4 items-start") as self._live:
+            self._build_live()
+        self._history = ui.column().classes("w-full")
+        self._refresh()
+        ui.timer(0.2, self._refresh)
+
+    def _build_setup(self) -> None:
+        setup = self._station.snapshot.setup
+        for name, (label, choices) in self._text.fields.items():
+            value = getattr(setup, name) or None
+            options = list(dict.fromkeys([*choices, *filter(None, [value])]))
+            self._inputs[name] = ui.select(
+                *(options,),
+                label=label,
+                value=value,
+                clearable=True,
+                with_input=True,
+                new_value_mode="add-unique",
+            ).classes("w-96 max-w-full")
+        ui.button("Start", on_click=self._begin)
+
+    def _begin(self) -> None:
+        chosen = {name: str(field.value or "") for name, field in self._inputs.items()}
+        self._station.begin(replace(self._station.snapshot.setup, **chosen))
+
+    def _build_live(self) -> None:
+        with ui.column().classes("flex-1").style("min-width: min(100%, 480px)"):
+            self._picture = ui.interactive_image().classes("w-full").props("alt='live picture'")
+            with ui.row().classes("items-center"):
+                self._still = ui.label("").classes("text-xl font-bold")
+                self._sees = ui.label("")
+            self._coverage = ui.html("", sanitize=False)
+            self._advice = ui.label("").classes("text-sm")
+        with ui.column().classes("flex-1").style("min-width: min(100%, 360px)"):
+            self._next = ui.label("").classes("text-lg")
+            self._next_pose = ui.label("").classes("font-mono")
+            self._warned = ui.label(
+                "Drive there yourself, slowly: nothing here knows cables, tools or obstacles."
+            ).classes("text-sm")
+            with ui.column().classes("w-full gap-1") as self._typing:
+                self._form = ui.select(
+                    {
+                        "": "form of the pose: as recognised",
+                        **{k: f.words for k, f in POSE_FORMS.items()},
+                    },
+                    value=self._station.snapshot.setup.pose_form,
+                    on_change=self._read,
+                ).classes("w-full")
+                self._typed = (
+                    ui.input("Pose of the flange, as the pendant shows it", on_change=self._read)
+                    .props("autofocus autocomplete=off")
+                    .classes("w-full font-mono")
+                    .on("keydown.enter", self._take)
+                )
+                self._understood = ui.label("").props("aria-live=polite")
+            with ui.row().classes("gap-1"):
+                self._take_button = ui.button("Take view (Enter)", on_click=self._take)
+                ui.button("Undo last", on_click=lambda: self._ask(self._station.undo)).props("flat")
+                ui.button("Another pose", on_click=lambda: self._ask(self._station.skip)).props(
+                    "flat"
+                )
+                ui.button(self._text.finish, on_click=lambda: self._ask(self._station.finish))
+                ui.button("Close", on_click=lambda: self._ask(self._station.end)).props("flat")
+            self._missed = ui.label("").classes("text-red-700").props("role=alert")
+            self._views = ui.column().classes("gap-0 text-sm")
+
+    def _ask(self, request: Callable[[Snapshot], None]) -> None:
+        if self._shown is not None:
+            request(self._shown)
+
+    def _read(self) -> PendantPose | None:
+        """Reads the typed pose, and says how it is understood."""
+        line, form = self._typed.value.strip(), self._form.value or None
+        forms = possible_forms(line)
+        self._understood.text = ""
+        if not line:
+            return None
+        if form is None and len(forms) > 1:
+            self._understood.text = f"It may be a pose of {', '.join(forms)}: choose above."
+            return None
+        try:
+            read = read_pose(line, "the pose", form)
+        except DataError as error:
+            self._understood.text = f"{error.message} {error.next_step}"
+            return None
+        self._understood.text = f"Read as {read.words}: {pose_words(read.pose)}"
+        return read
+
+    def _take(self) -> None:
+        read, shown = self._read(), self._shown
+        if read is not None and shown is not None:
+            self._station.take(read.pose, read.form.name, shown)
+
+    def _refresh(self) -> None:
+        """Shows what has changed in the snapshot."""
+        now, before = self._station.snapshot, self._shown
+        self._shown = now
+        if now is before:
+            return
+        is_live = now.phase == "live"
+        self._setup.visible = now.phase in ("setup", "stopped")
+        self._live.visible = is_live or bool(now.views)
+        self._problem.text = now.problem
+        self._status.text = self._status_of(now)
+        if is_live and (before is None or now.pictures != before.pictures):
+            self._picture.set_source(f"{_PICTURE}?{now.pictures}")
+        self._still.text = "still" if now.is_still else "hold still"
+        self._sees.text, self._advice.text = now.sees, now.advice
+        self._typing.visible = self._take_button.visible = now.takes_typed
+        self._missed.text = now.missed
+        if before is None or now.coverage != before.coverage:
+            self._coverage.content = now.coverage
+        if before is None or (now.next_pose, now.pose_form) != (before.next_pose, before.pose_form):
+            self._show_next(now)
+        if before is None or now.views != before.views:
+            self._show_views(now)
+            if before is not None and len(now.views) > len(before.views):
+                self._typed.value = ""
+        if before is None or (now.trial, now.outcome) != (before.trial, before.outcome):
+            self._show_outcome(now)
+
+    def _status_of(self, now: Snapshot) -> str:
+        if now.phase == "opening":
+            return "opening the devices ..."
+        if now.is_judging:
+            return "computing the result ..."
+        if now.phase == "stopped":
+            return f"{len(now.views)} views are on the disk."
+        return f"{now.arm}: {len(now.views)} views" if now.phase == "live" else ""
+
+    def _show_next(self, now: Snapshot) -> None:
+        pose = now.next_pose
+        self._next.text = "" if pose is None else pose.words
+        known = pose is not None and pose.base_from_flange is not None
+        self._next_pose.text = (
+            pendant_words(pose.base_from_flange, POSE_FORMS[now.pose_form])
+            if pose is not None and pose.base_from_flange is not None
+            else ""
+        )
+        self._next_pose.visible = self._warned.visible = known
+
+    def _show_views(self, now: Snapshot) -> None:
+        self._views.clear()
+        with self._views:
+            for line in reversed(now.views):
+                ui.label(line)
+
+    def _show_outcome(self, now: Snapshot) -> None:
+        shown: Outcome | None = now.outcome or now.trial
+        colour = _COLOURS["grey" if shown is None else shown.light]
+        words = "no result yet" if shown is None else shown.title
+        so_far = " so far" if now.outcome is None and shown is not None else ""
+        self._light.content = (
+            f'<span role="status" style="background:{colour};color:white;border-radius:1em;'
+            f'padding:0.4em 1em;font-size:1.2em;white-space:nowrap">{words}{so_far}</span>'
+        )
+        self._outcome.clear()
+        self._outcome.visible = shown is not None
+        self._history.clear()
+        with self._outcome:
+            for reason in () if shown is None else shown.reasons[:3]:
+                ui.label(reason)
+            if shown is not None and shown.next_step:
+                ui.label(f"Next: {shown.next_step}").classes("font-bold")
+            if shown is not None and now.outcome is not None:
+                ui.label(f"The files are in {shown.folder}.").classes("text-sm")
+        with self._history:
+            for light, date, line in self._text.history():
+                with ui.row().classes("items-center no-wrap"):
+                    ui.html(f'<span style="color:{_COLOURS[light]}">&#9679;</span>', sanitize=False)
+                    ui.label(f"{date}: {line}")

@@ -1,0 +1,406 @@
+"""A recording that pages watch and steer: one thread owns arm, camera and folder."""
+
+import queue
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from threading import Thread
+from typing import Literal
+
+import numpy as np
+
+from visioncal.calibration.stages.detect import find_corners
+from visioncal.core.conventions import controller_form
+from visioncal.core.errors import DriverError, VisioncalError
+from visioncal.core.number_format import figure
+from visioncal.core.types import Camera, Corners, FloatArray, Image, Mount, Rejection, Target
+from visioncal.live.capture.cell import LiveCell
+from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
+from visioncal.live.capture.take import TakenView, grey_of, image_motion_px
+from visioncal.live.drivers.protocols import Answer, ArmState, MovingArm, RequestingArm
+from visioncal.live.page.drawing import coverage_svg, live_picture
+from visioncal.live.page.outcome import Light, Outcome, ask_command
+from visioncal.live.page.suggestion import NextPose, next_view
+from visioncal.live.planning.cell import flange_at
+from visioncal.robot import Robot
+
+# From this number of views on a calibration is tried after each.
+_FIRST_TRIAL = 5
+
+
+class TypedPoses:
+    """Arm without a connection, whose poses are typed on a page."""
+
+    name = "poses typed by hand"
+    invitation = ""
+
+    def __init__(self) -> None:
+        # (4, 4) the pose whose view is not yet taken [m].
+        self.pending: FloatArray | None = None
+
+    def request(self, timeout_s: float, wanted: str = "") -> ArmState | None:
+        """Returns the typed pose, once; it is never waited for."""
+        del timeout_s, wanted
+        pose, self.pending = self.pending, None
+        return None if pose is None else ArmState(time.monotonic(), pose)
+
+    def reply(self, answer: Answer, reason: str = "") -> None:
+        """Nothing: the page shows the view's report."""
+
+    def state(self) -> ArmState:
+        """Never called: a view is taken at the pose that requested it."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Holds no resources."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a page asks before a recording begins, in the words of the command line."""
+
+    target: str = "charuco_9x6_30mm"  # The board.
+    mount: str = "eye-in-hand"
+    robot: str = ""  # The arm's model; empty where it has none.
+    arm: str = "manual"
+    camera: str = "uvc:0"
+    pose_form: str = ""  # How poses are typed; empty to recognise it.
+    against: str = ""  # The calibration to verify.
+
+
+@dataclass(frozen=True)
+class PageText:
+    """What a page asks and says."""
+
+    title: str
+    # Fields of the setup that are asked for, by their names: label, and what may be chosen.
+    fields: Mapping[str, tuple[str, Sequence[str]]]
+    finish: str  # Label of the button that judges the views.
+    # Earlier results, the newest first: light, name and words.
+    history: Callable[[], Sequence[tuple[Light, str, str]]] = lambda: ()
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A recording to make, and the command that judges it."""
+
+    begin: Callable[[LiveCell], Journal]  # Begins or resumes the session.
+    target: Target
+    robot: Robot | None  # The arm's model; None where it is not known.
+    mount: Mount
+    lens: Camera | None  # Intrinsics; None where they are not known.
+    stops: tuple[NextPose, ...]  # Planned poses; none where coverage decides.
+    count: int  # Number of views after which it is judged; 0 where the person decides.
+    options: CaptureOptions
+    # The command's words, from the folder that it writes; a trial writes no drawings.
+    command: Callable[[Path, bool], Sequence[str]]
+    result: Path  # Where the result goes.
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """What pages show."""
+
+    phase: Literal["setup", "opening", "live", "stopped"] = "setup"
+    setup: Setup = field(default_factory=Setup)
+    problem: str = ""  # What is wrong, and what to do.
+    picture: bytes = b""  # The live picture, a JPEG.
+    pictures: int = 0  # Number of pictures so far.
+    sees: str = ""  # What is seen in it.
+    is_still: bool = False
+    arm: str = ""  # The arm's name.
+    takes_typed: bool = False  # Whether poses are typed.
+    views: tuple[str, ...] = ()  # A line a view.
+    missed: str = ""  # Why the last try gave no view.
+    coverage: str = ""  # The coverage, as SVG.
+    advice: str = ""
+    next_pose: NextPose | None = None
+    pose_form: str = ""  # The form in which poses are shown.
+    trial: Outcome | None = None  # Result of the views so far.
+    outcome: Outcome | None = None  # Result at the end.
+    is_judging: bool = False
+
+
+class Station:
+    """A recording that pages watch and steer.
+
+    Pages read `snapshot`, which is replaced whole, and call the methods below, which put a request
+    into the queue of the thread that owns the devices. A request of a page that has not seen the
+    newest view is dropped: two browsers, or a key pressed twice, take one view.
+
+    Args:
+        prepare: Makes the task of a setup; raises VisioncalError.
+        devices: Opens the devices of a setup; an arm whose poses are typed is given.
+        setup: The setup to begin with, or to show.
+        begins: Whether to begin at once.
+        remember: Called with the setup once its devices are open.
+    """
+
+    def __init__(
+        self,
+        prepare: Callable[[Setup], Task],
+        devices: Callable[[Setup, TypedPoses], AbstractContextManager[LiveCell]],
+        setup: Setup,
+        *,
+        begins: bool,
+        remember: Callable[[Setup], None] = lambda _: None,
+    ) -> None:
+        self._prepare, self._devices, self._remember = prepare, devices, remember
+        self.snapshot = Snapshot(setup=setup)
+        self._requests: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._open = ExitStack()
+        self._judge = ThreadPoolExecutor(1)
+        self._judging: Future[Outcome] | None = None
+        if begins:
+            self.begin(setup)
+        self._thread = Thread(target=self._work, name="recording", daemon=True)
+        self._thread.start()
+
+    def begin(self, setup: Setup) -> None:
+        """Opens the devices of a setup and begins, or goes on after a failure."""
+        self._requests.put(lambda: self._begin(setup))
+
+    def take(self, base_from_flange: FloatArray, form: str, seen: Snapshot) -> None:
+        """Takes a view at a pose (4, 4) [m] that was typed in a form of `POSE_FORMS`."""
+
+        def typed() -> None:
+            self._publish(pose_form=form)
+            self._typed.pending = base_from_flange
+
+        self._put(seen, typed)
+
+    def undo(self, seen: Snapshot) -> None:
+        """Removes the last view."""
+        self._put(seen, self._undo)
+
+    def skip(self, seen: Snapshot) -> None:
+        """Suggests another pose."""
+        self._put(seen, self._skip)
+
+    def finish(self, seen: Snapshot) -> None:
+        """Judges the views."""
+        self._put(seen, lambda: self._ask(self._task.result, is_trial=False))
+
+    def end(self, seen: Snapshot) -> None:
+        """Closes the devices, and asks for another setup."""
+        self._put(seen, lambda: self._stop(""))
+
+    def close(self) -> None:
+        """Ends the thread, which closes the devices."""
+        self._requests.put(None)
+        self._thread.join(10.0)
+        self._judge.shutdown(cancel_futures=True)
+
+    def _put(self, seen: Snapshot, request: Callable[[], None]) -> None:
+        def guarded() -> None:
+            now = self.snapshot
+            if now.phase == "live" and len(now.views) == len(seen.views):
+                request()
+
+        self._requests.put(guarded)
+
+    def _publish(self, **changes: object) -> None:
+        self.snapshot = replace(self.snapshot, **changes)  # type: ignore[arg-type]
+
+    def _work(self) -> None:
+        """Serves requests, and between them the live picture, until it is closed."""
+        while True:
+            is_live = self.snapshot.phase == "live"
+            try:
+                request = self._requests.get(timeout=0.001 if is_live else 0.2)
+            except queue.Empty:
+                request = self._live if is_live else lambda: None
+            if request is None:
+                break
+            try:
+                request()
+            except VisioncalError as error:
+                self._stop(f"{error.message} {error.next_step}".strip())
+            except Exception:  # noqa: BLE001
+                traceback.print_exc()
+                self._stop("This is a bug of visioncal; its terminal says more. Views are safe.")
+        self._open.close()
+
+    def _stop(self, problem: str) -> None:
+        self._open.close()
+        phase = "stopped" if self.snapshot.views else "setup"
+        self._publish(phase=phase, problem=problem)
+
+    def _begin(self, setup: Setup) -> None:
+        if self.snapshot.phase == "live":
+            return
+        self._publish(phase="opening", setup=setup, problem="")
+        self._task, self._typed = self._prepare(setup), TypedPoses()
+        self._previous: Image | None = None
+        # Intrinsics by a trial, where no others are known.
+        self._fitted: Camera | None = None
+        cell = self._open.enter_context(self._devices(setup, self._typed))
+        self._journal = self._task.begin(cell)
+        self._cell, self._rejected = cell, list[FloatArray]()
+        self._remember(setup)
+        self._capture = self._started()
+        self._rest = RestWatch(self._journal, self._task.options.still)
+        form = None if self._task.robot is None else controller_form(self._task.robot.name)
+        shown = setup.pose_form or ("ros" if form is None else form.name)
+        self._publish(
+            phase="live",
+            arm=cell.arm.name,
+            takes_typed=cell.arm is self._typed,
+            pose_form=shown,
+            views=tuple(f"view {view.number}: recorded before" for view in self._journal.views),
+            missed=getattr(cell.arm, "invitation", ""),
+            trial=None,
+            outcome=None,
+        )
+        self._advise()
+
+    def _started(self) -> Capture:
+        task = self._task
+        seen = (task.target, task.robot, self._cell.camera.factory or task.lens or self._fitted)
+        return Capture(self._cell, *seen, self._journal, task.options, None, self._taken)
+
+    def _live(self) -> None:
+        """Shows a picture, and takes a view where the arm requests one or has come to rest."""
+        cell, task = self._cell, self._task
+        if not task.options.single:
+            image = cell.camera.frame().image
+            grey = grey_of(image)
+            found, _ = find_corners(grey, task.target, 0)
+            moved_px = np.inf if self._previous is None else image_motion_px(self._previous, grey)
+            self._previous = grey
+            self._show(image, found)
+            self._publish(is_still=moved_px <= task.options.still.image_px)
+        if isinstance(cell.arm, RequestingArm):
+            try:
+                take_requested(self._capture, cell.arm, task.count, 0.01)
+            except EOFError:
+                self._stop("The robot's program has ended.")
+            except DriverError as error:
+                if not task.options.single:
+                    raise
+                # The picture of a typed pose may still be saved.
+                self._publish(missed=f"{error.message} {error.next_step}")
+        elif isinstance(cell.arm, MovingArm) and self._rest.begins(cell.state()):
+            self._capture.view(*self._capture.next_numbers(), task.count)
+
+    def _show(self, image: Image, found: Corners | Rejection) -> None:
+        """Publishes a picture with what is found in it."""
+        corners = found if isinstance(found, Corners) else None
+        pose = self.snapshot.next_pose
+        wanted = None if pose is None else pose.cam_from_target
+        sees = (
+            f"{len(found.ids)} corners, edges {figure(found.blur_px)} px"
+            if isinstance(found, Corners)
+            else found.reason
+        )
+        picture = live_picture(image, self._task.target, corners, self._capture.coach.lens, wanted)
+        self._publish(picture=picture, pictures=self.snapshot.pictures + 1, sees=sees)
+
+    def _taken(self, step: CaptureEvent) -> None:
+        """Publishes a view, and tries a calibration of all so far."""
+        if not isinstance(step.found, TakenView):
+            self._publish(missed=step.words)
+            return
+        if self._task.options.single:
+            self._show(step.found.frame.image, step.found.corners)
+        self._publish(views=(*self.snapshot.views, step.words), missed="", outcome=None)
+        self._after_change()
+
+    def _undo(self) -> None:
+        if not self._journal.views:
+            return
+        self._journal.undo()
+        self._capture = self._started()
+        self._publish(views=self.snapshot.views[:-1], missed="", trial=None, outcome=None)
+        self._after_change()
+
+    def _after_change(self) -> None:
+        count = len(self._journal.views)
+        if self._task.count and count >= self._task.count:
+            self._ask(self._task.result, is_trial=False)
+        elif count >= _FIRST_TRIAL and not self._task.stops:
+            self._ask(self._trial_folder(), is_trial=True)
+        self._advise()
+
+    def _trial_folder(self) -> Path:
+        return Path(self._open.enter_context(tempfile.TemporaryDirectory())) / "trial"
+
+    def _ask(self, folder: Path, *, is_trial: bool) -> None:
+        """Runs the judging command beside the recording."""
+        views = len(self._journal.views)
+        if not views:
+            self._publish(missed="There is no view yet.")
+            return
+        words = self._task.command(folder, is_trial)
+        if self._judging is not None:
+            # One that is still waiting is superseded; one that runs says how it is so far.
+            self._judging.cancel()
+        self._judging = self._judge.submit(ask_command, words, folder, views)
+        self._judging.add_done_callback(self._answered)
+        self._publish(is_judging=not is_trial)
+
+    def _answered(self, future: Future[Outcome]) -> None:
+        if not future.cancelled():
+            self._requests.put(lambda: self._judged(future.result()))
+
+    def _judged(self, outcome: Outcome) -> None:
+        if self.snapshot.phase != "live":
+            return
+        if outcome.folder == self._task.result:
+            self._publish(outcome=outcome, is_judging=False)
+        elif outcome.views <= len(self._journal.views):
+            self._publish(trial=outcome)
+            fitted = outcome.document.get("camera")
+            if fitted and self._capture.coach.camera is None:
+                size = self._cell.camera.resolution
+                numbers = (np.array(fitted[name]) for name in ("matrix", "distortion"))
+                self._fitted = Camera(fitted["model"], size, *numbers)
+                self._capture = self._started()
+            self._advise()
+
+    def _skip(self) -> None:
+        pose = self.snapshot.next_pose
+        if pose is not None and pose.cam_from_target is not None:
+            self._rejected.append(pose.cam_from_target)
+        self._advise()
+
+    def _advise(self) -> None:
+        """Publishes the coverage, and the next pose."""
+        coach, task, taken = self._capture.coach, self._task, len(self._journal.views)
+        pose: NextPose | None
+        if task.count and taken >= task.count:
+            pose = NextPose("All views are there.")
+        elif task.stops:
+            at = taken + len(self._rejected)
+            pose = task.stops[at] if at < len(task.stops) else None
+        else:
+            pose = self._suggested()
+        self._publish(
+            coverage=coverage_svg(coach.covered, coach.poses),
+            advice=coach.words(),
+            next_pose=pose,
+        )
+
+    def _suggested(self) -> NextPose:
+        """The next view by coverage, and where a trial says it, the pose of the flange."""
+        coach, task, trial = self._capture.coach, self._task, self.snapshot.trial
+        if not coach.poses:
+            return NextPose("Begin with the whole board large in the picture.")
+        view = next_view(task.target, coach.lens, [*coach.poses, *self._rejected])
+        tilt = np.rad2deg(np.arccos(np.clip(view[2, 2], -1.0, 1.0)))
+        words = (
+            "Move until the board fills the orange outline, its first corner in the ring; it is "
+            f"tilted by {tilt:.0f} degrees there."
+        )
+        if trial is None or trial.light == "red" or not trial.document:
+            return NextPose(words, view)
+        edges = trial.document["transforms"].values()
+        x, z = (np.array(edge["matrix"]) for edge in edges)
+        return NextPose(words, view, flange_at(task.mount, x, z, view))
