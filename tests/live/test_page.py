@@ -184,6 +184,24 @@ def test_a_calibration_by_typed_poses_is_that_of_their_session(cell, calibrated)
     assert result.session_sha256 == visioncal.calibrate(taken).session_sha256
 
 
+def test_a_robots_own_program_is_watched_on_the_page(cell, browser):
+    seen, port = cell / "seen", free_port()
+    views = Session.load(seen).views
+    devices = ("--arm", f"socket:{port}", "--camera", f"played:{seen}")
+    what = ("--target", "charuco_9x6_30mm", "--views", len(views))
+    with served("record", "-o", cell / "sent", *devices, *what) as (url, _):
+        page = opened(browser, url)
+        page.get_by_text("Waiting for the robot's own program").wait_for()
+        assert not page.get_by_label(POSE).is_visible()
+        with socket.create_connection(("127.0.0.1", port)) as robot, robot.makefile("r") as file:
+            for at, view in enumerate(views, 1):
+                (seen / "shown").write_text(str(view.number))
+                robot.sendall(f"{at} | {kuka(view.base_from_flange())}\n".encode())
+                assert file.readline().split()[0] == ("next" if at < len(views) else "done")
+        page.get_by_role("status").get_by_text("good", exact=True).wait_for()
+    assert len(Session.load(cell / "sent").views) == len(views)
+
+
 @pytest.mark.usefixtures("calibrated")
 def test_a_check_passes_and_fails_and_is_remembered(cell, browser):
     with served("verify", cell / "checks", "--against", cell) as (url, _):

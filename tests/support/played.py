@@ -28,8 +28,11 @@ class PlayedCamera:
         del timeout_s
         at_s = time.monotonic()
         try:
-            number = int((self._folder / "shown").read_text())
-        except (OSError, ValueError):
+            # Empty for the moment in which it is written.
+            while not (shown := (self._folder / "shown").read_text()):
+                pass
+            number = int(shown)
+        except OSError:
             raise DriverError(
                 "The played camera gives no picture.", next_step="Look at its cable."
             ) from None
