@@ -71,7 +71,7 @@ class LiveCell:
             raise DriverError(
                 f"{self.arm.name}: {words}: the arm stands still, and no view was taken there.",
                 culprits=[self.arm.name],
-                next_step=f"{_STOPPED[state.safety]} and go on with --resume.",
+                next_step=f"{_STOPPED[state.safety]} and go on.",
             )
         if age_s > _STALE_S:
             raise DriverError(

@@ -122,8 +122,7 @@ class Gate:
                     f"goal in joint {joint + 1}; within {np.rad2deg(_ARRIVED_RAD):.1f} deg is "
                     "needed.",
                     culprits=[name],
-                    next_step="Was it stopped on the pendant? Start it again there, and go on with "
-                    "--resume.",
+                    next_step="Was it stopped on the pendant? Start it again there.",
                 )
 
     def _wait(self, arm: MovingArm, expected_s: float, look: Callable[[], None]) -> None:

@@ -328,7 +328,7 @@ class Journal:
             f"{self.folder}: too little room: {free / 1e6:.1f} MB are free, and "
             f"{(needed + _SPARE_BYTES) / 1e6:.1f} MB are needed for {what}.",
             culprits=[str(self.folder)],
-            next_step="Make room on that disk and go on with --resume.",
+            next_step="Make room on that disk.",
         )
 
 

@@ -18,7 +18,7 @@ from visioncal.live.capture.gate import Consent, Gate, check_same_arm, clear_pat
 from visioncal.live.capture.journal import Journal, state_of
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.take import Missed, TakenView, take, why_arm_moves
-from visioncal.live.drivers.protocols import ArmState, RequestingArm
+from visioncal.live.drivers.protocols import ArmState, MovingArm, RequestingArm
 from visioncal.live.planning.design import Accuracy
 from visioncal.live.planning.plan import Stop
 from visioncal.live.planning.plan_file import PlanFile
@@ -181,8 +181,7 @@ class Capture:
             f"{reasons[-1]}.",
             culprits=[f"view {step.view}" for step in recent],
             next_step="Look at the board: does it lie where the plan has it, in the light and "
-            f"unhidden? Is it a {self.target.name}, and the lens in focus? Then go on with "
-            "--resume.",
+            f"unhidden? Is it a {self.target.name}, and the lens in focus?",
         )
 
     def next_numbers(self) -> tuple[int, int]:
@@ -210,14 +209,13 @@ class Capture:
             if self.options.single:
                 resume = "Record all into a new session: a folder begins with its first picture."
             if isinstance(error, KeyboardInterrupt):
+                halted = "; the arm was halted" if isinstance(self.cell.arm, MovingArm) else ""
                 raise DriverError(
-                    f"stopped by Ctrl-C or a signal; the arm was halted. {stored}",
+                    f"stopped by Ctrl-C or a signal{halted}. {stored}",
                     culprits=["Ctrl-C"],
                     next_step=resume,
                 ) from None
-            step = error.next_step
-            if "--resume" not in step:
-                step = f"{step} {resume}".strip()
+            step = f"{error.next_step} {resume}".strip()
             message = f"{error.message} {stored}"
             raise type(error)(message, culprits=error.culprits, next_step=step) from error
 

@@ -100,7 +100,7 @@ class OakCamera:
                     raise DriverError(
                         f"{self.name} gave no picture within {timeout_s:g} s.",
                         culprits=[self.name],
-                        next_step="Look at its cable and its power; then go on with --resume.",
+                        next_step="Look at its cable and its power.",
                     )
                 continue
             # Depthai's clock is this host's monotonic one.
@@ -220,7 +220,7 @@ def _worded(dai: ModuleType, name: str, what: str = "gives no frames any more") 
         raise DriverError(
             f"{name} {what}: {error}.",
             culprits=[name],
-            next_step="Look at its cable and its power; then go on with --resume.",
+            next_step="Look at its cable and its power.",
         ) from error
 
 

@@ -146,7 +146,7 @@ class SocketArm:
                     f"{self.name} has sent no stop to {self.host}:{self.port} for "
                     f"{self._patience_s:.0f} s.{refused}",
                     culprits=[f"{self.host}:{self.port}"],
-                    next_step="Start it again on the pendant, and go on with --resume; see whether "
+                    next_step="Start it again on the pendant; see whether "
                     "it has this computer's address and port, and whether a firewall is between.",
                 )
             if waited.read() > timeout_s:

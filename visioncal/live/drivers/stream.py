@@ -21,7 +21,7 @@ from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
 # The longest wait, in intervals between this camera's pictures: one under way at the request, the
 # requested one, and one more for network jitter; and the pictures of which the mean counts.
 _INTERVALS, _PACED = 3.0, 50
-_RESUME = "Look at its cable, its power and its network; then go on with --resume."
+_STEP = "Look at its cable, its power and its network."
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ class StreamingCamera:
 
     def _read(self, arrivals: Iterator[Arrival | None], closing: ExitStack) -> None:
         ended = "gives no picture: it is unplugged, or closed its stream"
-        error = camera_error(self.name, ended, _RESUME)
+        error = camera_error(self.name, ended, _STEP)
         with closing:
             try:
                 for arrival in arrivals:
@@ -134,7 +134,7 @@ class StreamingCamera:
                     if arrival is not None:
                         self._handle(arrival)
             except Exception as caught:  # noqa: BLE001
-                error = camera_error(self.name, f"{ended} ({caught})", _RESUME)
+                error = camera_error(self.name, f"{ended} ({caught})", _STEP)
                 error.__cause__ = caught
         # Raised to whoever waits for a picture.
         with self._news:
@@ -176,7 +176,7 @@ class StreamingCamera:
     def _timeout_error(self, waited_s: float) -> DriverError:
         if self._too_old <= _INTERVALS:
             why = f"stalls: no picture has come for {waited_s:.1f} s"
-            return camera_error(self.name, why, _RESUME)
+            return camera_error(self.name, why, _STEP)
         why = f"gives no fresh pictures: {self._too_old} that came were older than the request, or "
         step = "It sends more than can be carried or decoded: set a lower rate or resolution."
         return camera_error(self.name, f"{why}cut short", step)

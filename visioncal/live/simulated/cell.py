@@ -79,7 +79,7 @@ class SimulatedCamera:
             raise DriverError(
                 f"The {self.name} gave no picture within {timeout_s:g} s.",
                 culprits=[self.name],
-                next_step="Look at its cable and its power, then go on with --resume.",
+                next_step="Look at its cable and its power.",
             )
         self._clock.sleep(max(start + exposure_s - requested_at, 0.0))
         middle_s = start + 0.5 * exposure_s
