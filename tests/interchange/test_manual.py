@@ -11,6 +11,7 @@ from support.refusals import raised
 from support.rotations import CASES
 from support.samples import made_up
 
+from visioncal.core.conventions import POSE_FORMS, pendant_words
 from visioncal.core.documents.pendants import read_pose
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
@@ -70,6 +71,14 @@ def test_a_line_means_what_its_maker_says(line):
     found = read_pose(line, "the line")
     # To rounding.
     assert np.abs(found.pose - a_pose(LINES[line])).max() < 1e-12
+
+
+@pytest.mark.parametrize("form", POSE_FORMS)
+def test_a_pose_that_is_shown_can_be_typed_back(form):
+    pose = compose(Rotation.from_rotvec([0.4, -1.2, 2.0]).as_matrix(), np.array([0.5, -0.2, 0.8]))
+    read = read_pose(pendant_words(pose, POSE_FORMS[form]), "the line", form)
+    # Half of the last digits that are shown: 0.005 mm, and about 1e-5 rad.
+    assert np.abs(read.pose - pose).max() < 2e-5
 
 
 def test_bare_numbers_are_what_the_user_says():

@@ -57,6 +57,8 @@ _NAMED_ROTATIONS: Mapping[tuple[str, ...], tuple[str, ...]] = {
     ("qx", "qy", "qz", "qw"): ("ros",),
     ("rx", "ry", "rz"): ("ur", "yaskawa", "staubli"),
 }
+# Forms whose numbers have the names of another, which is meant unless they are stated.
+_SAME_NAMES = {"doosan": "kuka", "rpy": "ur"}
 # Forms by the count of bare numbers; seven are the columns of views.csv.
 _BARE_FORMS: Mapping[int, tuple[str, ...]] = {
     6: ("ur", "kuka", "fanuc", "yaskawa", "staubli", "doosan"),
@@ -263,7 +265,8 @@ def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:
         return written.forms[0]
     # Bare numbers may be of any form that the user states.
     is_bare = written.forms in _BARE_FORMS.values()
-    if stated is not None and stated in POSE_FORMS and (is_bare or stated in written.forms):
+    as_written = _SAME_NAMES.get(stated or "", stated)
+    if stated is not None and stated in POSE_FORMS and (is_bare or as_written in written.forms):
         return stated
     makers = ", ".join(written.forms)
     said = "" if stated is None else f", not of {stated!r}"
