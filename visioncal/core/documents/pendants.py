@@ -265,8 +265,8 @@ def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:
         return written.forms[0]
     # Bare numbers may be of any form that the user states.
     is_bare = written.forms in _BARE_FORMS.values()
-    as_written = _SAME_NAMES.get(stated or "", stated)
-    if stated is not None and stated in POSE_FORMS and (is_bare or as_written in written.forms):
+    fits = is_bare or not {stated, _SAME_NAMES.get(stated or "")}.isdisjoint(written.forms)
+    if stated is not None and stated in POSE_FORMS and fits:
         return stated
     makers = ", ".join(written.forms)
     said = "" if stated is None else f", not of {stated!r}"
