@@ -145,7 +145,7 @@ CALIBRATING = (
     (
         "visioncal.cli.record",
         {"depthai", "rtde_control", "rtde_receive", "harvesters", "genicam", "pypylon"}
-        | {"pyrealsense2"},
+        | {"pyrealsense2", "nicegui", "visioncal.live.page"},
     ),
 )
 
