@@ -20,7 +20,7 @@ from support.refusals import raised
 
 from visioncal.core.errors import DriverError
 from visioncal.live.capture.devices import open_camera
-from visioncal.live.drivers import features, folder, realsense
+from visioncal.live.drivers import folder, realsense, stream
 from visioncal.live.drivers.features import bgr_or_grey
 from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
 from visioncal.session import Session
@@ -150,7 +150,7 @@ def pylon(monkeypatch):
 
     monkeypatch.setattr(library.InstantCamera, "Open", opened)
     monkeypatch.setattr(library.InstantCamera, gone, lambda _: emulated.is_removed)
-    monkeypatch.setattr(features, "_SETTLE_S", 0.1)
+    monkeypatch.setattr(stream, "SETTLE_S", 0.1)
     return emulated
 
 

@@ -8,7 +8,7 @@ import pytest
 from support.refusals import raised
 
 from visioncal.core.errors import DriverError
-from visioncal.live.drivers import oak
+from visioncal.live.drivers import oak, stream
 from visioncal.live.drivers.oak import OakCamera, depthai
 from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
 
@@ -96,7 +96,7 @@ def a_device(monkeypatch, *, lens=0, coefficients=(), is_colour=True, has_autofo
     library.node = SimpleNamespace(Camera=CameraNode)
     monkeypatch.setattr(oak, "depthai", lambda: library)
     # Long enough for a picture or two.
-    monkeypatch.setattr(oak, "_SETTLE_S", 0.1)
+    monkeypatch.setattr(stream, "SETTLE_S", 0.1)
     return device, seen
 
 
@@ -123,7 +123,7 @@ def test_a_device_is_held_where_automatic_exposure_and_focus_went(monkeypatch):
 def test_what_is_wished_is_set_from_the_start(monkeypatch):
     _, seen = a_device(monkeypatch, is_colour=False)
     requested = DeviceSetup((640, 400), 5000, 200, 90)
-    camera = OakCamera(requested)
+    camera = OakCamera("", requested)
     camera.close()
     assert seen.initial.getExposureTime().total_seconds() == pytest.approx(5e-3)
     assert (seen.initial.getSensitivity(), seen.initial.getLensPosition()) == (200, 90)
@@ -135,7 +135,7 @@ def test_what_is_wished_is_set_from_the_start(monkeypatch):
 
 def test_the_factorys_intrinsics_are_scaled_and_cropped(monkeypatch):
     a_device(monkeypatch, coefficients=(-0.1, 0.05, 1e-3, -1e-3, 0.01))
-    camera = OakCamera(DeviceSetup((2028, 1140)))
+    camera = OakCamera("", DeviceSetup((2028, 1140)))
     camera.close()
     # Half the size; 1520 rows are cropped to 1140 about the middle.
     assert camera.factory.matrix == pytest.approx([1500.25, 1500.75, 1015.125, 569.25], abs=1e-3)
@@ -145,7 +145,7 @@ def test_the_factorys_intrinsics_are_scaled_and_cropped(monkeypatch):
 
 def test_a_lens_that_no_model_of_ours_describes_is_not_taken(monkeypatch):
     a_device(monkeypatch, coefficients=[0.1] * 9)
-    camera = OakCamera(DeviceSetup((640, 400)))
+    camera = OakCamera("", DeviceSetup((640, 400)))
     camera.close()
     assert camera.factory is None
     assert "thin-prism" in camera.settings["factory_intrinsics"]

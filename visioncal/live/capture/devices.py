@@ -96,12 +96,6 @@ def _socket(address: str, *, form: str | None, **__: object) -> Arm:
     return SocketArm(host or "127.0.0.1", int(port), form)
 
 
-def _oak(address: str, requested: DeviceSetup) -> CameraDevice:
-    from visioncal.live.drivers.oak import OakCamera
-
-    return OakCamera(requested, device=address or None)
-
-
 def _driver(name: str) -> Callable[[str, DeviceSetup], CameraDevice]:
     """Opener of a camera by its driver, `module.Class` of an address and what is requested."""
     module, _, kind = f"visioncal.live.drivers.{name}".rpartition(".")
@@ -113,7 +107,7 @@ ARMS: Mapping[str, Callable[..., Arm]] = {"ur": _ur, "manual": _manual, "socket"
 # Those that request views, and are not driven.
 REQUESTING = ("manual", "socket")
 CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {
-    "oak": _oak,
+    "oak": _driver("oak.OakCamera"),
     "uvc": _driver("uvc.UvcCamera"),
     "genicam": _driver("genicam.GenicamCamera"),
     "basler": _driver("basler.BaslerCamera"),

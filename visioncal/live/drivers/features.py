@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from visioncal.core.extras import Handle
 from visioncal.core.types import Image
+from visioncal.live.drivers import stream
 from visioncal.live.drivers.protocols import DeviceSetup
-from visioncal.live.drivers.stream import Arrival, camera_error
 
 # Pixel formats and their OpenCV codes, in the order in which they are chosen. SFNC names a Bayer
 # pattern by its first two pixels, as OpenCV's names of four letters do.
@@ -23,8 +23,6 @@ _FORMATS: dict[str, int | None] = {
     "BayerGB8": cv2.COLOR_BayerGBRG2BGR,
     "BayerBG8": cv2.COLOR_BayerBGGR2BGR,
 }
-# Time for automatic functions before they are held [s].
-_SETTLE_S = 1.5
 # Older cameras have the second names.
 _EXPOSURE, _GAIN = ("ExposureTime", "ExposureTimeAbs"), ("Gain", "GainRaw")
 
@@ -68,7 +66,7 @@ class Features:
         sent = self.get("PixelFormat")
         if sent not in _FORMATS and all(self._why_not(name, "PixelFormat") for name in _FORMATS):
             why = f"sends {sent}; one of {', '.join(_FORMATS)} is needed"
-            raise camera_error(self.name, why, "Set its PixelFormat in its maker's viewer.")
+            raise stream.camera_error(self.name, why, "Set its PixelFormat in its maker's viewer.")
         for name, value in (
             ("AcquisitionMode", "Continuous"),
             ("TriggerSelector", "FrameStart"),
@@ -88,13 +86,14 @@ class Features:
                 self._why_not(free, guard)
                 if why := self._why_not(number, *names).rstrip("."):
                     step = f"Give one that it takes, or leave {option} out."
-                    raise camera_error(self.name, f"does not take {option} {number}: {why}", step)
+                    why = f"does not take {option} {number}: {why}"
+                    raise stream.camera_error(self.name, why, step)
 
-    def held(self, arrivals: Iterator[Arrival | None]) -> dict[str, str | float]:
+    def held(self, arrivals: Iterator[stream.Arrival | None]) -> dict[str, str | float]:
         """Lets automatic functions that are on settle, and holds what they found: the settings."""
         names = ("ExposureAuto", "GainAuto", "BalanceWhiteAuto")
         automatic = [name for name in names if self.get(name) not in (None, "Off")]
-        until = time.monotonic() + _SETTLE_S
+        until = time.monotonic() + stream.SETTLE_S
         while automatic and time.monotonic() < until:
             next(arrivals, None)
         for name in automatic:

@@ -21,6 +21,8 @@ from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
 # The longest wait, in intervals between this camera's pictures: one under way at the request, the
 # requested one, and one more for network jitter; and the pictures of which the mean counts.
 _INTERVALS, _PACED = 3.0, 50
+# Time for automatic exposure, focus and the like before they are held [s].
+SETTLE_S = 1.5
 _STEP = "Look at its cable, its power and its network."
 
 
