@@ -136,7 +136,7 @@ def calibrated(cell, browser) -> Path:
         choose(page, "Camera", f"played:{seen}")
         page.get_by_role("button", name="Start").click()
         page.get_by_label(POSE).fill("400 20 300 10 20 30")
-        page.get_by_text("It may be a pose of").wait_for()
+        page.get_by_text("one form is needed").wait_for()
         for place, view in enumerate(views[:4], 1):
             typed(page, seen, view, kuka(view.base_from_flange(), comma=place % 2 == 0), place)
         page.get_by_role("button", name="Undo last").click()

@@ -2,8 +2,8 @@
 
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from datetime import date
 from functools import partial
@@ -29,7 +29,6 @@ from visioncal.interchange.result_files import load_calibration
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.devices import ARMS, CAMERAS
 from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
-from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.drivers.uvc import without_password
 from visioncal.live.page.outcome import Light
 from visioncal.live.page.station import PageText, Setup, Station, Task, TypedPoses
@@ -71,20 +70,14 @@ def record_on_page(options: RecordOptions) -> None:
             chosen = replace(chosen, target=setup.target or None, mount=mount, robot=robot)
         recorded, out = recorded_cell(plan, chosen), options.out
         stops = () if plan is None else _planned(plan)
-
-        def command(folder: Path, is_trial: bool) -> Sequence[str]:
-            drawn = ("--no-report", "--no-recording") if is_trial else ()
-            return ("calibrate", str(out), "-o", str(folder), *drawn)
-
-        taking = taking_of(chosen, is_driven=False)
         return Task(
-            partial(_begin, out, recorded, plan, taking),
-            *(recorded.target, recorded.robot, recorded.mount),
+            partial(_begun, setup, chosen, recorded, plan, out),
+            recorded,
             None if plan is None else plan.cell.camera,
             stops,
             options.views or len(stops),
-            taking,
-            command,
+            taking_of(chosen, is_driven=False),
+            ("calibrate", str(out)),
             out.with_name(f"{out.name}-result"),
         )
 
@@ -95,7 +88,7 @@ def record_on_page(options: RecordOptions) -> None:
         f"Record {options.out.name}", {name: _FIELDS[name] for name in words}, "Calibrate"
     )
     setup = replace(_remembered(options.out), **given)
-    _serve(options.address, prepare, options, setup, text, begins=is_known)
+    _serve(options.address, prepare, setup, text, begins=is_known)
 
 
 def verify_on_page(options: VerifyOptions) -> None:
@@ -132,16 +125,12 @@ def verify_on_page(options: VerifyOptions) -> None:
         names = (name if at == 1 else f"{name}-{at}" for at in range(1, 1000))
         out = next(checks / name for name in names if not _result(checks / name).exists())
         moved = ("--board-moved",) if options.board_moved else ()
-
-        def command(folder: Path, _: bool) -> Sequence[str]:
-            return ("verify", str(out), "--against", str(against), "-o", str(folder), *moved)
-
-        taking = taking_of(_with_devices(RecordOptions(out=out), setup), is_driven=False)
+        chosen = _with_devices(RecordOptions(out=out), setup)
         return Task(
-            partial(_begin, out, recorded, None, taking),
-            *(target, calibration.robot, calibration.mount, lens.camera, stops, CheckLimits.stops),
-            taking,
-            command,
+            partial(_begun, setup, chosen, recorded, None, checks),
+            *(recorded, lens.camera, stops, CheckLimits.stops),
+            taking_of(chosen, is_driven=False),
+            ("verify", str(out), "--against", str(against), *moved),
             _result(out),
         )
 
@@ -149,36 +138,25 @@ def verify_on_page(options: VerifyOptions) -> None:
     text = PageText(f"Check {checks.name}", asked, "Check", partial(_history, checks))
     last = _remembered(checks)
     setup = last if last.against in found else replace(last, against=found[0])
-    _serve(options.address, prepare, RecordOptions(out=checks), setup, text)
+    _serve(options.address, prepare, setup, text)
 
 
 def _serve(
     address: tuple[str, int] | None,
     prepare: Callable[[Setup], Task],
-    recording: RecordOptions,
     setup: Setup,
     text: PageText,
     *,
     begins: bool = False,
 ) -> None:
-    """Serves a page until Ctrl-C; what it asks last is remembered in the recording's folder."""
+    """Serves a page until Ctrl-C."""
     client_library("nicegui", "page")
     # It imports NiceGUI, which an extra brings.
     from visioncal.live.page.server import serve
 
-    def devices(setup: Setup, typed: TypedPoses) -> AbstractContextManager[LiveCell]:
-        given = typed if setup.arm == "manual" else None
-        return opened(_with_devices(recording, setup), is_moved=False, given=given)
-
-    def remember(setup: Setup) -> None:
-        # Of a camera's URL without its user and password.
-        kept = replace(setup, camera=without_password(setup.camera))
-        recording.out.mkdir(parents=True, exist_ok=True)
-        write_atomically(recording.out / _REMEMBERED, json.dumps(asdict(kept), indent=2))
-
     host, port = address or ("127.0.0.1", 8321)
     say(f"The page is at http://{host}:{port}; Ctrl-C ends. Views are on the disk at any moment.")
-    station = Station(prepare, devices, setup, begins=begins, remember=remember)
+    station = Station(prepare, setup, begins=begins)
     try:
         serve(station, text, host, port, opens=sys.stdin.isatty())
     finally:
@@ -199,17 +177,26 @@ def _remembered(folder: Path) -> Setup:
         return Setup()
 
 
-def _begin(
-    out: Path,
+@contextmanager
+def _begun(
+    setup: Setup,
+    chosen: RecordOptions,
     recorded: RecordedCell | PlanCell,
     plan: PlanFile | None,
-    taking: CaptureOptions,
-    cell: LiveCell,
-) -> Journal:
-    facts = CaptureFacts.of(cell, out.name, recorded, plan)
-    journal = Journal.resume(out, facts, cell.clock.unix_offset_s(), 0)
-    check_order(taking, cell, is_resumed=bool(journal.views))
-    return journal
+    remembered: Path,
+) -> Iterator[tuple[LiveCell, Journal]]:
+    """Opens the devices and begins or resumes the session; a folder remembers what was chosen."""
+    given = TypedPoses() if setup.arm == "manual" else None
+    with opened(chosen, is_moved=False, given=given) as cell:
+        facts = CaptureFacts.of(cell, chosen.out.name, recorded, plan)
+        journal = Journal.resume(chosen.out, facts, cell.clock.unix_offset_s(), 0)
+        taking = taking_of(chosen, is_driven=False)
+        check_order(taking, cell, is_resumed=bool(journal.views))
+        # Of a camera's URL without its user and password.
+        kept = replace(setup, camera=without_password(setup.camera))
+        remembered.mkdir(parents=True, exist_ok=True)
+        write_atomically(remembered / _REMEMBERED, json.dumps(asdict(kept), indent=2))
+        yield cell, journal
 
 
 def _planned(plan: PlanFile) -> tuple[NextPose, ...]:

@@ -30,11 +30,11 @@ def ask_command(words: Sequence[str], folder: Path, views: int) -> Outcome:
     """Runs a command of visioncal with `--json` as a process of its own, and reads its answer.
 
     Args:
-        words: The command and its options.
+        words: The command and its options, but for its output.
         folder: Where it writes.
         views: Number of views of the session.
     """
-    command = [sys.executable, "-m", "visioncal", *words, "--json"]
+    command = [sys.executable, "-m", "visioncal", *words, "-o", str(folder), "--json"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     try:
         document = json.loads(ended.stdout)

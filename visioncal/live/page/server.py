@@ -6,6 +6,7 @@ nothing.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from urllib.parse import urlsplit
 
 from fastapi import Response
@@ -13,7 +14,7 @@ from nicegui import app, ui
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from visioncal.core.conventions import POSE_FORMS, pendant_words
-from visioncal.core.documents.pendants import PendantPose, possible_forms, read_pose
+from visioncal.core.documents.pendants import PendantPose, read_pose
 from visioncal.core.errors import DataError
 from visioncal.live.drivers.manual import pose_words
 from visioncal.live.page.outcome import Outcome
@@ -99,12 +100,7 @@ class _Page:
             value = getattr(setup, name) or None
             options = list(dict.fromkeys([*choices, *filter(None, [value])]))
             self._inputs[name] = ui.select(
-                *(options,),
-                label=label,
-                value=value,
-                clearable=True,
-                with_input=True,
-                new_value_mode="add-unique",
+                options, label=label, value=value, clearable=True, new_value_mode="add-unique"
             ).classes("w-96 max-w-full")
         ui.button("Start", on_click=self._begin)
 
@@ -113,6 +109,7 @@ class _Page:
         self._station.begin(replace(self._station.snapshot.setup, **chosen))
 
     def _build_live(self) -> None:
+        station = self._station
         with ui.column().classes("flex-1").style("min-width: min(100%, 480px)"):
             self._picture = ui.interactive_image().classes("w-full").props("alt='live picture'")
             with ui.row().classes("items-center"):
@@ -127,12 +124,10 @@ class _Page:
                 "Drive there yourself, slowly: nothing here knows cables, tools or obstacles."
             ).classes("text-sm")
             with ui.column().classes("w-full gap-1") as self._typing:
+                forms = {name: form.words for name, form in POSE_FORMS.items()}
                 self._form = ui.select(
-                    {
-                        "": "form of the pose: as recognised",
-                        **{k: f.words for k, f in POSE_FORMS.items()},
-                    },
-                    value=self._station.snapshot.setup.pose_form,
+                    {"": "form of the pose: as recognised", **forms},
+                    value=station.snapshot.setup.pose_form,
                     on_change=self._read,
                 ).classes("w-full")
                 self._typed = (
@@ -144,12 +139,13 @@ class _Page:
                 self._understood = ui.label("").props("aria-live=polite")
             with ui.row().classes("gap-1"):
                 self._take_button = ui.button("Take view (Enter)", on_click=self._take)
-                ui.button("Undo last", on_click=lambda: self._ask(self._station.undo)).props("flat")
-                ui.button("Another pose", on_click=lambda: self._ask(self._station.skip)).props(
-                    "flat"
-                )
-                ui.button(self._text.finish, on_click=lambda: self._ask(self._station.finish))
-                ui.button("Close", on_click=lambda: self._ask(self._station.end)).props("flat")
+                for words, request, look in (
+                    ("Undo last", station.undo, "flat"),
+                    ("Another pose", station.skip, "flat"),
+                    (self._text.finish, station.finish, ""),
+                    ("Close", station.end, "flat"),
+                ):
+                    ui.button(words, on_click=partial(self._ask, request)).props(look)
             self._missed = ui.label("").classes("text-red-700").props("role=alert")
             self._views = ui.column().classes("gap-0 text-sm")
 
@@ -159,16 +155,12 @@ class _Page:
 
     def _read(self) -> PendantPose | None:
         """Reads the typed pose, and says how it is understood."""
-        line, form = self._typed.value.strip(), self._form.value or None
-        forms = possible_forms(line)
+        line = self._typed.value.strip()
         self._understood.text = ""
         if not line:
             return None
-        if form is None and len(forms) > 1:
-            self._understood.text = f"It may be a pose of {', '.join(forms)}: choose above."
-            return None
         try:
-            read = read_pose(line, "the pose", form)
+            read = read_pose(line, "the pose", self._form.value or None)
         except DataError as error:
             self._understood.text = f"{error.message} {error.next_step}"
             return None
@@ -202,7 +194,10 @@ class _Page:
         if before is None or (now.next_pose, now.pose_form) != (before.next_pose, before.pose_form):
             self._show_next(now)
         if before is None or now.views != before.views:
-            self._show_views(now)
+            self._views.clear()
+            with self._views:
+                for line in reversed(now.views):
+                    ui.label(line)
             if before is not None and len(now.views) > len(before.views):
                 self._typed.value = ""
         if before is None or (now.trial, now.outcome) != (before.trial, before.outcome):
@@ -220,39 +215,31 @@ class _Page:
     def _show_next(self, now: Snapshot) -> None:
         pose = now.next_pose
         self._next.text = "" if pose is None else pose.words
-        known = pose is not None and pose.base_from_flange is not None
-        self._next_pose.text = (
-            pendant_words(pose.base_from_flange, POSE_FORMS[now.pose_form])
-            if pose is not None and pose.base_from_flange is not None
-            else ""
-        )
-        self._next_pose.visible = self._warned.visible = known
-
-    def _show_views(self, now: Snapshot) -> None:
-        self._views.clear()
-        with self._views:
-            for line in reversed(now.views):
-                ui.label(line)
+        flange = None if pose is None else pose.base_from_flange
+        self._next_pose.visible = self._warned.visible = flange is not None
+        if flange is not None:
+            self._next_pose.text = pendant_words(flange, POSE_FORMS[now.pose_form])
 
     def _show_outcome(self, now: Snapshot) -> None:
         shown: Outcome | None = now.outcome or now.trial
-        colour = _COLOURS["grey" if shown is None else shown.light]
-        words = "no result yet" if shown is None else shown.title
+        light, words = ("grey", "no result yet") if shown is None else (shown.light, shown.title)
         so_far = " so far" if now.outcome is None and shown is not None else ""
         self._light.content = (
-            f'<span role="status" style="background:{colour};color:white;border-radius:1em;'
-            f'padding:0.4em 1em;font-size:1.2em;white-space:nowrap">{words}{so_far}</span>'
+            f'<span role="status" style="background:{_COLOURS[light]};color:white;'
+            f'border-radius:1em;padding:0.4em 1em;font-size:1.2em;white-space:nowrap">{words}'
+            f"{so_far}</span>"
         )
         self._outcome.clear()
         self._outcome.visible = shown is not None
+        if shown is not None:
+            with self._outcome:
+                for reason in shown.reasons[:3]:
+                    ui.label(reason)
+                if shown.next_step:
+                    ui.label(f"Next: {shown.next_step}").classes("font-bold")
+                if now.outcome is not None:
+                    ui.label(f"The files are in {shown.folder}.").classes("text-sm")
         self._history.clear()
-        with self._outcome:
-            for reason in () if shown is None else shown.reasons[:3]:
-                ui.label(reason)
-            if shown is not None and shown.next_step:
-                ui.label(f"Next: {shown.next_step}").classes("font-bold")
-            if shown is not None and now.outcome is not None:
-                ui.label(f"The files are in {shown.folder}.").classes("text-sm")
         with self._history:
             for light, date, line in self._text.history():
                 with ui.row().classes("items-center no-wrap"):

@@ -18,9 +18,9 @@ from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DriverError, VisioncalError
 from visioncal.core.number_format import figure
-from visioncal.core.types import Camera, Corners, FloatArray, Image, Mount, Rejection, Target
+from visioncal.core.types import Camera, Corners, FloatArray, Image, Rejection
 from visioncal.live.capture.cell import LiveCell
-from visioncal.live.capture.journal import Journal
+from visioncal.live.capture.journal import Journal, RecordedCell
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
 from visioncal.live.capture.take import TakenView, grey_of, image_motion_px
@@ -28,8 +28,7 @@ from visioncal.live.drivers.protocols import Answer, ArmState, MovingArm, Reques
 from visioncal.live.page.drawing import coverage_svg, live_picture
 from visioncal.live.page.outcome import Light, Outcome, ask_command
 from visioncal.live.page.suggestion import NextPose, next_view
-from visioncal.live.planning.cell import flange_at
-from visioncal.robot import Robot
+from visioncal.live.planning.cell import PlanCell, flange_at
 
 # From this number of views on a calibration is tried after each.
 _FIRST_TRIAL = 5
@@ -91,17 +90,15 @@ class PageText:
 class Task:
     """A recording to make, and the command that judges it."""
 
-    begin: Callable[[LiveCell], Journal]  # Begins or resumes the session.
-    target: Target
-    robot: Robot | None  # The arm's model; None where it is not known.
-    mount: Mount
+    # Opens the devices, and begins or resumes the session.
+    begin: Callable[[], AbstractContextManager[tuple[LiveCell, Journal]]]
+    recorded: RecordedCell | PlanCell
     lens: Camera | None  # Intrinsics; None where they are not known.
     stops: tuple[NextPose, ...]  # Planned poses; none where coverage decides.
     count: int  # Number of views after which it is judged; 0 where the person decides.
     options: CaptureOptions
-    # The command's words, from the folder that it writes; a trial writes no drawings.
-    command: Callable[[Path, bool], Sequence[str]]
-    result: Path  # Where the result goes.
+    command: Sequence[str]  # The command's words, without the folder that it writes.
+    result: Path  # That folder.
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,23 +134,12 @@ class Station:
 
     Args:
         prepare: Makes the task of a setup; raises VisioncalError.
-        devices: Opens the devices of a setup; an arm whose poses are typed is given.
         setup: The setup to begin with, or to show.
         begins: Whether to begin at once.
-        remember: Called with the setup once its devices are open.
     """
 
-    def __init__(
-        self,
-        prepare: Callable[[Setup], Task],
-        devices: Callable[[Setup, TypedPoses], AbstractContextManager[LiveCell]],
-        setup: Setup,
-        *,
-        begins: bool,
-        remember: Callable[[Setup], None] = lambda _: None,
-    ) -> None:
-        self._prepare, self._devices, self._remember = prepare, devices, remember
-        self.snapshot = Snapshot(setup=setup)
+    def __init__(self, prepare: Callable[[Setup], Task], setup: Setup, *, begins: bool) -> None:
+        self._prepare, self.snapshot = prepare, Snapshot(setup=setup)
         self._requests: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._open = ExitStack()
         self._judge = ThreadPoolExecutor(1)
@@ -171,8 +157,9 @@ class Station:
         """Takes a view at a pose (4, 4) [m] that was typed in a form of `POSE_FORMS`."""
 
         def typed() -> None:
-            self._publish(pose_form=form)
-            self._typed.pending = base_from_flange
+            if isinstance(arm := self._cell.arm, TypedPoses):
+                self._publish(pose_form=form)
+                arm.pending = base_from_flange
 
         self._put(seen, typed)
 
@@ -186,7 +173,7 @@ class Station:
 
     def finish(self, seen: Snapshot) -> None:
         """Judges the views."""
-        self._put(seen, lambda: self._ask(self._task.result, is_trial=False))
+        self._put(seen, lambda: self._ask(is_trial=False))
 
     def end(self, seen: Snapshot) -> None:
         """Closes the devices, and asks for another setup."""
@@ -237,34 +224,33 @@ class Station:
         if self.snapshot.phase == "live":
             return
         self._publish(phase="opening", setup=setup, problem="")
-        self._task, self._typed = self._prepare(setup), TypedPoses()
+        self._task = self._prepare(setup)
         self._previous: Image | None = None
         # Intrinsics by a trial, where no others are known.
         self._fitted: Camera | None = None
-        cell = self._open.enter_context(self._devices(setup, self._typed))
-        self._journal = self._task.begin(cell)
-        self._cell, self._rejected = cell, list[FloatArray]()
-        self._remember(setup)
+        self._rejected = list[FloatArray]()
+        self._cell, self._journal = self._open.enter_context(self._task.begin())
         self._capture = self._started()
         self._rest = RestWatch(self._journal, self._task.options.still)
-        form = None if self._task.robot is None else controller_form(self._task.robot.name)
-        shown = setup.pose_form or ("ros" if form is None else form.name)
+        robot, arm = self._task.recorded.robot, self._cell.arm
+        form = None if robot is None else controller_form(robot.name)
         self._publish(
             phase="live",
-            arm=cell.arm.name,
-            takes_typed=cell.arm is self._typed,
-            pose_form=shown,
+            arm=arm.name,
+            takes_typed=isinstance(arm, TypedPoses),
+            pose_form=setup.pose_form or ("ros" if form is None else form.name),
             views=tuple(f"view {view.number}: recorded before" for view in self._journal.views),
-            missed=getattr(cell.arm, "invitation", ""),
+            missed=getattr(arm, "invitation", ""),
             trial=None,
             outcome=None,
         )
         self._advise()
 
     def _started(self) -> Capture:
-        task = self._task
-        seen = (task.target, task.robot, self._cell.camera.factory or task.lens or self._fitted)
-        return Capture(self._cell, *seen, self._journal, task.options, None, self._taken)
+        cell, task = self._cell, self._task
+        seen = task.recorded.target, task.recorded.robot
+        lens = cell.camera.factory or task.lens or self._fitted
+        return Capture(cell, *seen, lens, self._journal, task.options, None, self._taken)
 
     def _live(self) -> None:
         """Shows a picture, and takes a view where the arm requests one or has come to rest."""
@@ -272,7 +258,7 @@ class Station:
         if not task.options.single:
             image = cell.camera.frame().image
             grey = grey_of(image)
-            found, _ = find_corners(grey, task.target, 0)
+            found, _ = find_corners(grey, task.recorded.target, 0)
             moved_px = np.inf if self._previous is None else image_motion_px(self._previous, grey)
             self._previous = grey
             self._show(image, found)
@@ -300,7 +286,8 @@ class Station:
             if isinstance(found, Corners)
             else found.reason
         )
-        picture = live_picture(image, self._task.target, corners, self._capture.coach.lens, wanted)
+        coach = self._capture.coach
+        picture = live_picture(image, coach.target, corners, coach.lens, wanted)
         self._publish(picture=picture, pictures=self.snapshot.pictures + 1, sees=sees)
 
     def _taken(self, step: CaptureEvent) -> None:
@@ -324,21 +311,21 @@ class Station:
     def _after_change(self) -> None:
         count = len(self._journal.views)
         if self._task.count and count >= self._task.count:
-            self._ask(self._task.result, is_trial=False)
+            self._ask(is_trial=False)
         elif count >= _FIRST_TRIAL and not self._task.stops:
-            self._ask(self._trial_folder(), is_trial=True)
+            self._ask(is_trial=True)
         self._advise()
 
-    def _trial_folder(self) -> Path:
-        return Path(self._open.enter_context(tempfile.TemporaryDirectory())) / "trial"
-
-    def _ask(self, folder: Path, *, is_trial: bool) -> None:
-        """Runs the judging command beside the recording."""
+    def _ask(self, *, is_trial: bool) -> None:
+        """Runs the judging command beside the recording; a trial, without its drawings."""
         views = len(self._journal.views)
         if not views:
             self._publish(missed="There is no view yet.")
             return
-        words = self._task.command(folder, is_trial)
+        folder, words = self._task.result, self._task.command
+        if is_trial:
+            folder = Path(self._open.enter_context(tempfile.TemporaryDirectory())) / "trial"
+            words = (*words, "--no-report", "--no-recording")
         if self._judging is not None:
             # One that is still waiting is superseded; one that runs says how it is so far.
             self._judging.cancel()
@@ -390,10 +377,10 @@ class Station:
 
     def _suggested(self) -> NextPose:
         """The next view by coverage, and where a trial says it, the pose of the flange."""
-        coach, task, trial = self._capture.coach, self._task, self.snapshot.trial
+        coach, trial = self._capture.coach, self.snapshot.trial
         if not coach.poses:
             return NextPose("Begin with the whole board large in the picture.")
-        view = next_view(task.target, coach.lens, [*coach.poses, *self._rejected])
+        view = next_view(coach.target, coach.lens, [*coach.poses, *self._rejected])
         tilt = np.rad2deg(np.arccos(np.clip(view[2, 2], -1.0, 1.0)))
         words = (
             "Move until the board fills the orange outline, its first corner in the ring; it is "
@@ -403,4 +390,4 @@ class Station:
             return NextPose(words, view)
         edges = trial.document["transforms"].values()
         x, z = (np.array(edge["matrix"]) for edge in edges)
-        return NextPose(words, view, flange_at(task.mount, x, z, view))
+        return NextPose(words, view, flange_at(self._task.recorded.mount, x, z, view))

@@ -27,7 +27,6 @@ class NextPose:
     words: str
     cam_from_target: FloatArray | None = None  # (4, 4) where the camera will see the board [m].
     base_from_flange: FloatArray | None = None  # (4, 4) where the flange will be [m].
-    q: FloatArray | None = None  # (n,) joint angles there [rad].
 
 
 def next_view(target: Target, lens: Camera, avoid: Sequence[FloatArray]) -> FloatArray:
