@@ -42,6 +42,10 @@ _FILL = b" \t\r\n\0"
 _ALL = ("", "0.0.0.0", "::")
 
 
+class _LostError(Exception):
+    """The link is closed or broken."""
+
+
 @dataclass(eq=False)
 class _Link:
     """A connection to the robot's program."""
@@ -51,9 +55,53 @@ class _Link:
     has_spoken: bool = False  # Whether it has ever sent a whole line.
     since_s: float = field(default_factory=time.monotonic)  # When it was taken [s].
 
+    def __post_init__(self) -> None:
+        self.peer.setblocking(False)
+        self.peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        # The system probes a silent peer, and breaks the link where it does not answer.
+        limits = dict.fromkeys(("TCP_NODELAY", "TCP_KEEPIDLE", "TCP_KEEPALIVE", "TCP_KEEPINTVL"), 1)
+        # An answer that is not confirmed counts, too [ms]; not all systems have all names.
+        limits |= {"TCP_KEEPCNT": _DEAD_S - 1, "TCP_USER_TIMEOUT": 1000 * _DEAD_S}
+        for name, value in limits.items():
+            with suppress(AttributeError, OSError):
+                self.peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
-class _LostError(Exception):
-    """The link is closed or broken."""
+    def receive(self) -> None:
+        """Adds what has come to its text; raises _LostError."""
+        # More than this is refused anyway.
+        while len(self.received) <= 2 * _MAX_LINE:
+            try:
+                data = self.peer.recv(_MAX_LINE)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                raise _LostError from error
+            if not data:
+                raise _LostError
+            self.received += data
+
+    def send(self, words: bytes) -> None:
+        """Sends a line; raises _LostError, also where the client reads nothing."""
+        try:
+            if self.peer.send(words + b"\n") <= len(words):
+                raise _LostError
+        except OSError as error:
+            raise _LostError from error
+
+    def refuse_more(self) -> None:
+        """Refuses what came before an answer; raises _LostError."""
+        if self.received.strip(_FILL):
+            self.send(b"error more than one line before its answer")
+            raise _LostError
+
+    def close(self) -> None:
+        """Closes it, so that its last answer arrives."""
+        with suppress(OSError):
+            # Unread bytes would reset the link, and take the last answer away.
+            self.peer.shutdown(socket.SHUT_WR)
+            for _ in range(20):
+                self.peer.recv(_MAX_LINE)
+        self.peer.close()
 
 
 class SocketArm:
@@ -92,7 +140,6 @@ class SocketArm:
         self._server.setblocking(False)
         self.host, self.port = host, int(self._server.getsockname()[1])
         self._link: _Link | None = None
-        self._asking: _Link | None = None
         self._stop: ArmState | None = None
         self._joints: int | None = None
         self._patience_s, self._idle = patience_s, Stopwatch()
@@ -101,11 +148,10 @@ class SocketArm:
     @property
     def invitation(self) -> str:
         """Where it listens, and where the robot's programs are."""
-        shared = (
-            " Every computer that reaches this one can send poses." if self.host in _ALL else ""
-        )
+        shared = "Every computer that reaches this one can send poses. "
         return (
-            f"Waiting for the robot's own program at {self.host}:{self.port}.{shared} Programs for "
+            f"Waiting for the robot's own program at {self.host}:{self.port}. "
+            f"{shared if self.host in _ALL else ''}Programs for "
             f"KUKA, ABB and FANUC are in {CLIENTS}; a line as "
             "'1 | X 512.3 Y -12.5 Z 800 A 10 B 0 C 180' says where it stands."
         )
@@ -127,7 +173,6 @@ class SocketArm:
         while True:
             line = self._next_line()
             if line is not None:
-                self._asking = self._link
                 if line.strip().lower() == "end":
                     self.reply("done")
                 if self._is_done:
@@ -158,15 +203,16 @@ class SocketArm:
 
         The stop is answered again when the program connects again and sends it again.
         """
-        link, self._asking = self._asking, None
+        # Links come and go while requests are waited for alone.
+        link = self._link
         if link is None:
             return
         words = " ".join(f"{answer} {reason}".split()).encode("ascii", "replace")
-        with self._dropped_if_lost(link):
+        with self._dropped_if_lost():
             # What came before the answer did not wait for it.
-            self._receive(link)
-            self._send(link, words[: _MAX_ANSWER - 1])
-            self._refuse_more(link)
+            link.receive()
+            link.send(words[: _MAX_ANSWER - 1])
+            link.refuse_more()
         self._idle.restart()
         if answer in ("next", "done") and self._stop is not None:
             self._joints = 0 if self._stop.q is None else len(self._stop.q)
@@ -176,8 +222,7 @@ class SocketArm:
 
     def close(self) -> None:
         """Closes link and port, by which the robot's program learns that nothing listens."""
-        if self._link is not None:
-            self._drop(self._link)
+        self._drop()
         self._server.close()
 
     def _understood(self, line: str) -> ArmState:
@@ -211,23 +256,23 @@ class SocketArm:
         link = self._link
         if link is None:
             return None
-        with self._dropped_if_lost(link):
-            self._receive(link)
+        with self._dropped_if_lost():
+            link.receive()
             link.received = link.received.lstrip(_FILL)
             first, *rest = _ENDS.split(link.received, maxsplit=1)
             if len(first) > _MAX_LINE:
-                self._send(link, b"error a line of more than %d bytes" % _MAX_LINE)
+                link.send(b"error a line of more than %d bytes" % _MAX_LINE)
                 raise _LostError
             if not rest:
                 return None
             link.received, link.has_spoken = rest[0], True
             # A program that went away does not wait at its stop.
-            self._receive(link)
-            self._refuse_more(link)
+            link.receive()
+            link.refuse_more()
             try:
                 return first.strip(_FILL).decode("utf-8")
             except UnicodeDecodeError:
-                self._send(link, b"error the line is no text in ASCII or UTF-8")
+                link.send(b"error the line is no text in ASCII or UTF-8")
         return None
 
     def _accept(self) -> None:
@@ -236,75 +281,39 @@ class SocketArm:
             peer, _ = self._server.accept()
         except OSError:
             return
-        peer.setblocking(False)
-        if self._link is not None:
+        link, now = _Link(peer), self._link
+        if now is not None:
             # The same program may have hung up, and connects again.
-            with self._dropped_if_lost(self._link):
-                self._receive(self._link)
-        now = self._link
-        if now is not None and not now.has_spoken and time.monotonic() > now.since_s + _MUTE_S:
-            self._drop(now)
+            with self._dropped_if_lost():
+                now.receive()
+            if not now.has_spoken and time.monotonic() > now.since_s + _MUTE_S:
+                self._drop()
         if self._link is None:
-            _set_keepalive(peer)
-            self._link = _Link(peer)
+            self._link = link
             return
-        with suppress(OSError):
-            peer.send(b"busy another program is connected\n")
-        self._drop(_Link(peer))
-
-    @staticmethod
-    def _receive(link: _Link) -> None:
-        """Adds what has come to a link's text; raises _LostError."""
-        # More than this is refused anyway.
-        while len(link.received) <= 2 * _MAX_LINE:
-            try:
-                data = link.peer.recv(_MAX_LINE)
-            except BlockingIOError:
-                return
-            except OSError as error:
-                raise _LostError from error
-            if not data:
-                raise _LostError
-            link.received += data
-
-    @staticmethod
-    def _send(link: _Link, words: bytes) -> None:
-        """Sends a line; raises _LostError, also where the client reads nothing."""
-        try:
-            if link.peer.send(words + b"\n") <= len(words):
-                raise _LostError
-        except OSError as error:
-            raise _LostError from error
-
-    def _refuse_more(self, link: _Link) -> None:
-        if link.received.strip(_FILL):
-            self._send(link, b"error more than one line before its answer")
-            raise _LostError
+        with suppress(_LostError):
+            link.send(b"busy another program is connected")
+        link.close()
 
     @contextmanager
-    def _dropped_if_lost(self, link: _Link) -> Iterator[None]:
+    def _dropped_if_lost(self) -> Iterator[None]:
         try:
             yield
         except _LostError:
-            self._drop(link)
+            self._drop()
 
-    def _drop(self, link: _Link) -> None:
-        with suppress(OSError):
-            # Unread bytes would reset the link, and take the last answer away.
-            link.peer.shutdown(socket.SHUT_WR)
-            for _ in range(20):
-                link.peer.recv(_MAX_LINE)
-        link.peer.close()
-        if self._link is link:
-            self._link = None
+    def _drop(self) -> None:
+        if self._link is not None:
+            self._link.close()
+        self._link = None
 
     def _linger(self, *, is_answered: bool) -> None:
         """Answers `done` to whatever comes, until a program that was told has closed its link."""
         lingering = Stopwatch()
         while lingering.read() < _LINGER_S and not (is_answered and self._link is None):
             if self._next_line() is not None and self._link is not None:
-                with self._dropped_if_lost(self._link):
-                    self._send(self._link, b"done")
+                with self._dropped_if_lost():
+                    self._link.send(b"done")
                     is_answered = True
             self._wait()
 
@@ -328,15 +337,3 @@ def _joints(text: str) -> FloatArray:
     if not np.abs(angles).max() < 50.0:
         raise DataError(f"a joint angle of {np.abs(angles).max():.4g} rad is too large.")
     return angles
-
-
-def _set_keepalive(peer: socket.socket) -> None:
-    """Has the system probe a silent peer, and break the link where it does not answer."""
-    peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    seconds = dict.fromkeys(("TCP_KEEPIDLE", "TCP_KEEPALIVE", "TCP_KEEPINTVL"), 1)
-    # An answer that is not confirmed counts, too [ms]; not all systems have all names.
-    limits = {"TCP_KEEPCNT": _DEAD_S - 1, "TCP_USER_TIMEOUT": 1000 * _DEAD_S}
-    for name, value in (seconds | limits).items():
-        with suppress(AttributeError, OSError):
-            peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
