@@ -7,6 +7,7 @@ of the tag at the upper left, for a single marker its centre. x runs along colum
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -174,13 +175,18 @@ def outline(target: Target) -> FloatArray:
     return np.pad(corners, ((0, 0), (0, 1)), constant_values=middle_z)
 
 
-def closed_outline(target: Target) -> FloatArray:
-    """(k, 3) outline as a line strip [m]; for a rig, the edges of its bounding box."""
+def closed_outline(target: Target, parts: int = 1) -> FloatArray:
+    """(k, 3) outline as a line strip [m]; for a rig, the edges of its bounding box.
+
+    Lenses bend its sides in images: each consists of that many equal parts.
+    """
+    low, high = _bounds(target)
+    corners = outline(target)[[0, 1, 2, 3, 0]]
     if target.is_rig:
-        low, high = _bounds(target)
-        return np.asarray(low + _BOX * (high - low))
-    corners = outline(target)
-    return np.vstack([corners, corners[:1]])
+        corners = low + _BOX * (high - low)
+    shares = np.arange(parts)[:, None] / parts
+    sides = [begin + shares * (end - begin) for begin, end in pairwise(corners)]
+    return np.vstack([*sides, corners[-1:]])
 
 
 def _bounds(target: Target) -> tuple[FloatArray, FloatArray]:

@@ -1,10 +1,9 @@
 """Pictures of a recording in progress: what the camera sees, and what the views cover."""
 
-from itertools import pairwise
-
 import cv2
 import numpy as np
 
+from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Mask, Target
 from visioncal.vision.camera import project
 from visioncal.vision.targets import closed_outline, corner_positions
@@ -37,12 +36,8 @@ def live_picture(
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     drawn = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR) if small.ndim == 2 else small
     if wanted is not None:
-        edge = closed_outline(target)
-        # Edges are curved where the lens distorts.
-        steps = np.linspace(0.0, 1.0, 9)[:-1, None]
-        ways = [start + steps * (end - start) for start, end in pairwise(edge)]
-        points = np.vstack([*ways, edge[-1:], corner_positions(target)[:1]])
-        px = scale * project(lens, points @ wanted[:3, :3].T + wanted[:3, 3])
+        points = np.vstack([closed_outline(target, 8), corner_positions(target)[:1]])
+        px = scale * project(lens, apply(wanted, points))
         if np.isfinite(px).all() and np.abs(px).max() < 20 * _WIDTH:
             *line, first = np.rint(px).astype(int)
             cv2.polylines(drawn, [np.array(line)], isClosed=False, color=_WANTED, thickness=3)

@@ -7,9 +7,10 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.transforms import compose, invert, rotation_angle
+from visioncal.core.transforms import apply, compose, invert, rotation_angle
 from visioncal.core.types import Camera, FloatArray, Target
-from visioncal.vision.camera import normalise, project
+from visioncal.live.planning.visibility import FieldOfView
+from visioncal.vision.camera import normalise
 from visioncal.vision.targets import extent_m, outline
 
 # Views to choose from: the board's tilt and its turn in the image [deg], its centre from the
@@ -42,38 +43,31 @@ def next_view(target: Target, lens: Camera, avoid: Sequence[FloatArray]) -> Floa
     """
     low, high = extent_m(target)
     centre = np.append(0.5 * (low + high), 0.0)
-    size, first = np.array(lens.resolution, dtype=float), avoid[0]
-    usual_m = float(np.linalg.norm(first[:3, :3] @ centre + first[:3, 3]))
+    first = avoid[0]
+    usual_m = float(np.linalg.norm(apply(first, centre[None])))
     turn = float(np.arctan2(first[1, 0], first[0, 0]))
     tilts = [Rotation.identity()]
     for tilt, azimuth in product(np.deg2rad(_TILTS_DEG), np.deg2rad(np.arange(0, 360, 60))):
         tilts.append(Rotation.from_rotvec(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])))
-    views = []
-    for by, turned, x, y, far in product(
-        tilts, turn + np.deg2rad(_TURNS_DEG), _PLACES, _PLACES, _DISTANCES
-    ):
-        rotation = (by * Rotation.from_euler("z", turned)).as_matrix()
-        ray = np.append(normalise(lens, (size * (0.5 + np.array([x, y])))[None])[0], 1.0)
-        position = far * usual_m * ray / np.linalg.norm(ray)
-        views.append(compose(rotation, position - rotation @ centre))
-    candidates = np.array(views)
-    edges = outline(target)
-    fits = np.array([_is_inside(lens, edges @ view[:3, :3].T + view[:3, 3]) for view in candidates])
+    turns = Rotation.from_euler("z", (turn + np.deg2rad(_TURNS_DEG))[:, None])
+    rotations = [(by * turned).as_matrix() for by, turned in product(tilts, turns)]
+    shares = 0.5 + np.array([*product(_PLACES, _PLACES)])
+    rays = np.insert(normalise(lens, np.array(lens.resolution) * shares), 2, 1.0, axis=1)
+    rays *= usual_m / np.linalg.norm(rays, axis=1, keepdims=True)
+    places = [far * ray for ray, far in product(rays, _DISTANCES)]
+    candidates = np.array(
+        [compose(turned, at - turned @ centre) for turned, at in product(rotations, places)]
+    )
+    field = FieldOfView(lens, 0.03 * min(lens.resolution))
+    fits = field.holds(apply(candidates, outline(target)))
     candidates = candidates[fits] if fits.any() else candidates
     apart = [_apart(candidates, view, centre, lens) for view in avoid]
     return np.asarray(candidates[int(np.argmax(np.min(apart, axis=0)))])
 
 
-def _is_inside(lens: Camera, points: FloatArray) -> bool:
-    px, size = project(lens, points), np.array(lens.resolution)
-    # NaN is outside, too.
-    return bool(np.all((px > 0.03 * size) & (px < 0.97 * size)))
-
-
 def _apart(views: FloatArray, view: FloatArray, centre: FloatArray, lens: Camera) -> FloatArray:
     """How different views (k, 4, 4) are from another one: (k,), dimensionless."""
-    both = np.concatenate([views, view[None]])
-    points = both[:, :3, :3] @ centre + both[:, :3, 3]
+    points = apply(np.concatenate([views, view[None]]), centre[None])[:, 0]
     places = points[:, :2] / points[:, 2:] * lens.matrix[:2] / max(lens.resolution)
     logs = np.log(np.linalg.norm(points, axis=1))
     steps = [

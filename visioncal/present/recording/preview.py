@@ -120,10 +120,7 @@ def _path(preview: Preview) -> tuple[FloatArray, list[int]]:
 
 def _log_stops(stream: rr.RecordingStream, preview: Preview, steps: Sequence[int]) -> None:
     """Draws the image of each stop, on both timelines; `steps` are its steps on the way."""
-    outline = closed_outline(preview.target)
-    # The lens bends the board's sides.
-    shares = np.linspace(0.0, 1.0, 9)[:, None]
-    sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
+    sides = closed_outline(preview.target, 8)
     px, rims = [], []
     for flange in preview.base_from_flange:
         base_from_cam, base_from_target = preview.placed(flange)
