@@ -11,8 +11,8 @@ from support.refusals import raised
 from support.rotations import CASES
 from support.samples import made_up
 
-from visioncal.core.conventions import POSE_FORMS, pendant_words
-from visioncal.core.documents.pendants import read_pose
+from visioncal.core.conventions import POSE_FORMS
+from visioncal.core.documents.pendants import pendant_words, read_pose
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
 from visioncal.interchange.exports import export

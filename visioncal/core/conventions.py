@@ -259,26 +259,3 @@ def write_pose(pose: FloatArray, form: PoseForm) -> FloatArray:
     position = pose[:3, 3] / UNITS_M[form.unit]
     rotation = ROTATION_FORMS[form.rotation].write(pose[None, :3, :3])[0]
     return np.concatenate([position, rotation])
-
-
-# Names of the rotation's numbers, as pendants show them.
-_SHOWN: Mapping[str, str] = {
-    "kuka": "A B C",
-    "fanuc": "W P R",
-    "abb": "q1 q2 q3 q4",
-    "doosan": "A B C",
-    "ros": "qx qy qz qw",
-}
-
-
-def pendant_words(pose: FloatArray, form: PoseForm) -> str:
-    """Writes a (4, 4) pose [m] as a pendant shows it: `X 512.30 mm, ... A 10.120 deg, ...`."""
-    numbers = write_pose(pose, form).tolist()
-    unit = "deg" if form.rotation.endswith("-deg") else "rad"
-    digits = 3 if unit == "deg" else 5
-    # The length unit that pendants show, whatever a program's poses have.
-    shown = [f"{name} {1e3 * value:.2f} mm" for name, value in zip("XYZ", pose[:3, 3], strict=True)]
-    names = _SHOWN.get(form.name, "RX RY RZ").split()
-    of_angle = "" if len(names) == 4 else f" {unit}"
-    turns = zip(names, numbers[3:], strict=True)
-    return ", ".join([*shown, *(f"{name} {value:.{digits}f}{of_angle}" for name, value in turns)])

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.core.conventions import POSE_FORMS, UNITS_M, PoseForm, PoseNumbers, Reading
+from visioncal.core.choices import UNITS_M
+from visioncal.core.conventions import POSE_FORMS, PoseForm, PoseNumbers, Reading, write_pose
 from visioncal.core.documents.values import DECIMAL_COMMA
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
@@ -159,6 +160,19 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
             "another form.",
         )
     return PendantPose(poses[0], chosen, reading)
+
+
+def pendant_words(pose: FloatArray, form: PoseForm) -> str:
+    """Writes a (4, 4) pose [m] as a pendant shows it: `X 512.30 mm, ... A 10.120 deg, ...`."""
+    maker = _SAME_NAMES.get(form.name, form.name)
+    names = next(names for names, forms in _NAMED_ROTATIONS.items() if maker in forms)
+    digits, unit = (3, "deg") if form.rotation.endswith("-deg") else (5, "rad")
+    # The length unit that pendants show, whatever a program's poses have.
+    words = [f"{name} {1e3 * value:.2f} mm" for name, value in zip("XYZ", pose[:3, 3], strict=True)]
+    for name, value in zip(names, write_pose(pose, form)[3:], strict=True):
+        angle = f"{name.upper()} {value:.{digits}f} {unit}"
+        words.append(f"{name} {value:.5f}" if name.startswith("q") else angle)
+    return ", ".join(words)
 
 
 def _plain(line: str) -> str:

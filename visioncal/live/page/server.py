@@ -13,8 +13,8 @@ from fastapi import Response
 from nicegui import app, ui
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from visioncal.core.conventions import POSE_FORMS, pendant_words
-from visioncal.core.documents.pendants import PendantPose, read_pose
+from visioncal.core.conventions import POSE_FORMS
+from visioncal.core.documents.pendants import PendantPose, pendant_words, read_pose
 from visioncal.core.errors import DataError
 from visioncal.live.drivers.manual import pose_words
 from visioncal.live.page.outcome import Outcome
