@@ -53,7 +53,11 @@ class OakCamera(stream.StreamingCamera):
         device = _open_device(dai, address)
         closing.callback(device.close)
         with stream.being_opened("OAK", RuntimeError, dai.MessageQueue.QueueException):
-            sensor = _sensor(device)
+            sensors = {sensor.socket.name: sensor for sensor in device.getConnectedCameraFeatures()}
+            if _SOCKET not in sensors:
+                why = f"has no camera on {_SOCKET}; it has {', '.join(sensors) or 'none'}"
+                raise stream.camera_error("OAK", why, "Look at the camera's ribbon cable.", _SOCKET)
+            sensor = sensors[_SOCKET]
             name = f"{device.getDeviceName()} {_SOCKET} ({sensor.sensorName})"
             # The sensor's whole view, divided by a whole number to a width that USB can carry, in
             # even numbers of pixels.
@@ -61,7 +65,10 @@ class OakCamera(stream.StreamingCamera):
             whole = sensor.width // parts // 2 * 2, sensor.height // parts // 2 * 2
             resolution = requested.resolution or whole
             calibration = device.readCalibrationOrDefault()
-            focus = _calibrated_focus(calibration, sensor)
+            # The lens position of the factory calibration; None for a fixed lens.
+            focus = None
+            if sensor.hasAutofocus and calibration.hasCameraCalibration(sensor.socket):
+                focus = max(int(calibration.getLensPosition(sensor.socket)), 0) or None
             if requested.focus is None:
                 requested = replace(requested, focus=focus)
             pipeline = dai.Pipeline(device)
@@ -102,15 +109,6 @@ def _open_device(dai: ModuleType, address: str) -> Handle:
         ) from error
 
 
-def _sensor(device: Handle) -> Handle:
-    """The device's description of its camera's sensor."""
-    sensors = {feature.socket.name: feature for feature in device.getConnectedCameraFeatures()}
-    if _SOCKET not in sensors:
-        why = f"has no camera on {_SOCKET}; it has {', '.join(sensors) or 'none'}"
-        raise stream.camera_error("OAK", why, "Look at the camera's ribbon cable.", _SOCKET)
-    return sensors[_SOCKET]
-
-
 def _hold_settings(
     dai: ModuleType,
     name: str,
@@ -139,14 +137,6 @@ def _hold_settings(
         control.setManualFocus(int(held["focus"]))
     control_queue.send(control)
     return held
-
-
-def _calibrated_focus(calibration: Handle, sensor: Handle) -> int | None:
-    """Lens position of the factory calibration; None for a fixed lens."""
-    if not sensor.hasAutofocus or not calibration.hasCameraCalibration(sensor.socket):
-        return None
-    position = int(calibration.getLensPosition(sensor.socket))
-    return position if position > 0 else None
 
 
 def _arrivals(dai: ModuleType, queue: Handle) -> Iterator[stream.Arrival | None]:

@@ -61,8 +61,7 @@ def coverage_svg(covered: Mask, poses: list[FloatArray]) -> str:
     parts = [
         f'<rect x="{20 * x}" y="{20 * y}" width="19" height="19" '
         f'fill="{"#3cc83c" if covered[y, x] else "#ddd"}"/>'
-        for y in range(rows)
-        for x in range(columns)
+        for y, x in np.ndindex(rows, columns)
     ]
     # Tilts as a pole figure: rings at 20 and 40 degrees, a dot a view.
     middle, reach = 20 * columns + 70, 20 * rows / 2
