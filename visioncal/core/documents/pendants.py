@@ -233,13 +233,10 @@ def _named(line: str) -> _PendantNumbers | None:
         values = _values(words)
         if values is None:
             return _PendantNumbers((), likely, doubt="it has decimal commas and decimal points")
-        with_commas = [word for word in words[:3] if "," in word]
+        with_commas = [word for word in words if "," in word]
         # No angle has thousands.
-        if (
-            with_commas
-            and all(map(_THOUSANDS.fullmatch, with_commas))
-            and "," not in "".join(words[3:])
-        ):
+        grouped = [word for word in words[:3] if _THOUSANDS.fullmatch(word)]
+        if with_commas and with_commas == grouped:
             doubt = f"the comma of {with_commas[0]} may be decimal, or group thousands"
             return _PendantNumbers((), likely, doubt=doubt)
         return _PendantNumbers(values, likely, *units)
@@ -248,12 +245,12 @@ def _named(line: str) -> _PendantNumbers | None:
 
 def _values(words: list[str]) -> tuple[float, ...] | None:
     """Numbers with one kind of decimal sign; None where they are none, or have both."""
-    with_commas = [re.fullmatch(DECIMAL_COMMA, word) is not None for word in words]
-    for word, has_comma in zip(words, with_commas, strict=True):
-        if not has_comma and (
-            re.fullmatch(_NUMBER, word) is None or (any(with_commas) and "." in word)
-        ):
-            return None
+    with_commas = [word for word in words if re.fullmatch(DECIMAL_COMMA, word)]
+    others = [word for word in words if word not in with_commas]
+    if not all(re.fullmatch(_NUMBER, word) for word in others):
+        return None
+    if with_commas and any("." in word for word in others):
+        return None
     return tuple(float(word.replace(",", ".")) for word in words)
 
 
