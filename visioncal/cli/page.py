@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import date
 from functools import partial
@@ -84,9 +84,8 @@ def record_on_page(options: RecordOptions) -> None:
     words = (*described, *_DEVICES)
     given = {name: value for name in words if (value := getattr(options, name)) is not None}
     is_known = {"arm", "camera"} <= given.keys() and (plan is not None or "target" in given)
-    text = PageText(
-        f"Record {options.out.name}", {name: _FIELDS[name] for name in words}, "Calibrate"
-    )
+    fields = {name: _FIELDS[name] for name in words}
+    text = PageText(f"Record {options.out.name}", fields, "Calibrate")
     setup = replace(_remembered(options.out), **given)
     _serve(options.address, prepare, setup, text, begins=is_known)
 
@@ -112,14 +111,9 @@ def verify_on_page(options: VerifyOptions) -> None:
         recorded = RecordedCell(calibration.mount, target, calibration.robot)
         x, z = (edge.matrix for edge in calibration.edges.values())
         poses = stops_to_repeat(calibration, None, 2 * CheckLimits.stops).poses
-        stops = tuple(
-            NextPose(
-                "Stand where the calibration stood: the board then fills the orange outline.",
-                seen_from(calibration.mount, x, z, pose),
-                pose,
-            )
-            for pose in poses
-        )
+        words = "Stand where the calibration stood: the board then fills the orange outline."
+        seen = seen_from(calibration.mount, x, z, poses)
+        stops = tuple(map(partial(NextPose, words), seen, poses))
         # An unfinished check of this day goes on.
         name = f"{date.today().isoformat()}-{against.resolve().name}"
         names = (name if at == 1 else f"{name}-{at}" for at in range(1, 1000))
@@ -232,12 +226,9 @@ def _history(checks: Path) -> list[tuple[Light, str, str]]:
     lines: list[tuple[Light, str, str]] = []
     found = checks.glob(f"*-verified/{VERIFY}")
     for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True):
-        try:
+        with suppress(OSError, ValueError, KeyError, IndexError):
             document = json.loads(path.read_text(encoding="utf-8"))
             light: Light = "green" if document["passed"] else "red"
-            lines.append(
-                (light, path.parent.name.removesuffix("-verified"), document["sentences"][0])
-            )
-        except (OSError, ValueError, KeyError, IndexError):
-            continue
+            name = path.parent.name.removesuffix("-verified")
+            lines.append((light, name, document["sentences"][0]))
     return lines
