@@ -1,6 +1,7 @@
 """`--page` of `record` and `verify`: what a page asks, and the task that its answers make."""
 
 import json
+import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -19,7 +20,7 @@ from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.choices import CameraMount
 from visioncal.core.conventions import POSE_FORMS
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, DriverError
 from visioncal.core.extras import client_library
 from visioncal.core.files import write_atomically
 from visioncal.core.limits import CheckLimits
@@ -29,10 +30,11 @@ from visioncal.interchange.result_files import load_calibration
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.devices import ARMS, CAMERAS
 from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
+from visioncal.live.drivers.folder import FolderCamera
 from visioncal.live.drivers.uvc import without_password
 from visioncal.live.page.outcome import Light
 from visioncal.live.page.station import PageText, Setup, Station, Task, TypedPoses
-from visioncal.live.page.suggestion import NextPose
+from visioncal.live.page.suggestion import NextPose, by_travel
 from visioncal.live.planning.cell import PlanCell, seen_from
 from visioncal.live.planning.plan_file import PlanFile, read_plan
 from visioncal.live.planning.repeated import stops_to_repeat
@@ -111,6 +113,9 @@ def verify_on_page(options: VerifyOptions) -> None:
         recorded = RecordedCell(calibration.mount, target, calibration.robot)
         x, z = (edge.matrix for edge in calibration.edges.values())
         poses = stops_to_repeat(calibration, None, 2 * CheckLimits.stops).poses
+        # The first of them are the widest apart; the others are for where one cannot be reached.
+        first = by_travel(poses[: CheckLimits.stops])
+        poses = np.concatenate([poses[first], poses[CheckLimits.stops :]])
         words = "Stand where the calibration stood: the board then fills the orange outline."
         seen = seen_from(calibration.mount, x, z, poses)
         stops = tuple(map(partial(NextPose, words), seen, poses))
@@ -149,6 +154,15 @@ def _serve(
     from visioncal.live.page.server import serve
 
     host, port = address or ("127.0.0.1", 8321)
+    try:
+        socket.create_server((host, port)).close()
+    except OSError as error:
+        raise DriverError(
+            f"the page cannot be served at {host}:{port}: {error.strerror}.",
+            culprits=["--address"],
+            next_step="Another page may be open there: end it, or name another port, as --address "
+            "127.0.0.1:8322; the host is an address of this computer.",
+        ) from error
     say(f"The page is at http://{host}:{port}; Ctrl-C ends. Views are on the disk at any moment.")
     station = Station(prepare, setup, begins=begins)
     try:
@@ -184,8 +198,10 @@ def _begun(
     with opened(chosen, is_moved=False, given=given) as cell:
         facts = CaptureFacts.of(cell, chosen.out.name, recorded, plan)
         journal = Journal.resume(chosen.out, facts, cell.clock.unix_offset_s(), 0)
-        taking = taking_of(chosen, is_driven=False)
-        check_order(taking, cell, is_resumed=bool(journal.views))
+        check_order(taking_of(chosen, is_driven=False), cell, is_resumed=False)
+        if journal.views and isinstance(cell.camera, FolderCamera):
+            # Those of the views so far, and of poses that gave none.
+            cell.camera.skip()
         # Of a camera's URL without its user and password.
         kept = replace(setup, camera=without_password(setup.camera))
         remembered.mkdir(parents=True, exist_ok=True)

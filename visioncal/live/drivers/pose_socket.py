@@ -152,7 +152,7 @@ class SocketArm:
         return (
             f"Waiting for the robot's own program at {self.host}:{self.port}. "
             f"{shared if self.host in _ALL else ''}Programs for "
-            f"KUKA, ABB and FANUC are in {CLIENTS}; a line as "
+            f"KUKA, ABB, FANUC and UR are in {CLIENTS}; a line as "
             "'1 | X 512.3 Y -12.5 Z 800 A 10 B 0 C 180' says where it stands."
         )
 
@@ -240,7 +240,7 @@ class SocketArm:
                 f"the pose may be of {', '.join(forms)}.",
                 next_step=f"Name its numbers, or start visioncal with --pose-form {forms[0]}.",
             )
-        pose = read_pose(parts[0], "the pose", self._form).pose
+        pose = read_pose(parts[0], "the pose", self._form)
         joints = _joints(parts[1]) if len(parts) == 2 else None
         count = 0 if joints is None else len(joints)
         if self._joints not in (None, count):
@@ -248,7 +248,8 @@ class SocketArm:
                 f"{count} joints, and {self._joints} at the first stop.",
                 next_step="Send the same joints at all stops, or none at any.",
             )
-        return ArmState(time.monotonic(), pose, joints, stop=int(number))
+        form = pose.form.name
+        return ArmState(time.monotonic(), pose.pose, joints, stop=int(number), pose_form=form)
 
     def _next_line(self) -> str | None:
         """Whole line that the client waits for an answer to; None where there is none."""

@@ -34,6 +34,7 @@ class ArmState:
     safety: Safety = "normal"  # Whether it may move.
     controller_s: float = 0.0  # Time on the controller's own clock, where it has one [s].
     stop: int | None = None  # Number of the stop by the robot's own program, where it counts them.
+    pose_form: str = ""  # Form of `POSE_FORMS` in which the pose was sent; empty where unknown.
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,11 @@ class Outcome:
     views: int  # Number of views of which it is.
     document: dict[str, Any]  # What the command printed; empty where it failed.
 
+    @property
+    def report(self) -> Path:
+        """Its page."""
+        return self.folder / "report.html"
+
 
 def ask_command(words: Sequence[str], folder: Path, views: int) -> Outcome:
     """Runs a command of visioncal with `--json` as a process of its own, and reads its answer.
@@ -44,16 +49,16 @@ def ask_command(words: Sequence[str], folder: Path, views: int) -> Outcome:
     if "error" in document:
         error = document["error"]
         return Outcome("grey", "no result", (error["message"],), error["next"], folder, views, {})
-    if "verdict" in document:
-        status, findings = document["verdict"]["status"], document["verdict"]["findings"]
-        reasons = tuple(finding["words"] for finding in findings)
-        steps = (finding["do"] for finding in findings if "do" in finding)
-        title, light = status, _OF_VERDICTS[status]
-    else:
-        passed = document["passed"]
-        title, light = ("valid", "green") if passed else ("not valid", "red")
-        reasons, steps = tuple(document["sentences"]), iter(document["next"])
-    step = next(steps, "")
-    if isinstance(step, dict):
-        step = " ".join(filter(None, (step.get("words"), step.get("command"))))
-    return Outcome(light, title, reasons, step, folder, views, document)
+    if "verdict" not in document:
+        # Its sentences say what to do.
+        said = (tuple(document["sentences"]), "", folder, views, document)
+        return (
+            Outcome("green", "valid", *said)
+            if document["passed"]
+            else Outcome("red", "not valid", *said)
+        )
+    status, findings = document["verdict"]["status"], document["verdict"]["findings"]
+    reasons = tuple(finding["words"] for finding in findings)
+    step: dict[str, str] = next((finding["do"] for finding in findings if "do" in finding), {})
+    words = " ".join(step[part] for part in ("words", "command") if part in step)
+    return Outcome(_OF_VERDICTS[status], status, reasons, words, folder, views, document)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from urllib.parse import urlsplit
 
+import numpy as np
 from fastapi import Response
 from nicegui import app, ui
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -16,12 +17,13 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.documents.pendants import PendantPose, pendant_words, read_pose
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.live.drivers.manual import pose_words
 from visioncal.live.page.outcome import Outcome
 from visioncal.live.page.station import PageText, Snapshot, Station
 
 _COLOURS = {"green": "#2e9e2e", "yellow": "#e0a800", "red": "#c62828", "grey": "#777777"}
-_PICTURE = "/live.jpg"
+_PICTURE, _REPORT = "/live.jpg", "/report"
 
 
 class _SameOrigin:
@@ -65,7 +67,14 @@ def serve(station: Station, text: PageText, host: str, port: int, *, opens: bool
         headers = {"Cache-Control": "no-store"}
         return Response(station.snapshot.picture, 200, headers, "image/jpeg")
 
+    def report() -> Response:
+        outcome = station.snapshot.outcome
+        if outcome is None or not outcome.report.is_file():
+            return Response("There is no report.", 404)
+        return Response(outcome.report.read_bytes(), media_type="text/html")
+
     app.get(_PICTURE)(live_picture)
+    app.get(_REPORT)(report)
     ui.page("/", title=text.title)(lambda: _Page(station, text) and None)
     app.on_shutdown(station.close)
     ui.run(
@@ -79,12 +88,13 @@ class _Page:
     def __init__(self, station: Station, text: PageText) -> None:
         self._station, self._text = station, text
         self._shown: Snapshot | None = None
-        self._inputs: dict[str, ui.select] = {}
+        self._inputs: dict[str, ui.input] = {}
         with ui.row().classes("w-full items-center gap-4"):
             ui.label(text.title).classes("text-2xl")
             self._light = ui.html("", sanitize=False)
             self._status = ui.label("").props("aria-live=polite")
         self._problem = ui.label("").classes("text-red-700 text-lg").props("role=alert")
+        self._note = ui.label("").classes("text-sm")
         with ui.card().classes("w-full") as self._setup:
             self._build_setup()
         self._outcome = ui.card().classes("w-full gap-1")
@@ -97,11 +107,12 @@ class _Page:
     def _build_setup(self) -> None:
         setup = self._station.snapshot.setup
         for name, (label, choices) in self._text.fields.items():
-            value = getattr(setup, name) or None
-            options = list(dict.fromkeys([*choices, *filter(None, [value])]))
-            self._inputs[name] = ui.select(
-                options, label=label, value=value, clearable=True, new_value_mode="add-unique"
-            ).classes("w-96 max-w-full")
+            value = getattr(setup, name)
+            self._inputs[name] = (
+                ui.input(label, value=value, autocomplete=[*choices])
+                .props(f'clearable hint="{", ".join(choices)}"')
+                .classes("w-full")
+            )
         ui.button("Start", on_click=self._begin)
 
     def _begin(self) -> None:
@@ -164,8 +175,11 @@ class _Page:
         except DataError as error:
             self._understood.text = f"{error.message} {error.next_step}"
             return None
-        self._understood.text = f"Read as {read.words}: {pose_words(read.pose)}"
-        return read
+        words = f"Read as {read.words}: {pose_words(read.pose)}"
+        # No flange is within 10 mm of its base.
+        is_metric = read.reading.unit == "mm" and np.abs(read.pose[:3, 3]).max() < 0.01
+        self._understood.text = f"{words}. In metres? Then write X 0.5 m." if is_metric else words
+        return None if is_metric else read
 
     def _take(self) -> None:
         read, shown = self._read(), self._shown
@@ -185,7 +199,8 @@ class _Page:
         self._status.text = self._status_of(now)
         if is_live and (before is None or now.pictures != before.pictures):
             self._picture.set_source(f"{_PICTURE}?{now.pictures}")
-        self._still.text = "still" if now.is_still else "hold still"
+        self._still.text = {None: "", True: "still", False: "hold still"}[now.is_still]
+        self._note.text = now.note
         self._sees.text, self._advice.text = now.sees, now.advice
         self._typing.visible = self._take_button.visible = now.takes_typed
         self._missed.text = now.missed
@@ -209,8 +224,8 @@ class _Page:
         if now.is_judging:
             return "computing the result ..."
         if now.phase == "stopped":
-            return f"{len(now.views)} views are on the disk."
-        return f"{now.arm}: {len(now.views)} views" if now.phase == "live" else ""
+            return f"on the disk: {counted(len(now.views), 'view')}"
+        return f"{now.arm}: {counted(len(now.views), 'view')}" if now.phase == "live" else ""
 
     def _show_next(self, now: Snapshot) -> None:
         pose = now.next_pose
@@ -235,10 +250,13 @@ class _Page:
             with self._outcome:
                 for reason in shown.reasons[:3]:
                     ui.label(reason)
-                if shown.next_step:
-                    ui.label(f"Next: {shown.next_step}").classes("font-bold")
+                # A trial's commands would be of a folder that goes.
                 if now.outcome is not None:
+                    if shown.next_step:
+                        ui.label(f"Next: {shown.next_step}").classes("font-bold")
                     ui.label(f"The files are in {shown.folder}.").classes("text-sm")
+                    if shown.report.is_file():
+                        ui.link("Open the report", _REPORT, new_tab=True)
         self._history.clear()
         with self._history:
             for light, date, line in self._text.history():

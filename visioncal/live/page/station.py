@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from threading import Thread
 from typing import Literal
@@ -27,7 +28,7 @@ from visioncal.live.capture.take import TakenView, grey_of, image_motion_px
 from visioncal.live.drivers.protocols import Answer, ArmState, MovingArm, RequestingArm
 from visioncal.live.page.drawing import coverage_svg, live_picture
 from visioncal.live.page.outcome import Light, Outcome, ask_command
-from visioncal.live.page.suggestion import NextPose, next_view
+from visioncal.live.page.suggestion import NextPose, near, next_view
 from visioncal.live.planning.cell import PlanCell, flange_at
 
 # From this number of views on a calibration is tried after each.
@@ -111,10 +112,11 @@ class Snapshot:
     picture: bytes = b""  # The live picture, a JPEG.
     pictures: int = 0  # Number of pictures so far.
     sees: str = ""  # What is seen in it.
-    is_still: bool = False
+    is_still: bool | None = None  # None where pictures are no stream.
     arm: str = ""  # The arm's name.
     takes_typed: bool = False  # Whether poses are typed.
     views: tuple[str, ...] = ()  # A line a view.
+    note: str = ""  # How views are requested.
     missed: str = ""  # Why the last try gave no view.
     coverage: str = ""  # The coverage, as SVG.
     advice: str = ""
@@ -157,8 +159,16 @@ class Station:
         """Takes a view at a pose (4, 4) [m] that was typed in a form of `POSE_FORMS`."""
 
         def typed() -> None:
+            for view in self._journal.views:
+                pose = view.base_from_flange()
+                if pose is not None and np.abs(pose.as_matrix() - base_from_flange).max() < 1e-9:
+                    same = f"View {view.number} has this very pose: type that of this picture, or "
+                    self._publish(missed=f"{same}drive to another.")
+                    return
             if isinstance(arm := self._cell.arm, TypedPoses):
                 self._publish(pose_form=form)
+                if self._task.options.single:
+                    self._publish(sees="waiting for the next picture of the folder ...")
                 arm.pending = base_from_flange
 
         self._put(seen, typed)
@@ -172,12 +182,18 @@ class Station:
         self._put(seen, self._skip)
 
     def finish(self, seen: Snapshot) -> None:
-        """Judges the views."""
-        self._put(seen, lambda: self._ask(is_trial=False))
+        """Judges the views, also after the devices are closed."""
+        if seen.views:
+            self._requests.put(lambda: self._ask(is_trial=False))
 
     def end(self, seen: Snapshot) -> None:
         """Closes the devices, and asks for another setup."""
-        self._put(seen, lambda: self._stop(""))
+
+        def end() -> None:
+            self._open.close()
+            self.snapshot = Snapshot(setup=self.snapshot.setup)
+
+        self._put(seen, end)
 
     def close(self) -> None:
         """Ends the thread, which closes the devices."""
@@ -240,7 +256,8 @@ class Station:
             takes_typed=isinstance(arm, TypedPoses),
             pose_form=setup.pose_form or ("ros" if form is None else form.name),
             views=tuple(f"view {view.number}: recorded before" for view in self._journal.views),
-            missed=getattr(arm, "invitation", ""),
+            note=getattr(arm, "invitation", ""),
+            missed="",
             trial=None,
             outcome=None,
         )
@@ -267,7 +284,8 @@ class Station:
             try:
                 take_requested(self._capture, cell.arm, task.count, 0.01)
             except EOFError:
-                self._stop("The robot's program has ended.")
+                self._ask(is_trial=False)
+                self._stop("")
             except DriverError as error:
                 if not task.options.single:
                     raise
@@ -297,7 +315,9 @@ class Station:
             return
         if self._task.options.single:
             self._show(step.found.frame.image, step.found.corners)
-        self._publish(views=(*self.snapshot.views, step.words), missed="", outcome=None)
+        form = step.found.state.pose_form or self.snapshot.pose_form
+        views = (*self.snapshot.views, step.words)
+        self._publish(views=views, missed="", outcome=None, pose_form=form)
         self._after_change()
 
     def _undo(self) -> None:
@@ -338,11 +358,9 @@ class Station:
             self._requests.put(lambda: self._judged(future.result()))
 
     def _judged(self, outcome: Outcome) -> None:
-        if self.snapshot.phase != "live":
-            return
         if outcome.folder == self._task.result:
             self._publish(outcome=outcome, is_judging=False)
-        elif outcome.views <= len(self._journal.views):
+        elif self.snapshot.phase == "live" and outcome.views <= len(self._journal.views):
             self._publish(trial=outcome)
             fitted = outcome.document.get("camera")
             if fitted and self._capture.coach.camera is None:
@@ -380,14 +398,21 @@ class Station:
         coach, trial = self._capture.coach, self.snapshot.trial
         if not coach.poses:
             return NextPose("Begin with the whole board large in the picture.")
-        view = next_view(coach.target, coach.lens, [*coach.poses, *self._rejected])
+        avoid, flange, view = [*coach.poses, *self._rejected], None, None
+        if trial is not None and trial.light != "red" and trial.document:
+            edges = trial.document["transforms"].values()
+            x, z = (np.array(edge["matrix"]) for edge in edges)
+            place = partial(flange_at, self._task.recorded.mount, x, z)
+            poses = (view.base_from_flange() for view in self._journal.views)
+            taken = np.array([pose.as_matrix() for pose in poses if pose is not None])
+            view = next_view(coach.target, coach.lens, avoid, lambda at: near(place(at), taken))
+            flange = None if view is None else place(view)
+        view = next_view(coach.target, coach.lens, avoid) if view is None else view
+        if view is None:
+            return NextPose("Another place, with the whole board in the picture.")
         tilt = np.rad2deg(np.arccos(np.clip(view[2, 2], -1.0, 1.0)))
         words = (
             "Move until the board fills the orange outline, its first corner in the ring; it is "
             f"tilted by {tilt:.0f} degrees there."
         )
-        if trial is None or trial.light == "red" or not trial.document:
-            return NextPose(words, view)
-        edges = trial.document["transforms"].values()
-        x, z = (np.array(edge["matrix"]) for edge in edges)
-        return NextPose(words, view, flange_at(self._task.recorded.mount, x, z, view))
+        return NextPose(words, view, flange)

@@ -1,6 +1,6 @@
 """The next view to take: a pose of the board in the camera that differs most from all so far."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import apply, compose, invert, rotation_angle
-from visioncal.core.types import Camera, FloatArray, Target
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.live.planning.visibility import FieldOfView
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import extent_m, outline
@@ -19,6 +19,8 @@ _TILTS_DEG, _TURNS_DEG = (15.0, 32.0), (0.0, 50.0, -50.0)
 _PLACES, _DISTANCES = (-0.22, 0.0, 0.22), (0.85, 1.0, 1.25)
 # What counts as another view: as far apart as these together [rad, shares of the image, log].
 _APART = np.array([0.5, 0.35, 0.25])
+# How far from a pose that was taken another may be suggested in numbers [m, rad].
+_NEAR_M, _NEAR_RAD = 0.3, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,16 +32,22 @@ class NextPose:
     base_from_flange: FloatArray | None = None  # (4, 4) where the flange will be [m].
 
 
-def next_view(target: Target, lens: Camera, avoid: Sequence[FloatArray]) -> FloatArray:
+def next_view(
+    target: Target,
+    lens: Camera,
+    avoid: Sequence[FloatArray],
+    allowed: Callable[[FloatArray], Mask] | None = None,
+) -> FloatArray | None:
     """The view that differs most from all others, about as far away as the first of them.
 
     Args:
         target: The board.
         lens: Intrinsics; rough ones are enough.
         avoid: (4, 4) `cam_from_target` of one view or more so far, and of rejected suggestions [m].
+        allowed: Says of (k, 4, 4) views which may be suggested, (k,).
 
     Returns:
-        (4, 4) `cam_from_target` with the whole board in the image [m].
+        (4, 4) `cam_from_target` with the whole board in the image [m]; None where none is allowed.
     """
     low, high = extent_m(target)
     centre = np.append(0.5 * (low + high), 0.0)
@@ -58,9 +66,11 @@ def next_view(target: Target, lens: Camera, avoid: Sequence[FloatArray]) -> Floa
     candidates = np.array(
         [compose(turned, at - turned @ centre) for turned, at in product(rotations, places)]
     )
-    field = FieldOfView(lens, 0.03 * min(lens.resolution))
-    fits = field.holds(apply(candidates, outline(target)))
-    candidates = candidates[fits] if fits.any() else candidates
+    field = FieldOfView(lens, 0.06 * min(lens.resolution))
+    candidates = candidates[field.holds(apply(candidates, outline(target)))]
+    candidates = candidates if allowed is None else candidates[allowed(candidates)]
+    if not len(candidates):
+        return None
     apart = [_apart(candidates, view, centre, lens) for view in avoid]
     return np.asarray(candidates[int(np.argmax(np.min(apart, axis=0)))])
 
@@ -76,3 +86,27 @@ def _apart(views: FloatArray, view: FloatArray, centre: FloatArray, lens: Camera
         np.abs(logs[:-1] - logs[-1]),
     ]
     return np.asarray(np.array(steps).T @ (1.0 / _APART))
+
+
+def near(flanges: FloatArray, taken: FloatArray) -> Mask:
+    """Which poses of the flange (k, 4, 4) are near those taken (n, 4, 4), and no farther out [m].
+
+    Where an arm has stood it can stand; what it reaches beyond, and what stands there, only its
+    user knows.
+    """
+    apart = taken[:, None, :3, 3] - flanges[None, :, :3, 3]
+    turned = rotation_angle(invert(taken)[:, None] @ flanges[None])
+    beside = (np.linalg.norm(apart, axis=2) < _NEAR_M) & (turned < _NEAR_RAD)
+    out, low = np.linalg.norm(taken[:, :3, 3], axis=1).max(), taken[:, 2, 3].min()
+    is_inside = (np.linalg.norm(flanges[:, :3, 3], axis=1) <= out) & (flanges[:, 2, 3] >= low)
+    return np.asarray(beside.any(axis=0) & is_inside)
+
+
+def by_travel(poses: FloatArray) -> IntArray:
+    """An order of poses (n, 4, 4) [m] from the first on, each time to the nearest that is left."""
+    order, left = [0], set(range(1, len(poses)))
+    while left:
+        here = poses[order[-1], :3, 3]
+        order.append(min(left, key=lambda at: float(np.linalg.norm(poses[at, :3, 3] - here))))
+        left.remove(order[-1])
+    return np.array(order)
