@@ -55,7 +55,7 @@ def expect_results_of_calibrate(fleet, out, rows):
         verdict = alone.verdict.with_paths(fleet / name, out.absolute() / name)
         found = Calibration.load(out / name)
         assert facts(found) == facts(replace(alone, verdict=verdict))
-        assert (row.residual_mm, row.used) == (found.rms.mm, 10)
+        assert (row.entry.figures["residual_mm"], row.entry.figures["used"]) == (found.rms.mm, 10)
     failed = {row.name: row for row in rows if row.state == "failed"}
     assert sorted(failed) == ["broken", "empty"]
     assert "session.toml does not exist" in failed["empty"].words
@@ -72,7 +72,9 @@ def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
     expect_results_of_calibrate(fleet, tmp_path, found.rows)
     table = parquet.read_table(found.table).to_pylist()
     assert [value["name"] for value in table] == [row.name for row in found.rows]
-    assert {value["residual_mm"] for value in table} == {row.residual_mm for row in found.rows}
+    assert {value["residual_mm"] for value in table} == {
+        row.columns["residual_mm"] for row in found.rows
+    }
     page = found.page.read_text()
     assert all(page.count(f'<th scope="row">{end}') == 1 for end in ("broken<", "empty<"))
     assert all(row.words in html.unescape(page) for row in found.rows)
@@ -98,7 +100,7 @@ def test_what_was_done_is_kept(fleet, tmp_path):
     table.write_text("\n".join(whole.splitlines()[:-1]) + "\n")
     (row,) = batch(fleet / "robot_0/week_0", tmp_path / "robot_0", without=BARE).rows
     table.write_text(whole)
-    assert (row.state, row.views) == ("done", 9)
+    assert (row.state, row.entry.figures["views"]) == ("done", 9)
     asked = batch(fleet / "robot_*", tmp_path, without=BARE, need_mm=1.0)
     assert [row.state for row in asked.rows] == 4 * ["done"]
 

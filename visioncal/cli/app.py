@@ -52,8 +52,8 @@ class _Commands(LazyGroup):
     }
     listed = (
         *("demo", "plan", "record", "calibrate", "doctor", "batch", "show", "verify", "diff"),
-        *("convert", "export", "tcp", "locate", "fixture", "touch-test", "correct", "simulate"),
-        *("target", "dynamics"),
+        *("convert", "export", "tcp", "locate", "fixture", "touch-test", "correct", "history"),
+        *("simulate", "target", "dynamics"),
     )
 
 

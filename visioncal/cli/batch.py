@@ -1,8 +1,11 @@
 """`visioncal batch`."""
 
+from pathlib import Path
+
 import typer
 
 from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, answer
+from visioncal.cli.history import enter
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import BatchOptions
 from visioncal.core.errors import DataError
@@ -26,6 +29,9 @@ def batch_command(options: BatchOptions) -> None:
             without=[name for name, is_wanted in wanted.items() if not is_wanted],
             progress=progress,
         )
+    entries = [row.entry for row in found.rows if row.entry is not None]
+    first = Path(found.rows[0].session)
+    enter(options.history, first, lambda _: entries, options.out)
     counts = found.counts
     named = ("good", "check", "bad", "failed", "kept")
     words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])

@@ -5,12 +5,14 @@ import typer
 from visioncal.calibration.pipeline.run_state import CalibrationOptions
 from visioncal.calibration.run import run
 from visioncal.cli.console import exit_status, report_written, say, with_run_paths
+from visioncal.cli.history import enter
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import CalibrateOptions
 from visioncal.cli.summary import print_summary
 from visioncal.core.verdict import need_options
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import frames_to_keep
+from visioncal.results.history import entries_of
 from visioncal.session import Session
 
 
@@ -48,4 +50,11 @@ def calibrate_command(options: CalibrateOptions) -> None:
         print_summary(result.calibration, verbose=options.verbose)
     if left is not None:
         say(left.words)
+    places = str(session.absolute()), str(options.out.absolute())
+    enter(
+        options.history,
+        session,
+        lambda _: entries_of(result.calibration, options.cell or "", *places),
+        options.out,
+    )
     report_written(written, quiet=options.as_json, status=exit_status(result.calibration.verdict))

@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from visioncal.cli.parsing import address_in, numbers_in, size_in
-from visioncal.core.choices import ImagesKept
+from visioncal.core.choices import SITE_FILE, ImagesKept
 from visioncal.interchange.outputs import RECORDING, REPORT
 
 # For type hints only, so that --help stays fast.
@@ -98,6 +99,16 @@ class PageOptions:
         metavar="HOST:PORT",
         needs="page",
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActOptions:
+    """Where an act on a cell is entered."""
+
+    history: Path | None = option(
+        f"History to enter this into; else the nearest {SITE_FILE} above the session."
+    )
+    cell: str | None = option("The cell's name there; else the calibration's, or the session's.")
 
 
 @dataclass(frozen=True, kw_only=True)

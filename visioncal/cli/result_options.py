@@ -9,6 +9,7 @@ import typer
 
 from visioncal.cli.options import (
     REQUIRED,
+    ActOptions,
     NeedOptions,
     PageOptions,
     PartOptions,
@@ -30,7 +31,7 @@ from visioncal.cli.options import (
 )
 from visioncal.cli.parsing import FORMS, POSE, serial_in, views_in
 from visioncal.cli.session_options import RobotPoseOptions
-from visioncal.core.choices import UNITS_M, WIDEST_RAD, Convention, SolverName
+from visioncal.core.choices import SITE_FILE, UNITS_M, WIDEST_RAD, ActKind, Convention, SolverName
 from visioncal.interchange.outputs import REPORT, VERIFY
 
 
@@ -46,7 +47,7 @@ def _show_formats(wanted: bool) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateOptions(NeedOptions, WorkOptions):
+class CalibrateOptions(NeedOptions, WorkOptions, ActOptions):
     """Turn a session into a hand-eye calibration, with reasons to trust it or not.
 
     Writes calibration.json, report.html and recording.rrd. Tools and fixtures that had joined an
@@ -93,6 +94,9 @@ class BatchOptions(NeedOptions):
         "A Dask scheduler, as tcp://HOST:8786 (extra cluster).", metavar="ADDRESS"
     )
     level: str = option("As for calibrate.", default="auto", metavar="auto|hand-eye|offsets|...")
+    history: Path | None = option(
+        f"History to enter the results into; else the nearest {SITE_FILE} above the first session."
+    )
     no_report: bool = flag(f"Leave each {REPORT} out.")
     recordings: bool = flag("Also write each recording, with all images.")
 
@@ -119,7 +123,7 @@ class ShowOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifyOptions(PartOptions, PageOptions):
+class VerifyOptions(PartOptions, PageOptions, ActOptions):
     """Check whether a calibration still holds, and what has changed if it does not.
 
     With --page SESSION is a folder of checks: a browser leads through five stops of one of the
@@ -202,7 +206,7 @@ class CorrectOptions(PartOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameOptions(RobotPoseOptions, PartOptions):
+class FrameOptions(RobotPoseOptions, PartOptions, ActOptions):
     """What places a frame, and where it goes."""
 
     touches: Path | None = argument("A table of touches, or a session that shows it.", default=None)
@@ -263,7 +267,7 @@ class FixtureOptions(FrameOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TouchTestOptions:
+class TouchTestOptions(ActOptions):
     """Prove a calibration: touch what the camera locates, and enter the gaps.
 
     The session has one image or more of a board as it lies now. Prints where to send the robot,
@@ -313,4 +317,28 @@ class LocateOptions:
     )
     sigma_px: float | None = option("Noise of a feature; else that of the corners.")
     force: bool = force_bad()
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
+class HistoryOptions:
+    """List a site's history: what was calibrated, verified, placed and touched, and when.
+
+    Commands enter their results where --history or the site's file says so; entries never change.
+    With -o it is written as a page, the worst cell first, with the years of each, or as a table.
+    Exit status 2: it cannot be read or written, for the reason given.
+    """
+
+    file: Path | None = argument(
+        f"The history's file; else the nearest {SITE_FILE} here or above.", default=None
+    )
+    cell: str | None = option("Of this cell alone; with --add: whose results they are.")
+    kind: ActKind | None = option("Of this kind alone.")
+    show: str | None = option("One entry in full, by the beginning of its id.", metavar="ID")
+    add: list[Path] | None = option(
+        "Add the results of an output folder, such as old ones; once more changes nothing.",
+        metavar="OUT",
+    )
+    out: Path | None = option("The page (.html) or the table (.csv) to write.", "-o", "--out")
+    force: bool = force_flag()
     as_json: bool = json_flag()

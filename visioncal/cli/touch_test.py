@@ -17,6 +17,7 @@ from visioncal.cli.console import (
     report_written,
     warn,
 )
+from visioncal.cli.history import cell_of, enter
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import TouchTestOptions
@@ -33,6 +34,7 @@ from visioncal.frames.touches import Tool
 from visioncal.interchange.result_files import load_result, rewrite_result
 from visioncal.results import Calibration, to_document
 from visioncal.results.compensation.correction import correct
+from visioncal.results.history import entries_of
 from visioncal.session import Session
 
 _FORM = "Flange targets: x, y, z [mm], rotation vector [rad]; hover first, then touch."
@@ -77,6 +79,13 @@ def touch_test_command(options: TouchTestOptions) -> None:
         print_json({"points": targets, "touch_test": to_document(extended)["touch_test"]})
     else:
         answer(touch_test_finding(test).reason)
+    out = str(calibration.absolute())
+    enter(
+        options.history,
+        options.session,
+        lambda history: entries_of(extended, cell_of(history, options.cell, result), "", out),
+        out,
+    )
     report_written(written, quiet=options.as_json, status=0 if test.passed else EXIT_BAD)
 
 

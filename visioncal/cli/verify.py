@@ -7,12 +7,14 @@ import typer
 
 from visioncal.calibration.verification import to_document, triggers_of, verdict_of, verify
 from visioncal.cli.console import EXIT_BAD, answer, report_written
+from visioncal.cli.history import cell_of, enter
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.summary import print_steps
 from visioncal.interchange.outputs import Written, refuse_calibration, write_check
 from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
+from visioncal.results.history import entry_of_check
 from visioncal.session import Session
 
 # Headings of the triggers by state, with their styles.
@@ -34,9 +36,8 @@ def verify_command(options: VerifyOptions) -> None:
         return
     if options.output is not None:
         refuse_calibration(options.output)
-    loaded, calibration = select_matching(
-        Session.load(options.session), load_result(against), options.choice
-    )
+    result = load_result(against)
+    loaded, calibration = select_matching(Session.load(options.session), result, options.choice)
     with shown_progress(quiet=options.as_json) as progress:
         check = verify(
             loaded, calibration, board_placed_anew=options.board_moved, progress=progress
@@ -45,7 +46,8 @@ def verify_command(options: VerifyOptions) -> None:
         loaded, calibration, failed=not check.passed, collision=options.collision
     )
     verdict = verdict_of(check).with_paths(options.session, against, ["visioncal", *sys.argv[1:]])
-    document = json.dumps(to_document(check, triggers, verdict), indent=2, allow_nan=False) + "\n"
+    content = to_document(check, triggers, verdict)
+    document = json.dumps(content, indent=2, allow_nan=False) + "\n"
     written = (
         Written(())
         if options.output is None
@@ -67,4 +69,18 @@ def verify_command(options: VerifyOptions) -> None:
             words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)
             if words:
                 answer(words, begin, style)
+    out = "" if options.output is None else str(options.output.absolute())
+    enter(
+        options.history,
+        options.session,
+        lambda history: [
+            entry_of_check(
+                content,
+                cell_of(history, options.cell, result),
+                str(options.session.absolute()),
+                out,
+            )
+        ],
+        out,
+    )
     report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)

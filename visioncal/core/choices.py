@@ -29,6 +29,9 @@ PLAN_SPEED, PLAN_ACCELERATION = 0.4, 0.6
 # Greatest joint motion between consecutive targets of a path on one branch of the arm [rad].
 WIDEST_RAD = math.pi / 2
 
+# The history of a site, for every session below its folder; kinds of what it has.
+SITE_FILE = "visioncal-history.db"
+ActKind: TypeAlias = Literal["calibrated", "verified", "tool", "fixture", "touched"]
 # Output of `dynamics identify`.
 DYNAMICS_FILE = "dynamics.json"
 # Default relative standard deviation of a drive's gain: half the difference of two published lists

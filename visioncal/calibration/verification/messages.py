@@ -1,6 +1,7 @@
 """Verdict of a check in sentences, and as verify.json."""
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -305,7 +306,9 @@ def to_document(
     others = [change for change in listed_changes(check) if change not in check.named]
     return {
         "schema": 1,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "passed": check.passed,
+        "status": verdict.status,
         "calibration": {
             "session": calibration.session_name,
             "sha256": calibration.session_sha256,

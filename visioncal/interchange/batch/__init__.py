@@ -1,6 +1,5 @@
 """Batch calibration of many sessions, on this machine or on a cluster."""
 
-from visioncal.interchange.batch.run import Batch, Job, Options, batch, jobs_of
-from visioncal.results.fleet import FleetRow
+from visioncal.interchange.batch.run import Batch, Job, Options, Row, batch, jobs_of
 
-__all__ = ["Batch", "FleetRow", "Job", "Options", "batch", "jobs_of"]
+__all__ = ["Batch", "Job", "Options", "Row", "batch", "jobs_of"]

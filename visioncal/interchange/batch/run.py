@@ -18,13 +18,14 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from multiprocessing.context import BaseContext
 from pathlib import Path
 from threading import Thread
-from typing import get_args
+from typing import Literal
 
 from visioncal.core.arguments import typed
+from visioncal.core.codec import read, write
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.extras import client_library
 from visioncal.core.files import natural, read_text, write_atomically
@@ -34,7 +35,7 @@ from visioncal.core.verdict import need_options
 from visioncal.core.version import __version__
 from visioncal.interchange.outputs import CALIBRATION, RECORDING, REPORT, Written, write_outputs
 from visioncal.results import Calibration
-from visioncal.results.fleet import FleetRow, row_of, worst_first
+from visioncal.results.history import FIGURES, Entry, entry_of
 from visioncal.session import Session
 
 ROW = "row.json"
@@ -59,6 +60,43 @@ class Job:
     session: Path
     folder: Path  # Absolute path for its result.
     options: Options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """What became of one session of a batch."""
+
+    name: str  # Name of the session and of its result's folder.
+    session: str  # Path of the session.
+    # `done`, `kept` of an earlier run, or `failed`.
+    state: Literal["done", "kept", "failed"]
+    entry: Entry | None = None  # The entry of its result; None where there is none.
+    failure: str = ""  # Why there is no result.
+    error: str = ""  # Class of the error.
+    next_step: str = ""  # Remedy of the error.
+    seconds: float | None = None  # Duration of the calibration [s].
+    has_report: bool = False  # Whether its folder has a report.
+
+    @property
+    def verdict(self) -> str:
+        """`good`, `check` or `bad`; empty without a result."""
+        return "" if self.entry is None else self.entry.status
+
+    @property
+    def words(self) -> str:
+        """The verdict's first sentence, or why there is no result."""
+        return self.failure if self.entry is None else self.entry.reason
+
+    @property
+    def columns(self) -> dict[str, str | float | bool | None]:
+        """The row of a table."""
+        own = ("name", "session", "state", "verdict", "words", "error", "next_step", "seconds")
+        row = {name: getattr(self, name) for name in (*own, "has_report")}
+        facts = {"session_sha256": "sha256", "visioncal": "visioncal", "created": "at"}
+        facts |= {"robot": "robot", "mount": "mount"}
+        row |= {name: getattr(self.entry, fact, "") for name, fact in facts.items()}
+        figures = {} if self.entry is None else self.entry.figures
+        return row | {name: figures.get(name) for name in FIGURES}
 
 
 def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list[Job]:
@@ -105,7 +143,7 @@ def _sessions_of(given: str) -> Iterator[Path]:
             yield from inner or [found]
 
 
-def work(job: Job) -> FleetRow:
+def work(job: Job) -> Row:
     """Calibrates one session into its folder, on one thread.
 
     Returns:
@@ -116,10 +154,15 @@ def work(job: Job) -> FleetRow:
         with one_blas_thread():
             session = _session(job)
             calibration, written = _calibrated(job, session)
-            row = row_of(job.name, str(job.session), calibration, __version__)
-            row = replace(row, has_report=job.folder / REPORT in written.files)
+            row = Row(
+                name=job.name,
+                session=str(job.session),
+                state="done",
+                entry=entry_of(calibration, "", str(job.session), str(job.folder)),
+                has_report=job.folder / REPORT in written.files,
+            )
             # Written last: it marks the session as done.
-            document = {**_made_by(job, session), "row": asdict(row)}
+            document = {**_made_by(job, session), "row": write(Row, row)}
             write_atomically(job.folder / ROW, json.dumps(document, indent=1))
     except VisioncalError as error:
         row = failed_row(job, type(error).__name__, error.message, error.next_step)
@@ -128,36 +171,30 @@ def work(job: Job) -> FleetRow:
     return replace(row, seconds=time.perf_counter() - begin)
 
 
-def failed_row(job: Job, error: str, words: str, next_step: str) -> FleetRow:
+def failed_row(job: Job, error: str, words: str, next_step: str) -> Row:
     """The row of a session without a result: the error's class, its words, and what to do."""
-    return FleetRow(
+    return Row(
         name=job.name,
         session=str(job.session),
         state="failed",
-        words=words,
+        failure=words,
         error=error,
         next_step=next_step,
     )
 
 
-def kept_row(job: Job) -> FleetRow | None:
+def kept_row(job: Job) -> Row | None:
     """The row of an earlier run with the same inputs; None where there is none."""
-    names = {field.name for field in fields(FleetRow)}
     try:
         document = json.loads(read_text(job.folder / ROW))
         made_by = _made_by(job, _session(job))
-    except (VisioncalError, ValueError):
+        row = read(Row, document["row"], "row")
+    except (VisioncalError, ValueError, TypeError, KeyError):
         return None
-    if (
-        not isinstance(document, dict)
-        or {key: document.get(key) for key in made_by} != made_by
-        or set(document.get("row", ())) != names
-        or not (job.folder / CALIBRATION).exists()
-    ):
+    is_same = {key: document.get(key) for key in made_by} == made_by
+    if not is_same or row.entry is None or not (job.folder / CALIBRATION).exists():
         return None
-    return replace(
-        FleetRow(**document["row"]), name=job.name, session=str(job.session), state="kept"
-    )
+    return replace(row, name=job.name, session=str(job.session), state="kept")
 
 
 def _session(job: Job) -> Session:
@@ -197,7 +234,7 @@ TABLE, PAGE = "batch.parquet", "index.html"
 class Batch:
     """Results of many sessions."""
 
-    rows: tuple[FleetRow, ...]  # One a session, the worst first.
+    rows: tuple[Row, ...]  # One a session, the worst first.
     table: Path
     page: Path
 
@@ -259,36 +296,51 @@ def batch(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{folder} cannot be written: {error.strerror}.") from error
-    rows: list[FleetRow] = []
+    rows: list[Row] = []
     # Reported before the first result, which may take minutes.
     progress = progress or (lambda *_: None)
     progress("batch", 0, len(jobs))
     for row in _rows(jobs, workers, scheduler):
         rows.append(row)
         progress("batch", len(rows), len(jobs))
-    results = Batch(worst_first(rows), folder / TABLE, folder / PAGE)
+    # Those without a result first, then by their verdicts and names.
+    order = ("", "bad", "check", "good")
+    ordered = sorted(rows, key=lambda row: (order.index(row.verdict), row.name))
+    results = Batch(tuple(ordered), folder / TABLE, folder / PAGE)
     import pyarrow as pa
     from pyarrow import parquet
 
-    types = {str: pa.string(), bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
-    # A literal is text; of an optional value the other type counts.
-    kinds = {
-        name: next((kind for kind in (hint, *get_args(hint)) if kind in types), str)
-        for name, hint in FleetRow.__annotations__.items()
+    types = dict.fromkeys(FIGURES, pa.float64()) | {
+        "seconds": pa.float64(),
+        "has_report": pa.bool_(),
     }
-    schema = pa.schema([(name, types[kind]) for name, kind in kinds.items()])
+    table = [row.columns for row in results.rows]
+    schema = pa.schema([(name, types.get(name, pa.string())) for name in table[0]])
     buffer = io.BytesIO()
-    parquet.write_table(
-        pa.Table.from_pylist([asdict(row) for row in results.rows], schema=schema), buffer
-    )
+    parquet.write_table(pa.Table.from_pylist(table, schema=schema), buffer)
     write_atomically(results.table, buffer.getvalue())
-    from visioncal.present.report.fleet import fleet_page
-
-    write_atomically(results.page, fleet_page(results.rows))
+    write_atomically(results.page, _page(results.rows))
     return results
 
 
-def _rows(jobs: Sequence[Job], workers: int | None, scheduler: str | None) -> Iterator[FleetRow]:
+def _page(rows: Sequence[Row]) -> str:
+    """The page of a batch: that of a history of one day."""
+    from visioncal.present.report import fleet
+
+    shown = [
+        fleet.failed_row(row.name, row.failure, row.next_step)
+        if row.entry is None
+        else fleet.row_of(
+            row.name,
+            [row.entry],
+            link=f"{row.name}/{REPORT if row.has_report else CALIBRATION}",
+        )
+        for row in rows
+    ]
+    return fleet.fleet_page(shown, "Batch", f"{len(rows)} sessions", TABLE)
+
+
+def _rows(jobs: Sequence[Job], workers: int | None, scheduler: str | None) -> Iterator[Row]:
     """Rows of earlier results, and then those of the other sessions, as they finish."""
     waiting = []
     for job in jobs:
@@ -306,7 +358,7 @@ DIED, LOST = "WorkerDied", "SchedulerLost"
 
 def rows_of(
     jobs: Sequence[Job], workers: int | None = None, scheduler: str | None = None
-) -> Iterator[FleetRow]:
+) -> Iterator[Row]:
     """The rows of all jobs, in the order in which they finish; see `batch`.
 
     If a local process dies, the jobs that were running are run again, each in a pool of its own:
@@ -321,7 +373,7 @@ def rows_of(
     while waiting:
         # A cluster has a queue of its own; a pool gets no more than it runs: what it has, ran.
         most, engine = (len(jobs), _cluster(scheduler)) if scheduler else (count, _pool(count))
-        running: dict[Future[FleetRow], Job] = {}
+        running: dict[Future[Row], Job] = {}
         with engine as executor:
             try:
                 while waiting or running:
@@ -341,7 +393,7 @@ def rows_of(
             yield _row_alone(job)
 
 
-def _row(future: Future[FleetRow], job: Job, scheduler: str | None) -> FleetRow:
+def _row(future: Future[Row], job: Job, scheduler: str | None) -> Row:
     """The row of a finished job; raises BrokenExecutor where the pool's processes ended."""
     try:
         return future.result()
@@ -364,7 +416,7 @@ _MEMORY = (
 )
 
 
-def _row_alone(job: Job) -> FleetRow:
+def _row_alone(job: Job) -> Row:
     with _pool(1) as executor:
         try:
             return executor.submit(work, job).result()

@@ -1,0 +1,135 @@
+"""`visioncal history`, and the entries of the commands that calibrate, check and place."""
+
+import shlex
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from visioncal.cli.console import answer, print_json, print_table, say, warn
+from visioncal.cli.result_options import HistoryOptions
+from visioncal.core.choices import SITE_FILE
+from visioncal.core.codec import write
+from visioncal.core.errors import DataError
+from visioncal.core.files import check_free, write_atomically
+from visioncal.core.number_format import counted
+from visioncal.interchange.outputs import CALIBRATION, VERIFY
+from visioncal.interchange.result_files import content_of, load_result_or_frames
+from visioncal.results import Calibration
+from visioncal.results.history import (
+    Entry,
+    History,
+    entries_of,
+    entry_of_check,
+    entry_of_frame,
+    table_of,
+)
+
+
+def enter(
+    stated: Path | None, near: Path, acts: Callable[[History], Iterable[Entry]], again: Path | str
+) -> None:
+    """Enters acts whose files are written; where that fails, it costs no more than a warning.
+
+    Args:
+        stated: The history's file; None for the site's, if there is one.
+        near: The session or file by which the site is found.
+        acts: Makes the entries.
+        again: The output folder, from which they can be added later; empty for none.
+    """
+    history = History(stated) if stated is not None else History.of_site(near)
+    if history is None:
+        return
+    try:
+        history.append(*acts(history))
+    except DataError as error:
+        later = shlex.join(["visioncal", "history", str(history.path), "--add", str(again)])
+        how = f"Then enter it: {later}" if str(again) else "Then run the command once more."
+        warn(f"This is not in the history: {error.message} {error.next_step} {how}")
+
+
+def cell_of(history: History, cell: str | None, calibration: Calibration) -> str:
+    """The cell that was named, or that of a calibration."""
+    if cell is not None:
+        return cell
+    facts = calibration.session_name, calibration.session_sha256, calibration.created
+    return history.cell_of(*facts)
+
+
+def history_command(options: HistoryOptions) -> None:
+    """Runs `visioncal history`."""
+    history = History(options.file) if options.file else History.of_site(Path.cwd() / SITE_FILE)
+    if history is None:
+        raise DataError(
+            f"there is no {SITE_FILE} here or above.",
+            culprits=["FILE"],
+            next_step="Name a history's file, or begin one where all sessions of the site are "
+            f"below: visioncal calibrate SESSION -o OUT --history {SITE_FILE}",
+        )
+    if options.add:
+        found = [entry for out in options.add for entry in _stored(history, out, options.cell)]
+        new = history.append(*found)
+        say(f"{counted(new, 'entry')} added, {len(found) - new} were there already")
+        return
+    entries = history.entries(options.cell, options.kind, begin=options.show or "")
+    if options.out is not None:
+        _write(options.out, entries, history.path, force=options.force)
+    elif options.as_json:
+        print_json([{"id": entry.id} | write(Entry, entry) for entry in entries])
+    elif options.show is None:
+        titles = ("id", "time", "cell", "kind", "verdict", "first reason")
+        rows = [
+            (entry.id[:8], f"{entry.time:%Y-%m-%d %H:%M}", entry.cell, entry.kind, entry.status)
+            for entry in entries
+        ]
+        print_table(
+            titles, [(*row, entry.reason) for row, entry in zip(rows, entries, strict=True)]
+        )
+    elif len(entries) == 1:
+        for name, value in entries[0].columns.items():
+            if value not in ("", None):
+                answer(f"{value}", f"{name}: ")
+    else:
+        raise DataError(
+            f"{counted(len(entries), 'entry')} of {history.path} begin with {options.show!r}.",
+            culprits=["--show"],
+            next_step=f"visioncal history {shlex.quote(str(history.path))} lists them.",
+        )
+
+
+def _write(out: Path, entries: Sequence[Entry], source: Path, *, force: bool) -> None:
+    check_free(out, force=force)
+    if out.suffix.lower() == ".csv":
+        text = table_of(entries)
+    elif out.suffix.lower() == ".html":
+        from visioncal.present.report.fleet import page_of_history
+
+        text = page_of_history(entries, source.absolute().parent.name, datetime.now(UTC))
+    else:
+        raise DataError(
+            f"{out} is neither a page (.html) nor a table (.csv).",
+            culprits=["-o"],
+            next_step="Give it one of these endings.",
+        )
+    write_atomically(out, text)
+    say(f"wrote {out}")
+
+
+def _stored(history: History, out: Path, cell: str | None) -> Sequence[Entry]:
+    """The entries of the results in a folder or below, of a result's file or of one of frames."""
+    place, check = str(out.absolute()), content_of(out / VERIFY if out.is_dir() else out)
+    if "triggers" in check:
+        entry = entry_of_check(check, cell or "", "", place)
+        checked: Any = check["calibration"]
+        facts = (checked[name] for name in ("session", "sha256", "created"))
+        return [entry if cell else replace(entry, cell=history.cell_of(*facts))]
+    below = sorted(file.parent for file in out.rglob(CALIBRATION)) if out.is_dir() else []
+    if below and below != [out]:
+        return [entry for folder in below for entry in _stored(history, folder, cell)]
+    result = load_result_or_frames(out)
+    if isinstance(result, Calibration):
+        return entries_of(result, cell_of(history, cell, result), "", place)
+    own = cell or out.absolute().parent.name
+    frames = result.frames.items()
+    return [entry_of_frame(name, frame, own, None, "", place) for name, frame in frames]

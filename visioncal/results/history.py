@@ -1,0 +1,453 @@
+"""The history of a site's cells: one SQLite file to which every act is appended."""
+
+import csv
+import io
+import json
+import math
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+
+from visioncal.core.choices import SITE_FILE, ActKind
+from visioncal.core.codec import REST, Key, read, reading, write
+from visioncal.core.errors import DataError
+from visioncal.core.files import one_line, sha256
+from visioncal.core.types import Need
+from visioncal.core.verdict import VerdictStatus
+from visioncal.core.version import __version__
+from visioncal.results.edge import StoredEdge
+from visioncal.results.frame import Frame
+from visioncal.results.result import Calibration
+from visioncal.session.frames import frames_of_kind
+
+# Seconds that an entry waits for others that are being written.
+_PATIENCE_S = 20.0
+# "vcal", by which our files are known among SQLite's.
+_APPLICATION = 0x7663616C
+# The form of the file, the statements of each version in turn: old files are brought forward.
+# REPLACE would delete without the trigger on DELETE, hence the one on INSERT, which also makes a
+# repeated entry harmless.
+_FORMS = (
+    (
+        "CREATE TABLE entry (id TEXT PRIMARY KEY NOT NULL, at TEXT NOT NULL, cell TEXT NOT NULL, "
+        "kind TEXT NOT NULL, document TEXT NOT NULL)",
+        "CREATE INDEX entry_by_cell ON entry (cell, at)",
+        "CREATE TRIGGER entry_once BEFORE INSERT ON entry "
+        "WHEN EXISTS (SELECT 1 FROM entry WHERE id = NEW.id) BEGIN SELECT RAISE(IGNORE); END",
+        "CREATE TRIGGER entry_stays BEFORE UPDATE ON entry "
+        "BEGIN SELECT RAISE(ABORT, 'a history is only appended to'); END",
+        "CREATE TRIGGER entry_remains BEFORE DELETE ON entry "
+        "BEGIN SELECT RAISE(ABORT, 'a history is only appended to'); END",
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Entry:
+    """An act on a cell: a calibration, a check, a tool or fixture that was placed, a touch test."""
+
+    cell: str  # Name of the cell, the same for all its acts.
+    at: str  # Time of the act, ISO 8601, in UTC.
+    kind: ActKind  # Kind of the act.
+    status: VerdictStatus  # Its verdict.
+    reason: str  # The verdict's first reason.
+    visioncal: str = __version__  # Version of the program.
+    session: str = ""  # Name of the session, or of the file of touches.
+    sha256: str = ""  # Digest of the input; empty where a result does not keep it.
+    source: str = ""  # Absolute path of the input; empty where unknown.
+    out: str = ""  # Absolute path of the result; empty where none was written.
+    against: str = ""  # Digest of the calibrated session that a later act is about.
+    # What was estimated, by name.
+    edges: Annotated[Mapping[str, StoredEdge], Key("transforms")] = field(default_factory=dict)
+    # Transforms of boards, which are put elsewhere on purpose.
+    boards: tuple[str, ...] = ()
+    need: Need | None = None  # Required accuracy of picks.
+    good_for_mm: float | None = None  # The least need for which it is good [mm].
+    conditions: tuple[str, ...] = ()  # What the result is valid for, in sentences.
+    robot: str = ""  # Model of the robot.
+    mount: str = ""  # Mount of the camera.
+    # Numbers of the result by name, with their units: `views`, `noise_mm`, `radius95_mm` ...
+    figures: Mapping[str, float] = field(default_factory=dict)
+    # What a newer version has noted, unchanged.
+    further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict, repr=False)
+
+    @property
+    def id(self) -> str:
+        """Its identity: of what was found and when, not of where it lies or of which cell it is.
+
+        A result that is added once more, from wherever, is thus the same entry.
+        """
+        found = {name: edge.matrix.tolist() for name, edge in self.edges.items()}
+        content = [self.kind, self.at, self.status, self.session, self.reason, found]
+        return sha256(json.dumps(content, sort_keys=True).encode())[:16]
+
+    @property
+    def time(self) -> datetime:
+        """Time of the act."""
+        return datetime.fromisoformat(self.at)
+
+    @property
+    def columns(self) -> dict[str, str | float | None]:
+        """The entry as a row of a table; a transform as translation [m], rotation vector [rad]."""
+        row: dict[str, str | float | None] = {"id": self.id}
+        row |= {name: str(getattr(self, name)) for name in _TEXTS}
+        row |= {"conditions": " ".join(self.conditions), "good_for_mm": self.good_for_mm}
+        row |= {f"need_{unit}": getattr(self.need, unit, None) for unit in ("mm", "deg")}
+        row |= {name: self.figures.get(name) for name in FIGURES}
+        for name, edge in self.edges.items():
+            twist = [*edge.matrix[:3, 3], *edge.transform.rotation.as_rotvec()]
+            labels = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
+            row |= {
+                f"{name} {label}": x for label, x in zip(labels, map(float, twist), strict=True)
+            }
+            row |= {f"{name} sigma_mm": edge.sigma_mm, f"{name} sigma_deg": edge.sigma_deg}
+        return row
+
+
+_TEXTS = (
+    *("at", "cell", "kind", "status", "reason", "visioncal", "session", "sha256", "source", "out"),
+    *("against", "robot", "mount"),
+)
+FIGURES = (
+    *("views", "used", "residual_mm", "residual_deg", "residual_px", "noise_mm", "noise_deg"),
+    *("noise_px", "sigma_mm", "sigma_deg", "radius95_mm", "arm_mm", "drift_mm", "focal_px"),
+    *("ambient_c", "payload_kg"),
+)
+
+
+def entry_of(calibration: Calibration, cell: str = "", source: str = "", out: str = "") -> Entry:
+    """The entry of a calibration.
+
+    Args:
+        calibration: The result.
+        cell: Name of the cell; that of the session where empty.
+        source: Path of the session.
+        out: Path of the result's folder.
+    """
+    targets = frames_of_kind((name.partition("_from_")[2] for name in calibration.edges), "target")
+    need = calibration.need
+    return Entry(
+        cell=one_line(cell) or calibration.session_name,
+        at=_utc(calibration.created),
+        kind="calibrated",
+        status=calibration.verdict.status,
+        reason=next(iter(calibration.verdict.reasons), calibration.verdict.headline),
+        session=calibration.session_name,
+        sha256=calibration.session_sha256,
+        source=source,
+        out=out,
+        edges=calibration.edges,
+        boards=tuple(name for name in calibration.edges if name.partition("_from_")[2] in targets),
+        need=None if need is None else need.need,
+        good_for_mm=calibration.verdict.good_for_mm,
+        conditions=tuple(condition.words for condition in calibration.conditions),
+        robot="" if calibration.robot is None else calibration.robot.name,
+        mount=calibration.mount,
+        figures=_figures(calibration),
+    )
+
+
+def entry_of_frame(
+    name: str,
+    frame: Frame,
+    cell: str,
+    calibration: Calibration | None,
+    source: str = "",
+    out: str = "",
+) -> Entry:
+    """The entry of a tool or a fixture by its transform's name; see `entry_of`."""
+    return Entry(
+        cell=one_line(cell),
+        at=_utc(frame.created),
+        kind="tool" if name.startswith("flange") else "fixture",
+        status=frame.verdict.status,
+        reason=next(iter(frame.verdict.reasons), frame.verdict.headline),
+        session=one_line(frame.source),
+        edges={name: frame.edge},
+        against="" if calibration is None else calibration.session_sha256,
+        figures={"residual_mm": frame.rms_mm, "noise_mm": frame.noise_mm},
+        source=source,
+        out=out,
+    )
+
+
+def entries_of(
+    calibration: Calibration, cell: str = "", source: str = "", out: str = ""
+) -> tuple[Entry, ...]:
+    """The entries of a result: itself, the frames that joined it, and its touch test."""
+    own = entry_of(calibration, cell, source, out)
+    frames = (
+        entry_of_frame(name, frame, own.cell, calibration, out=out)
+        for name, frame in calibration.frames.items()
+    )
+    test = calibration.touch_test
+    if test is None:
+        return own, *frames
+    gaps = [point.gap_mm for point in test.points]
+    words = f"Touched with {test.tool}: gaps of {min(gaps):.2f} to {max(gaps):.2f} mm"
+    touched = Entry(
+        cell=own.cell,
+        at=_utc(test.created),
+        kind="touched",
+        status="good" if test.passed else "bad",
+        reason=f"{words}, {'as' if test.passed else 'larger than'} predicted.",
+        session=own.session,
+        out=out,
+        against=own.sha256,
+        figures={"residual_mm": float(np.sqrt(np.mean(np.square(gaps))))},
+    )
+    return own, *frames, touched
+
+
+def entry_of_check(
+    document: Mapping[str, Any], cell: str = "", source: str = "", out: str = ""
+) -> Entry:
+    """The entry of a check, from its verify.json.
+
+    Raises:
+        DataError: The document lacks something, such as the time in one of an older version.
+    """
+    with reading(out or "verify.json", "a check", "Verify once more, by this version."):
+        session, against = document["session"], document["calibration"]
+        return Entry(
+            cell=one_line(cell or against["session"]),
+            at=_utc(document["created"]),
+            kind="verified",
+            status=document["status"],
+            reason=next(iter(document["sentences"]), ""),
+            session=one_line(session["name"]),
+            sha256=session["sha256"],
+            against=against["sha256"],
+            source=source,
+            out=out,
+            figures={"misfit": document["misfit"], "p_value": document["p_value"]},
+        )
+
+
+def _utc(created: str) -> str:
+    """A time as entries have it, so that their order as texts is that of the acts."""
+    then = datetime.fromisoformat(created)
+    return (then if then.tzinfo else then.replace(tzinfo=UTC)).astimezone(UTC).isoformat()
+
+
+def _figures(calibration: Calibration) -> dict[str, float]:
+    """Numbers of a result; those that it does not have are absent."""
+    camera, budget = calibration.camera, calibration.budget
+    arm, drift, noise = calibration.arm_errors, calibration.thermal, calibration.noise
+    # Of a cell without a camera, the first transform.
+    names = (name for name in calibration.edges if "_from_cam" in name)
+    edge = calibration.edges[next(names, next(iter(calibration.edges)))]
+    figures = {
+        "views": len(calibration.views),
+        "used": sum(view.used for view in calibration.views),
+        "residual_mm": calibration.rms.mm,
+        "residual_deg": calibration.rms.deg,
+        "residual_px": calibration.rms.px,
+        "noise_mm": noise.get("robot_translation_mm", noise.get("combined_translation_mm")),
+        "noise_deg": noise.get("robot_rotation_deg", noise.get("combined_rotation_deg")),
+        "noise_px": noise.get("pixel_px"),
+        "sigma_mm": edge.sigma_mm,
+        "sigma_deg": edge.sigma_deg if edge.oriented else None,
+        "radius95_mm": None if budget is None else budget.radius95_mm,
+        "arm_mm": None if arm is None else arm.sigma_mm,
+        "drift_mm": None
+        if drift is None
+        else max((at.drift_mm for at in drift.course), default=0.0),
+        "focal_px": None if camera is None else float(np.mean(camera.camera.matrix[:2])),
+        **calibration.means,
+    }
+    return {
+        name: float(value)
+        for name, value in figures.items()
+        if value is not None and math.isfinite(value)
+    }
+
+
+@dataclass(frozen=True)
+class History:
+    """A history's file; created by the first entry.
+
+    Each call opens and closes it, so that processes share it. An entry that `append` has returned
+    from is on the disk, once, however often it is repeated.
+    """
+
+    path: Path
+
+    @classmethod
+    def of_site(cls, near: Path) -> Self | None:
+        """The history of the site to which a path belongs: the nearest in its folder or above."""
+        folders = (near.absolute(), *near.absolute().parents)
+        found = (folder / SITE_FILE for folder in folders if (folder / SITE_FILE).is_file())
+        return next(map(cls, found), None)
+
+    def append(self, *entries: Entry) -> int:
+        """Appends entries, all of them or none, and returns how many were not there yet.
+
+        Raises:
+            DataError: The file cannot be written, is locked, or is no history.
+        """
+        rows = [
+            (entry.id, entry.at, entry.cell, entry.kind, json.dumps(write(Entry, entry)))
+            for entry in entries
+        ]
+        with self._opened(creating=True) as file:
+            file.execute("BEGIN IMMEDIATE")
+            before = file.total_changes
+            file.executemany("INSERT INTO entry VALUES (?, ?, ?, ?, ?)", rows)
+            new = file.total_changes - before
+            file.execute("COMMIT")
+        return new
+
+    def entries(
+        self,
+        cell: str | None = None,
+        kind: ActKind | None = None,
+        at: str | None = None,
+        begin: str = "",
+    ) -> tuple[Entry, ...]:
+        """The entries in the order of their times.
+
+        Args:
+            cell: Those of a cell alone.
+            kind: Those of a kind alone.
+            at: Those of a time alone.
+            begin: Those whose identity begins so.
+
+        Raises:
+            DataError: The file is missing, cannot be read, is locked, or is no history.
+        """
+        if not self.path.exists():
+            raise DataError(
+                f"{self.path} does not exist.",
+                culprits=[str(self.path)],
+                next_step="Name a history's file, or begin one: visioncal calibrate SESSION -o OUT "
+                f"--history {self.path}",
+            )
+        query = (
+            "SELECT document FROM entry WHERE cell = ifnull(?, cell) AND kind = ifnull(?, kind) "
+            "AND at = ifnull(?, at) AND substr(id, 1, length(?)) = ? ORDER BY at, id"
+        )
+        with self._opened() as file:
+            rows = file.execute(query, (cell, kind, at, begin, begin)).fetchall()
+        with reading(str(self.path), "a history", "Take an earlier copy of it."):
+            return tuple(read(Entry, json.loads(document), "") for (document,) in rows)
+
+    def cell_of(self, session: str, digest: str, created: str) -> str:
+        """The cell of a calibration, by its session's name and digest and by its own time.
+
+        As its entry says, or else the session's name.
+        """
+        known = self.entries(kind="calibrated", at=_utc(created)) if self.path.exists() else ()
+        return next((entry.cell for entry in known if entry.sha256 == digest), session)
+
+    @contextmanager
+    def _opened(self, *, creating: bool = False) -> Iterator[sqlite3.Connection]:
+        """The open file in the present form, with errors in plain words."""
+        try:
+            with closing(self._connected("rwc" if creating else "rw")) as file:
+                self._bring_forward(file)
+                if creating:
+                    # While another process has it open, the next entry tries again.
+                    with suppress(sqlite3.OperationalError):
+                        file.execute("PRAGMA journal_mode = WAL")
+                yield file
+        except sqlite3.Error as error:
+            code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+            why, do = _FAULTS.get(code, (f"cannot be used: {error}", "Take an earlier copy of it."))
+            if self.path.is_dir():
+                why, do = "is a folder", f"Name a file, such as {self.path / SITE_FILE}."
+            elif not self.path.parent.is_dir():
+                why, do = "cannot be created: its folder does not exist", "Create the folder first."
+            raise self._refusal(why, do) from error
+
+    def _connected(self, mode: str) -> sqlite3.Connection:
+        address, beside = self.path.absolute().as_uri(), Path(f"{self.path}-wal")
+        try:
+            return _connection(f"{address}?mode={mode}")
+        except sqlite3.OperationalError as error:
+            # In a read-only place there is no room for the files beside it; nobody writes there.
+            is_closed = not beside.exists() or not beside.stat().st_size
+            read_only = (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
+            if mode != "rw" or error.sqlite_errorcode & 0xFF not in read_only or not is_closed:
+                raise
+            return _connection(f"{address}?mode=ro&immutable=1")
+
+    def _bring_forward(self, file: sqlite3.Connection) -> None:
+        """Brings a new file, or one of an older version, into the present form."""
+        if self._version(file) < len(_FORMS):
+            file.execute("BEGIN IMMEDIATE")
+            # Another process may have been quicker.
+            for statements in _FORMS[self._version(file) :]:
+                for statement in statements:
+                    file.execute(statement)
+            file.execute(f"PRAGMA application_id = {_APPLICATION}")
+            file.execute(f"PRAGMA user_version = {len(_FORMS)}")
+            file.execute("COMMIT")
+
+    def _version(self, file: sqlite3.Connection) -> int:
+        names = ("application_id", "user_version", "schema_version")
+        application, version, tables = (
+            int(file.execute(f"PRAGMA {name}").fetchone()[0]) for name in names
+        )
+        if application != _APPLICATION and (application or version or tables):
+            raise self._refusal("is a file of another program", "Name a history's file.")
+        if version > len(_FORMS):
+            why = f"is of form {version}, and this version of visioncal knows {len(_FORMS)}"
+            raise self._refusal(why, "Use the newer version that wrote it.")
+        return version
+
+    def _refusal(self, why: str, do: str) -> DataError:
+        return DataError(f"{self.path} {why}.", culprits=[str(self.path)], next_step=do)
+
+
+def _connection(address: str) -> sqlite3.Connection:
+    file = sqlite3.connect(address, uri=True, timeout=_PATIENCE_S, isolation_level=None)
+    try:
+        file.execute("PRAGMA synchronous = FULL")
+        # The file is opened by the first statement that reads.
+        file.execute("PRAGMA user_version").fetchone()
+    except sqlite3.Error:
+        file.close()
+        raise
+    return file
+
+
+# Why a file cannot be used, by SQLite's code, and what to do.
+_FAULTS = {
+    sqlite3.SQLITE_BUSY: (
+        f"is locked: another program has been writing it for {_PATIENCE_S:.0f} s",
+        "Close the program that has it open, such as a viewer of SQLite files.",
+    ),
+    sqlite3.SQLITE_READONLY: (
+        "cannot be written: it or its folder is read-only",
+        "Ask for the right to write there, or copy it to where you may.",
+    ),
+    sqlite3.SQLITE_CANTOPEN: (
+        "cannot be opened: you may not read it, or not write into its folder",
+        "Ask for the right to, or copy it to where you may.",
+    ),
+    sqlite3.SQLITE_FULL: ("cannot be written: the disk is full", "Make room on that disk."),
+    sqlite3.SQLITE_IOERR: (
+        "cannot be read or written: the disk is full, or fails",
+        "Make room on that disk; a file on a network drive belongs onto a disk of this machine.",
+    ),
+    sqlite3.SQLITE_CORRUPT: ("is damaged", "Take an earlier copy of it."),
+    sqlite3.SQLITE_NOTADB: ("is no history: no SQLite file at all", "Name a history's file."),
+}
+
+
+def table_of(entries: Iterable[Entry]) -> str:
+    """Entries as CSV, a row an entry; see `Entry.columns`."""
+    rows = [entry.columns for entry in entries]
+    names = dict.fromkeys(name for row in rows for name in row)
+    text = io.StringIO()
+    table = csv.DictWriter(text, names, restval="", lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    return text.getvalue()
