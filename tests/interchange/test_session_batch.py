@@ -73,7 +73,7 @@ def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
     table = parquet.read_table(found.table).to_pylist()
     assert [value["name"] for value in table] == [row.name for row in found.rows]
     assert {value["residual_mm"] for value in table} == {
-        row.columns["residual_mm"] for row in found.rows
+        row.entry and row.entry.figures["residual_mm"] for row in found.rows
     }
     page = found.page.read_text()
     assert all(page.count(f'<th scope="row">{end}') == 1 for end in ("broken<", "empty<"))

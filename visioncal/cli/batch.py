@@ -30,8 +30,7 @@ def batch_command(options: BatchOptions) -> None:
             progress=progress,
         )
     entries = [row.entry for row in found.rows if row.entry is not None]
-    first = Path(found.rows[0].session)
-    enter(options.history, first, lambda _: entries, options.out)
+    enter(options, Path(found.rows[0].session), entries, options.out)
     counts = found.counts
     named = ("good", "check", "bad", "failed", "kept")
     words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])

@@ -50,11 +50,5 @@ def calibrate_command(options: CalibrateOptions) -> None:
         print_summary(result.calibration, verbose=options.verbose)
     if left is not None:
         say(left.words)
-    places = str(session.absolute()), str(options.out.absolute())
-    enter(
-        options.history,
-        session,
-        lambda _: entries_of(result.calibration, options.cell or "", *places),
-        options.out,
-    )
+    enter(options, session, entries_of(result.calibration), options.out)
     report_written(written, quiet=options.as_json, status=exit_status(result.calibration.verdict))

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.cli.console import answer, exit_status, print_json, report_written, say
 from visioncal.cli.convert import import_options
-from visioncal.cli.history import cell_of, enter
+from visioncal.cli.history import enter
 from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import FixtureOptions, FrameOptions, TcpOptions
@@ -27,7 +27,7 @@ from visioncal.interchange.outputs import RECORDING, Written
 from visioncal.interchange.result_files import load_result, load_result_or_frames, rewrite_result
 from visioncal.results import Calibration, Frame, FrameFile
 from visioncal.results.frame import frames_document
-from visioncal.results.history import Entry, History, entry_of_frame
+from visioncal.results.history import entry_of_frame
 from visioncal.results.selecting import transform_name_in_cell
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
@@ -91,21 +91,6 @@ def _place(
     return _Place(name, calibration, result, folder, file, frames)
 
 
-def _enter(
-    options: FrameOptions, place: _Place, frame: Frame, source: Path, again: Path | str
-) -> None:
-    """Enters a frame into the history, in the cell of its calibration or of the source's folder."""
-
-    def acts(history: History) -> list[Entry]:
-        result = place.result
-        own = source.absolute().parent.name
-        cell = options.cell or own if result is None else cell_of(history, options.cell, result)
-        paths = str(source.absolute()), str(again and Path(again).absolute())
-        return [entry_of_frame(place.name, frame, cell, result, *paths)]
-
-    enter(options.history, source, acts, again)
-
-
 def _keep_and_report(place: _Place, frame: Frame, source: Path, options: FrameOptions) -> None:
     """Writes a frame to its destination, and prints it for people, or as JSON."""
     # The suggested command runs again, and has a frame to replace then.
@@ -121,9 +106,10 @@ def _keep_and_report(place: _Place, frame: Frame, source: Path, options: FrameOp
     elif place.folder is not None and place.result is not None and verdict.status != "bad":
         written = rewrite_result(place.folder, replace(place.result, frames=frames))
     if destination is not None:
+        entries, of = [entry_of_frame(place.name, frame, place.result)], place.result
         # A bad one is in no folder from which it could be added later.
-        again = destination if written.files else ""
-        _enter(options, place, frame, source, again)
+        kept = destination if written.files else ""
+        enter(options, source, entries, kept, "" if of is None else of.session_sha256)
     if options.as_json:
         print_json(frames_document({place.name: frame}))
         report_written(written, quiet=True, status=exit_status(verdict))

@@ -1,13 +1,13 @@
 """`visioncal history`, and the entries of the commands that calibrate, check and place."""
 
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from visioncal.cli.console import answer, print_json, print_table, say, warn
+from visioncal.cli.options import ActOptions
 from visioncal.cli.result_options import HistoryOptions
 from visioncal.core.choices import SITE_FILE
 from visioncal.core.codec import write
@@ -28,33 +28,44 @@ from visioncal.results.history import (
 
 
 def enter(
-    stated: Path | None, near: Path, acts: Callable[[History], Iterable[Entry]], again: Path | str
+    options: ActOptions, near: Path, entries: Iterable[Entry], out: Path | str = "", of: str = ""
 ) -> None:
     """Enters acts whose files are written; where that fails, it costs no more than a warning.
 
     Args:
-        stated: The history's file; None for the site's, if there is one.
-        near: The session or file by which the site is found.
-        acts: Makes the entries.
-        again: The output folder, from which they can be added later; empty for none.
+        options: Which history and which cell are meant.
+        near: The session or file that was read, by which the site is found.
+        entries: The entries, whose cell and paths are filled in.
+        out: The output, from which they can be added later; empty for none.
+        of: Digest of the calibrated session that they are about: its cell is theirs.
     """
-    history = History(stated) if stated is not None else History.of_site(near)
+    history = History(options.history) if options.history else History.of_site(near)
     if history is None:
         return
+    places = str(near.absolute()), str(out and Path(out).absolute())
     try:
-        history.append(*acts(history))
+        history.append(*_of_cell(history, options.cell, of, entries, *places))
     except DataError as error:
-        later = shlex.join(["visioncal", "history", str(history.path), "--add", str(again)])
-        how = f"Then enter it: {later}" if str(again) else "Then run the command once more."
+        later = shlex.join(["visioncal", "history", str(history.path), "--add", str(out)])
+        how = f"Then enter it: {later}" if out else "Then run the command once more."
         warn(f"This is not in the history: {error.message} {error.next_step} {how}")
 
 
-def cell_of(history: History, cell: str | None, calibration: Calibration) -> str:
-    """The cell that was named, or that of a calibration."""
-    if cell is not None:
-        return cell
-    facts = calibration.session_name, calibration.session_sha256, calibration.created
-    return history.cell_of(*facts)
+def _of_cell(
+    history: History,
+    cell: str | None,
+    of: str,
+    entries: Iterable[Entry],
+    source: str = "",
+    out: str = "",
+) -> list[Entry]:
+    """Entries of the cell that was named, or that is known of what they are about."""
+    known = history.entries(sha256=of) if of and not cell and history.path.exists() else ()
+    named = cell or next((entry.cell for entry in known), "")
+    return [
+        replace(one, cell=named or one.cell, source=one.source or source, out=one.out or out)
+        for one in entries
+    ]
 
 
 def history_command(options: HistoryOptions) -> None:
@@ -118,18 +129,18 @@ def _write(out: Path, entries: Sequence[Entry], source: Path, *, force: bool) ->
 
 def _stored(history: History, out: Path, cell: str | None) -> Sequence[Entry]:
     """The entries of the results in a folder or below, of a result's file or of one of frames."""
-    place, check = str(out.absolute()), content_of(out / VERIFY if out.is_dir() else out)
-    if "triggers" in check:
-        entry = entry_of_check(check, cell or "", "", place)
-        checked: Any = check["calibration"]
-        facts = (checked[name] for name in ("session", "sha256", "created"))
-        return [entry if cell else replace(entry, cell=history.cell_of(*facts))]
+    entries: Iterable[Entry]
+    check, of = content_of(out / VERIFY if out.is_dir() else out), ""
     below = sorted(file.parent for file in out.rglob(CALIBRATION)) if out.is_dir() else []
-    if below and below != [out]:
+    if "triggers" in check:
+        entries = [entry_of_check(check, str(out))]
+        of = entries[0].against
+    elif below and below != [out]:
         return [entry for folder in below for entry in _stored(history, folder, cell)]
-    result = load_result_or_frames(out)
-    if isinstance(result, Calibration):
-        return entries_of(result, cell_of(history, cell, result), "", place)
-    own = cell or out.absolute().parent.name
-    frames = result.frames.items()
-    return [entry_of_frame(name, frame, own, None, "", place) for name, frame in frames]
+    else:
+        result = load_result_or_frames(out)
+        if isinstance(result, Calibration):
+            entries, of = entries_of(result), result.session_sha256
+        else:
+            entries = [entry_of_frame(*item, None) for item in result.frames.items()]
+    return _of_cell(history, cell, of, entries, out=str(out.absolute()))

@@ -77,7 +77,7 @@ class CalibrateOptions(NeedOptions, WorkOptions, ActOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchOptions(NeedOptions):
+class BatchOptions(NeedOptions, ActOptions):
     """Calibrate many sessions at once, and show their results on one page.
 
     Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
@@ -94,9 +94,6 @@ class BatchOptions(NeedOptions):
         "A Dask scheduler, as tcp://HOST:8786 (extra cluster).", metavar="ADDRESS"
     )
     level: str = option("As for calibrate.", default="auto", metavar="auto|hand-eye|offsets|...")
-    history: Path | None = option(
-        f"History to enter the results into; else the nearest {SITE_FILE} above the first session."
-    )
     no_report: bool = flag(f"Leave each {REPORT} out.")
     recordings: bool = flag("Also write each recording, with all images.")
 

@@ -17,7 +17,7 @@ from visioncal.cli.console import (
     report_written,
     warn,
 )
-from visioncal.cli.history import cell_of, enter
+from visioncal.cli.history import enter
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import TouchTestOptions
@@ -79,13 +79,8 @@ def touch_test_command(options: TouchTestOptions) -> None:
         print_json({"points": targets, "touch_test": to_document(extended)["touch_test"]})
     else:
         answer(touch_test_finding(test).reason)
-    out = str(calibration.absolute())
-    enter(
-        options.history,
-        options.session,
-        lambda history: entries_of(extended, cell_of(history, options.cell, result), "", out),
-        out,
-    )
+    entries = entries_of(extended)
+    enter(options, options.session, entries, calibration, result.session_sha256)
     report_written(written, quiet=options.as_json, status=0 if test.passed else EXIT_BAD)
 
 

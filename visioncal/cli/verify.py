@@ -7,7 +7,7 @@ import typer
 
 from visioncal.calibration.verification import to_document, triggers_of, verdict_of, verify
 from visioncal.cli.console import EXIT_BAD, answer, report_written
-from visioncal.cli.history import cell_of, enter
+from visioncal.cli.history import enter
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.summary import print_steps
@@ -36,8 +36,9 @@ def verify_command(options: VerifyOptions) -> None:
         return
     if options.output is not None:
         refuse_calibration(options.output)
-    result = load_result(against)
-    loaded, calibration = select_matching(Session.load(options.session), result, options.choice)
+    loaded, calibration = select_matching(
+        Session.load(options.session), load_result(against), options.choice
+    )
     with shown_progress(quiet=options.as_json) as progress:
         check = verify(
             loaded, calibration, board_placed_anew=options.board_moved, progress=progress
@@ -69,18 +70,6 @@ def verify_command(options: VerifyOptions) -> None:
             words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)
             if words:
                 answer(words, begin, style)
-    out = "" if options.output is None else str(options.output.absolute())
-    enter(
-        options.history,
-        options.session,
-        lambda history: [
-            entry_of_check(
-                content,
-                cell_of(history, options.cell, result),
-                str(options.session.absolute()),
-                out,
-            )
-        ],
-        out,
-    )
+    entries = [entry_of_check(content)]
+    enter(options, options.session, entries, options.output or "", entries[0].against)
     report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)

@@ -36,8 +36,7 @@ _APPLICATION = 0x7663616C
 _FORMS = (
     (
         "CREATE TABLE entry (id TEXT PRIMARY KEY NOT NULL, at TEXT NOT NULL, cell TEXT NOT NULL, "
-        "kind TEXT NOT NULL, document TEXT NOT NULL)",
-        "CREATE INDEX entry_by_cell ON entry (cell, at)",
+        "kind TEXT NOT NULL, sha256 TEXT NOT NULL, document TEXT NOT NULL)",
         "CREATE TRIGGER entry_once BEFORE INSERT ON entry "
         "WHEN EXISTS (SELECT 1 FROM entry WHERE id = NEW.id) BEGIN SELECT RAISE(IGNORE); END",
         "CREATE TRIGGER entry_stays BEFORE UPDATE ON entry "
@@ -71,7 +70,6 @@ class Entry:
     good_for_mm: float | None = None  # The least need for which it is good [mm].
     conditions: tuple[str, ...] = ()  # What the result is valid for, in sentences.
     robot: str = ""  # Model of the robot.
-    mount: str = ""  # Mount of the camera.
     # Numbers of the result by name, with their units: `views`, `noise_mm`, `radius95_mm` ...
     figures: Mapping[str, float] = field(default_factory=dict)
     # What a newer version has noted, unchanged.
@@ -93,156 +91,39 @@ class Entry:
         return datetime.fromisoformat(self.at)
 
     @property
-    def columns(self) -> dict[str, str | float | None]:
+    def columns(self) -> dict[str, str | float]:
         """The entry as a row of a table; a transform as translation [m], rotation vector [rad]."""
-        row: dict[str, str | float | None] = {"id": self.id}
-        row |= {name: str(getattr(self, name)) for name in _TEXTS}
-        row |= {"conditions": " ".join(self.conditions), "good_for_mm": self.good_for_mm}
-        row |= {f"need_{unit}": getattr(self.need, unit, None) for unit in ("mm", "deg")}
-        row |= {name: self.figures.get(name) for name in FIGURES}
+        facts = write(Entry, self).items()
+        row: dict[str, str | float] = {"id": self.id}
+        row |= {name: value for name, value in facts if isinstance(value, str | float)}
+        need = {} if self.need is None else vars(self.need)
+        row |= {f"need_{unit}": need[unit] for unit in ("mm", "deg") if need.get(unit) is not None}
+        row |= {"conditions": " ".join(self.conditions), **self.figures}
         for name, edge in self.edges.items():
             twist = [*edge.matrix[:3, 3], *edge.transform.rotation.as_rotvec()]
             labels = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
-            row |= {
-                f"{name} {label}": x for label, x in zip(labels, map(float, twist), strict=True)
-            }
+            row |= {f"{name} {label}": float(x) for label, x in zip(labels, twist, strict=True)}
             row |= {f"{name} sigma_mm": edge.sigma_mm, f"{name} sigma_deg": edge.sigma_deg}
         return row
 
 
-_TEXTS = (
-    *("at", "cell", "kind", "status", "reason", "visioncal", "session", "sha256", "source", "out"),
-    *("against", "robot", "mount"),
-)
-FIGURES = (
-    *("views", "used", "residual_mm", "residual_deg", "residual_px", "noise_mm", "noise_deg"),
-    *("noise_px", "sigma_mm", "sigma_deg", "radius95_mm", "arm_mm", "drift_mm", "focal_px"),
-    *("ambient_c", "payload_kg"),
-)
+def table_of(entries: Iterable[Entry]) -> str:
+    """Entries as CSV, a row an entry; see `Entry.columns`."""
+    rows = [entry.columns for entry in entries]
+    text = io.StringIO()
+    names = dict.fromkeys(name for row in rows for name in row)
+    table = csv.DictWriter(text, names, restval="", lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    return text.getvalue()
 
 
-def entry_of(calibration: Calibration, cell: str = "", source: str = "", out: str = "") -> Entry:
-    """The entry of a calibration.
-
-    Args:
-        calibration: The result.
-        cell: Name of the cell; that of the session where empty.
-        source: Path of the session.
-        out: Path of the result's folder.
-    """
-    targets = frames_of_kind((name.partition("_from_")[2] for name in calibration.edges), "target")
-    need = calibration.need
-    return Entry(
-        cell=one_line(cell) or calibration.session_name,
-        at=_utc(calibration.created),
-        kind="calibrated",
-        status=calibration.verdict.status,
-        reason=next(iter(calibration.verdict.reasons), calibration.verdict.headline),
-        session=calibration.session_name,
-        sha256=calibration.session_sha256,
-        source=source,
-        out=out,
-        edges=calibration.edges,
-        boards=tuple(name for name in calibration.edges if name.partition("_from_")[2] in targets),
-        need=None if need is None else need.need,
-        good_for_mm=calibration.verdict.good_for_mm,
-        conditions=tuple(condition.words for condition in calibration.conditions),
-        robot="" if calibration.robot is None else calibration.robot.name,
-        mount=calibration.mount,
-        figures=_figures(calibration),
-    )
-
-
-def entry_of_frame(
-    name: str,
-    frame: Frame,
-    cell: str,
-    calibration: Calibration | None,
-    source: str = "",
-    out: str = "",
-) -> Entry:
-    """The entry of a tool or a fixture by its transform's name; see `entry_of`."""
-    return Entry(
-        cell=one_line(cell),
-        at=_utc(frame.created),
-        kind="tool" if name.startswith("flange") else "fixture",
-        status=frame.verdict.status,
-        reason=next(iter(frame.verdict.reasons), frame.verdict.headline),
-        session=one_line(frame.source),
-        edges={name: frame.edge},
-        against="" if calibration is None else calibration.session_sha256,
-        figures={"residual_mm": frame.rms_mm, "noise_mm": frame.noise_mm},
-        source=source,
-        out=out,
-    )
-
-
-def entries_of(
-    calibration: Calibration, cell: str = "", source: str = "", out: str = ""
-) -> tuple[Entry, ...]:
+def entries_of(calibration: Calibration) -> Iterator[Entry]:
     """The entries of a result: itself, the frames that joined it, and its touch test."""
-    own = entry_of(calibration, cell, source, out)
-    frames = (
-        entry_of_frame(name, frame, own.cell, calibration, out=out)
-        for name, frame in calibration.frames.items()
-    )
-    test = calibration.touch_test
-    if test is None:
-        return own, *frames
-    gaps = [point.gap_mm for point in test.points]
-    words = f"Touched with {test.tool}: gaps of {min(gaps):.2f} to {max(gaps):.2f} mm"
-    touched = Entry(
-        cell=own.cell,
-        at=_utc(test.created),
-        kind="touched",
-        status="good" if test.passed else "bad",
-        reason=f"{words}, {'as' if test.passed else 'larger than'} predicted.",
-        session=own.session,
-        out=out,
-        against=own.sha256,
-        figures={"residual_mm": float(np.sqrt(np.mean(np.square(gaps))))},
-    )
-    return own, *frames, touched
-
-
-def entry_of_check(
-    document: Mapping[str, Any], cell: str = "", source: str = "", out: str = ""
-) -> Entry:
-    """The entry of a check, from its verify.json.
-
-    Raises:
-        DataError: The document lacks something, such as the time in one of an older version.
-    """
-    with reading(out or "verify.json", "a check", "Verify once more, by this version."):
-        session, against = document["session"], document["calibration"]
-        return Entry(
-            cell=one_line(cell or against["session"]),
-            at=_utc(document["created"]),
-            kind="verified",
-            status=document["status"],
-            reason=next(iter(document["sentences"]), ""),
-            session=one_line(session["name"]),
-            sha256=session["sha256"],
-            against=against["sha256"],
-            source=source,
-            out=out,
-            figures={"misfit": document["misfit"], "p_value": document["p_value"]},
-        )
-
-
-def _utc(created: str) -> str:
-    """A time as entries have it, so that their order as texts is that of the acts."""
-    then = datetime.fromisoformat(created)
-    return (then if then.tzinfo else then.replace(tzinfo=UTC)).astimezone(UTC).isoformat()
-
-
-def _figures(calibration: Calibration) -> dict[str, float]:
-    """Numbers of a result; those that it does not have are absent."""
-    camera, budget = calibration.camera, calibration.budget
-    arm, drift, noise = calibration.arm_errors, calibration.thermal, calibration.noise
     # Of a cell without a camera, the first transform.
-    names = (name for name in calibration.edges if "_from_cam" in name)
-    edge = calibration.edges[next(names, next(iter(calibration.edges)))]
+    names = [name for name in calibration.edges if "_from_cam" in name]
+    edge = calibration.edges[next(iter([*names, *calibration.edges]))]
+    camera, budget, noise = calibration.camera, calibration.budget, calibration.noise
     figures = {
         "views": len(calibration.views),
         "used": sum(view.used for view in calibration.views),
@@ -255,18 +136,84 @@ def _figures(calibration: Calibration) -> dict[str, float]:
         "sigma_mm": edge.sigma_mm,
         "sigma_deg": edge.sigma_deg if edge.oriented else None,
         "radius95_mm": None if budget is None else budget.radius95_mm,
-        "arm_mm": None if arm is None else arm.sigma_mm,
-        "drift_mm": None
-        if drift is None
-        else max((at.drift_mm for at in drift.course), default=0.0),
         "focal_px": None if camera is None else float(np.mean(camera.camera.matrix[:2])),
         **calibration.means,
     }
-    return {
-        name: float(value)
-        for name, value in figures.items()
-        if value is not None and math.isfinite(value)
-    }
+    children = {name: name.partition("_from_")[2] for name in calibration.edges}
+    targets = frames_of_kind(children.values(), "target")
+    own = Entry(
+        cell=calibration.session_name,
+        at=_utc(calibration.created),
+        kind="calibrated",
+        status=calibration.verdict.status,
+        reason=next(iter(calibration.verdict.reasons), calibration.verdict.headline),
+        session=calibration.session_name,
+        sha256=calibration.session_sha256,
+        edges=calibration.edges,
+        boards=tuple(name for name, child in children.items() if child in targets),
+        need=None if calibration.need is None else calibration.need.need,
+        good_for_mm=calibration.verdict.good_for_mm,
+        conditions=tuple(condition.words for condition in calibration.conditions),
+        robot="" if calibration.robot is None else calibration.robot.name,
+        figures={
+            name: float(value)
+            for name, value in figures.items()
+            if value is not None and math.isfinite(value)
+        },
+    )
+    yield own
+    for name, frame in calibration.frames.items():
+        yield entry_of_frame(name, frame, calibration)
+    if (test := calibration.touch_test) is not None:
+        gaps = [point.gap_mm for point in test.points]
+        outcome = "as" if test.passed else "larger than"
+        yield Entry(
+            cell=own.cell,
+            at=_utc(test.created),
+            kind="touched",
+            status="good" if test.passed else "bad",
+            reason=f"Touched with {test.tool}: the largest gap is {max(gaps):.2f} mm, {outcome} "
+            "predicted.",
+            session=own.session,
+            against=own.sha256,
+        )
+
+
+def entry_of_frame(name: str, frame: Frame, calibration: Calibration | None) -> Entry:
+    """The entry of a tool or a fixture, by its transform's name; without a calibration, None."""
+    return Entry(
+        cell=one_line(frame.source) if calibration is None else calibration.session_name,
+        at=_utc(frame.created),
+        kind="tool" if name.startswith("flange") else "fixture",
+        status=frame.verdict.status,
+        reason=next(iter(frame.verdict.reasons), frame.verdict.headline),
+        session=one_line(frame.source),
+        edges={name: frame.edge},
+        against="" if calibration is None else calibration.session_sha256,
+        figures={"residual_mm": frame.rms_mm, "noise_mm": frame.noise_mm},
+    )
+
+
+def entry_of_check(document: Mapping[str, Any], label: str = "verify.json") -> Entry:
+    """The entry of a check by its verify.json; raises DataError for one of an older version."""
+    with reading(label, "a check", "Verify once more, by this version."):
+        return Entry(
+            cell=one_line(document["calibration"]["session"]),
+            at=_utc(document["created"]),
+            kind="verified",
+            status=document["status"],
+            reason=next(iter(document["sentences"]), ""),
+            session=one_line(document["session"]["name"]),
+            sha256=document["session"]["sha256"],
+            against=document["calibration"]["sha256"],
+            figures={"misfit": document["misfit"], "p_value": document["p_value"]},
+        )
+
+
+def _utc(created: str) -> str:
+    """A time as entries have it, so that their order as texts is that of the acts."""
+    then = datetime.fromisoformat(created)
+    return (then if then.tzinfo else then.replace(tzinfo=UTC)).astimezone(UTC).isoformat()
 
 
 @dataclass(frozen=True)
@@ -293,13 +240,13 @@ class History:
             DataError: The file cannot be written, is locked, or is no history.
         """
         rows = [
-            (entry.id, entry.at, entry.cell, entry.kind, json.dumps(write(Entry, entry)))
-            for entry in entries
+            (one.id, one.at, one.cell, one.kind, one.sha256, json.dumps(write(Entry, one)))
+            for one in entries
         ]
         with self._opened(creating=True) as file:
             file.execute("BEGIN IMMEDIATE")
             before = file.total_changes
-            file.executemany("INSERT INTO entry VALUES (?, ?, ?, ?, ?)", rows)
+            file.executemany("INSERT INTO entry VALUES (?, ?, ?, ?, ?, ?)", rows)
             new = file.total_changes - before
             file.execute("COMMIT")
         return new
@@ -308,7 +255,7 @@ class History:
         self,
         cell: str | None = None,
         kind: ActKind | None = None,
-        at: str | None = None,
+        sha256: str | None = None,
         begin: str = "",
     ) -> tuple[Entry, ...]:
         """The entries in the order of their times.
@@ -316,7 +263,7 @@ class History:
         Args:
             cell: Those of a cell alone.
             kind: Those of a kind alone.
-            at: Those of a time alone.
+            sha256: Those of an input alone, by its digest.
             begin: Those whose identity begins so.
 
         Raises:
@@ -331,20 +278,12 @@ class History:
             )
         query = (
             "SELECT document FROM entry WHERE cell = ifnull(?, cell) AND kind = ifnull(?, kind) "
-            "AND at = ifnull(?, at) AND substr(id, 1, length(?)) = ? ORDER BY at, id"
+            "AND sha256 = ifnull(?, sha256) AND substr(id, 1, length(?)) = ? ORDER BY at, id"
         )
         with self._opened() as file:
-            rows = file.execute(query, (cell, kind, at, begin, begin)).fetchall()
+            rows = file.execute(query, (cell, kind, sha256, begin, begin)).fetchall()
         with reading(str(self.path), "a history", "Take an earlier copy of it."):
             return tuple(read(Entry, json.loads(document), "") for (document,) in rows)
-
-    def cell_of(self, session: str, digest: str, created: str) -> str:
-        """The cell of a calibration, by its session's name and digest and by its own time.
-
-        As its entry says, or else the session's name.
-        """
-        known = self.entries(kind="calibrated", at=_utc(created)) if self.path.exists() else ()
-        return next((entry.cell for entry in known if entry.sha256 == digest), session)
 
     @contextmanager
     def _opened(self, *, creating: bool = False) -> Iterator[sqlite3.Connection]:
@@ -440,14 +379,3 @@ _FAULTS = {
     sqlite3.SQLITE_CORRUPT: ("is damaged", "Take an earlier copy of it."),
     sqlite3.SQLITE_NOTADB: ("is no history: no SQLite file at all", "Name a history's file."),
 }
-
-
-def table_of(entries: Iterable[Entry]) -> str:
-    """Entries as CSV, a row an entry; see `Entry.columns`."""
-    rows = [entry.columns for entry in entries]
-    names = dict.fromkeys(name for row in rows for name in row)
-    text = io.StringIO()
-    table = csv.DictWriter(text, names, restval="", lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    return text.getvalue()

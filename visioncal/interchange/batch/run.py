@@ -35,7 +35,7 @@ from visioncal.core.verdict import need_options
 from visioncal.core.version import __version__
 from visioncal.interchange.outputs import CALIBRATION, RECORDING, REPORT, Written, write_outputs
 from visioncal.results import Calibration
-from visioncal.results.history import FIGURES, Entry, entry_of
+from visioncal.results.history import Entry, entries_of
 from visioncal.session import Session
 
 ROW = "row.json"
@@ -86,17 +86,6 @@ class Row:
     def words(self) -> str:
         """The verdict's first sentence, or why there is no result."""
         return self.failure if self.entry is None else self.entry.reason
-
-    @property
-    def columns(self) -> dict[str, str | float | bool | None]:
-        """The row of a table."""
-        own = ("name", "session", "state", "verdict", "words", "error", "next_step", "seconds")
-        row = {name: getattr(self, name) for name in (*own, "has_report")}
-        facts = {"session_sha256": "sha256", "visioncal": "visioncal", "created": "at"}
-        facts |= {"robot": "robot", "mount": "mount"}
-        row |= {name: getattr(self.entry, fact, "") for name, fact in facts.items()}
-        figures = {} if self.entry is None else self.entry.figures
-        return row | {name: figures.get(name) for name in FIGURES}
 
 
 def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list[Job]:
@@ -154,11 +143,12 @@ def work(job: Job) -> Row:
         with one_blas_thread():
             session = _session(job)
             calibration, written = _calibrated(job, session)
+            entry = next(entries_of(calibration))
             row = Row(
                 name=job.name,
                 session=str(job.session),
                 state="done",
-                entry=entry_of(calibration, "", str(job.session), str(job.folder)),
+                entry=replace(entry, source=str(job.session), out=str(job.folder)),
                 has_report=job.folder / REPORT in written.files,
             )
             # Written last: it marks the session as done.
@@ -310,14 +300,14 @@ def batch(
     import pyarrow as pa
     from pyarrow import parquet
 
-    types = dict.fromkeys(FIGURES, pa.float64()) | {
-        "seconds": pa.float64(),
-        "has_report": pa.bool_(),
-    }
-    table = [row.columns for row in results.rows]
-    schema = pa.schema([(name, types.get(name, pa.string())) for name in table[0]])
+    facts = [
+        {**vars(row), **({} if row.entry is None else row.entry.columns), "session": row.session}
+        for row in results.rows
+    ]
+    names = dict.fromkeys(name for fact in facts for name in fact if name != "entry")
+    table = pa.table({name: [fact.get(name) for fact in facts] for name in names})
     buffer = io.BytesIO()
-    parquet.write_table(pa.Table.from_pylist(table, schema=schema), buffer)
+    parquet.write_table(table, buffer)
     write_atomically(results.table, buffer.getvalue())
     write_atomically(results.page, _page(results.rows))
     return results
