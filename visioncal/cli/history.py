@@ -13,7 +13,6 @@ from visioncal.core.choices import SITE_FILE
 from visioncal.core.codec import write
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
-from visioncal.core.number_format import counted
 from visioncal.interchange.outputs import CALIBRATION, VERIFY
 from visioncal.interchange.result_files import content_of, load_result_or_frames
 from visioncal.results import Calibration
@@ -81,7 +80,7 @@ def history_command(options: HistoryOptions) -> None:
     if options.add:
         found = [entry for out in options.add for entry in _stored(history, out, options.cell)]
         new = history.append(*found)
-        say(f"{counted(new, 'entry')} added, {len(found) - new} were there already")
+        say(f"{new} added, {len(found) - new} were there already")
         return
     entries = history.entries(options.cell, options.kind, begin=options.show or "")
     if options.out is not None:
@@ -103,7 +102,7 @@ def history_command(options: HistoryOptions) -> None:
                 answer(f"{value}", f"{name}: ")
     else:
         raise DataError(
-            f"{counted(len(entries), 'entry')} of {history.path} begin with {options.show!r}.",
+            f"{len(entries)} entries of {history.path} begin with {options.show!r}.",
             culprits=["--show"],
             next_step=f"visioncal history {shlex.quote(str(history.path))} lists them.",
         )

@@ -278,7 +278,7 @@ class History:
             )
         query = (
             "SELECT document FROM entry WHERE cell = ifnull(?, cell) AND kind = ifnull(?, kind) "
-            "AND sha256 = ifnull(?, sha256) AND substr(id, 1, length(?)) = ? ORDER BY at, id"
+            "AND sha256 = ifnull(?, sha256) AND substr(id, 1, length(?)) = ? ORDER BY at, rowid"
         )
         with self._opened() as file:
             rows = file.execute(query, (cell, kind, sha256, begin, begin)).fetchall()

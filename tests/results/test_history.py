@@ -1,0 +1,231 @@
+"""A site's history: what was acknowledged is there once, and what cannot be written is said."""
+
+import json
+import multiprocessing
+import os
+import resource
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.commands import visioncal
+
+from visioncal.cli.console import EXIT_BAD
+from visioncal.core.choices import SITE_FILE
+from visioncal.core.errors import DataError
+from visioncal.results import history as module
+from visioncal.results.edge import Edge
+from visioncal.results.history import Entry, History
+from visioncal.simulation import CellOptions, simulate, write_session
+
+FORK = multiprocessing.get_context("fork")
+
+
+def entry(number=0, **changed):
+    edge = Edge(np.eye(4), 1e-8 * np.eye(6))
+    at = f"2026-01-01T00:00:{number % 60:02}+00:00"
+    facts = {"cell": "cell 1", "at": at, "kind": "calibrated", "status": "good"}
+    facts |= {"reason": f"no. {number}", "edges": {"flange_from_cam": edge}}
+    return Entry(**facts | changed)
+
+
+def writer(path, first, count, acknowledged):
+    """Appends entries, each twice as after a lost answer, and notes what was acknowledged."""
+    with acknowledged.open("a") as notes:
+        for number in range(first, first + count):
+            one = entry(number, session=f"session {number}")
+            History(path).append(one)
+            notes.write(f"{one.id}\n")
+            notes.flush()
+            if number % 7 == 0:
+                History(path).append(one)
+
+
+@pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
+def test_what_was_acknowledged_is_there_once(tmp_path, count):
+    """Of eight processes three are killed on the way, and start again from their first entry."""
+    path, notes = tmp_path / SITE_FILE, [tmp_path / f"notes {at}" for at in range(8)]
+
+    def started(at):
+        process = FORK.Process(target=writer, args=(path, at * count, count, notes[at]))
+        process.start()
+        return process
+
+    running = {at: started(at) for at in range(8)}
+    for at in (0, 3, 6):
+        # Somewhere in its work: of the full run, too.
+        while not notes[at].exists() or len(notes[at].read_bytes()) < 17 * (count // 4):
+            time.sleep(0.002)
+        os.kill(running[at].pid, signal.SIGKILL)
+        running[at].join()
+        assert running[at].exitcode == -signal.SIGKILL
+        running[at] = started(at)
+    for process in running.values():
+        process.join()
+        assert process.exitcode == 0
+    kept = [one.id for one in History(path).entries()]
+    assert len(kept) == len({*kept}) == 8 * count
+    assert {line for file in notes for line in file.read_text().split()} == {*kept}
+
+
+def test_entries_are_only_appended(tmp_path):
+    history = History(tmp_path / "history?.db")
+    assert history.append(entry(1), entry(2, kind="verified", cell="cell 2", edges={})) == 2
+    assert history.append(entry(1), entry(3)) == 1
+    file = sqlite3.connect(history.path)
+    assert file.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    for change in ("UPDATE entry SET cell = 'x'", "DELETE FROM entry"):
+        with pytest.raises(sqlite3.IntegrityError, match="only appended"):
+            file.execute(change)
+    file.execute("REPLACE INTO entry SELECT id, at, 'x', kind, sha256, document FROM entry")
+    file.close()
+    assert [one.cell for one in history.entries()] == ["cell 1", "cell 2", "cell 1"]
+    assert [one.reason for one in history.entries(cell="cell 2")] == ["no. 2"]
+    assert [one.reason for one in history.entries(kind="calibrated")] == ["no. 1", "no. 3"]
+    (found,) = history.entries(begin=entry(3).id[:10])
+    assert found.edges["flange_from_cam"].covariance.tolist() == (1e-8 * np.eye(6)).tolist()
+
+
+def test_files_of_other_versions(tmp_path, monkeypatch):
+    """An older one is brought forward with its entries, a newer one is refused in words."""
+    history = History(tmp_path / "history.db")
+    history.append(entry(1))
+    forms = (*module._FORMS, ("ALTER TABLE entry ADD COLUMN signed TEXT",))
+    with monkeypatch.context() as newer:
+        newer.setattr(module, "_FORMS", forms)
+        assert [one.reason for one in history.entries()] == ["no. 1"]
+    with pytest.raises(DataError, match="is of form 2, and this version of visioncal knows 1"):
+        history.append(entry(2))
+    # What a newer version has noted in an entry stays.
+    other = History(tmp_path / "other.db")
+    other.append(replace(entry(1), further={"operator": "Ana"}))
+    assert other.entries()[0].further == {"operator": "Ana"}
+
+
+def refused(path, *words, reading=False):
+    with pytest.raises(DataError) as caught:
+        History(path).entries() if reading else History(path).append(entry())
+    assert caught.value.next_step
+    for expected in words:
+        assert expected in caught.value.message, caught.value.message
+
+
+def test_files_that_cannot_be_used(tmp_path, monkeypatch):
+    history = History(tmp_path / "history.db")
+    history.append(entry(1))
+    monkeypatch.setattr(module, "_PATIENCE_S", 0.1)
+    file = sqlite3.connect(history.path, isolation_level=None)
+    file.execute("BEGIN IMMEDIATE")
+    refused(history.path, "is locked")
+    # Readers do not wait for writers.
+    assert len(history.entries()) == 1
+    file.close()
+    text, foreign = tmp_path / "notes.txt", tmp_path / "foreign.db"
+    text.write_text("a history of the site, told in words, over a hundred bytes long" * 20)
+    with sqlite3.connect(foreign) as other:
+        other.execute("CREATE TABLE music (title TEXT)")
+    refused(text, "no SQLite file")
+    refused(foreign, "of another program")
+    refused(tmp_path, "is a folder")
+    refused(tmp_path / "no" / "history.db", "its folder does not exist")
+    refused(tmp_path / "none.db", "does not exist", reading=True)
+    content = bytearray(history.path.read_bytes())
+    content[4096:8192] = b"\xff" * 4096
+    history.path.write_bytes(content)
+    refused(history.path, "is damaged", reading=True)
+
+
+def test_a_full_disk_takes_nothing_away(tmp_path):
+    """The largest file that the system allows is that of the entries that are there."""
+    history = History(tmp_path / "history.db")
+    for number in range(20):
+        history.append(entry(number))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    try:
+        refused(history.path, "the disk is full")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert len(history.entries()) == 20
+    assert history.append(entry(20)) == 1
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody with fewer rights")
+def test_a_read_only_place():
+    with tempfile.TemporaryDirectory() as folder:
+        history = History(Path(folder) / "history.db")
+        history.append(entry(1))
+        Path(folder).chmod(0o555)
+        history.path.chmod(0o444)
+        os.seteuid(65534)
+        try:
+            assert len(history.entries()) == 1
+            refused(history.path, "read-only")
+        finally:
+            os.seteuid(0)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A session below a site's folder."""
+    folder = tmp_path_factory.mktemp("site")
+    write_session(simulate(CellOptions(views=10)), folder / "line" / "monday", images=False)
+    return folder
+
+
+def test_commands_enter_what_they_did(site, tmp_path):
+    """Into the file that is named, then into the one above the session; it costs no result."""
+    session, out, file = site / "line" / "monday", tmp_path / "out", site / SITE_FILE
+    bare = ("--no-report", "--no-recording", "-o", out)
+    done = visioncal("calibrate", session, *bare, "--history", site / "no" / "x.db")
+    assert done.status == 0
+    assert (out / "calibration.json").exists()
+    assert f"visioncal history {site / 'no' / 'x.db'} --add {out}" in done.err
+    visioncal("calibrate", session, *bare, "--history", file, "--cell", "line 4").good()
+    check = visioncal("verify", session, "--against", out, "-o", tmp_path / "check")
+    (calibrated, verified) = History(file).entries()
+    assert (calibrated.kind, calibrated.cell) == ("calibrated", "line 4")
+    assert calibrated.source == str(session)
+    # A check is of the cell of its calibration, without a word.
+    assert (verified.kind, verified.cell) == ("verified", "line 4")
+    assert (verified.status == "bad") == (check.status == EXIT_BAD)
+    assert verified.against == calibrated.sha256
+    # Old results come in by their folders, and those that are there do not come twice.
+    again = visioncal("history", file, "--add", out, "--add", tmp_path / "check").good()
+    assert "0 added, 2 were there already" in again.err
+    added = visioncal("history", tmp_path / "new.db", "--cell", "line 5", "--add", out).good()
+    assert "1 added" in added.err
+    listed = visioncal("history", file).good().out
+    assert calibrated.id[:8] in listed
+    assert "line 4" in listed
+    shown = visioncal("history", file, "--show", verified.id[:6]).good().out
+    assert f"against: {calibrated.sha256}" in shown
+    visioncal("history", file, "--show", "xyz").refused("0 entries")
+    whole = json.loads(visioncal("history", file, "--json").good().out)
+    assert [one["id"] for one in whole] == [calibrated.id, verified.id]
+    visioncal("history", file, "-o", tmp_path / "table.csv").good()
+    assert calibrated.id in (tmp_path / "table.csv").read_text()
+    visioncal("history", file, "-o", tmp_path / "table.csv").refused("--force")
+    visioncal("history", file, "-o", tmp_path / "table.txt").refused(".csv")
+
+
+def test_a_failing_entry_is_a_warning(site, tmp_path):
+    """In another process, as users call it: a text where the site's file would be."""
+    (site / "line" / SITE_FILE).write_text("no database" * 100)
+    words = ["calibrate", site / "line" / "monday", "-o", tmp_path / "out", "--no-report", "--json"]
+    done = subprocess.run(
+        [sys.executable, "-m", "visioncal", *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    (site / "line" / SITE_FILE).unlink()
+    assert "no SQLite file" in done.stderr
+    assert json.loads(done.stdout)["schema"] == 2
