@@ -6,7 +6,7 @@ steps once in two years, and one in five drifts linearly. A step, and a year's d
 size: 0.1 to 10 mm, and 2 mrad for each mm. A step is before one of the entries.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit, logsumexp
 
 from visioncal.core.transforms import invert, log
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.results.history import Entry
 
 # Factors of an entry's covariance, with their probabilities; sizes in the values' units.
@@ -60,36 +60,24 @@ class Course:
     drift: Change | None  # The drift; None where there is probably none.
     sigma_steps: tuple[Change, ...]  # Steps of the logarithm of its sigma.
 
-    @property
-    def days(self) -> FloatArray:
-        """(n,) times since the first entry [days]."""
-        return _days(self.entries)
+    def missed(self, drift: Change, need_mm: float) -> tuple[datetime, datetime, datetime]:
+        """When a drift will miss a need [mm] if the latest entry's pose is used until then.
 
-    def missed(self, need_mm: float, good_for_mm: float | None) -> tuple[datetime, ...] | None:
-        """When a need will be missed at the present drift; None without a drift.
-
-        The drift adds to what the latest entry is good for: where nobody calibrates again, picks
-        use it until then.
-
-        Args:
-            need_mm: The required accuracy [mm].
-            good_for_mm: What the latest entry is good for [mm]; None for its own 95 %.
+        It adds to what that entry is good for, or else to its own 95 %.
 
         Returns:
-            The likeliest time, and the earliest and the latest one of 95 %; at the end of time
-            where the drift may be none.
+            The likeliest time, and the earliest and the latest of 95 %: a century on for never.
         """
-        if self.drift is None:
-            return None
         last = self.entries[-1]
-        own_mm = _RADIUS95 * last.edges[self.name].sigma_mm
-        left_mm = max(0.0, need_mm - (own_mm if good_for_mm is None else good_for_mm))
-        drift_mm, covariance = 1e3 * self.drift.vector[-3:], 1e6 * self.drift.covariance[-3:, -3:]
-        speed = float(np.linalg.norm(drift_mm))
-        along = drift_mm / max(speed, 1e-12)
-        reach = 1.96 * float(np.sqrt(along @ covariance @ along))
-        times = (left_mm / max(rate, 1e-9) for rate in (speed, speed + reach, speed - reach))
-        return tuple(last.time + timedelta(days=min(_YEAR * years, 36_500)) for years in times)
+        own_mm = last.good_for_mm or _RADIUS95 * last.edges[self.name].sigma_mm
+        drift_mm, covariance = 1e3 * drift.vector[-3:], 1e6 * drift.covariance[-3:, -3:]
+        speed = max(float(np.linalg.norm(drift_mm)), 1e-9)
+        reach = 1.96 * float(np.sqrt(drift_mm @ covariance @ drift_mm)) / speed
+        likely, early, late = (
+            last.time + timedelta(days=_YEAR * min(100.0, max(need_mm - own_mm, 0.0) / rate))
+            for rate in (speed, speed + reach, max(speed - reach, 1e-9))
+        )
+        return likely, early, late
 
 
 def courses(entries: Sequence[Entry]) -> tuple[Course, ...]:
@@ -111,13 +99,16 @@ def _course(name: str, entries: Sequence[Entry]) -> Course:
     matrices = np.array([edge.matrix for edge in edges])
     twists = log(invert(matrices[:1]) @ matrices)[:, part]
     covariances = np.array([edge.covariance[part, part] for edge in edges])
-    days = _days(entries)
-    steps, drift = find_changes(days, twists, covariances, _UNITS[part], drifts=True)
-    log_sigmas = np.log([max(edge.sigma_mm, 1e-6) for edge in edges])[:, None]
-    noise = np.full((len(edges), 1, 1), _SIGMA_OF_SIGMA**2)
-    sigma_steps, _ = find_changes(days, log_sigmas, noise, np.ones(1), drifts=False)
+    changes = sigma_changes = tuple[Change, ...]()
+    if len(entries) > 1:
+        changes = find_changes(_days(entries), twists, covariances, _UNITS[part])
+        log_sigmas = np.log([max(edge.sigma_mm, 1e-6) for edge in edges])[:, None]
+        noise = np.full((len(edges), 1, 1), _SIGMA_OF_SIGMA**2)
+        sigma_changes = find_changes(_days(entries), log_sigmas, noise, np.ones(1))
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    return Course(name, tuple(entries), twists, sigmas, steps, drift, sigma_steps)
+    steps = tuple(change for change in changes if change.at)
+    drift = next((change for change in changes if not change.at), None)
+    return Course(name, tuple(entries), twists, sigmas, steps, drift, sigma_changes)
 
 
 def _days(entries: Sequence[Entry]) -> FloatArray:
@@ -126,131 +117,106 @@ def _days(entries: Sequence[Entry]) -> FloatArray:
 
 
 def find_changes(
-    days: FloatArray,
-    values: FloatArray,
-    covariances: FloatArray,
-    units: FloatArray,
-    *,
-    drifts: bool,
-) -> tuple[tuple[Change, ...], Change | None]:
-    """Finds steps and a linear drift by their Bayes factors, the most probable change first.
+    days: FloatArray, values: FloatArray, covariances: FloatArray, units: FloatArray
+) -> tuple[Change, ...]:
+    """Finds a drift and steps by their Bayes factors, and returns them in this order.
 
-    In every round each step, and a drift, is compared with none, beside the changes that were
-    found; at the end each one is compared without itself. Likelihoods are exact: all is normal,
-    the level's prior is flat, sizes and the factor of the covariance are summed over (Kass and
-    Raftery 1995). See the module's assumptions.
+    In every round each one is compared with none, beside those that were found; at the end each is
+    compared without itself. All is normal, the level's prior is flat, and sizes and the factor of
+    the covariance are summed over (Kass and Raftery 1995). See the module's assumptions.
 
     Args:
-        days: (n,) ascending times.
-        values: (n, d) values.
+        days: (n,) ascending times, two at least.
+        values: (n, d) values; what has one component does not drift.
         covariances: (n, d, d) their covariances.
-        units: (d,) sizes of one of `_SIZES` in the values' units.
-        drifts: Whether they may drift.
-
-    Returns:
-        The steps in the order of time, and the drift.
+        units: (d,) the unit of sizes in each.
     """
-    count = len(days)
-    if count < 2:
-        return (), None
-    years = (days - days[-1]) / _YEAR
-    # A change per row: the drift, and a step before each entry but the first.
-    shapes = np.concatenate([[years], np.tri(count)[:, 1:].T])
-    chance = -np.expm1(-_STEPS_A_YEAR * np.diff(days) / _YEAR)
-    is_drift_possible = drifts and count >= _DRIFT_ENTRIES
-    odds = np.concatenate([[_DRIFTS if is_drift_possible else 0.0], np.clip(chance, 1e-6, 0.5)])
-    with np.errstate(divide="ignore"):
-        log_odds = np.log(odds / (1.0 - odds))
-    model = _Model(shapes, values / units, covariances / np.outer(units, units))
-    found: dict[int, int] = {}
-    is_drift = np.arange(count) == 0
+    count, gaps = len(days), np.diff(days) / _YEAR
+    model = _Model(days, values / units, covariances / np.outer(units, units))
+    drifts = _DRIFTS if len(units) > 1 and count >= _DRIFT_ENTRIES else 1e-12
+    odds = [drifts, *np.clip(-np.expm1(-_STEPS_A_YEAR * gaps), 1e-6, 0.5)]
+    log_odds = np.log(odds) - np.log1p(-np.array(odds))
+    is_drift, found = np.arange(count) == 0, dict[int, float]()
     while len(found) < min(_MOST_CHANGES, max(1, count // 2)):
-        scores = np.where([at in found for at in range(count)], -np.inf, log_odds)
         gains, sizes = model.gains(found)
-        scores = scores + gains
+        scores = np.where(np.isin(np.arange(count), [*found]), -np.inf, log_odds + gains)
+        # A step's probability is that of one at any time.
         totals = [logsumexp(scores[kind]) for kind in (is_drift, ~is_drift)]
         if expit(max(totals)) < _LIKELY:
             break
         best = int(np.argmax(np.where(is_drift == (totals[0] > totals[1]), scores, -np.inf)))
-        found[best] = int(sizes[best])
+        found[best] = float(sizes[best])
     probabilities = {}
     for at in [*found]:
         others = {other: size for other, size in found.items() if other != at}
-        gains, _ = model.gains(others)
         rivals = (is_drift == is_drift[at]) & ~np.isin(np.arange(count), [*others])
-        probabilities[at] = float(expit(logsumexp((log_odds + gains)[rivals])))
-        if probabilities[at] < _LIKELY:
-            found = others
-    vectors, covariance = model.estimate(found)
-    changes = {
-        at: Change(at, probabilities[at], vectors[row] * units, matrix * np.outer(units, units))
-        for row, (at, matrix) in enumerate(zip(found, covariance, strict=True))
-    }
-    return tuple(changes[at] for at in sorted(changes) if at), changes.get(0)
+        probabilities[at] = float(expit(logsumexp((log_odds + model.gains(others)[0])[rivals])))
+        found = found if probabilities[at] >= _LIKELY else others
+    return tuple(
+        Change(at, probabilities[at], vector * units, covariance * np.outer(units, units))
+        for at, vector, covariance in model.estimates(sorted(found))
+    )
 
 
 class _Model:
-    """The linear model of a level and changes, each of a shape over time and a normal vector."""
+    """A level and changes as normal vectors: 0 is the drift, k the step before entry k."""
 
-    def __init__(self, shapes: FloatArray, values: FloatArray, covariances: FloatArray) -> None:
-        self.shapes = shapes  # (m, n) the course of each change.
-        self.values = values  # (n, d) in units of the sizes.
-        # (n, d, d). What is exact to less than a thousandth of a unit, 1 um, does not stay so.
-        self.weights = np.linalg.inv(covariances + 1e-6 * np.eye(values.shape[1]))
-        self.weighted = np.einsum("nuv,nv->nu", self.weights, values)
-
-    def _normal(
-        self, found: dict[int, int], shapes: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Normal equations (k, c d, c d), (k, c d), and prior precisions (c - 1,) of `found`.
-
-        Columns are the level, the changes found, and one of `shapes` (k, n).
-        """
-        base = np.concatenate([np.ones((1, self.shapes.shape[1])), self.shapes[[*found]]])
-        columns = np.concatenate(
-            [np.broadcast_to(base, (len(shapes), *base.shape)), shapes[:, None]], axis=1
+    def __init__(self, days: FloatArray, values: FloatArray, covariances: FloatArray) -> None:
+        count, self.dimension = values.shape
+        self.size = values.size
+        # What is exact to less than a thousandth of a unit, 1 um, does not stay so.
+        weights = np.linalg.inv(covariances + 1e-6 * np.eye(self.dimension))
+        weighted = np.einsum("nuv,nv->nu", weights, values)
+        # The changes, the level, and none.
+        drift = (days - days[-1]) / _YEAR
+        shapes = np.concatenate(
+            [[drift], np.tri(count)[:, 1:].T, [np.ones(count), np.zeros(count)]]
         )
-        count, dimension = columns.shape[1], self.values.shape[1]
-        matrix = np.einsum("kan,kbn,nuv->kaubv", columns, columns, self.weights, optimize=True)
-        side = count * dimension
-        right = np.einsum("kan,nu->kau", columns, self.weighted)
-        # A level within some metres of the first entry: as good as flat.
-        precisions = np.array([1e-8, *(_SIZES[size] ** -2.0 for size in found.values())])
-        return matrix.reshape(-1, side, side), right.reshape(-1, side), precisions
+        self.level, self.none = count, count + 1
+        self.matrix = np.einsum("an,bn,nuv->aubv", shapes, shapes, weights, optimize=True)
+        self.right = shapes @ weighted
+        self.squares = float(np.sum(weighted * values))
 
-    def gains(self, found: dict[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Logarithms (m,) of each change's Bayes factor beside those found, and its best size."""
-        shapes = np.concatenate([np.zeros((1, self.shapes.shape[1])), self.shapes])
-        matrix, right, known = self._normal(found, shapes)
-        dimension = self.values.shape[1]
-        total = float(np.einsum("nu,nu->", self.weighted, self.values))
-        scores = np.empty((len(_SIZES), len(_INFLATIONS), len(shapes)))
+    def _equations(self, columns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Normal equations (k, c d, c d), (k, c d) of the changes in each row of (k, c)."""
+        side = columns.shape[1] * self.dimension
+        blocks = self.matrix.swapaxes(1, 2)[columns[:, :, None], columns[:, None]]
+        return blocks.swapaxes(2, 3).reshape(-1, side, side), self.right[columns].reshape(-1, side)
+
+    def gains(self, found: Mapping[int, float]) -> tuple[FloatArray, FloatArray]:
+        """Logarithms (n,) of the changes' Bayes factors beside those found, and their best sizes.
+
+        Args:
+            found: Sizes by change.
+        """
+        others = np.array([*range(self.level), self.none])
+        beside = np.tile([self.level, *found], (len(others), 1))
+        matrix, right = self._equations(np.column_stack([beside, others]))
+        scores = np.empty((len(_SIZES), len(_INFLATIONS), len(others)))
         for at, size in enumerate(_SIZES):
-            prior = np.repeat([*known, size**-2.0], dimension)
+            # A level within some metres: as good as flat.
+            prior = np.repeat([1e-8, *(known**-2.0 for known in found.values()), size**-2.0],
+                              self.dimension)  # fmt: skip
             for row, factor in enumerate(_INFLATIONS):
                 normal = matrix / factor + np.diag(prior)
                 solved = np.linalg.solve(normal, right[..., None] / factor)[..., 0]
-                fit = total / factor - np.einsum("ku,ku->k", right, solved) / factor
-                scale = self.values.size * np.log(factor) + np.linalg.slogdet(normal)[1]
-                evidence = -0.5 * (scale - np.log(prior).sum() + fit)
-                scores[at, row] = evidence + _LOG_INFLATIONS[row]
-        by_size = logsumexp(scores, axis=1)
+                misfit = (self.squares - np.sum(right * solved, axis=1)) / factor
+                scale = self.size * np.log(factor) + np.linalg.slogdet(normal)[1]
+                scores[at, row] = -0.5 * (scale - np.log(prior).sum() + misfit)
+        by_size = logsumexp(scores + _LOG_INFLATIONS[:, None], axis=1)
         gains = logsumexp(by_size, axis=0) - np.log(len(_SIZES))
-        return gains[1:] - gains[0], by_size[:, 1:].argmax(axis=0)
+        return gains[:-1] - gains[-1], _SIZES[by_size[:, :-1].argmax(axis=0)]
 
-    def estimate(self, found: dict[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Estimates (c, d) of the changes found, in their order, and their covariances (c, d, d).
+    def estimates(self, found: Sequence[int]) -> Iterator[tuple[int, FloatArray, FloatArray]]:
+        """Each change with its vector (d,) and covariance (d, d), whatever its size.
 
-        Of any size, and with the factor of the covariance that the residuals have.
+        The factor of the covariance is the one that the residuals have.
         """
-        matrix, right, _ = self._normal(found, np.zeros((1, self.shapes.shape[1])))
-        dimension, count = self.values.shape[1], len(found)
-        # The empty column of `_normal` is left out.
-        side = (1 + count) * dimension
-        covariance = np.linalg.inv(matrix[0, :side, :side])
-        fitted = covariance @ right[0, :side]
-        misfit = float(np.sum(self.weighted * self.values) - right[0, :side] @ fitted)
-        factor = np.clip(misfit / max(self.values.size - side, 1), 1.0, _INFLATIONS[-1])
-        blocks = covariance.reshape(1 + count, dimension, 1 + count, dimension)
-        own = [factor * blocks[at, :, at] for at in range(1, 1 + count)]
-        return fitted.reshape(-1, dimension)[1:], np.array(own).reshape(-1, dimension, dimension)
+        (matrix,), (right,) = self._equations(np.array([[*found, self.level]]))
+        covariance = np.linalg.inv(matrix)
+        fitted = covariance @ right
+        misfit = (self.squares - right @ fitted) / max(self.size - len(right), 1)
+        covariance *= np.clip(misfit, 1.0, _INFLATIONS[-1])
+        for row, at in enumerate(found):
+            part = slice(row * self.dimension, (row + 1) * self.dimension)
+            yield at, fitted[part], covariance[part, part]

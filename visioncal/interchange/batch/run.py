@@ -315,19 +315,17 @@ def batch(
 
 def _page(rows: Sequence[Row]) -> str:
     """The page of a batch: that of a history of one day."""
-    from visioncal.present.report import fleet
+    from visioncal.present.report.fleet import FleetRow, fleet_page
 
     shown = [
-        fleet.failed_row(row.name, row.failure, row.next_step)
+        FleetRow(row.name, failure=f"{row.failure} {row.next_step}")
         if row.entry is None
-        else fleet.row_of(
-            row.name,
-            [row.entry],
-            link=f"{row.name}/{REPORT if row.has_report else CALIBRATION}",
+        else FleetRow(
+            row.name, (row.entry,), link=f"{row.name}/{REPORT if row.has_report else CALIBRATION}"
         )
         for row in rows
     ]
-    return fleet.fleet_page(shown, "Batch", f"{len(rows)} sessions", TABLE)
+    return fleet_page(shown, "Batch", f"{len(rows)} sessions", TABLE)
 
 
 def _rows(jobs: Sequence[Job], workers: int | None, scheduler: str | None) -> Iterator[Row]:
