@@ -4,7 +4,6 @@ import json
 import multiprocessing
 import os
 import resource
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -53,26 +52,30 @@ def test_what_was_acknowledged_is_there_once(tmp_path, count):
     """Of eight processes three are killed on the way, and start again from their first entry."""
     path, notes = tmp_path / SITE_FILE, [tmp_path / f"notes {at}" for at in range(8)]
 
-    def started(at):
-        process = FORK.Process(target=writer, args=(path, at * count, count, notes[at]))
+    def started(at, most):
+        process = FORK.Process(target=writer, args=(path, 100_000 * at, most, notes[at]))
         process.start()
         return process
 
-    running = {at: started(at) for at in range(8)}
-    for at in (0, 3, 6):
-        # Somewhere in its work: of the full run, too.
-        while not notes[at].exists() or len(notes[at].read_bytes()) < 17 * (count // 4):
+    victims = {at: started(at, 100_000) for at in (0, 3, 6)}
+    running = [started(at, count) for at in range(8) if at not in victims]
+    for at, process in victims.items():
+        # An identity and the line's end are 17 characters.
+        while not notes[at].exists() or notes[at].stat().st_size < 17 * (count // 4):
             time.sleep(0.002)
-        os.kill(running[at].pid, signal.SIGKILL)
-        running[at].join()
-        assert running[at].exitcode == -signal.SIGKILL
-        running[at] = started(at)
-    for process in running.values():
+        process.kill()
+        process.join()
+        running.append(started(at, count))
+    for process in running:
         process.join()
         assert process.exitcode == 0
     kept = [one.id for one in History(path).entries()]
-    assert len(kept) == len({*kept}) == 8 * count
-    assert {line for file in notes for line in file.read_text().split()} == {*kept}
+    acknowledged = {line for file in notes for line in file.read_text().split()}
+    assert len(acknowledged) >= 8 * count
+    assert len(kept) == len({*kept})
+    assert acknowledged <= {*kept}
+    # What a killed process had written, and could not note any more.
+    assert len(kept) <= len(acknowledged) + 3
 
 
 def test_entries_are_only_appended(tmp_path):

@@ -106,10 +106,9 @@ def _keep_and_report(place: _Place, frame: Frame, source: Path, options: FrameOp
     elif place.folder is not None and place.result is not None and verdict.status != "bad":
         written = rewrite_result(place.folder, replace(place.result, frames=frames))
     if destination is not None:
-        entries, of = [entry_of_frame(place.name, frame, place.result)], place.result
         # A bad one is in no folder from which it could be added later.
         kept = destination if written.files else ""
-        enter(options, source, entries, kept, "" if of is None else of.session_sha256)
+        enter(options, source, [entry_of_frame(place.name, frame, place.result)], kept)
     if options.as_json:
         print_json(frames_document({place.name: frame}))
         report_written(written, quiet=True, status=exit_status(verdict))

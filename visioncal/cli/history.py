@@ -1,7 +1,7 @@
 """`visioncal history`, and the entries of the commands that calibrate, check and place."""
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,9 +26,7 @@ from visioncal.results.history import (
 )
 
 
-def enter(
-    options: ActOptions, near: Path, entries: Iterable[Entry], out: Path | str = "", of: str = ""
-) -> None:
+def enter(options: ActOptions, near: Path, entries: Iterable[Entry], out: Path | str = "") -> None:
     """Enters acts whose files are written; where that fails, it costs no more than a warning.
 
     Args:
@@ -36,35 +34,33 @@ def enter(
         near: The session or file that was read, by which the site is found.
         entries: The entries, whose cell and paths are filled in.
         out: The output, from which they can be added later; empty for none.
-        of: Digest of the calibrated session that they are about: its cell is theirs.
     """
     history = History(options.history) if options.history else History.of_site(near)
     if history is None:
         return
-    places = str(near.absolute()), str(out and Path(out).absolute())
     try:
-        history.append(*_of_cell(history, options.cell, of, entries, *places))
+        history.append(*_placed(history, options.cell, entries, out, near))
     except DataError as error:
         later = shlex.join(["visioncal", "history", str(history.path), "--add", str(out)])
         how = f"Then enter it: {later}" if out else "Then run the command once more."
         warn(f"This is not in the history: {error.message} {error.next_step} {how}")
 
 
-def _of_cell(
+def _placed(
     history: History,
     cell: str | None,
-    of: str,
     entries: Iterable[Entry],
-    source: str = "",
-    out: str = "",
-) -> list[Entry]:
-    """Entries of the cell that was named, or that is known of what they are about."""
-    known = history.entries(sha256=of) if of and not cell and history.path.exists() else ()
-    named = cell or next((entry.cell for entry in known), "")
-    return [
-        replace(one, cell=named or one.cell, source=one.source or source, out=one.out or out)
-        for one in entries
-    ]
+    out: Path | str,
+    source: Path | None = None,
+) -> Iterator[Entry]:
+    """Entries with their paths and their cell: the one that was named, or that is known already."""
+    place, origin = str(out and Path(out).absolute()), str(source.absolute()) if source else ""
+    for entry in entries:
+        session, known = entry.against or entry.sha256, tuple[Entry, ...]()
+        if session and not cell and history.path.exists():
+            known = history.entries(sha256=session)
+        named = cell or (known[0].cell if known else entry.cell)
+        yield replace(entry, cell=named, source=entry.source or origin, out=entry.out or place)
 
 
 def history_command(options: HistoryOptions) -> None:
@@ -126,20 +122,17 @@ def _write(out: Path, entries: Sequence[Entry], source: Path, *, force: bool) ->
     say(f"wrote {out}")
 
 
-def _stored(history: History, out: Path, cell: str | None) -> Sequence[Entry]:
+def _stored(history: History, out: Path, cell: str | None) -> Iterator[Entry]:
     """The entries of the results in a folder or below, of a result's file or of one of frames."""
-    entries: Iterable[Entry]
-    check, of = content_of(out / VERIFY if out.is_dir() else out), ""
+    check = content_of(out / VERIFY if out.is_dir() else out)
     below = sorted(file.parent for file in out.rglob(CALIBRATION)) if out.is_dir() else []
-    if "triggers" in check:
-        entries = [entry_of_check(check, str(out))]
-        of = entries[0].against
-    elif below and below != [out]:
-        return [entry for folder in below for entry in _stored(history, folder, cell)]
+    if below and below != [out]:
+        for folder in below:
+            yield from _stored(history, folder, cell)
+    elif "triggers" in check:
+        yield from _placed(history, cell, [entry_of_check(check, str(out))], out)
+    elif isinstance(result := load_result_or_frames(out), Calibration):
+        yield from _placed(history, cell, entries_of(result), out)
     else:
-        result = load_result_or_frames(out)
-        if isinstance(result, Calibration):
-            entries, of = entries_of(result), result.session_sha256
-        else:
-            entries = [entry_of_frame(*item, None) for item in result.frames.items()]
-    return _of_cell(history, cell, of, entries, out=str(out.absolute()))
+        frames = (entry_of_frame(*item, None) for item in result.frames.items())
+        yield from _placed(history, cell, frames, out)

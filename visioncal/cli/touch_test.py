@@ -79,8 +79,7 @@ def touch_test_command(options: TouchTestOptions) -> None:
         print_json({"points": targets, "touch_test": to_document(extended)["touch_test"]})
     else:
         answer(touch_test_finding(test).reason)
-    entries = entries_of(extended)
-    enter(options, options.session, entries, calibration, result.session_sha256)
+    enter(options, options.session, entries_of(extended), calibration)
     report_written(written, quiet=options.as_json, status=0 if test.passed else EXIT_BAD)
 
 

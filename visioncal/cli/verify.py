@@ -70,6 +70,5 @@ def verify_command(options: VerifyOptions) -> None:
             words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)
             if words:
                 answer(words, begin, style)
-    entries = [entry_of_check(content)]
-    enter(options, options.session, entries, options.output or "", entries[0].against)
+    enter(options, options.session, [entry_of_check(content)], options.output or "")
     report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)

@@ -212,7 +212,8 @@ def entry_of_check(document: Mapping[str, Any], label: str = "verify.json") -> E
 
 def _utc(created: str) -> str:
     """A time as entries have it, so that their order as texts is that of the acts."""
-    then = datetime.fromisoformat(created)
+    with reading(f"the time {created!r}", "a time", "Take the result as it was written."):
+        then = datetime.fromisoformat(created)
     return (then if then.tzinfo else then.replace(tzinfo=UTC)).astimezone(UTC).isoformat()
 
 
@@ -330,8 +331,9 @@ class History:
             file.execute("COMMIT")
 
     def _version(self, file: sqlite3.Connection) -> int:
-        names = ("application_id", "user_version", "schema_version")
-        application, version, tables = (
+        # In this order: another process that creates it meanwhile has then set the last, too.
+        names = ("schema_version", "user_version", "application_id")
+        tables, version, application = (
             int(file.execute(f"PRAGMA {name}").fetchone()[0]) for name in names
         )
         if application != _APPLICATION and (application or version or tables):
