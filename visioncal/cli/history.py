@@ -124,15 +124,15 @@ def _write(out: Path, entries: Sequence[Entry], source: Path, *, force: bool) ->
 
 def _stored(history: History, out: Path, cell: str | None) -> Iterator[Entry]:
     """The entries of the results in a folder or below, of a result's file or of one of frames."""
-    check = content_of(out / VERIFY if out.is_dir() else out)
-    below = sorted(file.parent for file in out.rglob(CALIBRATION)) if out.is_dir() else []
-    if below and below != [out]:
-        for folder in below:
-            yield from _stored(history, folder, cell)
-    elif "triggers" in check:
-        yield from _placed(history, cell, [entry_of_check(check, str(out))], out)
-    elif isinstance(result := load_result_or_frames(out), Calibration):
-        yield from _placed(history, cell, entries_of(result), out)
-    else:
-        frames = (entry_of_frame(*item, None) for item in result.frames.items())
-        yield from _placed(history, cell, frames, out)
+    names = (CALIBRATION, VERIFY) if out.is_dir() else ()
+    below = sorted({file.parent for name in names for file in out.rglob(name)})
+    for place in below or [out]:
+        check = content_of(place / VERIFY if place.is_dir() else place)
+        entries: Iterable[Entry]
+        if "triggers" in check:
+            entries = [entry_of_check(check, str(place))]
+        elif isinstance(result := load_result_or_frames(place), Calibration):
+            entries = entries_of(result)
+        else:
+            entries = [entry_of_frame(*item, None) for item in result.frames.items()]
+        yield from _placed(history, cell, entries, place)

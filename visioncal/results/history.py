@@ -121,8 +121,8 @@ def table_of(entries: Iterable[Entry]) -> str:
 def entries_of(calibration: Calibration) -> Iterator[Entry]:
     """The entries of a result: itself, the frames that joined it, and its touch test."""
     # Of a cell without a camera, the first transform.
-    names = [name for name in calibration.edges if "_from_cam" in name]
-    edge = calibration.edges[next(iter([*names, *calibration.edges]))]
+    names = sorted(calibration.edges, key=lambda name: "_from_cam" not in name)
+    edge = calibration.edges[names[0]] if names else None
     camera, budget, noise = calibration.camera, calibration.budget, calibration.noise
     figures = {
         "views": len(calibration.views),
@@ -133,8 +133,8 @@ def entries_of(calibration: Calibration) -> Iterator[Entry]:
         "noise_mm": noise.get("robot_translation_mm", noise.get("combined_translation_mm")),
         "noise_deg": noise.get("robot_rotation_deg", noise.get("combined_rotation_deg")),
         "noise_px": noise.get("pixel_px"),
-        "sigma_mm": edge.sigma_mm,
-        "sigma_deg": edge.sigma_deg if edge.oriented else None,
+        "sigma_mm": None if edge is None else edge.sigma_mm,
+        "sigma_deg": edge.sigma_deg if edge is not None and edge.oriented else None,
         "radius95_mm": None if budget is None else budget.radius95_mm,
         "focal_px": None if camera is None else float(np.mean(camera.camera.matrix[:2])),
         **calibration.means,
@@ -297,8 +297,9 @@ class History:
                     with suppress(sqlite3.OperationalError):
                         file.execute("PRAGMA journal_mode = WAL")
                 yield file
-        except sqlite3.Error as error:
-            code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        except (sqlite3.Error, UnicodeError) as error:
+            # Names in a damaged file may be no text: then SQLite's message cannot be read, either.
+            code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF
             why, do = _FAULTS.get(code, (f"cannot be used: {error}", "Take an earlier copy of it."))
             if self.path.is_dir():
                 why, do = "is a folder", f"Name a file, such as {self.path / SITE_FILE}."
@@ -353,7 +354,7 @@ def _connection(address: str) -> sqlite3.Connection:
         file.execute("PRAGMA synchronous = FULL")
         # The file is opened by the first statement that reads.
         file.execute("PRAGMA user_version").fetchone()
-    except sqlite3.Error:
+    except (sqlite3.Error, UnicodeError):
         file.close()
         raise
     return file
