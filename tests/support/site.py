@@ -29,7 +29,11 @@ def acts(cell: str, seed: int) -> Iterator[Entry]:
     def act(day: float, kind: str, edges: dict[str, Edge], **more: object) -> Entry:
         at = (NOW - timedelta(days=735 - day)).isoformat()
         facts = {"status": "good", "reason": f"All agree in {kind}.", "robot": "ur10e"}
-        return Entry(**facts | {"cell": cell, "at": at, "kind": kind, "edges": edges} | more)
+        return Entry(
+            **facts
+            | {"cell": cell, "at": at, "kind": kind, "edges": edges, "sha256": f"{cell} {seed}"}
+            | more
+        )
 
     def placed(pose: FloatArray, sigma_m: float = SIGMA_M) -> Edge:
         covariance = np.diag([2.0 * sigma_m] * 3 + [sigma_m] * 3) ** 2

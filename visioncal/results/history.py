@@ -16,6 +16,7 @@ import numpy as np
 
 from visioncal.core.choices import SITE_FILE, ActKind
 from visioncal.core.codec import REST, Key, read, reading, write
+from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line, sha256
 from visioncal.core.types import Need
@@ -82,7 +83,8 @@ class Entry:
         A result that is added once more, from wherever, is thus the same entry.
         """
         found = {name: edge.matrix.tolist() for name, edge in self.edges.items()}
-        content = [self.kind, self.at, self.status, self.session, self.reason, found]
+        inputs = [self.session, self.sha256, self.against]
+        content = [self.kind, self.at, self.status, self.reason, inputs, found]
         return sha256(json.dumps(content, sort_keys=True).encode())[:16]
 
     @property
@@ -284,7 +286,8 @@ class History:
         with self._opened() as file:
             rows = file.execute(query, (cell, kind, sha256, begin, begin)).fetchall()
         with reading(str(self.path), "a history", "Take an earlier copy of it."):
-            return tuple(read(Entry, json.loads(document), "") for (document,) in rows)
+            documents = (parse_stored(text.encode(), "an entry") for (text,) in rows)
+            return tuple(read(Entry, document, "") for document in documents)
 
     @contextmanager
     def _opened(self, *, creating: bool = False) -> Iterator[sqlite3.Connection]:
