@@ -124,12 +124,14 @@ def verify_on_page(options: VerifyOptions) -> None:
         names = (name if at == 1 else f"{name}-{at}" for at in range(1, 1000))
         out = next(checks / name for name in names if not _result(checks / name).exists())
         moved = ("--board-moved",) if options.board_moved else ()
+        stated = {"--history": options.history, "--cell": options.cell}
+        entered = [word for name, to in stated.items() if to for word in (name, str(to))]
         chosen = _with_devices(RecordOptions(out=out), setup)
         return Task(
             partial(_begun, setup, chosen, recorded, None, checks),
             *(recorded, lens.camera, stops, CheckLimits.stops),
             taking_of(chosen, is_driven=False),
-            ("verify", str(out), "--against", str(against), *moved),
+            ("verify", str(out), "--against", str(against), *moved, *entered),
             _result(out),
         )
 
