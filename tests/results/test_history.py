@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import resource
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -148,17 +149,22 @@ def test_files_that_cannot_be_used(tmp_path, monkeypatch):
     refused(history.path, "is damaged", reading=True)
 
 
+def limited(path):
+    """In a process of its own, whose files may not grow beyond a page of SQLite's."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+    refused(path, "the disk is full")
+
+
 def test_a_full_disk_takes_nothing_away(tmp_path):
     """The largest file that the system allows is that of the entries that are there."""
     history = History(tmp_path / "history.db")
     for number in range(20):
         history.append(entry(number))
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
-    try:
-        refused(history.path, "the disk is full")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    process = FORK.Process(target=limited, args=(history.path,))
+    process.start()
+    process.join()
+    assert process.exitcode == 0
     assert len(history.entries()) == 20
     assert history.append(entry(20)) == 1
 
