@@ -18,7 +18,7 @@ from visioncal.core.version import __version__
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline.checkup import Checkup, doctor
     from visioncal.calibration.run import calibrate
-    from visioncal.calibration.verification import verify
+    from visioncal.calibration.verification import Guard, Look, verify
     from visioncal.core.errors import (
         ConvergenceError,
         DataError,
@@ -59,8 +59,10 @@ _HOMES = {
     "DataError": "visioncal.core.errors",
     "DegenerateError": "visioncal.core.errors",
     "DriverError": "visioncal.core.errors",
+    "Guard": "visioncal.calibration.verification",
     "Loads": "visioncal.robot",
     "Located": "visioncal.frames.locate",
+    "Look": "visioncal.calibration.verification",
     "OnlineCompensator": "visioncal.robot.thermal",
     "Plane": "visioncal.frames.camera_chain",
     "Session": "visioncal.session",
@@ -101,8 +103,10 @@ __all__ = [
     "DataError",
     "DegenerateError",
     "DriverError",
+    "Guard",
     "Loads",
     "Located",
+    "Look",
     "OnlineCompensator",
     "Plane",
     "Session",

@@ -159,6 +159,8 @@ def test_every_pair_holds_and_what_was_pushed_is_named_by_its_own_pair_alone(pla
     seen = visioncal("verify", bumped, *against, *of("left", "a"))
     assert seen.status == 3
     assert "The camera moved by" in seen.out
+    # A guard needs a pair's name, too.
+    assert "--camera" in visioncal("guard", *against).refused().err
     done("verify", bumped, *against, *of("hand", target="floor"))
     # A check of one pair names it in the command that it advises.
     pushed = later_with(place, "target_floor", 0.01)

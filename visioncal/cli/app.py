@@ -51,8 +51,9 @@ class _Commands(LazyGroup):
         ),
     }
     listed = (
-        *("demo", "plan", "record", "calibrate", "doctor", "batch", "show", "verify", "diff"),
-        *("convert", "export", "tcp", "locate", "fixture", "touch-test", "correct", "history"),
+        *("demo", "plan", "record", "calibrate", "doctor", "batch", "show", "verify", "guard"),
+        *("diff", "convert", "export", "tcp", "locate", "fixture", "touch-test", "correct"),
+        "history",
         *("simulate", "target", "dynamics"),
     )
 

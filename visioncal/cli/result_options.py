@@ -137,6 +137,29 @@ class VerifyOptions(PartOptions, PageOptions, ActOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class GuardOptions(PartOptions):
+    """Say after each look of a working cell whether its calibration still holds.
+
+    Looks come as JSON lines on stdin; each is answered by a JSON line. A line has time_s,
+    base_from_flange, cam_from_target or corners, joints_rad where the arm was calibrated, and
+    target where there are several; acknowledge: true ends an alarm. Exit status 0: it holds; 3: it
+    does not; 2: a look could not be used, and the others are no reason to doubt.
+    """
+
+    against: Path = against_option()
+    false_alarm_looks: float = option(
+        "Mean number of looks to a false alarm.", default=10_000.0, min=100.0, max=1e9
+    )
+    slow_mm: float = option(
+        "Expected motion by heat, over hours (sigma, mm); it is learned.",
+        default=0.02,
+        min=0.0,
+        max=10.0,
+    )
+    state: Path | None = option("A file that keeps what was learned, for the next start.")
+
+
+@dataclass(frozen=True, kw_only=True)
 class DiffOptions(PartOptions):
     """Show what changed between two calibrations, and what is only noise.
 

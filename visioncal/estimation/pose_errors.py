@@ -200,10 +200,15 @@ def posture_correlation(poses: FloatArray) -> FloatArray:
     return np.exp(-_squared_distances(poses) / (2.0 * _RANGES[0] ** 2))
 
 
+def posture_features(poses: FloatArray) -> FloatArray:
+    """(s, 12) features of (s, 4, 4) postures, whose distance is that of the postures [rad]."""
+    places, turns = (poses[:, :3, 3] / LEVER_M, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0))
+    return np.concatenate([places, turns], axis=1)
+
+
 def _squared_distances(poses: FloatArray) -> FloatArray:
     """(s, s) squared distances of postures; 2 (1 - cos) of an angle [rad^2]."""
-    places, turns = (poses[:, :3, 3] / LEVER_M, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0))
-    features = np.concatenate([places, turns], axis=1)
+    features = posture_features(poses)
     return np.asarray(np.sum((features[:, None] - features) ** 2, axis=2))
 
 

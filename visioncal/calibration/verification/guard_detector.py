@@ -1,0 +1,295 @@
+"""Sequential test of a calibration's residuals: has anything changed, what, by how much, and when?
+
+A look's residual is `r = A x + b + H change + noise`. The state x has what is no fault: the
+calibration's own errors (constant, of its covariance), motions of the frames over hours (an
+Ornstein-Uhlenbeck process), and the joints' zeros; b is the arm's error at a posture, where it
+stands again and again. A Kalman filter predicts the next look; its innovations are white while
+nothing changes. A change at look k adds `(H - A F_k) change` to the later ones; F_k, by which the
+filter follows it, has a recursion (Willsky and Jones 1976). The last looks, and older ones at
+growing distances, are candidates (the window of Lai 1995, 1998): an update costs the same after any
+history, and its state is small.
+
+The statistic is that of Shiryaev and Roberts (Pollak 1987): the sum, over candidates, of the
+likelihood ratio of a change there to none, averaged over causes and sizes as in `verify`. Without a
+change it grows by one a look in the mean, so that the mean number of looks to a false alarm is its
+limit, and more by the overshoot alone. CUSUM (Page 1954; Lorden 1971) and GLR (Basseville and
+Nikiforov 1993) need simulated limits instead.
+
+That holds if innovations are as modelled. Therefore the noise, the share of the arm's error that is
+new at a known posture, and the size of slow motions are learned; these by the innovations'
+correlation with the motion that was predicted, which is none if it is as large as supposed (Mehra
+1970). The influence of an innovation is bounded (Huber 1964), however wrong a look is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from visioncal.core.types import FloatArray
+from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.model_evidence import SIZES_M
+
+# Candidates for the look of the change, and the looks after which one is given up.
+_CANDIDATES, _OLDEST = 14, 1000
+# Sizes of changes, as the mean squared shift of one look in units of its noise. Larger ones are
+# found as soon, as looks have a bounded influence.
+_SHIFTS = np.array([0.1, 0.6, 4.0])
+# Squared shift of all looks together below which a change is not shown.
+_SHOWN = 1e-3
+# Prior size of the change in its estimate [m]: hardly any.
+_WIDEST_M = 0.1
+# Share of the arm's error that is new, at first.
+_FRESH = 0.4
+# Squared length of an innovation that noise exceeds in one look of a hundred: the largest that
+# counts in full.
+_FAR = float(chdtri(6, 0.01))
+# Looks by which the noise is known at first, after which it is forgotten, and its proportions.
+_STATED, _MEMORY, _SOON = 200.0, 3000.0, 1000.0
+# Postures that are kept, and the distance within which they are one [rad, and 2 rad a metre].
+_PLACES, _SAME = 64, 0.05
+# Smallest slow motion [m, and radians], and the squared forecast that is supposed at first.
+_LEAST_M, _WEAK = 3e-6, 0.1
+# Time constant of slow motions [s]: of hours, and fast enough for the day's.
+_SLOW_S = 6 * 3600.0
+
+
+@dataclass(frozen=True, eq=False)
+class LookRows:
+    """One look, linearised."""
+
+    time_s: float  # When it was taken [s].
+    residual: FloatArray  # (6,) `log(predicted^-1 measured)`.
+    covariance: FloatArray  # (6, 6) of its noise by the calibration, but for the arm's.
+    by_edges: FloatArray  # (6, e) Jacobian by the frames, with what the lens follows of them.
+    by_motion: FloatArray  # (6, e) Jacobian by motions of the frames.
+    by_joints: FloatArray  # (6, n) Jacobian by the joints' zeros; n is 0 without joint angles.
+    posture: FloatArray  # (12,) features of the arm's posture, whose distance is in radians.
+    by_arm: FloatArray  # (6, 6) covariance of the arm's error at the posture, by the calibration.
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeKind:
+    """A cause that the test compares."""
+
+    name: str  # `camera`, `board NAME`, `joint 3`, or `none of these`.
+    columns: tuple[int, ...]  # Which of the changes of frames and joints it has.
+    prior: float  # Prior probability.
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """State of the test; all that is needed to go on after a restart."""
+
+    time_s: FloatArray  # () time of the last look [s].
+    looks: FloatArray  # () number of looks.
+    mean: FloatArray  # (p,) state: frames, their slow motions, joints' zeros.
+    covariance: FloatArray  # (p, p).
+    shape: FloatArray  # (6, 6) covariance of the noise in units of the stated.
+    fresh: FloatArray  # () share of the arm's error that is new at a known posture, in variance.
+    slow: FloatArray  # (e,) variances of the frames' slow motions.
+    forecast: FloatArray  # (b,) mean squared shift of a look by each frame's predicted motion.
+    postures: FloatArray  # (s, 12) features of the postures at which the arm stood.
+    stood: FloatArray  # (s,) looks at each; 0 of a free place.
+    offsets: FloatArray  # (s, 6) error of the arm at each, as it shows in looks.
+    offsets_covariance: FloatArray  # (s, 6, 6) of these.
+    usual: FloatArray  # (d, d) mean information of one look on a change.
+    # For each of c candidates: the look's number, the times of the last look before it and of
+    # itself [s], and the number of looks that it stands for.
+    born: FloatArray  # (c, 4).
+    follows: FloatArray  # (c, p, d) F: what the filter takes of a change into its state.
+    information: FloatArray  # (c, d, d) on the change, by innovations of bounded influence.
+    gradient: FloatArray  # (c, d).
+    raw_information: FloatArray  # (c, d, d) the same by the innovations that it may explain.
+    raw_gradient: FloatArray  # (c, d).
+
+    @classmethod
+    def of(cls, edges: FloatArray, slow_m: float, joints_rad: FloatArray) -> "Detector":
+        """Starts the test.
+
+        Args:
+            edges: (e, e) covariance of the calibrated frames.
+            slow_m: Standard deviation of a frame's slow motions [m].
+            joints_rad: (n,) standard deviations of the joints' zeros; empty without joint angles.
+        """
+        count, changes = len(edges), len(edges) + len(joints_rad)
+        size = count + changes
+        slow = np.tile(np.repeat([slow_m / LEVER_M, slow_m], 3), count // 6)
+        covariance = np.diag(np.concatenate([np.zeros(count), slow, joints_rad]) ** 2)
+        covariance[:count, :count] = edges
+        shapes = ((_PLACES, 12), _PLACES, (_PLACES, 6), (_PLACES, 6, 6), (changes, changes))
+        candidates = ((4,), (size, changes), *((changes, changes), (changes,)) * 2)
+        return cls(
+            *(np.zeros(()), np.zeros(()), np.zeros(size), covariance, np.eye(6)),
+            *(np.array(_FRESH), slow**2),
+            np.full(count // 6, _WEAK),
+            *(np.zeros(shape) for shape in shapes),
+            *(np.zeros((0, *shape)) for shape in candidates),
+        )
+
+    def without_candidates(self) -> "Detector":
+        """What the test has learned, with no change supposed so far."""
+        none = {name: getattr(self, name)[:0] for name in _CANDIDATE}
+        return replace(self, **none)
+
+
+# Fields of a detector with a row for each candidate.
+_CANDIDATE = ("born", "follows", "information", "gradient", "raw_information", "raw_gradient")
+
+
+def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
+    """The state after one more look.
+
+    Args:
+        state: State before it.
+        rows: The look; no earlier than the last.
+        is_learning: Whether noise and slow motions are learned, and a change may begin with this
+            look: not after an alarm.
+    """
+    edges, count = rows.by_edges.shape[1], float(state.looks)
+    before_s = float(state.time_s) if count else rows.time_s
+    motions, motion = slice(edges, 2 * edges), np.ones(len(state.mean))
+    motion[motions] = np.exp((before_s - rows.time_s) / _SLOW_S)
+    mean, covariance = motion * state.mean, motion[:, None] * state.covariance * motion
+    covariance[motions, motions] += (1.0 - motion[edges] ** 2) * np.diag(state.slow)
+    first = np.array([[count, before_s, rows.time_s, 1.0]])
+    grown = {"born": np.concatenate([state.born, first[: int(is_learning)]])}
+    for name in _CANDIDATE[1:]:
+        held = getattr(state, name)
+        grown[name] = np.concatenate([held, np.zeros((int(is_learning), *held.shape[1:]))])
+    follows = motion[:, None] * grown["follows"]
+    design = np.concatenate([rows.by_edges, rows.by_motion, rows.by_joints], axis=1)
+    at, places = _place(state, rows)
+    own, root = places["offsets_covariance"][at], np.linalg.cholesky(rows.covariance)
+    seen, part = design @ covariance, root @ state.shape @ root.T
+    noise = part + state.fresh * rows.by_arm
+    whiten = np.linalg.inv(np.linalg.cholesky(seen @ design.T + own + noise))
+    white = whiten @ (rows.residual - design @ mean - places["offsets"][at])
+    squared = float(white @ white)
+    share = min(1.0, float(np.sqrt(_FAR / max(squared, 1e-12))))
+    clipped = share * white
+    # Gains on whitened innovations.
+    gain, own_gain = (whiten @ seen).T, (whiten @ own).T
+    change = np.concatenate([rows.by_motion, rows.by_joints], axis=1)
+    signature = whiten @ (change - design @ follows)
+    turned = np.swapaxes(signature, 1, 2)
+    products, accepted = turned @ signature, np.ones(len(follows))
+    if squared > _FAR:
+        accepted = _explained(white, signature, grown["raw_information"], grown["raw_gradient"])
+    grown["follows"] = follows + share * gain @ signature
+    grown["information"] += products
+    grown["gradient"] += turned @ clipped
+    grown["raw_information"] += accepted[:, None, None] * products
+    grown["raw_gradient"] += accepted[:, None] * (turned @ white)
+    # What innovations still have of the slow motions that were predicted, by frames: none if these
+    # are as large as supposed.
+    forecast = (whiten @ (rows.by_motion * mean[motions])).reshape(6, -1, 6).sum(axis=2)
+    mean, covariance = mean + gain @ clipped, covariance - gain @ gain.T
+    # The arm's error at a posture is learned beside the state, and its small share in what the
+    # filter takes of a change is left out: it costs a little delay and no false alarm.
+    places["offsets"][at] += own_gain @ clipped
+    places["offsets_covariance"][at] -= own_gain @ own_gain.T
+    learned: dict[str, FloatArray] = {}
+    if is_learning:
+        # Of the noise in units of the stated: expectation and maximisation (Shumway and Stoffer
+        # 1982), look by look. Of the arm's share and the slow motions: what innovations have too
+        # much or too little of (Robbins and Monro 1951).
+        often = 1.0 / min(_STATED + count, _MEMORY)
+        soon = 1.0 / min(0.5 * (_STATED + count), _SOON)
+        of_noise, stated = whiten @ part, np.linalg.inv(root)
+        found = of_noise.T @ clipped
+        moment = stated @ (np.outer(found, found) + part - of_noise.T @ of_noise) @ stated.T
+        arm = whiten @ rows.by_arm @ whiten.T
+        more = clipped @ arm @ clipped / max(np.trace(arm), 1e-12) - 1.0
+        power = state.forecast + often * (np.sum(forecast**2, axis=0) - state.forecast)
+        larger = forecast.T @ clipped / power
+        learned = {
+            "shape": state.shape + often * (0.5 * (moment + moment.T) - state.shape),
+            "fresh": state.fresh * np.exp(soon * more),
+            "forecast": power,
+            "slow": np.maximum(state.slow * np.exp(soon * np.repeat(larger, 6)), _LEAST_M**2),
+            "usual": state.usual + (products[-1] - state.usual) / min(count + 1.0, 5e3),
+        }
+        if len(grown["born"]) > _CANDIDATES:
+            _thin(grown, count)
+    time_s, looks = np.array(rows.time_s), np.array(count + 1.0)
+    filtered = {"time_s": time_s, "looks": looks, "mean": mean, "covariance": covariance}
+    return replace(state, **filtered, **grown, **places, **learned)
+
+
+def _place(state: Detector, rows: LookRows) -> tuple[int, dict[str, FloatArray]]:
+    """The place of a look's posture among those known; a new one takes the least used."""
+    names = ("postures", "stood", "offsets", "offsets_covariance")
+    places = {name: getattr(state, name).copy() for name in names}
+    away = np.linalg.norm(state.postures - rows.posture, axis=1) + 1e9 * (state.stood == 0)
+    at = int(away.argmin())
+    if away[at] > _SAME:
+        at = int(state.stood.argmin())
+        for name, value in zip(names, (rows.posture, 0.0, 0.0, rows.by_arm), strict=True):
+            places[name][at] = value
+    places["stood"][at] += 1.0
+    return at, places
+
+
+def _explained(
+    white: FloatArray, signature: FloatArray, information: FloatArray, gradient: FloatArray
+) -> FloatArray:
+    """(c,) 1 where a candidate's estimate of the change explains a far innovation, else 0."""
+    covariance = np.linalg.inv(information + np.eye(information.shape[1]) / _WIDEST_M**2)
+    away = white - (signature @ (covariance @ gradient[:, :, None]))[:, :, 0]
+    total = np.eye(6) + signature @ covariance @ np.swapaxes(signature, 1, 2)
+    squares = np.sum(away * np.linalg.solve(total, away[:, :, None])[:, :, 0], axis=1)
+    return np.where(squares < _FAR, 1.0, 0.0)
+
+
+def _thin(grown: dict[str, FloatArray], looks: float) -> None:
+    """Gives up the oldest candidate, or the one whose neighbours are nearest for their age."""
+    born, ages = grown["born"], looks + 1.0 - grown["born"][:, 0]
+    at = 0
+    if ages[0] <= _OLDEST:
+        at = 1 + int(np.argmin((ages[:-2] - ages[2:]) / ages[1:-1]))
+        born[at + 1, 1], born[at + 1, 3] = born[at, 1], born[at + 1, 3] + born[at, 3]
+    for name in _CANDIDATE:
+        grown[name] = np.delete(grown[name], at, axis=0)
+
+
+def weighed(
+    state: Detector, kinds: Sequence[ChangeKind], units: FloatArray, *, is_raw: bool = False
+) -> FloatArray:
+    """(h, c) log likelihood ratio of each kind of change at each candidate to none, weighted.
+
+    Weights are prior probabilities, and the numbers of looks that candidates stand for; the sum of
+    the ratios is the statistic. Innovations of bounded influence say whether something changed;
+    `is_raw` ones, as they are, what it was. `units` (d,) are the sizes of each change for one of a
+    metre.
+    """
+    scores = np.zeros((len(kinds), len(state.born)))
+    every, slopes = state.information, state.gradient
+    if is_raw:
+        every, slopes = state.raw_information, state.raw_gradient
+    for at, kind in enumerate(kinds):
+        columns = np.array(kind.columns)
+        usual = float(np.diagonal(state.usual)[columns] @ units[columns] ** 2)
+        sizes_m = np.array(SIZES_M) if is_raw else np.sqrt(_SHIFTS / max(usual, 1e-12))
+        scale = (sizes_m[:, None] * units[columns])[:, None]
+        own = every[:, columns[:, None], columns] * scale[..., None] * scale[..., None, :]
+        inner, scaled = np.eye(len(columns)) + own, scale * slopes[:, columns]
+        squares = np.sum(scaled * np.linalg.solve(inner, scaled[..., None])[..., 0], axis=2)
+        ratios = 0.5 * (squares - np.linalg.slogdet(inner)[1])
+        # Of what looks do not show there is no evidence yet: of another board, of joints.
+        is_shown = np.trace(own[-1], axis1=1, axis2=2) > _SHOWN
+        mean = np.logaddexp.reduce(ratios, axis=0) - np.log(len(sizes_m))
+        scores[at] = np.where(is_shown, mean, -np.inf) + np.log(kind.prior)
+    return scores + np.log(state.born[:, 3])
+
+
+def estimate(
+    state: Detector, kind: ChangeKind, candidate: int, units: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """A change at a candidate, (q,), and its covariance (q, q)."""
+    columns = np.array(kind.columns)
+    information = state.raw_information[candidate][np.ix_(columns, columns)]
+    prior = np.diag((_WIDEST_M * units[columns]) ** -2.0)
+    covariance = np.linalg.inv(information + prior)
+    return covariance @ state.raw_gradient[candidate, columns], covariance

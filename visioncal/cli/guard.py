@@ -1,0 +1,119 @@
+"""`visioncal guard`."""
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+from scipy.spatial.transform import Rotation
+
+from visioncal.calibration.verification.guard import Guard, Look
+from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT
+from visioncal.cli.result_options import GuardOptions
+from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.files import check_values, read_text, write_atomically
+from visioncal.core.transforms import compose
+from visioncal.core.types import Corners, FloatArray
+from visioncal.interchange.result_files import load_result
+
+# A program that is killed loses fewer looks than these of what it has learned.
+_KEPT_EVERY = 50
+_KEYS = ("time_s", "base_from_flange", "cam_from_target", "corners", "joints_rad", "target")
+
+
+def guard_command(options: GuardOptions) -> None:
+    """Runs `visioncal guard`."""
+    calibration = load_result(options.against).chosen(options.choice)
+    guard = Guard(calibration, false_alarm_looks=options.false_alarm_looks, slow_mm=options.slow_mm)
+    if options.state is not None and options.state.exists():
+        guard.restore(_object(read_text(options.state), str(options.state)))
+    holds, is_refused = guard.holds, False
+    try:
+        for count, answer in enumerate(_answers(guard), 1):
+            typer.echo(json.dumps(answer, allow_nan=False))
+            sys.stdout.flush()
+            is_refused = is_refused or "error" in answer
+            if count % _KEPT_EVERY == 0 or guard.holds != holds:
+                holds = guard.holds
+                _keep(guard, options.state)
+    finally:
+        _keep(guard, options.state)
+    if not guard.holds or is_refused:
+        raise typer.Exit(EXIT_NO_RESULT if guard.holds else EXIT_BAD)
+
+
+def _keep(guard: Guard, path: Path | None) -> None:
+    if path is not None:
+        write_atomically(path, json.dumps(guard.document, allow_nan=False) + "\n")
+
+
+def _answers(guard: Guard) -> Iterator[dict[str, Any]]:
+    """Answers the lines of stdin; one that cannot be used changes nothing."""
+    for number, line in enumerate(sys.stdin, 1):
+        if not line.strip():
+            continue
+        try:
+            document = _object(line, f"line {number}")
+            if document == {"acknowledge": True}:
+                guard.acknowledge()
+                yield {"acknowledged": True}
+            else:
+                yield guard.update(_look(document, f"line {number}")).document
+        except VisioncalError as error:
+            yield {"error": {"message": f"line {number}: {error}", "next": error.next_step}}
+
+
+def _object(text: str, label: str) -> dict[str, Any]:
+    try:
+        document = json.loads(text)
+    except ValueError as error:
+        raise DataError(f"{label} is no JSON: {error}.", culprits=[label]) from None
+    check_values(document, label)
+    if not isinstance(document, dict):
+        raise DataError(f"{label} is {type(document).__name__}; a JSON object is needed.")
+    return document
+
+
+def _look(document: dict[str, Any], label: str) -> Look:
+    """A look of a line's JSON object.
+
+    Raises:
+        DataError: It has other keys or values.
+    """
+    if unknown := [key for key in document if key not in _KEYS]:
+        raise DataError(
+            f"{label} has {unknown[0]!r}; the keys are {', '.join(_KEYS)}.", culprits=unknown
+        )
+    key, corners = "time_s", document.get("corners")
+    try:
+        content: dict[str, Any] = {"time_s": float(document["time_s"])}
+        for key in ("base_from_flange", "cam_from_target"):
+            if key in document:
+                content[key] = _pose(document[key])
+        if "joints_rad" in document:
+            key = "joints_rad"
+            content[key] = np.array(document[key], dtype=float)
+        if corners is not None:
+            key, table = "corners", np.array(sorted(corners), dtype=float).reshape(-1, 3)
+            ids = table[:, 0].astype(np.int64)
+            content[key] = Corners(0, ids, table[:, 1:], 0.0)
+        return Look(target=str(document.get("target", "")), **content)
+    except KeyError:
+        raise DataError(f"{label} has no time_s.", culprits=["time_s"]) from None
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            f"{label}: {key} cannot be read: {error}.",
+            culprits=[key],
+            next_step="Poses are 4 x 4 matrices or x, y, z, qx, qy, qz, qw, in metres; corners are "
+            "[number, x, y] in pixels, joints in radians, times in seconds.",
+        ) from None
+
+
+def _pose(value: object) -> FloatArray:
+    numbers = np.array(value, dtype=float)
+    if numbers.shape == (7,):
+        return compose(Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3])
+    return numbers
