@@ -11,6 +11,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.verification.guard import Guard, Look
+from visioncal.calibration.verification.scene_guard import scene_looks
 from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT
 from visioncal.cli.result_options import GuardOptions
 from visioncal.core.errors import DataError, VisioncalError
@@ -18,6 +19,9 @@ from visioncal.core.files import check_values, read_text, write_atomically
 from visioncal.core.transforms import compose
 from visioncal.core.types import Corners, FloatArray
 from visioncal.interchange.result_files import load_result
+from visioncal.results import select_matching
+from visioncal.session import Session
+from visioncal.vision.boards.imaging import read_image
 
 # A program that is killed loses fewer looks than these of what it has learned.
 _KEPT_EVERY = 50
@@ -26,6 +30,9 @@ _KEYS = ("time_s", "base_from_flange", "cam_from_target", "corners", "joints_rad
 
 def guard_command(options: GuardOptions) -> None:
     """Runs `visioncal guard`."""
+    if options.scene is not None:
+        _by_scene(options, options.scene)
+        return
     calibration = load_result(options.against).chosen(options.choice)
     guard = Guard(calibration, false_alarm_looks=options.false_alarm_looks, slow_mm=options.slow_mm)
     if options.state is not None and options.state.exists():
@@ -43,6 +50,28 @@ def guard_command(options: GuardOptions) -> None:
         _keep(guard, options.state)
     if not guard.holds or is_refused:
         raise typer.Exit(EXIT_NO_RESULT if guard.holds else EXIT_BAD)
+
+
+def _by_scene(options: GuardOptions, images: Path) -> None:
+    """Answers each of a session's images of the standing scene."""
+    session, calibration = select_matching(
+        Session.load(images), load_result(options.against), options.choice
+    )
+    looks = scene_looks(
+        session,
+        calibration,
+        mask=None if options.mask is None else read_image(options.mask) > 127,
+        plane=options.plane or "",
+        steady_px=options.steady_px,
+        false_alarm_looks=options.false_alarm_looks,
+    )
+    holds, is_refused = True, False
+    for look in looks:
+        typer.echo(json.dumps(look.document, allow_nan=False))
+        sys.stdout.flush()
+        holds, is_refused = look.holds, is_refused or bool(look.found.reason)
+    if not holds or is_refused:
+        raise typer.Exit(EXIT_NO_RESULT if holds else EXIT_BAD)
 
 
 def _keep(guard: Guard, path: Path | None) -> None:

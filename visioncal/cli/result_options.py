@@ -142,7 +142,8 @@ class GuardOptions(PartOptions):
 
     Looks come as JSON lines on stdin; each is answered by a JSON line. A line has time_s,
     base_from_flange, cam_from_target or corners, joints_rad where the arm was calibrated, and
-    target where there are several; acknowledge: true ends an alarm. Exit status 0: it holds; 3: it
+    target where there are several; acknowledge: true ends an alarm. With --scene a look is an image
+    of the standing cell at a pose that the session shows again. Exit status 0: it holds; 3: it
     does not; 2: a look could not be used, and the others are no reason to doubt.
     """
 
@@ -157,6 +158,24 @@ class GuardOptions(PartOptions):
         max=10.0,
     )
     state: Path | None = option("A file that keeps what was learned, for the next start.")
+    scene: Path | None = option(
+        "A session or .rrd whose images show the standing scene; no board is needed."
+    )
+    mask: Path | None = option(
+        "With --scene: an image, white where things stand still.", needs="scene"
+    )
+    plane: str | None = option(
+        "With --scene, for the camera's offset too: the scene is a plane, the board's or at a "
+        "distance from the camera (mm).",
+        metavar="board|MM",
+        needs="scene",
+    )
+    steady_px: float = option(
+        "With --scene: how far images move from look to look without a fault (sigma, px).",
+        default=0.1,
+        min=0.01,
+        max=10.0,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -79,13 +79,13 @@ def _still_since(views: Iterable[View]) -> dict[int, int]:
         both = view.stamp_s is not None and last_s is not None
         # Two minutes apart, the robot may have moved in between.
         is_late = both and abs((view.stamp_s or 0.0) - (last_s or 0.0)) > 120.0
-        if first is None or _moved(first, view) or is_late:
+        if first is None or moved(first, view) or is_late:
             first = view
         last_s, run_starts[view.number] = view.stamp_s, first.number
     return run_starts
 
 
-def _moved(first: View, second: View) -> bool:
+def moved(first: View, second: View) -> bool:
     """Whether two rows differ in pose by more than noise, or in loads."""
     if any(first.numbers.get(name) != second.numbers.get(name) for name in LOAD):
         return True
