@@ -181,6 +181,15 @@ def test_a_recording_is_as_near_to_the_truth_as_it_says(tmp_path):
     assert squared > limit
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("patient")
+def test_a_slip_of_an_encoder_is_recovered_in_a_rehearsal(tmp_path):
+    pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")
+    done = visioncal("demo", "--live", "--fault", "encoder-slip", "-o", tmp_path).good()
+    assert "joint 3 (elbow_joint) off by +0.4 deg" in done.out
+    assert len(Session.load(tmp_path / "recovery/stops").views) == 15
+
+
 def test_the_cell_is_guessed_as_roughly_as_is_said():
     cell, again = Bench(5), Bench(5)
     for guess, true, same in zip(

@@ -109,6 +109,7 @@ def test_closed_ports_and_unknown_names_are_told_apart():
 
 
 def test_polyscope_x_is_watched_without_a_dashboard_and_not_driven():
+    pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")
     with spawn(replace(OPTIONS, polyscope=(10, 7, 0, 1000))) as running:
         raised(DriverError, "PolyScope X 10.7.0.*not driven.*--arm socket", UrArm, running.host)
         with closing(UrArm(running.host, watch_only=True)) as arm:

@@ -52,9 +52,8 @@ class _Commands(LazyGroup):
     }
     listed = (
         *("demo", "plan", "record", "calibrate", "doctor", "batch", "show", "verify", "guard"),
-        *("diff", "convert", "export", "tcp", "locate", "fixture", "touch-test", "correct"),
-        "history",
-        *("simulate", "target", "dynamics"),
+        *("recover", "diff", "convert", "export", "tcp", "locate", "fixture", "touch-test"),
+        *("correct", "history", "simulate", "target", "dynamics"),
     )
 
 

@@ -36,8 +36,15 @@ _MOST_SHOWN = 10
 _TOOLS = "flange_from_"
 
 
-def correct_command(options: CorrectOptions) -> None:
+def correct_command(
+    options: CorrectOptions, moved: tuple[FloatArray, FloatArray] | None = None
+) -> None:
     """Corrects a table of targets, and writes and prints the result.
+
+    Args:
+        options: The options.
+        moved: Motions (4, 4) of the targets before that, on the left and on the right; an arm that
+            is not calibrated is then taken as nominal. None for no motion.
 
     Raises:
         DataError: Something cannot be read or written, or targets are out of reach.
@@ -49,12 +56,13 @@ def correct_command(options: CorrectOptions) -> None:
     loaded = load_calibration(options.calibration, options.choice, needs)
     bad = check_usable(loaded.verdict, "the calibration", force=options.force)
     calibration = _at_temperatures(loaded, options.temperatures)
-    arm = CalibratedArm.of(calibration)
+    arm = CalibratedArm.of(calibration, or_nominal=moved is not None)
     if file is not None:
         check_free(file, force=options.force)
     targets = read_targets(options.targets, arm.real)
     flange_from_tool = _tool(calibration, options.tool)
-    base_from_flange = targets.base_from_tool @ invert(flange_from_tool)
+    before, after = moved or (np.eye(4), np.eye(4))
+    base_from_flange = before @ targets.base_from_tool @ invert(flange_from_tool) @ after
     corrected = correct(
         arm,
         base_from_flange,

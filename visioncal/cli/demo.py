@@ -1,11 +1,12 @@
 """`visioncal demo`; with `--live` it drives a simulated cell by the real client library."""
 
 import shutil
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import typer
 
 from visioncal.calibration.run import run
 from visioncal.cli.console import (
@@ -18,6 +19,8 @@ from visioncal.cli.console import (
 )
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.record import check_all, record_driven, say_line
+from visioncal.cli.recover import recover_command
+from visioncal.cli.result_options import RecoverOptions
 from visioncal.cli.session_options import DemoOptions
 from visioncal.cli.summary import print_summary, truth_rows
 from visioncal.core.extras import client_library
@@ -38,11 +41,13 @@ from visioncal.live.simulated.cell import Bench
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, Truth, read_truth, simulate, truth_path, write_session
-from visioncal.simulation.arms import forward
+from visioncal.simulation.arms import arm_named, forward
 from visioncal.simulation.records import truth_of, write_truth
 
 # The default speed of a UR's program; nobody stands beside this one.
 _TAKING = CaptureOptions(speed=1.05, acceleration=1.4)
+# A rehearsed slip of an encoder: of the elbow, by a tooth of its gear.
+_SLIPPED, _SLIP_DEG = 2, 0.4
 
 
 def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
@@ -62,7 +67,11 @@ def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
     plan.parent.mkdir(parents=True, exist_ok=True)
     # From the begin, so that the next demonstration replaces one that was interrupted.
     write_truth(session, truth_of(bench.truth))
-    planned = _planned(bench.known, stops, seed, plan)
+    _drive(bench, _planned(bench.known, stops, seed, plan), session)
+
+
+def _drive(bench: Bench, planned: PlanFile, session: Path) -> None:
+    """Drives a simulated arm to planned stops, and records them."""
     # The arm begins so near to the first stop, as if guided there by hand [rad].
     bench.start(planned.stops[0].q + 2e-3)
     with closing(bench):
@@ -139,6 +148,24 @@ def demo_command(options: DemoOptions) -> None:
     say(f"Open {result / 'report.html'} in a browser to see it all.")
     agrees = squared <= limit
     report_written(written, status=exit_status(done.calibration.verdict) if agrees else EXIT_BAD)
+    if options.fault is not None:
+        _rehearse(options, result)
+
+
+def _rehearse(options: DemoOptions, result: Path) -> None:
+    """Lets a joint's encoder slip, and recovers the calibration as a user does."""
+    folder = options.out / "recovery"
+    shutil.rmtree(folder, ignore_errors=True)
+    answer(f"the encoder of joint {_SLIPPED + 1} slips by {_SLIP_DEG:g} deg")
+    asked = RecoverOptions(folder=folder, against=result)
+    # Ends where the stops are to be recorded.
+    with suppress(typer.Exit):
+        recover_command(asked)
+    slip_rad = np.zeros(len(arm_named("ur5e").offset))
+    slip_rad[_SLIPPED] = np.deg2rad(_SLIP_DEG)
+    bench = Bench(options.seed, tuple(slip_rad.tolist()))
+    _drive(bench, read_plan(folder / "plan"), folder / "stops")
+    recover_command(asked)
 
 
 def chi_square(calibration: Calibration, truth: Truth) -> tuple[float, float]:

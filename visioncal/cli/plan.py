@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -67,8 +68,16 @@ class Source:
     session: Session | None = None
 
 
-def plan_command(options: PlanOptions) -> None:
-    """Runs `visioncal plan`."""
+def plan_command(options: PlanOptions, session: Path | None = None) -> str:
+    """Runs `visioncal plan`.
+
+    Args:
+        options: The options.
+        session: Where a recovery records the stops, for which new ones are better than no way.
+
+    Returns:
+        The command that records stops of a calibration.
+    """
     limits = Limits(
         math.radians(options.margin_deg),
         options.distance_m,
@@ -82,8 +91,7 @@ def plan_command(options: PlanOptions) -> None:
     purpose_of(options.purpose, "--for")
     start, words = chosen_part(find_source(options.source), options)
     if options.to_verify:
-        _plan_to_verify(options, start, words, (limits, boxes))
-        return
+        return _plan_to_verify(options, start, words, (limits, boxes), session)
     with shown_progress(quiet=options.as_json) as progress:
         cell, begun = _begin(start, words, (limits, boxes), progress)
         # Cosine between the z axes of board and base.
@@ -101,9 +109,12 @@ def plan_command(options: PlanOptions) -> None:
     else:
         _report(plan)
     report_written(written, quiet=options.as_json)
+    return ""
 
 
-def _plan_to_verify(options: PlanOptions, start: Source, words: PlanOptions, kept: Kept) -> None:
+def _plan_to_verify(
+    options: PlanOptions, start: Source, words: PlanOptions, kept: Kept, session: Path | None
+) -> str:
     """Plans to stand again at stops of a calibration; their table alone if no way is known."""
     calibration = start.calibration
     if calibration is None:
@@ -119,11 +130,13 @@ def _plan_to_verify(options: PlanOptions, start: Source, words: PlanOptions, kep
     if spread.q is not None and calibration.robot and (words.target or "" in targets):
         # Not all candidates have a free way to each other.
         more = stops_to_repeat(calibration, start.session, 4 * count)
-        with shown_progress(quiet=options.as_json) as progress:
+        for postures in (more.q,) if session is None else (more.q, None):
             try:
-                cell = cell_of(start, words, kept)
-                request = replace(_request(options, cell), count=count)
-                plan = make_plan(cell, request, postures=more.q, progress=progress)
+                with shown_progress(quiet=options.as_json) as progress:
+                    cell = cell_of(start, words, kept)
+                    request = replace(_request(options, cell), count=count)
+                    plan = make_plan(cell, request, postures=postures, progress=progress)
+                break
             except DataError as error:
                 warn(f"the way between calibrated stops is not planned: {error.message}")
     if plan is None:
@@ -135,14 +148,16 @@ def _plan_to_verify(options: PlanOptions, start: Source, words: PlanOptions, kep
         record = f"--arm {arm} --plan {options.out}"
         document = plan_document(plan, {"kind": start.words})
         written = write_plan(options.out, plan, document)
+    record = f"visioncal record {record} --camera uvc:0 -o {quote(str(session or 'monday'))}"
     if options.as_json:
         print_json(document)
-    else:
+    elif session is None:
         of_views = "" if plan else f", of views {listed([*map(str, spread.views)])}"
         answer(f"{count} stops at postures of {calibration.session_name}{of_views}:")
-        answer(f"  visioncal record {record} --camera uvc:0 -o monday")
+        answer(f"  {record}")
         answer(f"  visioncal verify monday --against {options.source}")
     report_written(written, quiet=options.as_json)
+    return record
 
 
 def _request(stops: PlanOptions, cell: PlanCell) -> PlanRequest:

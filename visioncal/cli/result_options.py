@@ -32,6 +32,7 @@ from visioncal.cli.options import (
 from visioncal.cli.parsing import FORMS, POSE, serial_in, views_in
 from visioncal.cli.session_options import RobotPoseOptions
 from visioncal.core.choices import SITE_FILE, UNITS_M, WIDEST_RAD, ActKind, Convention, SolverName
+from visioncal.core.limits import RecoveryLimits
 from visioncal.interchange.outputs import REPORT, VERIFY
 
 
@@ -176,6 +177,37 @@ class GuardOptions(PartOptions):
         min=0.01,
         max=10.0,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecoverOptions(PartOptions, ActOptions):
+    """Recover a calibration after a knock: new stops, the cause, and a new zero or calibration.
+
+    FOLDER holds the whole act: started again, it goes on where it was ended. It drives nothing:
+    where stops are to be recorded, it says how. A third of them is held back, and proves the
+    result. Exit status 0: recovered and proven, or nothing has changed; 3: the cause is not known,
+    or the proof fails; 2: it cannot go on yet, for the reason given.
+    """
+
+    folder: Path = argument(
+        "A folder for the act; the same one to go on.", metavar="FOLDER", file_okay=False
+    )
+    against: Path = against_option()
+    stops: Path | None = option("A session with new stops; else FOLDER/stops.")
+    count: int = option(
+        "How many stops.", default=RecoveryLimits.stops, min=RecoveryLimits.fewest, max=200
+    )
+    cause: list[str] | None = option(
+        "What happened, where stops cannot tell; may be repeated. base: the base moved, away from "
+        "all that stands around it; mount: camera and tools are on another mount.",
+        metavar="camera|board|base|mount|'joint N'",
+    )
+    targets: Path | None = option("Also convert a table of targets, as correct does.")
+    tool: str | None = option("Frame of the targets: a tool; else the flange.", needs="targets")
+    to: list[str] | None = option(
+        "Also export in a format, as ur; may be repeated.", metavar="FORMAT"
+    )
+    force: bool = force_bad()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -75,6 +75,9 @@ class DemoOptions:
     views: int = option("Number of views.", default=20, min=5, max=200)
     seed: int = seed_option()
     live: bool = flag("Plan and record the stops, with a UR's client library and a simulated arm.")
+    fault: Literal["encoder-slip"] | None = option(
+        "With --live: then an encoder slips, and the calibration is recovered.", needs="live"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

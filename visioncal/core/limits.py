@@ -96,6 +96,17 @@ class CheckLimits:
 
 
 @dataclass(frozen=True)
+class RecoveryLimits:
+    """Numbers of stops of a recovery."""
+
+    # One stop in so many is held back for the proof, in turn: three of the fewest, as camera and
+    # board together explain any two.
+    held_back_each: int = 3
+    fewest: int = 9  # The others then are no fewer than a check needs.
+    stops: int = 15  # What is asked for.
+
+
+@dataclass(frozen=True)
 class DynamicsLimits:
     """Limits on identified dynamics."""
 

@@ -95,6 +95,8 @@ class HypothesisEvidence:
     likelihood: float  # Logarithm of its marginal likelihood.
     values: FloatArray  # (p,) its unknowns, by the stops alone.
     covariance: FloatArray  # (p, p) of these.
+    # (p, k) covariance of their errors with those of the belief's unknowns, which stay as they are.
+    with_unknowns: FloatArray
     noise_factor: float  # Most likely factor on the noise.
     misfit: float  # Squared Mahalanobis distance that the cause leaves unexplained.
     freedom: int  # Degrees of freedom of the misfit.
@@ -136,6 +138,7 @@ def evidence_of(
         float(np.logaddexp.reduce(scores) - np.log(len(sizes_m))),
         mean,
         covariance,
+        -covariance @ white.jacobian.T @ white.by_unknowns,
         likeliest[0],
         misfit,
         len(remaining) - len(mean),
@@ -150,6 +153,7 @@ class _White:
     residuals: FloatArray
     jacobian: FloatArray
     log_det: float  # Logarithm of the determinant of the covariance that was taken out.
+    by_unknowns: FloatArray  # (6 n, k) covariance of the residuals with the belief's unknowns.
 
     def score(self, sigmas: FloatArray, freedom: float) -> float:
         """Log marginal likelihood for (p,) prior sigmas, up to a constant common to all causes."""
@@ -201,7 +205,7 @@ def _whitened(
         covariance = sensor + (weights[:, None, :, None] * products).reshape(size, size)
         jacobian, by_noise = by_unknowns.reshape(end, -1), belief.covariance
         residuals = linear.residuals.reshape(-1) - by_cause @ values
-        total = covariance[:end, :end]
+        total, lasting = covariance[:end, :end], np.zeros((end, known))
         if again is not None:
             by_noise = again.by_noise
             cross = covariance[end:, :end]
@@ -213,12 +217,14 @@ def _whitened(
             variances, vectors = np.linalg.eigh(belief.covariance - by_noise)
             root = elsewhere @ vectors * np.sqrt(np.maximum(variances, 0.0))
             total += root @ root.T
+            lasting = root @ (vectors * np.sqrt(np.maximum(variances, 0.0))).T
             jacobian = jacobian - gain @ by_unknowns[repeats].reshape(size - end, -1)
         root = cholesky(total + jacobian @ by_noise @ jacobian.T, lower=True)
         whitened[factor, new_share] = _White(
             solve_triangular(root, residuals, lower=True),
             solve_triangular(root, by_cause, lower=True),
             2.0 * float(np.log(np.diag(root)).sum()),
+            solve_triangular(root, jacobian @ by_noise + lasting, lower=True),
         )
     return whitened
 

@@ -89,15 +89,17 @@ def _simultaneous(kind: str, one: ChangeHypothesis, other: ChangeHypothesis) -> 
     )
 
 
+def nominal_model(predicted: PredictedStops, prior: CalibrationPrior) -> ArmModel | None:
+    """The nominal arm, where none was calibrated; None where the robot is unknown."""
+    robot, matched = prior.calibration.calibrated_robot, predicted.observed.reported.matched
+    reported = np.eye(4) if matched is None else matched.flange_from_reported
+    return None if robot is None else ArmModel(robot, reported, {}, np.zeros(0))
+
+
 def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[ChangeHypothesis]:
     """An offset of each joint, and a common scale of all lengths."""
-    model, robot = prior.model, prior.calibration.calibrated_robot
+    model = prior.model or nominal_model(predicted, prior)
     q = predicted.observed.arm_at_stops.joints_rad
-    if model is None and robot is not None:
-        # The nominal arm, where none was calibrated.
-        matched = predicted.observed.reported.matched
-        reported = np.eye(4) if matched is None else matched.flange_from_reported
-        model = ArmModel(robot, reported, {}, np.zeros(0))
     if model is None or q is None:
         return
     offsets, arm = model.columns("offsets", q), model.robot

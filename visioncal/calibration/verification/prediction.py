@@ -82,7 +82,10 @@ def predict_stops(
     session, calibrated = _with_calibrated_targets(session, prior), prior.calibration.robot
     if calibrated is not None:
         if session.robot_document is not None:
-            check_robot(session, Robot.from_document(session.robot_document), calibrated)
+            stated, arm = Robot.from_document(session.robot_document), prior.calibration.arm
+            # A recording by a plan of the calibrated arm names that.
+            if arm is None or arm.robot is None or not _move_alike(stated, arm.robot):
+                check_robot(session, stated, calibrated)
         # The calibrated robot has its base in the frame of the poses.
         session = replace(session, robot_document=calibrated.document)
     run = _STAGES["detect"](_STAGES["robot"](RunState(session, progress)))
@@ -260,19 +263,25 @@ def _differences(prior: CalibrationPrior, name: str, target: Target) -> list[str
     ]
 
 
+def _move_alike(stated: Robot, calibrated: Robot) -> bool:
+    """Whether both models move their flanges alike."""
+    if stated.joint_count != calibrated.joint_count:
+        return False
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (5, calibrated.joint_count))
+    # Motions are compared: the calibrated base may have been moved to the frame of the poses.
+    ours, theirs = (robot.base_from_flange(q) for robot in (calibrated, stated))
+    between = [invert(array[0]) @ array for array in (ours, theirs)]
+    return bool(np.abs(log(invert(between[0]) @ between[1])).max() < _ONE_ROBOT)
+
+
 def check_robot(session: Session, stated: Robot, calibrated: Robot) -> None:
     """Refuses a robot other than the calibration's, by the motion of its flange.
 
     Raises:
         DataError: They differ.
     """
-    if stated.joint_count == calibrated.joint_count:
-        q = np.random.default_rng(0).uniform(-1.0, 1.0, (5, calibrated.joint_count))
-        # Motions are compared: the calibrated base may have been moved to the frame of the poses.
-        ours, theirs = (robot.base_from_flange(q) for robot in (calibrated, stated))
-        between = [invert(array[0]) @ array for array in (ours, theirs)]
-        if np.abs(log(invert(between[0]) @ between[1])).max() < _ONE_ROBOT:
-            return
+    if _move_alike(stated, calibrated):
+        return
     raise DataError(
         f"session {session.name!r} names robot {stated.name}, which moves its flange otherwise: it "
         f"is another robot, or another tip, than the calibrated {calibrated.name}.",

@@ -99,6 +99,8 @@ class SimulatedCamera:
 class Bench:
     """A simulated cell with a camera on the flange of a UR; the same seed gives the same cell.
 
+    Where joints slipped, each stands by `slip_rad` beyond what its encoder reads.
+
     Once started, its controller is another process, and its camera renders the truth. It
     notes the truth of each view.
 
@@ -108,9 +110,9 @@ class Bench:
         views: The arm's true state in the middle of each view's exposure, with the view.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, slip_rad: tuple[float, ...] = ()) -> None:
         options = CellOptions(robot=_ROBOT, views=1, cut_views=0.0, seed=seed)
-        self._options = ControllerOptions(robot=_ROBOT, seed=seed, errors=_WORN)
+        self._options = ControllerOptions(robot=_ROBOT, seed=seed, errors=_WORN, slip_rad=slip_rad)
         cell = simulate(options)
         true_arm = replace(cell.robot, true_arm=self._options.true_arm)
         self.truth = replace(cell, robots={"": true_arm})

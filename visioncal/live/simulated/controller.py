@@ -92,6 +92,8 @@ class ControllerOptions:
             dh_sigma_m=3e-4, dh_sigma_rad=3e-4, offset_sigma_rad=5e-4
         )
     )
+    # By how much each joint stands beyond what its encoder reads [rad]; empty for nothing.
+    slip_rad: tuple[float, ...] = ()
     q: tuple[float, ...] = _HOME  # Joint angles at the start [rad].
     # Tool offset that is set: x, y, z [m] and a rotation vector [rad].
     tcp: tuple[float, ...] = (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)
@@ -109,8 +111,8 @@ class ControllerOptions:
     @property
     def true_arm(self) -> DhArm:
         """True arm, with errors."""
-        arm = replace(self.errors, robot=self.robot)
-        return arm.built(np.random.default_rng([self.seed, 2]))
+        arm = replace(self.errors, robot=self.robot).built(np.random.default_rng([self.seed, 2]))
+        return replace(arm, offset=arm.offset + np.array(self.slip_rad or 0.0))
 
 
 class TrueState(NamedTuple):

@@ -51,10 +51,14 @@ class CalibratedArm:
 
     @classmethod
     @typed
-    def of(cls, calibration: Calibration) -> Self:
-        """Reads both models from a calibration; raises DataError."""
+    def of(cls, calibration: Calibration, *, or_nominal: bool = False) -> Self:
+        """Reads both models from a calibration; raises DataError.
+
+        With `or_nominal`, the arm may be the controller's own.
+        """
         nominal, real = calibration.robot, calibration.calibrated_robot
-        if nominal is None or real is None or not calibration.arm_is_calibrated:
+        is_known = or_nominal or calibration.arm_is_calibrated
+        if nominal is None or real is None or not is_known:
             raise _without_arm(calibration)
         if real.joint_count < _LEAST_JOINTS:
             raise DataError(

@@ -1,0 +1,219 @@
+"""`visioncal recover`: one act, which can be ended after each step, and gone on with."""
+
+import shlex
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import typer
+
+from visioncal.calibration.recovery import causes_found, moved_along, parted, recover
+from visioncal.calibration.run import Run
+from visioncal.calibration.verification import Check, verdict_of, verify
+from visioncal.cli.console import (
+    EXIT_BAD,
+    EXIT_NO_RESULT,
+    answer,
+    exit_status,
+    report_written,
+    say,
+    warn,
+    with_run_paths,
+)
+from visioncal.cli.correct import correct_command
+from visioncal.cli.export import export_command
+from visioncal.cli.history import enter
+from visioncal.cli.plan import plan_command
+from visioncal.cli.progress import shown_progress
+from visioncal.cli.result_options import CorrectOptions, ExportOptions, RecoverOptions
+from visioncal.cli.session_options import PlanOptions
+from visioncal.cli.summary import print_steps, print_verdict
+from visioncal.core.errors import DataError
+from visioncal.core.files import write_json
+from visioncal.core.number_format import counted
+from visioncal.core.verdict import Verdict
+from visioncal.interchange.outputs import write_outputs
+from visioncal.interchange.result_files import content_of, load_result
+from visioncal.results import Calibration, select_matching
+from visioncal.results.history import entries_of
+from visioncal.session import Session
+
+_ACT, _TABLE = "recover.json", "views.csv"
+
+
+def _opened(folder: Path, old: Calibration) -> dict[str, Any]:
+    """What recover.json says of a recovery, or its begin; raises DataError."""
+    known, against = content_of(folder / _ACT), [old.session_sha256, old.created]
+    if known.get("against", against) != against:
+        raise DataError(
+            f"{folder} is the recovery of another calibration than that of "
+            f"{old.session_name!r}, {old.created}.",
+            culprits=[str(folder), "--against"],
+            next_step="Name that one, or another folder.",
+        )
+    return {"schema": 1, "against": against, "minutes": {}} | known
+
+
+@contextmanager
+def _step(options: RecoverOptions, facts: dict[str, Any], name: str) -> Iterator[None]:
+    """Writes down how long a step took, once it is done."""
+    begun = time.monotonic()
+    yield
+    facts["minutes"][name] = round((time.monotonic() - begun) / 60.0, 3)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    write_json(options.folder / _ACT, facts)
+
+
+def recover_command(options: RecoverOptions) -> None:
+    """Runs `visioncal recover`.
+
+    Raises:
+        DataError: Something cannot be read or written, or a step is impossible.
+        VerdictError: The recovered calibration is bad, and was to be exported.
+    """
+    loaded, result = load_result(options.against), options.folder / "result"
+    path = options.stops or options.folder / "stops"
+    facts = _opened(options.folder, loaded)
+    session, old = select_matching(_recorded(options, facts, path), loaded, options.choice)
+    stated = facts["stated"] = options.cause or facts.get("stated", [])
+    causes = tuple(stated)
+    with (
+        _step(options, facts, "result"),
+        shown_progress(quiet=False) as progress,
+        with_run_paths(path),
+    ):
+        check = None
+        if old.joint_fit is not None:
+            check = verify(parted(session)[0], old, progress=progress)
+            verdict = verdict_of(check).with_paths(path, options.against, _again())
+            if check.passed and not stated:
+                answer(f"nothing has changed: {options.against} holds, by {verdict.top[0]}")
+                raise typer.Exit
+            causes = causes or causes_found(check)
+            if check.explained and not causes:
+                _ask_cause(check, verdict)
+            if not stated:
+                _ask_side(options, old, causes)
+        if not causes:
+            say("no single change explains the stops: they are calibrated on their own")
+        new = recover(session, old, causes, check)
+        progress("write", 0, 1)
+        written = write_outputs(result, session, Run(new, ()))
+    enter(options, path, entries_of(new), result)
+    print_verdict(new.verdict, str(result))
+    for joint in [cause for cause in causes if cause.startswith("joint")]:
+        answer(
+            f"Or master {joint} on the controller, by the angle above: then {options.against} "
+            f"holds again, and {result} does not. It is for the controller as it is now."
+        )
+    base_moved, flange_moved = moved_along(old, new, causes)
+    if options.targets is not None:
+        with _step(options, facts, "targets"):
+            to_correct = CorrectOptions(
+                targets=options.targets,
+                calibration=result,
+                out=_cleared(options.folder / "targets.csv"),
+                tool=options.tool,
+                payload_m=(0.0, 0.0, 0.0),
+                force=options.force,
+            )
+            # A tool's targets find its new mount in the result.
+            by_flange = flange_moved if options.tool is None else np.eye(4)
+            correct_command(to_correct, (base_moved, by_flange))
+    for name in options.to or ():
+        with _step(options, facts, f"export {name}"):
+            out = _cleared(options.folder / "exports" / name)
+            export_command(ExportOptions(source=result, to=name, out=out, force=options.force))
+    minutes = facts["minutes"]
+    steps = ", ".join(f"{name} {value:.2f}" for name, value in minutes.items())
+    answer(f"{steps}; {sum(minutes.values()):.2f} in all", "minutes: ")
+    report_written(written, status=exit_status(new.verdict))
+
+
+def _cleared(file: Path) -> Path:
+    """A file of the act, without what an earlier command wrote."""
+    file.parent.mkdir(exist_ok=True)
+    file.unlink(missing_ok=True)
+    return file
+
+
+def _recorded(options: RecoverOptions, facts: dict[str, Any], path: Path) -> Session:
+    """The recorded stops; without them, plans them, says how to record, and exits."""
+    table, planned = path if path.suffix == ".rrd" else path / _TABLE, options.folder / "plan"
+    session = Session.load(path) if table.is_file() else None
+    if session is not None and len(session.views) >= options.count:
+        if options.stops is None and planned.is_dir():
+            taken_s = table.stat().st_mtime - planned.stat().st_mtime
+            facts["minutes"]["stops"] = round(max(taken_s, 0.0) / 60.0, 3)
+        return session
+    if options.stops is None and "record" not in facts:
+        asked = PlanOptions(
+            **{name: getattr(options, name) for name in ("camera", "robot", "target")},
+            source=str(options.against),
+            to_verify=True,
+            stops=options.count,
+            out=planned,
+        )
+        with _step(options, facts, "plan"):
+            try:
+                facts["record"] = plan_command(asked, path)
+            except DataError as error:
+                warn(f"no stops are planned: {error.message}")
+    lines = [
+        f"{counted(options.count, 'stop')} are next; keep clear: an arm whose joint slipped",
+        "stands elsewhere than it reads. Record them, and type the same command again:",
+    ]
+    record = facts.get("record", f"visioncal record --page -o {shlex.quote(str(path))}")
+    if session is not None:
+        lines = [
+            f"{len(session.views)} of {options.count} stops are in {path}. Record the others,",
+            "and type the same command again; or go on with fewer by --count.",
+        ]
+        record += " --resume"
+    return _exit_with([*lines, f"  {record}"], EXIT_NO_RESULT)
+
+
+def _ask_cause(check: Check, verdict: Verdict) -> NoReturn:
+    """Says what cannot be told apart, or not recovered, and exits."""
+    kinds = ("camera", "board", "joint")
+    alike = [[change.name] for change in check.named if change.cause.kind in kinds]
+    how = "Look which of them it is, and say so:"
+    if len(check.named) == 1 or not alike:
+        print_steps(verdict.next_steps)
+        alike, how = [], "Or record more stops, as --count 30, or name each --cause."
+    _exit_with(["what to recover is not known:", *verdict.top, how], EXIT_BAD, alike)
+
+
+def _ask_side(options: RecoverOptions, old: Calibration, causes: Sequence[str]) -> None:
+    """Asks whether all else moved along with a camera or board, where targets or tools may."""
+    on_flange = "camera" if old.mount == "eye-in-hand" else "board"
+    along = [
+        at if at.startswith("joint") else "mount" if at.startswith(on_flange) else "base"
+        for at in causes
+    ]
+    if [*causes] != along and (options.targets or old.frames):
+        question = [
+            f"{' and '.join(causes)} moved: alone, or with the robot's base or the tool's mount,",
+            "so that targets, tools and fixtures of that side have to follow? Say so, as",
+        ]
+        _exit_with(question, EXIT_NO_RESULT, [causes, along])
+
+
+def _exit_with(lines: Sequence[str], status: int, stated: Sequence[Sequence[str]] = ()) -> NoReturn:
+    """Says what is needed to go on, with the command by each choice of causes, and exits."""
+    for line in lines:
+        answer(line)
+    for causes in stated:
+        options = chain.from_iterable(("--cause", cause) for cause in causes)
+        answer(f"  {shlex.join([*_again(), *options])}")
+    raise typer.Exit(status)
+
+
+def _again() -> list[str]:
+    """The typed command."""
+    return ["visioncal", *sys.argv[1:]]
