@@ -129,7 +129,7 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     command = ("recover", act, "--against", out)
     begun = visioncal(*command)
     assert begun.status == 2
-    assert f"visioncal record --arm manual --target BOARD --camera uvc:0 -o {stops}" in begun.out
+    assert f"visioncal record --arm manual --target BOARD --camera uvc:0 -o {stops}" in begun.err
     # The recording was cut off after nine stops, and is whole later.
     stops.mkdir()
     (stops / "session.toml").write_text((cell / "moved/session.toml").read_text())
@@ -137,13 +137,13 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     (stops / "views.csv").write_text("".join(rows[:10]))
     cut = visioncal(*command)
     assert cut.status == 2
-    assert "9 of 15 stops" in cut.out
+    assert "9 of 15 stops" in cut.err
     (stops / "views.csv").write_text("".join(rows))
     asked = ("--targets", stops / "views.csv", "--to", "ur")
     sided = visioncal(*command, *asked)
     assert sided.status == 2
-    assert "--cause camera\n" in sided.out
-    assert "--cause mount\n" in sided.out
+    assert "--cause camera\n" in sided.err
+    assert "--cause mount\n" in sided.err
     assert not (act / "result").exists()
     done = visioncal(*command, *asked, "--cause", "camera").good()
     assert "the camera moved by 3 mm" in done.out

@@ -17,7 +17,6 @@ from visioncal.calibration.run import Run
 from visioncal.calibration.verification import Check, verdict_of, verify
 from visioncal.cli.console import (
     EXIT_BAD,
-    EXIT_NO_RESULT,
     answer,
     exit_status,
     report_written,
@@ -164,18 +163,17 @@ def _recorded(options: RecoverOptions, facts: dict[str, Any], path: Path) -> Ses
                 facts["record"] = plan_command(asked, path)
             except DataError as error:
                 warn(f"no stops are planned: {error.message}")
-    lines = [
-        f"{counted(options.count, 'stop')} are next; keep clear: an arm whose joint slipped",
-        "stands elsewhere than it reads. Record them, and type the same command again:",
-    ]
+    reason = f"{counted(options.count, 'stop')} are next."
+    how = (
+        "Keep clear: an arm whose joint slipped stands elsewhere than it reads. Record them, and "
+        "type the same command again:"
+    )
     record = facts.get("record", f"visioncal record --page -o {shlex.quote(str(path))}")
     if session is not None:
-        lines = [
-            f"{len(session.views)} of {options.count} stops are in {path}. Record the others,",
-            "and type the same command again; or go on with fewer by --count.",
-        ]
+        reason = f"{len(session.views)} of {options.count} stops are in {path}."
+        how = "Record the others, and type the same command again; or go on with fewer by --count."
         record += " --resume"
-    return _exit_with([*lines, f"  {record}"], EXIT_NO_RESULT)
+    raise DataError(reason, culprits=[str(path)], next_step=f"{how}\n  {record}")
 
 
 def _ask_cause(check: Check, verdict: Verdict) -> NoReturn:
@@ -186,7 +184,9 @@ def _ask_cause(check: Check, verdict: Verdict) -> NoReturn:
     if len(check.named) == 1 or not alike:
         print_steps(verdict.next_steps)
         alike, how = [], "Or record more stops, as --count 30, or name each --cause."
-    _exit_with(["what to recover is not known:", *verdict.top, how], EXIT_BAD, alike)
+    for line in ("what to recover is not known:", *verdict.top, how, *map(_with_causes, alike)):
+        answer(line)
+    raise typer.Exit(EXIT_BAD)
 
 
 def _ask_side(options: RecoverOptions, old: Calibration, causes: Sequence[str]) -> None:
@@ -197,21 +197,18 @@ def _ask_side(options: RecoverOptions, old: Calibration, causes: Sequence[str]) 
         for at in causes
     ]
     if [*causes] != along and (options.targets or old.frames):
-        question = [
-            f"{' and '.join(causes)} moved: alone, or with the robot's base or the tool's mount,",
-            "so that targets, tools and fixtures of that side have to follow? Say so, as",
-        ]
-        _exit_with(question, EXIT_NO_RESULT, [causes, along])
+        raise DataError(
+            f"{' and '.join(causes)} moved: alone, or with the robot's base or the tool's mount, "
+            "so that targets, tools and fixtures of that side have to follow?",
+            culprits=["--cause"],
+            next_step="\n".join(["Say so, as", *map(_with_causes, (causes, along))]),
+        )
 
 
-def _exit_with(lines: Sequence[str], status: int, stated: Sequence[Sequence[str]] = ()) -> NoReturn:
-    """Says what is needed to go on, with the command by each choice of causes, and exits."""
-    for line in lines:
-        answer(line)
-    for causes in stated:
-        options = chain.from_iterable(("--cause", cause) for cause in causes)
-        answer(f"  {shlex.join([*_again(), *options])}")
-    raise typer.Exit(status)
+def _with_causes(causes: Sequence[str]) -> str:
+    """The typed command with causes."""
+    options = chain.from_iterable(("--cause", cause) for cause in causes)
+    return f"  {shlex.join([*_again(), *options])}"
 
 
 def _again() -> list[str]:
