@@ -25,8 +25,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri
 
+from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.model_evidence import SIZES_M
@@ -44,7 +44,7 @@ _WIDEST_M = 0.1
 _FRESH = 0.4
 # Squared length of an innovation that noise exceeds in one look of a hundred: the largest that
 # counts in full.
-_FAR = float(chdtri(6, 0.01))
+_FAR = float(chi2_limit(0.01, 6))
 # Looks by which the noise is known at first, after which it is forgotten, and its proportions.
 _STATED, _MEMORY, _SOON = 200.0, 3000.0, 1000.0
 # Postures that are kept, and the distance within which they are one [rad, and 2 rad a metre].
@@ -272,16 +272,27 @@ def weighed(
         columns = np.array(kind.columns)
         usual = float(np.diagonal(state.usual)[columns] @ units[columns] ** 2)
         sizes_m = np.array(SIZES_M) if is_raw else np.sqrt(_SHIFTS / max(usual, 1e-12))
-        scale = (sizes_m[:, None] * units[columns])[:, None]
-        own = every[:, columns[:, None], columns] * scale[..., None] * scale[..., None, :]
-        inner, scaled = np.eye(len(columns)) + own, scale * slopes[:, columns]
-        squares = np.sum(scaled * np.linalg.solve(inner, scaled[..., None])[..., 0], axis=2)
-        ratios = 0.5 * (squares - np.linalg.slogdet(inner)[1])
+        sizes = sizes_m[:, None] * units[columns]
+        information = every[:, columns[:, None], columns]
+        ratios = log_ratios(information, slopes[:, columns], sizes)
         # Of what looks do not show there is no evidence yet: of another board, of joints.
-        is_shown = np.trace(own[-1], axis1=1, axis2=2) > _SHOWN
+        is_shown = np.diagonal(information, axis1=1, axis2=2) @ sizes[-1] ** 2 > _SHOWN
         mean = np.logaddexp.reduce(ratios, axis=0) - np.log(len(sizes_m))
         scores[at] = np.where(is_shown, mean, -np.inf) + np.log(kind.prior)
     return scores + np.log(state.born[:, 3])
+
+
+def log_ratios(information: FloatArray, gradient: FloatArray, sizes: FloatArray) -> FloatArray:
+    """(s, c) log likelihood ratios of changes to none, by prior standard deviations (s, q).
+
+    Each of c candidates has the information (q, q) of its innovations on a change of q unknowns,
+    and their gradient (q,); the change is integrated out.
+    """
+    scale = sizes[:, None]
+    inner = np.eye(sizes.shape[1]) + information * scale[..., None] * scale[..., None, :]
+    scaled = scale * gradient
+    squares = np.sum(scaled * np.linalg.solve(inner, scaled[..., None])[..., 0], axis=2)
+    return np.asarray(0.5 * (squares - np.linalg.slogdet(inner)[1]))
 
 
 def estimate(

@@ -18,9 +18,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtr, chdtri
+from scipy.special import chdtr
 
+from visioncal.calibration.verification.guard_detector import log_ratios
 from visioncal.core.errors import DataError
+from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Image, Mask
 from visioncal.results import Calibration
@@ -92,7 +94,7 @@ class SceneWatch:
         off, spread, size = turn / self._unit - expected, noise + known, len(turn)
         length2 = max(float(off @ np.linalg.solve(spread, off)), 1e-12)
         # One look may be of a thing that moved: however far off it is, it is bounded.
-        bound = float(chdtri(size, _RARE))
+        bound = float(chi2_limit(_RARE, size))
         off *= min(1.0, float(np.sqrt(bound / length2)))
         # Without the bound a ratio would be one in the mean; the longest looks make most of it.
         grown = 1.0 + _SIZES_PX**2 / np.linalg.det(spread) ** (1.0 / size)
@@ -118,12 +120,8 @@ class SceneWatch:
             gain = after @ np.linalg.inv(prior + after[0])
             information += after - gain @ after
             score += by_after - gain @ by_after[0]
-        ratios = []
-        for size in _SIZES_PX:
-            posterior = information + np.eye(len(self._unit)) / size**2
-            solved = np.linalg.solve(posterior, score[:, :, None])[:, :, 0]
-            _, log_det = np.linalg.slogdet(size**2 * posterior)
-            ratios.append(0.5 * (np.sum(score * solved, axis=1) - log_det))
+        sizes_px = np.repeat(_SIZES_PX[:, None], len(self._unit), axis=1)
+        ratios = log_ratios(information, score, sizes_px)
         return float(np.exp(np.minimum(ratios, 600.0)).mean(axis=0).sum())
 
 
