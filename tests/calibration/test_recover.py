@@ -111,6 +111,25 @@ def test_stops_recorded_by_a_plan_of_the_calibrated_arm_are_verified_and_recover
     assert "3 stops held back from a first estimate agree" in new.verdict.findings[0].words
 
 
+def test_a_joint_is_to_be_mastered_where_its_angle_is_proven_and_nothing_else_changed(tmp_path):
+    place, slip = usual("eye-in-hand"), Change(joints_rad=np.deg2rad(0.5) * np.eye(6)[2])
+    stops, out = tmp_path / "my stops", tmp_path / "my out"
+    fresh = again(place.cell, np.random.default_rng(3), slip, 9)
+    cell_session(fresh, "stops", seen="corners").save(stops)
+    out.mkdir()
+    place.calibration.save(out / "calibration.json")
+    act = ("recover", tmp_path / "act", "--against", out, "--stops", stops, "--count", 9)
+    mastered = visioncal(*act).good().out
+    assert f"Or master joint 3 on the controller, by the angle above: then {out} holds" in mastered
+    assert "only where: The transforms belong to the calibrated arm" in mastered
+    both = visioncal(*act, "--cause", "joint 3", "--cause", "camera").good().out
+    assert "Or master" not in both
+    unproven = visioncal(*act, "--cause", "joint 2")
+    assert unproven.status == 3
+    assert "disagree" in unproven.out
+    assert "Or master" not in unproven.out
+
+
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory):
     """A calibrated cell, and later stops of it: as it was, and with the camera moved."""

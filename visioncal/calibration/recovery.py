@@ -30,7 +30,7 @@ from visioncal.core.limits import CheckLimits, RecoveryLimits
 from visioncal.core.number_format import counted, listed
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import Finding, Remedy, Verdict
+from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, remarks
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.model_evidence import (
@@ -111,6 +111,7 @@ def recover(
         DataError: A cause is not possible here, or the stops give no calibration.
     """
     before, without, digest = old.validation.held_out, "", session.digest()
+    warnings: tuple[str, ...] = ()
     if check is not None and old.robot is not None and session.robot_document is not None:
         # What was checked may name the arm as it was: a recording by a plan of that does.
         session = replace(session, robot_document=old.robot.document)
@@ -120,7 +121,7 @@ def recover(
         off, back = rms_of(_seen(proof, proof.residuals)), proof.predicted.views
         new, words = changed(whole, causes, off)
         unrecovered = rms_of(at for at in _seen(whole, whole.residuals) if at.view in back)
-        without = f" {unrecovered.words} without recovering;"
+        without, warnings = f" {unrecovered.words} without recovering;", whole.predicted.warnings
     else:
         proof, new = verify(held, run(fit).calibration), run(session).calibration
         off = rms_of(_seen(proof, proof.residuals))
@@ -138,7 +139,8 @@ def recover(
     # Praise and advice were of the old stops; doubts remain.
     doubts = () if new.verdict.status == "good" else new.verdict.findings
     doubts = tuple(replace(doubt, do=None) for doubt in doubts)
-    verdict = Verdict(new.verdict.status if passed else "bad", (found, *doubts))
+    findings = (found, *doubts, *remarks(warnings, NOTE))
+    verdict = Verdict(new.verdict.status if passed else "bad", findings)
     return replace(new, session_sha256=digest, verdict=verdict)
 
 

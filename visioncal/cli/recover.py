@@ -31,7 +31,7 @@ from visioncal.cli.plan import plan_command
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import CorrectOptions, ExportOptions, RecoverOptions
 from visioncal.cli.session_options import PlanOptions
-from visioncal.cli.summary import print_steps, print_verdict
+from visioncal.cli.summary import print_conditions, print_steps, print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_json
 from visioncal.core.number_format import counted
@@ -89,6 +89,8 @@ def recover_command(options: RecoverOptions) -> None:
         check = None
         if old.joint_fit is not None:
             check = verify(parted(session)[0], old, progress=progress)
+            for words in check.predicted.warnings:
+                warn(words)
             verdict = verdict_of(check).with_paths(path, options.against, _again())
             if check.passed and not stated:
                 answer(f"nothing has changed: {options.against} holds, by {verdict.top[0]}")
@@ -105,9 +107,11 @@ def recover_command(options: RecoverOptions) -> None:
         written = write_outputs(result, session, Run(new, ()))
     enter(options, path, entries_of(new), result)
     print_verdict(new.verdict, str(result))
-    for joint in [cause for cause in causes if cause.startswith("joint")]:
+    print_conditions(new)
+    # A zero of the controller is set by a proven angle alone, and where nothing else changed.
+    if len(causes) == 1 and causes[0].startswith("joint") and new.verdict.status != "bad":
         answer(
-            f"Or master {joint} on the controller, by the angle above: then {options.against} "
+            f"Or master {causes[0]} on the controller, by the angle above: then {options.against} "
             f"holds again, and {result} does not. It is for the controller as it is now."
         )
     base_moved, flange_moved = moved_along(old, new, causes)

@@ -37,12 +37,17 @@ def print_steps(steps: Sequence[Remedy]) -> None:
             answer("", f"     {step.command}")
 
 
+def print_conditions(calibration: Calibration) -> None:
+    """Prints what a result is valid for, unless its verdict says so."""
+    for words in calibration.unstated_conditions:
+        answer(words, "only where: ", "bold yellow")
+
+
 def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     """Prints a result: the verdict first, then the transforms and errors."""
     cell = calibration.cell
     print_verdict(calibration.verdict, calibration.session_name)
-    for words in calibration.unstated_conditions:
-        answer(words, "only where: ", "bold yellow")
+    print_conditions(calibration)
     if cell is not None:
         answer(f"the cell's frame is that of {cell.reference}")
     for name, edge in calibration.edges.items():
