@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ class Outcome:
     title: str  # The verdict in a word or two.
     reasons: tuple[str, ...]  # The likeliest first.
     next_step: str  # What to do; empty for nothing.
-    folder: Path  # Where its files are.
+    folder: Path  # Where its files are; those of a trial are gone.
     views: int  # Number of views of which it is.
     document: dict[str, Any]  # What the command printed; empty where it failed.
 
@@ -31,16 +32,19 @@ class Outcome:
         return self.folder / "report.html"
 
 
-def ask_command(words: Sequence[str], folder: Path, views: int) -> Outcome:
+def ask_command(words: Sequence[str], folder: Path | None, views: int) -> Outcome:
     """Runs a command of visioncal with `--json` as a process of its own, and reads its answer.
 
     Args:
         words: The command and its options, but for its output.
-        folder: Where it writes.
+        folder: Where it writes; None for a trial, which draws nothing and keeps no file.
         views: Number of views of the session.
     """
-    command = [sys.executable, "-m", "visioncal", *words, "-o", str(folder), "--json"]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    with tempfile.TemporaryDirectory() as passing:
+        if folder is None:
+            folder, words = Path(passing) / "trial", (*words, "--no-report", "--no-recording")
+        command = [sys.executable, "-m", "visioncal", *words, "-o", str(folder), "--json"]
+        ended = subprocess.run(command, capture_output=True, text=True, check=False)
     try:
         document = json.loads(ended.stdout)
     except ValueError:

@@ -250,7 +250,7 @@ class _Page:
             with self._outcome:
                 for reason in shown.reasons[:3]:
                     ui.label(reason)
-                # A trial's commands would be of a folder that goes.
+                # A trial's commands would be of a folder that is gone.
                 if now.outcome is not None:
                     if shown.next_step:
                         ui.label(f"Next: {shown.next_step}").classes("font-bold")

@@ -1,7 +1,6 @@
 """A recording that pages watch and steer: one thread owns arm, camera and folder."""
 
 import queue
-import tempfile
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -342,14 +341,11 @@ class Station:
         if not views:
             self._publish(missed="There is no view yet.")
             return
-        folder, words = self._task.result, self._task.command
-        if is_trial:
-            folder = Path(self._open.enter_context(tempfile.TemporaryDirectory())) / "trial"
-            words = (*words, "--no-report", "--no-recording")
+        folder = None if is_trial else self._task.result
         if self._judging is not None:
             # One that is still waiting is superseded; one that runs says how it is so far.
             self._judging.cancel()
-        self._judging = self._judge.submit(ask_command, words, folder, views)
+        self._judging = self._judge.submit(ask_command, self._task.command, folder, views)
         self._judging.add_done_callback(self._answered)
         self._publish(is_judging=not is_trial)
 
