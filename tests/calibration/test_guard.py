@@ -165,21 +165,21 @@ def test_of_the_command_line(tmp_path, monkeypatch):
         done = visioncal("guard", *against)
         return done.status, [json.loads(line) for line in done.out.splitlines()]
 
-    def told(count, start, change=None):
+    def seen(count, start, change=None):
         for look in looks(place, rng, count, change, start):
             corners = np.column_stack([look.corners.ids, look.corners.px]).tolist()
             pose = look.base_from_flange.tolist()
-            told = {"time_s": look.time_s, "base_from_flange": pose, "corners": corners}
-            yield json.dumps({**told, "joints_rad": look.joints_rad.tolist()})
+            line = {"time_s": look.time_s, "base_from_flange": pose, "corners": corners}
+            yield json.dumps({**line, "joints_rad": look.joints_rad.tolist()})
 
-    status, said = sent(*told(20, 0))
+    status, said = sent(*seen(20, 0))
     assert (status, said[-1]["look"], said[-1]["holds"]) == (0, 20, True)
-    status, said = sent("{", "", '{"time_s": 1}', '{"when": 2}', "[]", *told(1, 20))
+    status, said = sent("{", "", '{"time_s": 1}', '{"when": 2}', "[]", "[" * 9999, *seen(1, 20))
     assert (status, said[-1]["look"]) == (2, 21)
-    wrong = ("no JSON", "cam_from_target or", "'when'", "is list")
+    wrong = ("no JSON", "cam_from_target or", "'when'", "is list", "nested deeper")
     for answer, words in zip(said, wrong, strict=False):
         assert words in answer["error"]["message"]
-    status, said = sent(*told(30, 21, Change(camera=knock(rng, 2.0, 0.2))))
+    status, said = sent(*seen(30, 21, Change(camera=knock(rng, 2.0, 0.2))))
     assert (status, said[-1]["holds"], said[-1]["causes"][0]["cause"]) == (3, False, "camera")
     status, said = sent('{"acknowledge": true}')
     assert (status, said) == (0, [{"acknowledged": True}])

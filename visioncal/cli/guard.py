@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from visioncal.calibration.verification.guard import Guard, Look
 from visioncal.calibration.verification.scene_guard import scene_looks
 from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT
 from visioncal.cli.result_options import GuardOptions
+from visioncal.core.documents.jsons import parse_json, parse_stored
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.files import check_values, read_text, write_atomically
+from visioncal.core.files import read_text, write_atomically
 from visioncal.core.transforms import compose
-from visioncal.core.types import Corners, FloatArray
+from visioncal.core.types import Corners
 from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
 from visioncal.session import Session
@@ -25,7 +27,7 @@ from visioncal.vision.boards.imaging import read_image
 
 # A program that is killed loses fewer looks than these of what it has learned.
 _KEPT_EVERY = 50
-_KEYS = ("time_s", "base_from_flange", "cam_from_target", "corners", "joints_rad", "target")
+_KEYS = tuple(each.name for each in fields(Look))
 
 
 def guard_command(options: GuardOptions) -> None:
@@ -36,7 +38,7 @@ def guard_command(options: GuardOptions) -> None:
     calibration = load_result(options.against).chosen(options.choice)
     guard = Guard(calibration, false_alarm_looks=options.false_alarm_looks, slow_mm=options.slow_mm)
     if options.state is not None and options.state.exists():
-        guard.restore(_object(read_text(options.state), str(options.state)))
+        guard.restore(parse_stored(read_text(options.state), str(options.state)))
     holds, is_refused = guard.holds, False
     try:
         for count, answer in enumerate(_answers(guard), 1):
@@ -85,28 +87,20 @@ def _answers(guard: Guard) -> Iterator[dict[str, Any]]:
         if not line.strip():
             continue
         try:
-            document = _object(line, f"line {number}")
+            document = parse_json(line, "the look")
+            if not isinstance(document, dict):
+                kind = type(document).__name__
+                raise DataError(f"the look is {kind}; a JSON object is needed.")
             if document == {"acknowledge": True}:
                 guard.acknowledge()
                 yield {"acknowledged": True}
             else:
-                yield guard.update(_look(document, f"line {number}")).document
+                yield guard.update(_look(document)).document
         except VisioncalError as error:
             yield {"error": {"message": f"line {number}: {error}", "next": error.next_step}}
 
 
-def _object(text: str, label: str) -> dict[str, Any]:
-    try:
-        document = json.loads(text)
-    except ValueError as error:
-        raise DataError(f"{label} is no JSON: {error}.", culprits=[label]) from None
-    check_values(document, label)
-    if not isinstance(document, dict):
-        raise DataError(f"{label} is {type(document).__name__}; a JSON object is needed.")
-    return document
-
-
-def _look(document: dict[str, Any], label: str) -> Look:
+def _look(document: dict[str, Any]) -> Look:
     """A look of a line's JSON object.
 
     Raises:
@@ -114,14 +108,17 @@ def _look(document: dict[str, Any], label: str) -> Look:
     """
     if unknown := [key for key in document if key not in _KEYS]:
         raise DataError(
-            f"{label} has {unknown[0]!r}; the keys are {', '.join(_KEYS)}.", culprits=unknown
+            f"the look has {unknown[0]!r}; the keys are {', '.join(_KEYS)}.", culprits=unknown
         )
     key, corners = "time_s", document.get("corners")
     try:
         content: dict[str, Any] = {"time_s": float(document["time_s"])}
         for key in ("base_from_flange", "cam_from_target"):
             if key in document:
-                content[key] = _pose(document[key])
+                numbers = np.array(document[key], dtype=float)
+                if numbers.shape == (7,):
+                    numbers = compose(Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3])
+                content[key] = numbers
         if "joints_rad" in document:
             key = "joints_rad"
             content[key] = np.array(document[key], dtype=float)
@@ -131,18 +128,11 @@ def _look(document: dict[str, Any], label: str) -> Look:
             content[key] = Corners(0, ids, table[:, 1:], 0.0)
         return Look(target=str(document.get("target", "")), **content)
     except KeyError:
-        raise DataError(f"{label} has no time_s.", culprits=["time_s"]) from None
+        raise DataError("the look has no time_s.", culprits=["time_s"]) from None
     except (TypeError, ValueError) as error:
         raise DataError(
-            f"{label}: {key} cannot be read: {error}.",
+            f"the look's {key} cannot be read: {error}.",
             culprits=[key],
             next_step="Poses are 4 x 4 matrices or x, y, z, qx, qy, qz, qw, in metres; corners are "
             "[number, x, y] in pixels, joints in radians, times in seconds.",
         ) from None
-
-
-def _pose(value: object) -> FloatArray:
-    numbers = np.array(value, dtype=float)
-    if numbers.shape == (7,):
-        return compose(Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3])
-    return numbers

@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtr
 
+from visioncal.calibration.stages.detect import image_of
 from visioncal.calibration.verification.guard_detector import log_ratios
 from visioncal.core.errors import DataError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, Image, Mask
+from visioncal.core.types import FloatArray, Image, Mask, Rejection
 from visioncal.results import Calibration
 from visioncal.session import Session, View
 from visioncal.session.observations import moved
-from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.scene import Registration, nothing, register
 
 # Sizes of changes, as sigmas of each component [px].
@@ -169,19 +169,20 @@ def scene_looks(
     planes = {first.number: scene_plane(calibration, first, plane) for first in firsts}
     # A turn about the axis moves the image's corners.
     unit = np.append(1 / camera.matrix[:2], 2 / np.hypot(*camera.resolution))
-    for distance_m in [abs(each[3]) for each in planes.values()][:1]:
-        unit = np.append(unit, distance_m * unit)
+    if planes:
+        unit = np.append(unit, abs(planes[firsts[0].number][3]) * unit)
     watch, used = SceneWatch(unit, steady_px, false_alarm_looks), 0
     references = dict[int, tuple[int, Image]]()
     for view, first in pairs:
-        image, group = _image(session, view), first.number
-        number, reference = references.get(group, (view.number, image))
-        # The reference is an image where there is one.
-        if isinstance(image, str) or isinstance(reference, str):
-            found = nothing(len(unit), f"the image {image}")
+        image, group = image_of(session, view), first.number
+        known = references.get(group)
+        number = view.number if known is None else known[0]
+        if isinstance(image, Rejection):
+            found = nothing(len(unit), image.reason)
         else:
+            reference = image if known is None else known[1]
             found = register(reference, image, camera, mask, planes.get(group))
-            if not found.reason and group in references:
+            if not found.reason and known is not None:
                 used += 1
                 watch.update(group, found.turn, found.covariance)
             elif not found.reason:
@@ -205,14 +206,6 @@ def _pairs(session: Session, *, is_fixed: bool) -> list[tuple[View, View]]:
             firsts = (first for _, first in pairs if is_fixed or not moved(first, view))
             pairs.append((view, next(firsts, view)))
     return pairs
-
-
-def _image(session: Session, view: View) -> Image | str:
-    """The (h, w) grey image of a view, or why there is none, worded to follow `the image`."""
-    if absence := session.images.absence(view.image):
-        return absence
-    image = decode_image(session.images.read(view.image))
-    return f"is {image}" if isinstance(image, str) else image
 
 
 def scene_plane(calibration: Calibration, view: View, stated: str) -> FloatArray:
