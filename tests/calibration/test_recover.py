@@ -164,7 +164,8 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     assert "--cause camera\n" in sided.err
     assert "--cause mount\n" in sided.err
     assert not (act / "result").exists()
-    done = visioncal(*command, *asked, "--cause", "camera").good()
+    done = visioncal(*command, *asked, "--cause", "camera", "--payload-kg", 3).good()
+    assert "--payload-kg 3 changes nothing" in " ".join(done.err.split())
     assert "the camera moved by 3 mm" in done.out
     assert "minutes: plan" in done.out
     assert "5 stops held back from a first estimate agree" in done.out
@@ -176,6 +177,11 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     assert len((act / "targets.csv").read_text().splitlines()) == len(rows)
     assert visioncal("verify", cell / "moved", "--against", act / "result").status == 0
     visioncal("recover", act, "--against", act / "result").refused("of another calibration")
+    # Taught targets are not overwritten by what becomes of them.
+    taught = (act / "targets.csv").read_text()
+    over = visioncal(*command, "--targets", act / "targets.csv", "--cause", "camera")
+    over.refused("where the converted targets are written")
+    assert (act / "targets.csv").read_text() == taught
 
 
 def test_an_act_ends_where_nothing_changed_and_where_the_proof_fails(cell, tmp_path):

@@ -42,11 +42,18 @@ from visioncal.results import Calibration, select_matching
 from visioncal.results.history import entries_of
 from visioncal.session import Session
 
-_ACT, _TABLE = "recover.json", "views.csv"
+_ACT, _TABLE, _TARGETS = "recover.json", "views.csv", "targets.csv"
 
 
-def _opened(folder: Path, old: Calibration) -> dict[str, Any]:
+def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
     """What recover.json says of a recovery, or its begin; raises DataError."""
+    folder, taught = options.folder, options.targets
+    if taught is not None and taught.resolve() == (folder / _TARGETS).resolve():
+        raise DataError(
+            f"--targets {taught} is where the converted targets are written: taught ones are kept.",
+            culprits=["--targets"],
+            next_step="Give the taught targets another name, or put them elsewhere.",
+        )
     known, against = content_of(folder / _ACT), [old.session_sha256, old.created]
     if known.get("against", against) != against:
         raise DataError(
@@ -77,7 +84,7 @@ def recover_command(options: RecoverOptions) -> None:
     """
     loaded, result = load_result(options.against), options.folder / "result"
     path = options.stops or options.folder / "stops"
-    facts = _opened(options.folder, loaded)
+    facts = _opened(options, loaded)
     session, old = select_matching(_recorded(options, facts, path), loaded, options.choice)
     stated = facts["stated"] = options.cause or facts.get("stated", [])
     causes = tuple(stated)
@@ -120,9 +127,11 @@ def recover_command(options: RecoverOptions) -> None:
             to_correct = CorrectOptions(
                 targets=options.targets,
                 calibration=result,
-                out=_cleared(options.folder / "targets.csv"),
+                out=_cleared(options.folder / _TARGETS),
                 tool=options.tool,
-                payload_m=(0.0, 0.0, 0.0),
+                payload_kg=options.payload_kg,
+                payload_m=options.payload_m,
+                temperatures=options.temperatures,
                 force=options.force,
             )
             # A tool's targets find its new mount in the result.

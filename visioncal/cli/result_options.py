@@ -180,7 +180,22 @@ class GuardOptions(PartOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecoverOptions(PartOptions, ActOptions):
+class LoadOptions:
+    """What the arm carries at targets, and how warm it is."""
+
+    payload_kg: float = option(
+        "Payload on the flange, for joints that bend (kg).", default=0.0, needs="targets"
+    )
+    payload_m: tuple[float, float, float] = numbers_option(
+        "Its centre in the flange [m].", form="x,y,z", default="0,0,0", needs="targets"
+    )
+    temperatures: str | None = option(
+        "Of the links [deg C], for an arm with drift.", metavar="T1,T2,...", needs="targets"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecoverOptions(LoadOptions, PartOptions, ActOptions):
     """Recover a calibration after a knock: new stops, the cause, and a new zero or calibration.
 
     FOLDER holds the whole act: started again, it goes on where it was ended. It drives nothing:
@@ -249,7 +264,7 @@ class ExportOptions(PartOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectOptions(PartOptions):
+class CorrectOptions(LoadOptions, PartOptions):
     """Correct targets so that the arm reaches them by its nominal controller.
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named. Exit
@@ -261,15 +276,8 @@ class CorrectOptions(PartOptions):
     out: Path | None = out_file()
     tool: str | None = option("Frame of the targets: a tool, or cam; else the flange.")
     seed_joints: str | None = option("Joints [rad] near the first target's.", metavar="Q1,Q2,...")
-    payload_kg: float = option("Payload on the flange, for joints that bend (kg).", default=0.0)
-    payload_m: tuple[float, float, float] = numbers_option(
-        "Its centre in the flange [m].", form="x,y,z", default="0,0,0"
-    )
     widest_deg: float = option(
         "Warn of wider turns.", default=math.degrees(WIDEST_RAD), min=1e-3, max=720.0
-    )
-    temperatures: str | None = option(
-        "Of the links [deg C], for an arm with drift.", metavar="T1,T2,..."
     )
     skip: bool = flag("Write the other targets where some are refused.", "--skip-unreachable")
     force: bool = force_both()
