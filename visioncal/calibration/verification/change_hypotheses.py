@@ -30,7 +30,8 @@ PAIRS = (BOTH, REPLACED)
 _FACTORS = (2.0, 4.0, 8.0, 16.0, 32.0)
 # Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
 _OTHER_SIZE_PER_M = 10.0
-_MOTION_UNITS = np.repeat([TURN_PER_M, 1.0], 3)
+# Units of a twist, for a change of one metre.
+MOTION_UNITS: FloatArray = np.repeat([TURN_PER_M, 1.0], 3)
 
 
 def causes_of(
@@ -46,7 +47,7 @@ def causes_of(
     measured, changes = predicted.problem.observations.measured, log(predicted.away(prior))
     # The camera's edge: a twist on its right, transformed to the target's side.
     moved = adjoint(invert(measured))
-    camera = ChangeHypothesis(CAMERA, _MOTION_UNITS, moved)
+    camera = ChangeHypothesis(CAMERA, MOTION_UNITS, moved)
     # A board that is larger by a share is seen nearer by the same share.
     nearer = np.zeros((len(measured), 6, 1))
     nearer[:, 3:, 0] = np.einsum("nji,nj->ni", measured[:, :3, :3], measured[:, :3, 3])
@@ -63,7 +64,7 @@ def causes_of(
         # The board's edge: a twist on its right.
         by_place = np.where(shown[:, None, None], -np.eye(6), 0.0)
         start, name = changes[shown].mean(axis=0), f"{BOARD} {names[index]}".strip()
-        place = ChangeHypothesis(name, _MOTION_UNITS, by_place, start=start, at=at)
+        place = ChangeHypothesis(name, MOTION_UNITS, by_place, start=start, at=at)
         other = replace(size, units=np.array([_OTHER_SIZE_PER_M]))
         causes += [place, _simultaneous(REPLACED, place, other)]
         # Camera and board together fit any two stops.
@@ -128,7 +129,7 @@ def _views(
         transform = adjoint(invert(boards) @ boards[first])
         yield ChangeHypothesis(
             f"{VIEW} {predicted.views[first]}",
-            _MOTION_UNITS,
+            MOTION_UNITS,
             np.where(at_stop[:, None, None], -transform, 0.0),
             start=changes[first],
             at=int(predicted.boards[first]),

@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
-from visioncal.calibration.verification.change_hypotheses import BOARD, CAMERA, JOINT
+from visioncal.calibration.verification.change_hypotheses import BOARD, CAMERA, JOINT, MOTION_UNITS
 from visioncal.calibration.verification.guard_detector import (
     ChangeKind,
     Detector,
@@ -26,14 +26,13 @@ from visioncal.core.transforms import invert, rigid_fault
 from visioncal.core.types import Corners, FloatArray
 from visioncal.estimation.arm import ArmErrors, link_basis
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.chain import chain, edge_names, robot_part
+from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.model_evidence import TURN_PER_M
 from visioncal.estimation.pose_errors import posture_features
 from visioncal.estimation.poses import determines_pose
 from visioncal.estimation.problem_parts import ROBOT, Effect
 from visioncal.results import Calibration
-from visioncal.session import frame_name
 from visioncal.vision.targets import first_corners
 
 NONE = "none of these"
@@ -42,8 +41,6 @@ NONE = "none of these"
 _OVERSHOOT = 0.67
 # Share of the arm's error, in variance, that counts as noise of the look in any case.
 _NEW = 0.1
-# Probability outside the interval of the change's time.
-_OUTSIDE = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -165,25 +162,21 @@ class Guard:
             self._arm = ArmModel(nominal, np.eye(4), {}, np.zeros(0))
         if self._arm is not None:
             joints = np.where(self._arm.robot.chain.prismatic, 1.0, TURN_PER_M)
-        self._units = np.append(np.tile(np.repeat([TURN_PER_M, 1.0], 3), edges // 6), joints)
-        names, (_, single) = tuple(prior.targets) or ("",), edge_names(prior.calibration.mount)
-        self._frames = [
-            frame_name("target", names[at]) if len(names) > 1 else single.partition("_from_")[2]
-            for at in prior.boards
-        ]
+        self._units = np.append(np.tile(MOTION_UNITS, edges // 6), joints)
+        names = tuple(prior.targets) or ("",)
+        self._boards = [f"{BOARD} {names[at]}".strip() for at in prior.boards]
         # Kinds of causes are equally likely, and causes of one kind.
-        share, count = 1.0 / (2.0 + bool(len(joints))), len(prior.boards)
-        boards = [f"{BOARD} {names[at]}".strip() for at in prior.boards]
+        share = 1.0 / (2.0 + bool(len(joints)))
         self._kinds = [ChangeKind(CAMERA, tuple(range(6)), share)]
-        for at, name in enumerate(boards, 1):
+        for at, name in enumerate(self._boards, 1):
             columns = tuple(range(6 * at, 6 * at + 6))
-            self._kinds.append(ChangeKind(name, columns, share / count))
+            self._kinds.append(ChangeKind(name, columns, share / len(self._boards)))
         for at in range(len(joints)):
             self._kinds.append(ChangeKind(f"{JOINT} {at + 1}", (edges + at,), share / len(joints)))
         self._other = ChangeKind(NONE, tuple(range(edges + len(joints))), share)
-        noise = prior.noise(from_corners=prior.calibration.camera is not None)
+        self._noise = prior.noise(from_corners=self._free is not None)
         # An arm that is off by a millimetre has zeros that are off by a milliradian.
-        zeros = np.full(len(joints), noise.robots[0, 1])
+        zeros = np.full(len(joints), self._noise.robots[0, 1])
         self._state = Detector.of(own, 1e-3 * slow_mm, zeros)
 
     @property
@@ -251,7 +244,7 @@ class Guard:
                     size |= {unit: factor * signed, f"sigma_{unit}": factor * sigma}
             causes.append(PossibleCause(cause=kind.name, probability=float(shares[at]), **size))
         passed = np.cumsum(by_time) / by_time.sum()
-        first, last = np.searchsorted(passed, [0.5 * _OUTSIDE, 1.0 - 0.5 * _OUTSIDE])
+        first, last = np.searchsorted(passed, [0.025, 0.975])
         last = min(int(last), len(born) - 1)
         return {
             "causes": tuple(causes),
@@ -275,6 +268,8 @@ class Guard:
             )
         board = prior.boards[0] if not look.target else targets.index(look.target)
         flange, effects, fitted = look.base_from_flange, list[Effect](), prior.fit.arm
+        edges = len(self._gain.T)
+        offsets = np.zeros((6, len(self._units) - edges))
         missing = {
             "base_from_flange": flange is None and prior.model is None,
             "joints_rad": fitted is not None and look.joints_rad is None,
@@ -290,6 +285,7 @@ class Guard:
                     f"{label}: joints_rad is {look.joints_rad.tolist()}; {count} are needed.",
                     culprits=["joints_rad"],
                 )
+            offsets = self._arm.columns("offsets", joints)[0]
             if prior.model is not None:
                 flange = prior.model.base_from_flange(joints)[0]
             if fitted is not None:
@@ -307,29 +303,25 @@ class Guard:
             flange[None],
             pose.cam_from_target[:1],
             covariance,
-            targets=(self._frames[prior.boards.index(board)],),
-            order=self._frames,
+            targets=(self._boards[prior.boards.index(board)],),
+            order=self._boards,
             effects=effects,
         )
-        linear, edges = problem.linear(prior.state), len(self._gain.T)
-        noise = prior.noise(from_corners=not problem.is_combined)
+        linear = problem.linear(prior.state)
         # What is truly otherwise acts against what is predicted.
         jacobian = -linear.jacobian[0]
         by_edges, by_values = jacobian[:, :edges], jacobian[:, edges:]
-        by_arm = linear.by_errors[0] * np.repeat(noise.robots[0], 3)
+        by_arm = linear.by_errors[0] * np.repeat(self._noise.robots[0], 3)
         by_arm = by_arm @ by_arm.T
-        by_joints = np.zeros((6, len(self._units) - edges))
-        if look.joints_rad is not None and self._arm is not None:
-            by_joints = -linear.by_flanges[0] @ self._arm.columns("offsets", joints)[0]
         return LookRows(
             time_s=look.time_s,
             residual=linear.residuals[0],
-            covariance=problem.total_covariance(linear, noise)[0]
+            covariance=problem.total_covariance(linear, self._noise)[0]
             + by_values @ self._rest @ by_values.T
             - (1.0 - _NEW) * by_arm,
             by_edges=by_edges + by_values @ self._gain,
             by_motion=by_edges,
-            by_joints=by_joints,
+            by_joints=-linear.by_flanges[0] @ offsets,
             posture=posture_features(flange[None])[0],
             by_arm=by_arm,
         )
