@@ -32,8 +32,6 @@ from visioncal.vision.targets import corner_positions
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 # Changes of a smaller probability are not listed.
 _LISTED_SHARE = 1e-3
-# No camera or board moves farther [mm]; poses in another unit seem to.
-_FARTHEST_MM = 5e3
 _ANEW = "calibrate again; these stops make a first result, and more a good one."
 _SIZE_WORDS = (
     "the {board} is {percent} % {larger} (sigma {sigma}) than it was: it was printed again or "
@@ -131,7 +129,8 @@ def verdict_of(check: Check) -> Verdict:
 def _remedy(check: Check, change: PossibleChange) -> Remedy:
     """Advice on a change."""
     found = _estimates(check, change)
-    if found.get(CAMERA, found).get("moved_mm", 0.0) > _FARTHEST_MM:
+    # No camera or board moves farther; poses in another unit seem to.
+    if found.get(CAMERA, found).get("moved_mm", 0.0) > 5e3:
         return _OTHER_POSES
     return _runnable(check, _KINDS[change.cause.kind][1])
 

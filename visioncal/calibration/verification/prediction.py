@@ -82,10 +82,9 @@ def predict_stops(
     session, calibrated = _with_calibrated_targets(session, prior), prior.calibration.robot
     if calibrated is not None:
         if session.robot_document is not None:
-            stated, arm = Robot.from_document(session.robot_document), prior.calibration.arm
             # A recording by a plan of the calibrated arm names that.
-            if arm is None or arm.robot is None or not _move_alike(stated, arm.robot):
-                check_robot(session, stated, calibrated)
+            arm = prior.calibration.calibrated_robot or calibrated
+            check_robot(session, Robot.from_document(session.robot_document), calibrated, arm)
         # The calibrated robot has its base in the frame of the poses.
         session = replace(session, robot_document=calibrated.document)
     run = _STAGES["detect"](_STAGES["robot"](RunState(session, progress)))
@@ -263,25 +262,26 @@ def _differences(prior: CalibrationPrior, name: str, target: Target) -> list[str
     ]
 
 
-def _move_alike(stated: Robot, calibrated: Robot) -> bool:
-    """Whether both models move their flanges alike."""
-    if stated.joint_count != calibrated.joint_count:
-        return False
-    q = np.random.default_rng(0).uniform(-1.0, 1.0, (5, calibrated.joint_count))
-    # Motions are compared: the calibrated base may have been moved to the frame of the poses.
-    ours, theirs = (robot.base_from_flange(q) for robot in (calibrated, stated))
-    between = [invert(array[0]) @ array for array in (ours, theirs)]
-    return bool(np.abs(log(invert(between[0]) @ between[1])).max() < _ONE_ROBOT)
-
-
-def check_robot(session: Session, stated: Robot, calibrated: Robot) -> None:
+def check_robot(session: Session, stated: Robot, calibrated: Robot, *others: Robot) -> None:
     """Refuses a robot other than the calibration's, by the motion of its flange.
 
+    Args:
+        session: The session.
+        stated: The robot that it names.
+        calibrated: The calibration's.
+        others: Other models of that which it may name.
+
     Raises:
-        DataError: They differ.
+        DataError: It differs from all.
     """
-    if _move_alike(stated, calibrated):
-        return
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (5, stated.joint_count))
+    for model in (calibrated, *others):
+        if model.joint_count == stated.joint_count:
+            # Motions are compared: the calibrated base may have been moved to the poses' frame.
+            ours, theirs = (robot.base_from_flange(q) for robot in (model, stated))
+            between = [invert(array[0]) @ array for array in (ours, theirs)]
+            if np.abs(log(invert(between[0]) @ between[1])).max() < _ONE_ROBOT:
+                return
     raise DataError(
         f"session {session.name!r} names robot {stated.name}, which moves its flange otherwise: it "
         f"is another robot, or another tip, than the calibrated {calibrated.name}.",
