@@ -15,6 +15,7 @@ from scipy.special import expit, logsumexp
 
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.budget import radius95
 from visioncal.results.history import Entry
 
 # Factors of an entry's covariance, with their probabilities; sizes in the values' units.
@@ -23,17 +24,15 @@ _LOG_INFLATIONS = np.log([8 / 15, 4 / 15, 2 / 15, 1 / 15])
 _SIZES = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
 # Units of values: rad and m of a transform.
 _UNITS = np.array([2e-3] * 3 + [1e-3] * 3)
-_YEAR = 365.25
+YEAR_DAYS = 365.25
 _STEPS_A_YEAR, _DRIFTS = 0.5, 0.2
-# A drift is told from a step by four entries at least; changes are looked for as long as they are
+# Four entries at least distinguish a drift from a step; changes are looked for as long as they are
 # more probable than not.
 _DRIFT_ENTRIES, _LIKELY, _MOST_CHANGES = 4, 0.5, 6
 # Entries of a transform that are looked at, the latest ones: the time grows with their square.
 _MOST_ENTRIES = 200
 # Relative sigma of a sigma, which has about 20 degrees of freedom.
 _SIGMA_OF_SIGMA = 0.16
-# 95 % of a normal vector's lengths, in root-mean-square lengths: sqrt(7.81 / 3).
-_RADIUS95 = 1.614
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +68,12 @@ class Course:
             The likeliest time, and the earliest and the latest of 95 %: a century on for never.
         """
         last = self.entries[-1]
-        own_mm = last.good_for_mm or _RADIUS95 * last.edges[self.name].sigma_mm
+        own_mm = last.good_for_mm or 1e3 * radius95(last.edges[self.name].covariance[3:, 3:])
         drift_mm, covariance = 1e3 * drift.vector[-3:], 1e6 * drift.covariance[-3:, -3:]
         speed = max(float(np.linalg.norm(drift_mm)), 1e-9)
         reach = 1.96 * float(np.sqrt(drift_mm @ covariance @ drift_mm)) / speed
         likely, early, late = (
-            last.time + timedelta(days=_YEAR * min(100.0, max(need_mm - own_mm, 0.0) / rate))
+            last.time + timedelta(days=YEAR_DAYS * min(100.0, max(need_mm - own_mm, 0.0) / rate))
             for rate in (speed, speed + reach, max(speed - reach, 1e-9))
         )
         return likely, early, late
@@ -101,19 +100,15 @@ def _course(name: str, entries: Sequence[Entry]) -> Course:
     covariances = np.array([edge.covariance[part, part] for edge in edges])
     changes = sigma_changes = tuple[Change, ...]()
     if len(entries) > 1:
-        changes = find_changes(_days(entries), twists, covariances, _UNITS[part])
+        days = np.array([(entry.time - entries[0].time) / timedelta(days=1) for entry in entries])
+        changes = find_changes(days, twists, covariances, _UNITS[part])
         log_sigmas = np.log([max(edge.sigma_mm, 1e-6) for edge in edges])[:, None]
         noise = np.full((len(edges), 1, 1), _SIGMA_OF_SIGMA**2)
-        sigma_changes = find_changes(_days(entries), log_sigmas, noise, np.ones(1))
+        sigma_changes = find_changes(days, log_sigmas, noise, np.ones(1))
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     steps = tuple(change for change in changes if change.at)
     drift = next((change for change in changes if not change.at), None)
     return Course(name, tuple(entries), twists, sigmas, steps, drift, sigma_changes)
-
-
-def _days(entries: Sequence[Entry]) -> FloatArray:
-    first = entries[0].time
-    return np.array([(entry.time - first) / timedelta(days=1) for entry in entries])
 
 
 def find_changes(
@@ -131,7 +126,7 @@ def find_changes(
         covariances: (n, d, d) their covariances.
         units: (d,) the unit of sizes in each.
     """
-    count, gaps = len(days), np.diff(days) / _YEAR
+    count, gaps = len(days), np.diff(days) / YEAR_DAYS
     model = _Model(days, values / units, covariances / np.outer(units, units))
     drifts = _DRIFTS if len(units) > 1 and count >= _DRIFT_ENTRIES else 1e-12
     odds = [drifts, *np.clip(-np.expm1(-_STEPS_A_YEAR * gaps), 1e-6, 0.5)]
@@ -168,7 +163,7 @@ class _Model:
         weights = np.linalg.inv(covariances + 1e-6 * np.eye(self.dimension))
         weighted = np.einsum("nuv,nv->nu", weights, values)
         # The changes, the level, and none.
-        drift = (days - days[-1]) / _YEAR
+        drift = (days - days[-1]) / YEAR_DAYS
         shapes = np.concatenate(
             [[drift], np.tri(count)[:, 1:].T, [np.ones(count), np.zeros(count)]]
         )
