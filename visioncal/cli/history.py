@@ -65,7 +65,7 @@ def _placed(
 
 def history_command(options: HistoryOptions) -> None:
     """Runs `visioncal history`."""
-    history = History(options.file) if options.file else History.of_site(Path.cwd() / SITE_FILE)
+    history = History(options.file) if options.file else History.of_site(Path.cwd())
     if history is None:
         raise DataError(
             f"there is no {SITE_FILE} here or above.",
@@ -84,14 +84,18 @@ def history_command(options: HistoryOptions) -> None:
     elif options.as_json:
         print_json([{"id": entry.id} | write(Entry, entry) for entry in entries])
     elif options.show is None:
-        titles = ("id", "time", "cell", "kind", "verdict", "first reason")
         rows = [
-            (entry.id[:8], f"{entry.time:%Y-%m-%d %H:%M}", entry.cell, entry.kind, entry.status)
+            (
+                entry.id[:8],
+                f"{entry.time:%Y-%m-%d %H:%M}",
+                entry.cell,
+                entry.kind,
+                entry.status,
+                entry.reason,
+            )
             for entry in entries
         ]
-        print_table(
-            titles, [(*row, entry.reason) for row, entry in zip(rows, entries, strict=True)]
-        )
+        print_table(("id", "time", "cell", "kind", "verdict", "first reason"), rows)
     elif len(entries) == 1:
         for name, value in entries[0].columns.items():
             if value not in ("", None):
