@@ -176,6 +176,11 @@ class Verdict:
         return tuple(finding.reason for finding in self.findings)
 
     @property
+    def first_reason(self) -> str:
+        """The first finding with its advice; the headline without findings."""
+        return next(iter(self.reasons), self.headline)
+
+    @property
     def causes(self) -> tuple[Finding, ...]:
         """Possible causes of doubts, likeliest first; those that are as good as certain as read."""
         possible = (finding for finding in self.findings if finding.probability)

@@ -279,7 +279,7 @@ def _findings(
         )
     bad = [
         f"The {name} has the verdict bad, to be cleared up before anything is made of the "
-        f"difference: {next(iter(verdict.reasons), verdict.headline)}"
+        f"difference: {verdict.first_reason}"
         for name, verdict in (("first", a.verdict), ("second", b.verdict))
         if verdict.status == "bad"
     ]
