@@ -162,7 +162,7 @@ def test_a_baslers_pictures_are_recorded_bit_for_bit(pylon, seen, tmp_path):
     assert pylon.device.IsOpen() is False
 
 
-def test_a_basler_that_is_not_there_refuses_or_leaves_is_told(pylon):
+def test_a_basler_that_is_missing_refuses_or_is_unplugged_is_reported(pylon):
     raised(DriverError, "connected: 0815-0000", open_camera, "basler:7", DeviceSetup())
     too_long = DeviceSetup(exposure_us=10**9)
     raised(DriverError, "must be smaller than or equal", open_camera, "basler", too_long)

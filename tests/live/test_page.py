@@ -125,7 +125,7 @@ def cell(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def calibrated(cell, browser) -> Path:
-    """A calibration made by the page alone, which survives what may befall it."""
+    """A calibration made by the page alone, through a reload, a lost camera and a kill."""
     seen, out = cell / "seen", cell / "cell"
     views = Session.load(seen).views
     with served("record", "-o", out) as (url, process):

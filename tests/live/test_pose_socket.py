@@ -72,7 +72,7 @@ class Robot:
         self.capture, self.arm = FakeCapture(self.meanwhile), SocketArm("127.0.0.1", 0)
 
     def meanwhile(self, stop):
-        """What befalls a view; whether there is none."""
+        """What happens during a view; whether there is none."""
         chance = self.rng.random()
         if chance < 0.05:
             self.hang_up(hard=chance < 0.02)
@@ -157,7 +157,7 @@ def another_client(robot, _):
     with client_of(robot.arm) as other:
         robot.step()
         robot.step()
-        # One is told to go, or one that said nothing is let go.
+        # The new one is refused, or the one that said nothing is dropped.
         assert select.select([other, robot.link], [], [], 0)[0]
 
 

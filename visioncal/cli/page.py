@@ -1,6 +1,5 @@
 """`--page` of `record` and `verify`: what a page asks, and the task that its answers make."""
 
-import json
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,10 +18,12 @@ from visioncal.cli.record import check_order, opened, recorded_cell, taking_of
 from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.choices import CameraMount
+from visioncal.core.codec import read
 from visioncal.core.conventions import POSE_FORMS
+from visioncal.core.documents.jsons import parse_stored, read_json
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.extras import client_library
-from visioncal.core.files import write_atomically
+from visioncal.core.files import read_text, write_json
 from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import counted
 from visioncal.interchange.outputs import CALIBRATION, VERIFY
@@ -30,12 +31,13 @@ from visioncal.interchange.result_files import load_calibration
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.devices import ARMS, CAMERAS
 from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
-from visioncal.live.drivers.folder import FolderCamera
+from visioncal.live.drivers.protocols import StoredPictures
 from visioncal.live.drivers.uvc import without_password
 from visioncal.live.page.outcome import Light
 from visioncal.live.page.station import PageText, Setup, Station, Task, TypedPoses
-from visioncal.live.page.suggestion import NextPose, by_travel
+from visioncal.live.page.suggestion import NextPose
 from visioncal.live.planning.cell import PlanCell, seen_from
+from visioncal.live.planning.path import short_order
 from visioncal.live.planning.plan_file import PlanFile, read_plan
 from visioncal.live.planning.repeated import stops_to_repeat
 from visioncal.robot import robot_names
@@ -114,7 +116,7 @@ def verify_on_page(options: VerifyOptions) -> None:
         x, z = (edge.matrix for edge in calibration.edges.values())
         poses = stops_to_repeat(calibration, None, 2 * CheckLimits.stops).poses
         # The first of them are the widest apart; the others are for where one cannot be reached.
-        first = by_travel(poses[: CheckLimits.stops])
+        first = short_order(None, poses[: CheckLimits.stops, :3, 3], 0)
         poses = np.concatenate([poses[first], poses[CheckLimits.stops :]])
         words = "Stand where the calibration stood: the board then fills the orange outline."
         seen = seen_from(calibration.mount, x, z, poses)
@@ -181,9 +183,8 @@ def _with_devices(recording: RecordOptions, setup: Setup) -> RecordOptions:
 def _remembered(folder: Path) -> Setup:
     """What was chosen last; the defaults where nothing is remembered that can be read."""
     try:
-        content = json.loads((folder / _REMEMBERED).read_text(encoding="utf-8"))
-        return Setup(**{name: str(value) for name, value in content.items()})
-    except (OSError, ValueError, TypeError, AttributeError):
+        return read(Setup, read_json(folder / _REMEMBERED), _REMEMBERED)
+    except DataError:
         return Setup()
 
 
@@ -198,16 +199,16 @@ def _begun(
     """Opens the devices and begins or resumes the session; a folder remembers what was chosen."""
     given = TypedPoses() if setup.arm == "manual" else None
     with opened(chosen, is_moved=False, given=given) as cell:
+        check_order(cell, is_resumed=False)
         facts = CaptureFacts.of(cell, chosen.out.name, recorded, plan)
         journal = Journal.resume(chosen.out, facts, cell.clock.unix_offset_s(), 0)
-        check_order(taking_of(chosen, is_driven=False), cell, is_resumed=False)
-        if journal.views and isinstance(cell.camera, FolderCamera):
+        if journal.views and isinstance(cell.camera, StoredPictures):
             # Those of the views so far, and of poses that gave none.
             cell.camera.skip()
         # Of a camera's URL without its user and password.
         kept = replace(setup, camera=without_password(setup.camera))
         remembered.mkdir(parents=True, exist_ok=True)
-        write_atomically(remembered / _REMEMBERED, json.dumps(asdict(kept), indent=2))
+        write_json(remembered / _REMEMBERED, asdict(kept))
         yield cell, journal
 
 
@@ -244,8 +245,8 @@ def _history(checks: Path) -> list[tuple[Light, str, str]]:
     lines: list[tuple[Light, str, str]] = []
     found = checks.glob(f"*-verified/{VERIFY}")
     for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True):
-        with suppress(OSError, ValueError, KeyError, IndexError):
-            document = json.loads(path.read_text(encoding="utf-8"))
+        with suppress(DataError, KeyError, IndexError):
+            document = parse_stored(read_text(path), str(path))
             light: Light = "green" if document["passed"] else "red"
             name = path.parent.name.removesuffix("-verified")
             lines.append((light, name, document["sentences"][0]))

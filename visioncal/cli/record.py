@@ -65,7 +65,7 @@ def record_command(options: RecordOptions) -> None:
             next_step="Name them, as --arm manual --camera uvc:0; --page asks for them.",
         )
     with signals_as_interrupts(), opened(options, is_moved=drives and not options.dry_run) as cell:
-        check_order(taking, cell, is_resumed=options.resume)
+        check_order(cell, is_resumed=options.resume)
         if driven is not None:
             _check_resolution(driven.cell.camera.resolution, cell.camera.resolution)
         if options.dry_run and driven is not None:
@@ -95,15 +95,14 @@ def taking_of(options: RecordOptions, *, is_driven: bool) -> CaptureOptions:
         speed=options.speed,
         frames=options.frames,
         still=Stillness(image_px=options.still_px, quiet_s=options.settle_s),
-        single=str(options.camera).partition(":")[0] == "folder",
         # Where a person sees them, missed views end nothing.
         missed_in_a_row=CaptureOptions.missed_in_a_row if is_driven else 0,
     )
 
 
-def check_order(taking: CaptureOptions, cell: LiveCell, *, is_resumed: bool) -> None:
+def check_order(cell: LiveCell, *, is_resumed: bool) -> None:
     """Refuses what would part a folder's pictures from their poses; raises DataError."""
-    if taking.single and (is_resumed or not isinstance(cell.arm, RequestingArm)):
+    if cell.is_stored and (is_resumed or not isinstance(cell.arm, RequestingArm)):
         raise DataError(
             "record: pictures of a folder belong to poses by their order alone, from the first on: "
             "neither a followed arm, a driven one nor --resume can keep it.",

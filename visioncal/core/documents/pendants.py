@@ -17,14 +17,13 @@ import numpy as np
 
 from visioncal.core.choices import UNITS_M
 from visioncal.core.conventions import POSE_FORMS, PoseForm, PoseNumbers, Reading, write_pose
-from visioncal.core.documents.values import DECIMAL_COMMA
+from visioncal.core.documents.values import DECIMAL, DECIMAL_COMMA
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 
-_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _UNIT = r"(?:mm|m|deg|rad)"
 _NAMED = re.compile(
-    rf"(?<![\w.])([Qq][1-4]|[A-Za-z]+)(?:_m)?\s*[:=]?\s*\"?({DECIMAL_COMMA}|{_NUMBER})\s*({_UNIT})?"
+    rf"(?<![\w.])([Qq][1-4]|[A-Za-z]+)(?:_m)?\s*[:=]?\s*\"?({DECIMAL_COMMA}|{DECIMAL})\s*({_UNIT})?"
     r"(?![\w.]|,[0-9])"
 )
 _BETWEEN = re.compile(r"[\s\[\]{}(),;]+")
@@ -207,7 +206,7 @@ def _marked(line: str) -> _PendantNumbers | None:
 
 def _numbers(text: str, forms: tuple[str, ...]) -> _PendantNumbers | None:
     words = [part for part in _BETWEEN.split(text) if part]
-    if not all(re.fullmatch(_NUMBER, word) for word in words):
+    if not all(re.fullmatch(DECIMAL, word) for word in words):
         return None
     return _PendantNumbers(tuple(map(float, words)), forms)
 
@@ -247,7 +246,7 @@ def _values(words: list[str]) -> tuple[float, ...] | None:
     """Numbers with one kind of decimal sign; None where they are none, or have both."""
     with_commas = [word for word in words if re.fullmatch(DECIMAL_COMMA, word)]
     others = [word for word in words if word not in with_commas]
-    if not all(re.fullmatch(_NUMBER, word) for word in others):
+    if not all(re.fullmatch(DECIMAL, word) for word in others):
         return None
     if with_commas and any("." in word for word in others):
         return None

@@ -13,7 +13,7 @@ from visioncal.core.files import UTF16_MARKS, read_bytes, save_as_utf8
 from visioncal.core.types import FloatArray
 
 # A number as others write it; also `1.`, `.5` and `1e-3`.
-DECIMAL = r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
+DECIMAL = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 # The same with a decimal comma.
 DECIMAL_COMMA = r"[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?"
 

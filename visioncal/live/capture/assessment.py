@@ -21,14 +21,6 @@ _ACROSS, _DOWN = 8, 5
 # Greatest deviation of a controller's calibrated arm from the nominal model [m, rad].
 _SAME_M, _SAME_RAD = 1e-2, 2e-2
 
-
-def usual_lens(resolution: tuple[int, int]) -> Camera:
-    """A lens with a horizontal field of 53 degrees, for pictures (width, height) of an unknown."""
-    width, height = resolution
-    matrix = np.array([width, width, 0.5 * (width - 1), 0.5 * (height - 1)], dtype=float)
-    return Camera("brown", resolution, matrix, np.zeros(5))
-
-
 # Accuracy predicted with some views, by their numbers; None while there is no prediction.
 Prediction: TypeAlias = Callable[[Sequence[int]], Accuracy | None]
 
@@ -48,8 +40,12 @@ class Coach:
 
     @property
     def lens(self) -> Camera:
-        """Intrinsics, or where they are not known those of a usual lens."""
-        return self.camera or usual_lens(self.resolution)
+        """Intrinsics; of an unknown lens, those of one with a horizontal field of 53 degrees."""
+        if self.camera is not None:
+            return self.camera
+        width, height = self.resolution
+        matrix = np.array([width, width, 0.5 * (width - 1), 0.5 * (height - 1)], dtype=float)
+        return Camera("brown", self.resolution, matrix, np.zeros(5))
 
     def add(self, corners: Corners) -> None:
         """Takes a view into account."""

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
-from visioncal.live.drivers.protocols import Arm, ArmState, CameraDevice, MovingArm
+from visioncal.live.drivers.protocols import Arm, ArmState, CameraDevice, MovingArm, StoredPictures
 
 # Greatest age of a state [s].
 _STALE_S = 1.0
@@ -57,6 +57,11 @@ class LiveCell:
     arm: Arm
     camera: CameraDevice
     clock: Clock = field(default_factory=HostClock)
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether each picture is another view's, and is taken without waiting for rest."""
+        return isinstance(self.camera, StoredPictures)
 
     def state(self) -> ArmState:
         """Reads the arm's state; raises DriverError."""

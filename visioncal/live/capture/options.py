@@ -31,8 +31,6 @@ class CaptureOptions:
     speed: float = PLAN_SPEED  # Speed of the joint that travels farthest [rad/s].
     acceleration: float = PLAN_ACCELERATION  # Its acceleration [rad/s^2].
     frames: int = 3  # Frames per view, of which the sharpest is kept.
-    # Whether every picture is another view's, as in a folder: it is taken without waiting for rest.
-    single: bool = False
     # Limits within which arm and image count as still.
     still: Stillness = field(default_factory=Stillness)
     # Number of stops in a row without a view that ends the recording; 0 for never, where a person

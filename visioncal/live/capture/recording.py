@@ -26,9 +26,6 @@ from visioncal.robot import Robot
 from visioncal.session import View
 from visioncal.vision.boards.imaging import decode_image
 
-# An arm that returns to a taught stop is nearer to it than this [mm, deg]; other stops are farther.
-_SAME_STOP_MM, _SAME_STOP_DEG = 0.5, 0.05
-
 
 @dataclass(frozen=True, eq=False)
 class CaptureEvent:
@@ -206,7 +203,7 @@ class Capture:
             if not count:
                 stored = f"No view was taken; {folder} is no session yet."
             resume = "Go on with --resume."
-            if self.options.single:
+            if self.cell.is_stored:
                 resume = "Record all into a new session: a folder begins with its first picture."
             if isinstance(error, KeyboardInterrupt):
                 halted = "; the arm was halted" if isinstance(self.cell.arm, MovingArm) else ""
@@ -337,13 +334,10 @@ class RestWatch:
             self._first = state
         if self._tried is not None and _is_elsewhere(self._tried, here):
             self._tried = None
-        poses = (view.base_from_flange() for view in self._journal.views)
-        known = [np.asarray(pose.as_matrix()) for pose in poses if pose is not None]
-        if (
-            state.stamp_s - self._first.stamp_s < still.quiet_s
-            or self._tried is not None
-            or not all(_is_elsewhere(pose, here) for pose in known)
-        ):
+        if state.stamp_s - self._first.stamp_s < still.quiet_s or self._tried is not None:
+            return False
+        taken = [pose for view in self._journal.views if (pose := state_of(view)) is not None]
+        if not all(_is_elsewhere(pose.base_from_flange, here) for pose in taken):
             return False
         self._first, self._tried = None, here
         return True
@@ -420,11 +414,12 @@ def take_requested(capture: Capture, arm: RequestingArm, count: int, wait_s: flo
 
 def _why_another_stop(recorded: View, state: ArmState) -> str:
     """States why a stop is not that of a recorded view of its number; empty where it is."""
-    pose = recorded.base_from_flange()
-    if pose is None:
+    taken = state_of(recorded)
+    if taken is None:
         return f"view {recorded.number} is recorded without a pose"
-    mm, deg = pose_difference(np.asarray(pose.as_matrix()), state.base_from_flange)
-    if mm <= _SAME_STOP_MM and deg <= _SAME_STOP_DEG:
+    mm, deg = pose_difference(taken.base_from_flange, state.base_from_flange)
+    # An arm that returns to a taught stop is nearer to it; other stops are farther.
+    if mm <= 0.5 and deg <= 0.05:
         return ""
     return (
         f"stop {recorded.number} is recorded {figure(mm)} mm and {figure(deg)} deg from here: "

@@ -84,7 +84,7 @@ def take(cell: LiveCell, target: Target, view: int, options: CaptureOptions) -> 
     Raises:
         DriverError: A device fails, or the arm is stopped.
     """
-    if options.single:
+    if cell.is_stored:
         return _selected([_StillFrame.of(cell)], target, view, 0.0)
     reason = ""
     # Frames during which something moved are discarded.

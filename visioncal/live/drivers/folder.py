@@ -10,7 +10,7 @@ from visioncal.live.drivers.stream import camera_error, check_resolution, refuse
 from visioncal.session.images import IMAGE_ENDINGS
 from visioncal.vision.boards.imaging import decode_image
 
-# How long the next picture is waited for, and between two looks at its size [s].
+# How long the next picture is waited for, and the interval at which its size is read [s].
 _PATIENCE_S, _POLL_S = 10.0, 0.1
 
 

@@ -48,7 +48,7 @@ class GenicamCamera(stream.StreamingCamera):
             for producer in producers:
                 harvester.add_file(str(producer))
             harvester.update()
-            # What a producer does not tell of a device is None.
+            # What a producer does not report of a device is None.
             infos = [info.property_dict for info in harvester.device_info_list]
         named = [tuple(str(info[key]) for key in _NAMES if info.get(key)) for info in infos]
         index = stream.chosen(kind, named, wanted, "its maker's viewer")

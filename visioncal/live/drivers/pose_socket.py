@@ -309,7 +309,7 @@ class SocketArm:
         self._link = None
 
     def _linger(self, *, is_answered: bool) -> None:
-        """Answers `done` to whatever comes, until a program that was told has closed its link."""
+        """Answers `done` to whatever comes, until an answered program has closed its link."""
         lingering = Stopwatch()
         while lingering.read() < _LINGER_S and not (is_answered and self._link is None):
             if self._next_line() is not None and self._link is not None:

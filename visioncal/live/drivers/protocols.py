@@ -144,6 +144,14 @@ class CameraDevice(Protocol):
         """Releases it; may be called twice."""
 
 
+@runtime_checkable
+class StoredPictures(CameraDevice, Protocol):
+    """Pictures that another program took, whenever it did: each is given once, in their order."""
+
+    def skip(self) -> None:
+        """Counts the pictures that are there as given."""
+
+
 @dataclass(frozen=True)
 class DeviceSetup:
     """Requested settings of a camera; None leaves the choice to the driver, which then holds it."""

@@ -20,7 +20,7 @@ from visioncal.core.errors import DriverError, VisioncalError
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Rejection
 from visioncal.live.capture.cell import LiveCell
-from visioncal.live.capture.journal import Journal, RecordedCell
+from visioncal.live.capture.journal import Journal, RecordedCell, state_of
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
 from visioncal.live.capture.take import TakenView, grey_of, image_motion_px
@@ -139,6 +139,13 @@ class Station:
         begins: Whether to begin at once.
     """
 
+    # The recording in progress: what it is for, its views, and whether a guided arm rests.
+    _task: Task
+    _capture: Capture
+    _rest: RestWatch
+    _previous: Image | None  # The live picture before, in grey.
+    _rejected: list[FloatArray]  # (4, 4) `cam_from_target` of suggestions that were skipped [m].
+
     def __init__(self, prepare: Callable[[Setup], Task], setup: Setup, *, begins: bool) -> None:
         self._prepare, self.snapshot = prepare, Snapshot(setup=setup)
         self._requests: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
@@ -158,17 +165,18 @@ class Station:
         """Takes a view at a pose (4, 4) [m] that was typed in a form of `POSE_FORMS`."""
 
         def typed() -> None:
-            for view in self._journal.views:
-                pose = view.base_from_flange()
-                if pose is not None and np.abs(pose.as_matrix() - base_from_flange).max() < 1e-9:
+            cell, views = self._capture.cell, self._capture.journal.views
+            for view in views:
+                taken = state_of(view)
+                if taken and np.abs(taken.base_from_flange - base_from_flange).max() < 1e-9:
                     same = f"View {view.number} has this very pose: type that of this picture, or "
                     self._publish(missed=f"{same}drive to another.")
                     return
-            if isinstance(arm := self._cell.arm, TypedPoses):
+            if isinstance(cell.arm, TypedPoses):
                 self._publish(pose_form=form)
-                if self._task.options.single:
+                if cell.is_stored:
                     self._publish(sees="waiting for the next picture of the folder ...")
-                arm.pending = base_from_flange
+                cell.arm.pending = base_from_flange
 
         self._put(seen, typed)
 
@@ -240,21 +248,18 @@ class Station:
             return
         self._publish(phase="opening", setup=setup, problem="")
         self._task = self._prepare(setup)
-        self._previous: Image | None = None
-        # Intrinsics by a trial, where no others are known.
-        self._fitted: Camera | None = None
-        self._rejected = list[FloatArray]()
-        self._cell, self._journal = self._open.enter_context(self._task.begin())
-        self._capture = self._started()
-        self._rest = RestWatch(self._journal, self._task.options.still)
-        robot, arm = self._task.recorded.robot, self._cell.arm
+        self._previous, self._rejected = None, []
+        cell, journal = self._open.enter_context(self._task.begin())
+        self._start(cell, journal, cell.camera.factory or self._task.lens)
+        self._rest = RestWatch(journal, self._task.options.still)
+        robot, arm = self._task.recorded.robot, cell.arm
         form = None if robot is None else controller_form(robot.name)
         self._publish(
             phase="live",
             arm=arm.name,
             takes_typed=isinstance(arm, TypedPoses),
             pose_form=setup.pose_form or ("ros" if form is None else form.name),
-            views=tuple(f"view {view.number}: recorded before" for view in self._journal.views),
+            views=tuple(f"view {view.number}: recorded before" for view in journal.views),
             note=getattr(arm, "invitation", ""),
             missed="",
             trial=None,
@@ -262,16 +267,15 @@ class Station:
         )
         self._advise()
 
-    def _started(self) -> Capture:
-        cell, task = self._cell, self._task
+    def _start(self, cell: LiveCell, journal: Journal, lens: Camera | None) -> None:
+        task = self._task
         seen = task.recorded.target, task.recorded.robot
-        lens = cell.camera.factory or task.lens or self._fitted
-        return Capture(cell, *seen, lens, self._journal, task.options, None, self._taken)
+        self._capture = Capture(cell, *seen, lens, journal, task.options, None, self._taken)
 
     def _live(self) -> None:
         """Shows a picture, and takes a view where the arm requests one or has come to rest."""
-        cell, task = self._cell, self._task
-        if not task.options.single:
+        cell, task = self._capture.cell, self._task
+        if not cell.is_stored:
             image = cell.camera.frame().image
             grey = grey_of(image)
             found, _ = find_corners(grey, task.recorded.target, 0)
@@ -286,7 +290,7 @@ class Station:
                 self._ask(is_trial=False)
                 self._stop("")
             except DriverError as error:
-                if not task.options.single:
+                if not cell.is_stored:
                     raise
                 # The picture of a typed pose may still be saved.
                 self._publish(missed=f"{error.message} {error.next_step}")
@@ -312,7 +316,7 @@ class Station:
         if not isinstance(step.found, TakenView):
             self._publish(missed=step.words)
             return
-        if self._task.options.single:
+        if self._capture.cell.is_stored:
             self._show(step.found.frame.image, step.found.corners)
         form = step.found.state.pose_form or self.snapshot.pose_form
         views = (*self.snapshot.views, step.words)
@@ -320,15 +324,16 @@ class Station:
         self._after_change()
 
     def _undo(self) -> None:
-        if not self._journal.views:
+        capture = self._capture
+        if not capture.journal.views:
             return
-        self._journal.undo()
-        self._capture = self._started()
+        capture.journal.undo()
+        self._start(capture.cell, capture.journal, capture.coach.camera)
         self._publish(views=self.snapshot.views[:-1], missed="", trial=None, outcome=None)
         self._after_change()
 
     def _after_change(self) -> None:
-        count = len(self._journal.views)
+        count = len(self._capture.journal.views)
         if self._task.count and count >= self._task.count:
             self._ask(is_trial=False)
         elif count >= _FIRST_TRIAL and not self._task.stops:
@@ -337,7 +342,7 @@ class Station:
 
     def _ask(self, *, is_trial: bool) -> None:
         """Runs the judging command beside the recording; a trial, without its drawings."""
-        views = len(self._journal.views)
+        views = len(self._capture.journal.views)
         if not views:
             self._publish(missed="There is no view yet.")
             return
@@ -356,14 +361,13 @@ class Station:
     def _judged(self, outcome: Outcome) -> None:
         if outcome.folder == self._task.result:
             self._publish(outcome=outcome, is_judging=False)
-        elif self.snapshot.phase == "live" and outcome.views <= len(self._journal.views):
+        elif self.snapshot.phase == "live" and outcome.views <= len(self._capture.journal.views):
             self._publish(trial=outcome)
-            fitted = outcome.document.get("camera")
-            if fitted and self._capture.coach.camera is None:
-                size = self._cell.camera.resolution
+            capture, fitted = self._capture, outcome.document.get("camera")
+            if fitted and capture.coach.camera is None:
                 numbers = (np.array(fitted[name]) for name in ("matrix", "distortion"))
-                self._fitted = Camera(fitted["model"], size, *numbers)
-                self._capture = self._started()
+                lens = Camera(fitted["model"], capture.coach.resolution, *numbers)
+                self._start(capture.cell, capture.journal, lens)
             self._advise()
 
     def _skip(self) -> None:
@@ -374,7 +378,7 @@ class Station:
 
     def _advise(self) -> None:
         """Publishes the coverage, and the next pose."""
-        coach, task, taken = self._capture.coach, self._task, len(self._journal.views)
+        coach, task, taken = self._capture.coach, self._task, len(self._capture.journal.views)
         pose: NextPose | None
         if task.count and taken >= task.count:
             pose = NextPose("All views are there.")
@@ -399,8 +403,8 @@ class Station:
             edges = trial.document["transforms"].values()
             x, z = (np.array(edge["matrix"]) for edge in edges)
             place = partial(flange_at, self._task.recorded.mount, x, z)
-            poses = (view.base_from_flange() for view in self._journal.views)
-            taken = np.array([pose.as_matrix() for pose in poses if pose is not None])
+            states = map(state_of, self._capture.journal.views)
+            taken = np.array([state.base_from_flange for state in states if state is not None])
             view = next_view(coach.target, coach.lens, avoid, lambda at: near(place(at), taken))
             flange = None if view is None else place(view)
         view = next_view(coach.target, coach.lens, avoid) if view is None else view

@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.transforms import apply, compose, invert, rotation_angle
-from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
+from visioncal.core.transforms import apply, compose, distances, invert, rotation_angle
+from visioncal.core.types import Camera, FloatArray, Mask, Target
 from visioncal.live.planning.visibility import FieldOfView
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import extent_m, outline
@@ -94,19 +94,8 @@ def near(flanges: FloatArray, taken: FloatArray) -> Mask:
     Where an arm has stood it can stand; what it reaches beyond, and what stands there, only its
     user knows.
     """
-    apart = taken[:, None, :3, 3] - flanges[None, :, :3, 3]
-    turned = rotation_angle(invert(taken)[:, None] @ flanges[None])
-    beside = (np.linalg.norm(apart, axis=2) < _NEAR_M) & (turned < _NEAR_RAD)
+    apart = (distances(flanges, pose) for pose in taken)
+    beside = [(shifts_m < _NEAR_M) & (angles < _NEAR_RAD) for shifts_m, angles in apart]
     out, low = np.linalg.norm(taken[:, :3, 3], axis=1).max(), taken[:, 2, 3].min()
     is_inside = (np.linalg.norm(flanges[:, :3, 3], axis=1) <= out) & (flanges[:, 2, 3] >= low)
-    return np.asarray(beside.any(axis=0) & is_inside)
-
-
-def by_travel(poses: FloatArray) -> IntArray:
-    """An order of poses (n, 4, 4) [m] from the first on, each time to the nearest that is left."""
-    order, left = [0], set(range(1, len(poses)))
-    while left:
-        here = poses[order[-1], :3, 3]
-        order.append(min(left, key=lambda at: float(np.linalg.norm(poses[at, :3, 3] - here))))
-        left.remove(order[-1])
-    return np.array(order)
+    return np.asarray(np.any(beside, axis=0) & is_inside)

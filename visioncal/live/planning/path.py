@@ -147,7 +147,7 @@ def order_stops(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed:
     best: _Tour | None = None
     first = int(np.linalg.norm(q - np.median(q, axis=0), axis=1).argmax()) if len(q) else 0
     for _ in range(1 if start_q is not None else 3):
-        order = _short_order(start_q, q, first)
+        order = short_order(start_q, q, first)
         tour = _Tour(detours, start_q, q)
         tour.walk(order)
         if best is None or len(tour.order) > len(best.order):
@@ -220,12 +220,21 @@ class _Tour:
         return self._q[self.order[place - 1]] if place else self._start
 
 
-def _short_order(start_q: FloatArray | None, q: FloatArray, first: int) -> list[int]:
-    """Order with a short path of the joints: nearest neighbours, improved by reversals."""
-    points = q if start_q is None else np.vstack([q, start_q])
+def short_order(start: FloatArray | None, stops: FloatArray, first: int) -> list[int]:
+    """Order with a short path: nearest neighbours, improved by reversals.
+
+    Args:
+        start: (n,) joints or a place to start from, in any unit; None to start at a stop.
+        stops: (k, n) joints or places.
+        first: Row of that stop.
+
+    Returns:
+        (k,) rows of the stops.
+    """
+    points = stops if start is None else np.vstack([stops, start])
     distance = np.linalg.norm(points[:, None] - points[None], axis=2)
-    order = [first if start_q is None else len(q)]
-    remaining = set(range(len(q))) - set(order)
+    order = [first if start is None else len(stops)]
+    remaining = set(range(len(stops))) - set(order)
     while remaining:
         last = order[-1]
         order.append(min(remaining, key=lambda row: distance[last, row]))
@@ -240,10 +249,10 @@ def _short_order(start_q: FloatArray | None, q: FloatArray, first: int) -> list[
             onward = np.where(after >= 0, distance[ends, after] - distance[tour[i], after], 0.0)
             gain = distance[tour[i - 1], tour[i]] - distance[tour[i - 1], ends] + onward
             j = int(gain.argmax())
-            # Less is rounding [rad].
+            # Less is rounding [rad, m].
             if gain[j] > 1e-9:
                 tour[i : i + 2 + j] = tour[i : i + 2 + j][::-1].copy()
                 gained = True
         if not gained:
             break
-    return [int(row) for row in tour if row < len(q)]
+    return [int(row) for row in tour if row < len(stops)]
