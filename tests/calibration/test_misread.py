@@ -37,7 +37,8 @@ from visioncal.interchange.formats import (
     reread,
 )
 from visioncal.results import Calibration
-from visioncal.robot import load_robot, with_base
+from visioncal.robot import load_robot
+from visioncal.robot.conversion import with_base
 from visioncal.session import Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, SimulatedCell, fine_camera, simulate, write_session

@@ -43,7 +43,8 @@ from visioncal.estimation.tolerance_probability import chance_within, radius_wit
 from visioncal.present.report.content import need_facts
 from visioncal.results import Calibration, Rms, to_document
 from visioncal.results.parts import VerdictForm
-from visioncal.robot import load_robot, with_base
+from visioncal.robot import load_robot
+from visioncal.robot.conversion import with_base
 from visioncal.robot.files import read_robot_document
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, SimulatedCell, simulate

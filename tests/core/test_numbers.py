@@ -16,7 +16,7 @@ from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, rounded_up, significant
 from visioncal.core.quantiles import chi2_limit, f_limit, t_chance
 from visioncal.core.types import FloatArray, scalar_of
-from visioncal.robot import REPEATABILITY
+from visioncal.robot.model import REPEATABILITY
 
 
 @pytest.fixture

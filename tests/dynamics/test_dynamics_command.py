@@ -8,9 +8,12 @@ import pytest
 from support.commands import visioncal
 
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.dynamics import ArmDynamics, BaseModel, FrictionTerms, Identified, estimate_payload
+from visioncal.dynamics import ArmDynamics, Identified
+from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.identified import Lag, judge
 from visioncal.dynamics.identify import Options
+from visioncal.dynamics.model import FrictionTerms
+from visioncal.dynamics.payload import estimate_payload
 from visioncal.dynamics.run import IdentificationRequest, conditioned_streams, identify_session
 from visioncal.interchange.outputs import write_dynamics
 from visioncal.robot import Loads, Robot, load_robot

@@ -12,28 +12,18 @@ from support.moved_arms import recorded, robot_with_bodies, true_base
 from support.refusals import raised
 
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.dynamics import (
-    ArmDynamics,
-    BaseModel,
-    DynamicModel,
-    Friction,
-    FrictionTerms,
-    JointMotion,
-)
+from visioncal.dynamics import ArmDynamics
+from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, identify, predict, validate
+from visioncal.dynamics.model import DynamicModel, Friction, FrictionTerms, JointMotion
 from visioncal.dynamics.reading import RecordedSamples
 from visioncal.dynamics.regression import NoiseBlock, regress
-from visioncal.robot import (
-    Inertias,
-    Robot,
-    joint_torques,
-    load_robot,
-    read_robot_document,
-    robot_names,
-    torque_regressor,
-)
+from visioncal.robot import Robot, load_robot
+from visioncal.robot.files import read_robot_document, robot_names
+from visioncal.robot.inertia import Inertias
+from visioncal.robot.torques import joint_torques, torque_regressor
 from visioncal.robot.writing import small_urdf, urdf_with_inertias, with_inertias
 from visioncal.simulation.dynamics import (
     drive_torques,

@@ -19,8 +19,9 @@ from visioncal.dynamics.excitation import ExcitationRequest, Harmonics, Objectiv
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_extremes, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
 from visioncal.dynamics.sweeps import Stroke, SweepRequest, plan_sweeps
-from visioncal.robot import Robot, joint_torques, load_robot
+from visioncal.robot import Robot, load_robot
 from visioncal.robot.collision import Body
+from visioncal.robot.torques import joint_torques
 from visioncal.simulation.arms import ur_arm
 
 pytestmark = pytest.mark.usefixtures("strict_rerun")

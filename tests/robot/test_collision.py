@@ -7,8 +7,9 @@ from support.refusals import raised
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
-from visioncal.robot import Robot, load_robot, read_robot_document
+from visioncal.robot import Robot, load_robot
 from visioncal.robot.collision import Body, Collisions, arm_bodies, capsule
+from visioncal.robot.files import read_robot_document
 from visioncal.simulation.arms import ur_arm
 
 POST = compose(np.eye(3), np.array([0.45, 0.1, 0.3]))

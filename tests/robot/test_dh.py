@@ -11,17 +11,10 @@ import pytest
 from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
-from visioncal.robot import (
-    Robot,
-    convert_table,
-    load_robot,
-    other_convention,
-    parallel_axes,
-    robot_names,
-    table_document,
-    table_from_document,
-    table_of,
-)
+from visioncal.robot import Robot, load_robot
+from visioncal.robot.conversion import convert_table, other_convention, parallel_axes, table_of
+from visioncal.robot.files import robot_names
+from visioncal.robot.tables import table_document, table_from_document
 from visioncal.robot.writing import small_urdf
 
 NUMBERS = ("theta_rad", "d_m", "a_m", "alpha_rad", "beta_rad", "parallel", "base", "flange")

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.robot import Robot, load_robot, robot_names
+from visioncal.robot import Robot, load_robot
 from visioncal.robot.chain import chain_document
+from visioncal.robot.files import robot_names
 from visioncal.robot.inverse import Inverse
 
 # A wrist bent and an elbow bent: far from every singular posture of a UR.

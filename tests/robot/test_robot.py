@@ -11,8 +11,9 @@ from support.urdf_arm import of_urdf, some_changes, some_joints
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
-from visioncal.robot import Robot, load_robot, read_robot_document, robot_file, robot_names
+from visioncal.robot import Robot, load_robot
 from visioncal.robot.chain import chain_document
+from visioncal.robot.files import read_robot_document, robot_file, robot_names
 from visioncal.robot.loads import Masses
 from visioncal.robot.writing import (
     corrected_urdf,

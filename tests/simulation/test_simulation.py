@@ -10,7 +10,7 @@ from support.marks import slow
 from support.moved_arms import robot_with_bodies
 
 from visioncal.core.transforms import invert, log, rotation_angle
-from visioncal.robot import body_regressor, joint_torques
+from visioncal.robot.torques import body_regressor, joint_torques
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,

@@ -36,14 +36,7 @@ from visioncal.core.files import check_free
 from visioncal.core.number_format import figure, matched, significant, some_of
 from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.types import FloatArray
-from visioncal.dynamics import (
-    BaseModel,
-    DynamicModel,
-    FrictionTerms,
-    Payload,
-    drive_gains,
-    estimate_payload,
-)
+from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.identified import (
     CLASSES,
@@ -54,6 +47,8 @@ from visioncal.dynamics.identified import (
 )
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, validate
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_limits
+from visioncal.dynamics.model import DynamicModel, FrictionTerms
+from visioncal.dynamics.payload import Payload, drive_gains, estimate_payload
 from visioncal.dynamics.plan_files import MotionPlan, motion_document
 from visioncal.dynamics.run import (
     IdentificationRequest,
@@ -71,8 +66,9 @@ from visioncal.live.drivers.ur import UrArm
 from visioncal.live.planning.messages import plan_warnings, plan_words
 from visioncal.present.torques import torque_table
 from visioncal.present.words import said
-from visioncal.robot import Inertias, load_robot, symmetric_matrices
+from visioncal.robot import load_robot
 from visioncal.robot.collision import Body, capsule
+from visioncal.robot.inertia import Inertias, symmetric_matrices
 from visioncal.session import STREAMS, Session, check_stream, save_stream
 
 

@@ -40,7 +40,7 @@ from visioncal.live.planning.cell import PlanCell, seen_from
 from visioncal.live.planning.path import short_order
 from visioncal.live.planning.plan_file import PlanFile, read_plan
 from visioncal.live.planning.repeated import stops_to_repeat
-from visioncal.robot import robot_names
+from visioncal.robot.files import robot_names
 from visioncal.vision.targets import target_from_document, target_names
 
 # What was chosen last, beside the views.

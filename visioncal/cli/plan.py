@@ -45,7 +45,8 @@ from visioncal.live.planning.recorded import (
 )
 from visioncal.live.planning.repeated import stops_to_repeat
 from visioncal.results import Calibration
-from visioncal.robot import Robot, has_ur_axes, load_robot
+from visioncal.robot import Robot, load_robot
+from visioncal.robot.conversion import has_ur_axes
 from visioncal.session import Session
 from visioncal.session.selecting import ANY, LENS, Choice, must_select_one, select
 from visioncal.vision.targets import target_from_document

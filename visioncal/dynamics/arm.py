@@ -9,7 +9,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import Friction
-from visioncal.robot import Inertias, Robot, joint_torques, parameter_transform
+from visioncal.robot import Robot
+from visioncal.robot.inertia import Inertias, parameter_transform
+from visioncal.robot.torques import joint_torques
 from visioncal.robot.writing import with_inertias
 
 

@@ -26,7 +26,7 @@ from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import DynamicModel, JointMotion
 from visioncal.dynamics.regression import NoiseBlock
 from visioncal.estimation.linalg import covariance_from
-from visioncal.robot import Inertias, LogCholesky
+from visioncal.robot.inertia import Inertias, LogCholesky
 
 # A column is dependent where less than this share of it is left, and has no effect where its norm
 # is less than this share of the largest. True shares are above 1e-3, rounding 1e-13.

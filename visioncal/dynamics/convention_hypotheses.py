@@ -17,7 +17,9 @@ from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import JointMotion, Measured, sign
-from visioncal.robot import Inertias, Robot, joint_torques
+from visioncal.robot import Robot
+from visioncal.robot.inertia import Inertias
+from visioncal.robot.torques import joint_torques
 
 # Least number of a test's samples: sweeps of single joints have fewer.
 _LEAST = 100

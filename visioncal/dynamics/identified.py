@@ -21,8 +21,9 @@ from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel, Consistent, random_motion
 from visioncal.dynamics.model import DynamicModel, FrictionTerms, JointMotion
 from visioncal.dynamics.regression import Stribeck
-from visioncal.robot import Inertias, Robot
+from visioncal.robot import Robot
 from visioncal.robot.files import robot_names
+from visioncal.robot.inertia import Inertias
 
 # Classes of a parameter's relative sigma; beyond the last it is not determined.
 CLASSES = ((0.02, "2 %"), (0.1, "10 %"), (1.0, "poorly"))

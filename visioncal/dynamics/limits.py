@@ -10,8 +10,10 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.model import JointMotion
-from visioncal.robot import Inertias, Robot, joint_torques, parameter_transform
+from visioncal.robot import Robot
 from visioncal.robot.collision import Body, Collisions, arm_bodies
+from visioncal.robot.inertia import Inertias, parameter_transform
+from visioncal.robot.torques import joint_torques
 
 CHECK_HZ = 1000.0
 

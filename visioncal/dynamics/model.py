@@ -6,7 +6,9 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.robot import PARAMETER_NAMES, Robot, torque_regressor
+from visioncal.robot import Robot
+from visioncal.robot.inertia import PARAMETER_NAMES
+from visioncal.robot.torques import torque_regressor
 
 # Below this speed a joint may stick, and the sign of its friction is undefined [rad/s].
 SLOW_RAD_S = 0.005

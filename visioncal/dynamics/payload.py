@@ -22,7 +22,8 @@ from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import FrictionTerms, JointMotion
 from visioncal.dynamics.regression import NoiseBlock, regress, rms_of
-from visioncal.robot import Inertias, body_regressor, symmetric_entries
+from visioncal.robot.inertia import Inertias, symmetric_entries
+from visioncal.robot.torques import body_regressor
 
 # Correlation of the gain errors of an arm's drives: of the 12 % of GAIN_SIGMA about 11 % are common
 # to all joints [-].

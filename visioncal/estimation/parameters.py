@@ -8,7 +8,9 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.robot import FUNCTION_NAMES, DHTable, table_of
+from visioncal.robot.chain import FUNCTION_NAMES
+from visioncal.robot.conversion import table_of
+from visioncal.robot.tables import DHTable
 
 _LENGTHS = ("d", "a")
 # Steps of differences [rad]: common normals of nearly parallel axes, which Hayati's form does

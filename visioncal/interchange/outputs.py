@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from visioncal.calibration.verification import Check, Trigger
     from visioncal.core.choices import ImagesKept
     from visioncal.core.verdict import Verdict
-    from visioncal.dynamics import Run
     from visioncal.dynamics.plan_files import MotionPlan
+    from visioncal.dynamics.run import Run
     from visioncal.live.planning.plan import Plan
     from visioncal.session import Session
 

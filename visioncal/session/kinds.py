@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import absence, is_inside, parse_toml, read_text
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, Target
-from visioncal.robot import ROBOT_SUFFIXES, read_robot_document
+from visioncal.robot.files import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session.columns import POSITION
 from visioncal.session.document import KINDS, Declaration, InstrumentTable, Kind, RobotTable
 from visioncal.session.table import View

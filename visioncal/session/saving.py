@@ -10,7 +10,8 @@ import tomli_w
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import sha256, temporary_folder, write_atomically
-from visioncal.robot import LINK_KEYS, robot_file
+from visioncal.robot.files import robot_file
+from visioncal.robot.model import LINK_KEYS
 from visioncal.session.corners import FILE as CORNERS
 from visioncal.session.corners import write_corners
 from visioncal.session.document import Kind

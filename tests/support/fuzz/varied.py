@@ -23,7 +23,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Target
 from visioncal.interchange.result_files import load_calibration
 from visioncal.present.viewer import blueprint
-from visioncal.robot import read_robot_document
+from visioncal.robot.files import read_robot_document
 from visioncal.simulation import BOARDS, CellOptions, Second, cell_session, simulate
 from visioncal.vision.targets import corner_positions
 

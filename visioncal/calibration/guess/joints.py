@@ -18,7 +18,9 @@ from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.robot import Robot, load_robot, other_convention, robot_names
+from visioncal.robot import Robot, load_robot
+from visioncal.robot.conversion import other_convention
+from visioncal.robot.files import robot_names
 
 # Largest deviation of an arm from its model, as a share of its reach and an angle [rad]: 2 mm and 3
 # mrad a link add up to half of it. Another arm of the same shape deviates by as much again.

@@ -20,7 +20,7 @@ from visioncal.core.number_format import counted, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Mount, Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
-from visioncal.robot import REPEATABILITY
+from visioncal.robot.model import REPEATABILITY
 from visioncal.session import Session
 
 

@@ -32,7 +32,8 @@ from visioncal.results.arm import (
     WorkspacePlace,
     WorkspaceSigma,
 )
-from visioncal.robot import convert_table, parallel_axes, table_from_document, table_of
+from visioncal.robot.conversion import convert_table, parallel_axes, table_of
+from visioncal.robot.tables import table_from_document
 
 # Number of postures of a map of the accuracy.
 _PLACES = 200

@@ -13,7 +13,9 @@ from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.robot import Robot, robot_names, with_base
+from visioncal.robot import Robot
+from visioncal.robot.conversion import with_base
+from visioncal.robot.files import robot_names
 from visioncal.session import View
 from visioncal.session.table import reported_matrices
 

@@ -10,7 +10,8 @@ from visioncal.core.number_format import counted
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.trajectory import Samples, Trajectory
-from visioncal.robot import REPEATABILITY, Robot
+from visioncal.robot import Robot
+from visioncal.robot.model import REPEATABILITY
 from visioncal.session import Session, View
 from visioncal.session.columns import POSE
 

@@ -9,7 +9,7 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.observability import Direction
 from visioncal.results import Rms, ViewResult
 from visioncal.results.views import holdout_rms, left_out_rms, rms_of
-from visioncal.robot import REPEATABILITY
+from visioncal.robot.model import REPEATABILITY
 
 
 @dataclass(frozen=True)

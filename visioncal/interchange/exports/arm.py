@@ -18,7 +18,9 @@ from visioncal.dynamics import ArmDynamics, Identified
 from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports.content import Format, Selection, Source
 from visioncal.results import Calibration
-from visioncal.robot import DHTable, Robot, parallel_axes, table_from_document, table_of
+from visioncal.robot import Robot
+from visioncal.robot.conversion import parallel_axes, table_of
+from visioncal.robot.tables import DHTable, table_from_document
 from visioncal.robot.writing import (
     corrected_tip,
     corrected_urdf,

@@ -9,7 +9,8 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import adjoint, invert
-from visioncal.dynamics import Identified, judge
+from visioncal.dynamics import Identified
+from visioncal.dynamics.identified import judge
 from visioncal.frames.naming import PARENTS
 from visioncal.interchange.exports.arm import ARMS, ArmFormat, select_arm, write_dynamics
 from visioncal.interchange.exports.content import (

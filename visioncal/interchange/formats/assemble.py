@@ -25,7 +25,8 @@ from visioncal.interchange.formats.intrinsics import (
     read_target_description,
     target_name,
 )
-from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
+from visioncal.robot import Robot
+from visioncal.robot.files import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session import ImageStore, Session, Stream
 from visioncal.session import columns as session_columns
 from visioncal.session.images import ListedImages

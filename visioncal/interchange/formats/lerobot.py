@@ -26,7 +26,7 @@ from visioncal.interchange.formats.foreign import (
     ImportOptions,
     frames_to_take,
 )
-from visioncal.robot import read_robot_document, robot_names
+from visioncal.robot.files import read_robot_document, robot_names
 from visioncal.session.images import ListedImages
 
 _STATE, _IMAGES = "observation.state", "observation.image"

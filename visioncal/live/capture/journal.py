@@ -29,7 +29,8 @@ from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.protocols import ArmState
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.plan_file import PlanFile
-from visioncal.robot import Robot, load_robot, robot_file, robot_names
+from visioncal.robot import Robot, load_robot
+from visioncal.robot.files import robot_file, robot_names
 from visioncal.session import Session, View
 from visioncal.session.columns import pose_row
 from visioncal.session.table import write_csv

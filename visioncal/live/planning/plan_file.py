@@ -19,7 +19,7 @@ from visioncal.core.version import __version__
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.plan import ACCURACY, Plan, PlannedStop, Stop
 from visioncal.live.planning.purposes import Purpose, purpose_of
-from visioncal.robot import has_ur_axes
+from visioncal.robot.conversion import has_ur_axes
 from visioncal.session.columns import POSE, pose_row
 
 _FILE, _SCHEMA = "plan.json", 1

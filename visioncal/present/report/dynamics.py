@@ -6,15 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from visioncal.core.number_format import matched, significant
-from visioncal.dynamics import (
-    Identified,
-    Prediction,
-    Run,
-    friction_at,
-    judge,
-    measured_friction,
-    stribeck_rows,
-)
+from visioncal.dynamics import Identified
+from visioncal.dynamics.identified import judge, stribeck_rows
+from visioncal.dynamics.identify import Prediction, friction_at, measured_friction
+from visioncal.dynamics.run import Run
 from visioncal.present import facts
 from visioncal.present.report.plotting import (
     ACCENT,
