@@ -28,13 +28,9 @@ def kind_of(target: Target) -> BoardKind:
     return KINDS[target.kind]
 
 
-def find_target(image: Image, target: Target, *, quick: bool = False) -> DetectedCorners | NotFound:
-    """Detects a target's corners in a (h, w) grey image, to sub-pixel accuracy.
-
-    Returns the corners, or why there are none. With `quick`, detection of a board stops if a first,
-    quick search fails.
-    """
-    return kind_of(target).find(image, target, quick=quick)
+def find_target(image: Image, target: Target) -> DetectedCorners | NotFound:
+    """A target's corners in a (h, w) grey image, to sub-pixel accuracy, or why there are none."""
+    return kind_of(target).find(image, target)
 
 
 def blur_of(image: Image, target: Target, ids: IntArray, px: FloatArray) -> float:

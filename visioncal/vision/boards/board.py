@@ -45,7 +45,7 @@ class Board(BoardKind):
         squares = self.corners(target)[ids, :2] / self.unit_m(target)
         return refine(image, self.around(target, ids, squares), squares, px)
 
-    def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:
+    def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
         """Corners by a quick search, or in a reduced copy if that finds the whole board."""
         sides = max(image.shape), min(image.shape)
         factors = [by for by in (4, 2) if sides[0] > by // 2 * self.long_side_px and sides[1] >= by]
@@ -58,8 +58,6 @@ class Board(BoardKind):
                 refined = self._refined(image, target, DetectedCorners(seen.ids, px))
                 if refined.weights is None:
                     return refined
-            if quick and isinstance(seen, NotFound):
-                return seen
         seen = self.search(image, target)
         return seen if isinstance(seen, NotFound) else self._refined(image, target, seen)
 

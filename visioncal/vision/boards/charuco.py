@@ -1,10 +1,10 @@
 """ChArUco boards: a checkerboard with markers in its light squares."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -42,8 +42,6 @@ _LAYOUT_MARKERS = 3
 # px.
 _QUICK_PX = 7
 
-# (4, 2) corners [px] by marker id.
-_Markers: TypeAlias = Mapping[int, FloatArray]
 _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
 # Steps between markers up to this length, and this close to whole squares, are counted [squares].
 _NEAR, _OFF = 2.5, 0.3
@@ -181,14 +179,14 @@ class Charuco(Board):
             return NotFound(
                 "markers are seen twice: another board with the same markers is in the image"
             )
-        by_id = {
-            int(marker): np.asarray(px, dtype=float).reshape(4, 2)
-            for marker, px in zip(np.ravel(marker_ids), marker_px, strict=True)
-        }
-        on_board, in_image = (match.reshape(-1, 4, 2) for match in _matches(by_id, target))
-        is_checked = len(on_board) >= _LAYOUT_MARKERS
-        if is_checked and layout_misfit(on_board, in_image) > LAYOUT_MISFIT:
-            return NotFound("the markers do not lie as the target describes them", misfit=True)
+        places = dict(zip(np.ravel(board.getIds()).tolist(), board.getObjPoints(), strict=True))
+        by_id = dict(zip(np.ravel(marker_ids).tolist(), marker_px, strict=True))
+        known = [marker for marker in by_id if marker in places]
+        if len(known) >= _LAYOUT_MARKERS:
+            on_board = np.array([places[marker][:, :2] for marker in known], dtype=float)
+            in_image = np.array([by_id[marker] for marker in known], dtype=float)
+            if layout_misfit(on_board, in_image.reshape(-1, 4, 2)) > LAYOUT_MISFIT:
+                return NotFound("the markers do not lie as the target describes them", misfit=True)
         if np.size(ids) == 0 or px is None:
             return NotFound(f"no board: {len(marker_px)} markers are seen, but no corner")
         order = np.argsort(ids.ravel())
@@ -227,18 +225,6 @@ def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
     )
     board.setLegacyPattern(target.legacy)
     return board
-
-
-def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]:
-    """Corners of the detected markers on the board [m], and in the image [px]."""
-    board = charuco_board(target)
-    ids = np.ravel(np.asarray(board.getIds()))
-    places = dict(zip(ids.tolist(), board.getObjPoints(), strict=True))
-    on_target = [marker for marker in markers if marker in places]
-    if not on_target:
-        return np.empty((0, 2)), np.empty((0, 2))
-    on_board = np.concatenate([places[marker][:, :2] for marker in on_target])
-    return on_board.astype(np.float64), np.concatenate([markers[marker] for marker in on_target])
 
 
 def _identified(image: Image, markers: Sequence[Marker]) -> Identity | None:

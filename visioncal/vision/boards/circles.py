@@ -15,7 +15,6 @@ from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.imaging import shrunk
 from visioncal.vision.boards.kind import (
     BoardRequest,
-    Cells,
     DetectedCorners,
     NotFound,
     counts_of,
@@ -93,11 +92,6 @@ class CircleGrid(Board):
         """Low and high x, y of the print [m]."""
         low, high = super().extent_m(target)
         return low - target.diameter_m / 2, high + target.diameter_m / 2
-
-    def cells(self, target: Target) -> tuple[Cells, ...]:
-        """None: its print is discs."""
-        del target
-        return ()
 
     def discs(self, target: Target) -> FloatArray:
         """(n, 3) centres and radii of its circles [m]."""

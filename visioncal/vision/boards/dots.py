@@ -16,7 +16,7 @@ from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.circles import find_blobs
-from visioncal.vision.boards.kind import BoardRequest, Cells, DetectedCorners, NotFound, sigma_of
+from visioncal.vision.boards.kind import BoardRequest, DetectedCorners, NotFound, sigma_of
 from visioncal.vision.boards.points import PointsKind, points_of
 from visioncal.vision.boards.template import Print
 
@@ -94,10 +94,6 @@ class Dots(PointsKind, Board):
         points = dict(zip(_COLUMNS, columns, strict=True))
         return {"points": points, "square_sigma_m": target.square_sigma_m}
 
-    def corners(self, target: Target) -> FloatArray:
-        """(n, 3) centres [m], in the order of its table."""
-        return np.array(target.points_m, dtype=float)
-
     def words(self, target: Target, size: str) -> str:
         """The board in a few words."""
         del size
@@ -107,11 +103,6 @@ class Dots(PointsKind, Board):
         """Low and high x, y of the print [m]."""
         places, radii = self.corners(target)[:, :2], _radii_m(target)[:, None]
         return (places - radii).min(axis=0), (places + radii).max(axis=0)
-
-    def cells(self, target: Target) -> tuple[Cells, ...]:
-        """None: its print is discs."""
-        del target
-        return ()
 
     def discs(self, target: Target) -> FloatArray:
         """(n, 3) centres and radii of its dots [m]."""

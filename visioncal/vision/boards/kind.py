@@ -130,16 +130,17 @@ class BoardKind(ABC):
     def words(self, target: Target, size: str) -> str:
         """The target in a few words, with its columns and rows as `size`."""
 
-    @abstractmethod
     def cells(self, target: Target) -> tuple[Cells, ...]:
         """Dark areas; those of two grids share at most a point; raises DataError."""
+        del target
+        return ()
 
     @abstractmethod
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
         """What a printed sheet says of it: words, the origin's place, how to measure its size."""
 
     @abstractmethod
-    def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:
+    def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
         """Its corners in a (h, w) grey image; see `find_target`."""
 
     def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:

@@ -90,16 +90,13 @@ class MarkerKind(BoardKind):
         family = family if family.startswith("a") else f"aruco_{family}"
         return f"{family}_id{target.marker_id}_{side}"
 
-    def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:
+    def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
         """Corners of the marker in a (h, w) grey image, or why there are none.
 
         OpenCV's corners (Garrido-Jurado et al. 2014) are biased inwards by blur. They are refined
         by the template of `refine_tags`; a corner that it does not fit remains OpenCV's, with less
         weight.
         """
-        del quick
-        if min(image.shape) < 2:
-            return NotFound("the image is a line")
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         ids, px = read_markers(image, target.dictionary, parameters)

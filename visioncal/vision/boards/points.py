@@ -19,7 +19,6 @@ from visioncal.vision.boards.kind import (
     Cells,
     DetectedCorners,
     NotFound,
-    aruco_dictionary,
     dictionary_size,
     marker_cells,
 )
@@ -38,13 +37,40 @@ class PointsKind(BoardKind):
     table_columns: ClassVar[tuple[str, ...]]  # Columns of its table, the needed ones first.
     needed_columns: ClassVar[int]  # Number of the needed ones.
 
+    def corners(self, target: Target) -> FloatArray:
+        """(n, 3) points [m], in the order of its table."""
+        return np.array(target.points_m, dtype=float)
+
     def loaded(self, document: dict[str, Any], folder: Path) -> dict[str, Any]:
         """The content of its `.toml` with the columns of its table."""
-        table = document.get("points")
-        if not isinstance(table, str):
+        name = document.get("points")
+        if not isinstance(name, str):
             return document
-        known = self.table_columns
-        points = _read_points(folder, table, known, known[: self.needed_columns])
+        path = folder / name.replace("\\", "/")
+        if not is_inside(path, folder):
+            raise DataError(
+                f"points = {name!r} leads out of the folder of the target's file.",
+                culprits=["points"],
+                next_step="Copy the table of points beside the target's file.",
+            )
+        table, needed = read_table(path), self.table_columns[: self.needed_columns]
+        unknown = [column for column in table.columns if column not in self.table_columns]
+        missing = [column for column in needed if column not in table.columns]
+        if unknown or missing:
+            optional = ", ".join(self.table_columns[self.needed_columns :])
+            raise DataError(
+                f"{path}: its columns are {', '.join(table.columns)}; {', '.join(needed)} are "
+                f"needed, and {optional} where they are known.",
+                culprits=[f"{path.name}: {word}" for word in (*missing, *unknown)],
+            )
+        reader = TableReader(table)
+        points = {
+            name: reader.whole(name).tolist()
+            if name in _WHOLE_NUMBERS
+            else reader.numbers(Column(name, is_needed=True))[:, 0].tolist()
+            for name in table.columns
+        }
+        reader.check()
         return document | {"points": points}
 
     def stored(
@@ -100,10 +126,6 @@ class Rig(PointsKind):
         points = {"points": {name: value for name, value in rig.items() if value}}
         return points | ({"dictionary": target.dictionary} if target.point_tags else {})
 
-    def corners(self, target: Target) -> FloatArray:
-        """(n, 3) points [m], in the order of its table."""
-        return np.array(target.points_m, dtype=float)
-
     def words(self, target: Target, size: str) -> str:
         """The rig in a few words."""
         del target, size
@@ -147,16 +169,13 @@ class Rig(PointsKind):
             "Measure the tags' corners and write them into that table, in metres.",
         )
 
-    def find(self, image: Image, target: Target, *, quick: bool) -> DetectedCorners | NotFound:
+    def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
         """Corners of its tags in a (h, w) grey image, or why there are none."""
-        del quick
         if not target.point_tags:
             return NotFound(
                 f"target {target.name} is a rig of points, which no image is searched for: "
                 "corners.csv has no rows of this view"
             )
-        if min(image.shape) < 2:
-            return NotFound("the image is a line")
         numbers, found_px = read_markers(image, target.dictionary)
         corner_ids = tag_corners(target)
         quads = {
@@ -170,17 +189,20 @@ class Rig(PointsKind):
                 f"no tag of the target's, of {target.dictionary}, is seen{seen}",
                 misfit=bool(numbers),
             )
-        places = self._in_plane(target, quads)
-        if places is not None:
-            side = float(np.linalg.norm(places[:, 1] - places[:, 0], axis=1).mean())
-            if layout_misfit(places / side, np.array(list(quads.values()))) > LAYOUT_MISFIT:
+        places = self.corners(target)
+        points = np.array([corner_ids[quad] for quad in quads])
+        quads_px = np.array([*quads.values()])
+        count = len(marker_cells(target.dictionary, 0))
+        # Two complete tags or more in the plane z = 0.
+        if len(quads) > 1 and points.min() >= 0 and not np.ptp(places[:, 2]):
+            flat = places[points, :2]
+            side = float(np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1).mean())
+            if layout_misfit(flat / side, quads_px) > LAYOUT_MISFIT:
                 return NotFound("the tags do not lie as the target describes them", misfit=True)
-        count = int(aruco_dictionary(target.dictionary).markerSize) + 2
-        if places is None:
-            parts = [refine_tags(image, count, quad[None]) for quad in quads.values()]
+            parts = [refine_tags(image, count, quads_px, flat)]
         else:
-            parts = [refine_tags(image, count, np.array(list(quads.values())), places)]
-        points = np.concatenate([corner_ids[quad] for quad in quads])
+            parts = [refine_tags(image, count, quad[None]) for quad in quads_px]
+        points = points.ravel()
         fitted = np.concatenate([part.fitted for part in parts]) & (points >= 0)
         if not fitted.any():
             return NotFound("no corner of the tags seen is like the print")
@@ -188,47 +210,6 @@ class Rig(PointsKind):
         order = np.argsort(points[fitted])
         blur_px = float(np.nanmedian([part.blur_px.max() for part in parts]))
         return DetectedCorners(points[fitted][order], px[order], blur_px=blur_px)
-
-    def _in_plane(self, target: Target, quads: Mapping[int, FloatArray]) -> FloatArray | None:
-        """(t, 4, 2) positions of two complete tags or more in the plane z = 0 [m]; else None."""
-        known = tag_corners(target)
-        numbers = np.array([known[quad] for quad in quads])
-        places = self.corners(target)
-        if len(quads) < 2 or (numbers < 0).any() or np.ptp(places[:, 2]) > 0.0:
-            return None
-        return np.asarray(places[numbers, :2])
-
-
-def _read_points(
-    folder: Path, name: str, known: Sequence[str], needed: Sequence[str]
-) -> dict[str, list[Any]]:
-    """Reads a table of points by columns, from the folder of its target's description."""
-    path = folder / name.replace("\\", "/")
-    if not is_inside(path, folder):
-        raise DataError(
-            f"points = {name!r} leads out of the folder of the target's file.",
-            culprits=["points"],
-            next_step="Copy the table of points beside the target's file.",
-        )
-    table = read_table(path)
-    unknown = [column for column in table.columns if column not in known]
-    missing = [column for column in needed if column not in table.columns]
-    if unknown or missing:
-        optional = ", ".join(column for column in known if column not in needed)
-        raise DataError(
-            f"{path}: its columns are {', '.join(table.columns)}; {', '.join(needed)} are needed, "
-            f"and {optional} where they are known.",
-            culprits=[f"{path.name}: {word}" for word in (*missing, *unknown)],
-        )
-    reader = TableReader(table)
-    read: dict[str, list[Any]] = {
-        name: reader.whole(name).tolist()
-        if name in _WHOLE_NUMBERS
-        else reader.numbers(Column(name, is_needed=True))[:, 0].tolist()
-        for name in table.columns
-    }
-    reader.check()
-    return read
 
 
 def points_of(

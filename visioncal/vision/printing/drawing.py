@@ -5,8 +5,6 @@ single fill, so that renderers show no seams between neighbouring cells.
 """
 
 import io
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import matplotlib as mpl
@@ -54,16 +52,7 @@ def not_in_font(text: str) -> str:
 def _saved(
     sheet: Sheet, kind: str, metadata: dict[str, str | None], dpi: float | None = None
 ) -> bytes:
-    with _style():
-        figure = _figure(sheet)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, dpi=dpi or "figure", metadata=metadata)
-    return buffer.getvalue()
-
-
-@contextmanager
-def _style() -> Iterator[None]:
-    """Settings that give the same bytes for the same sheet, whatever the user's settings."""
+    # They give the same bytes for the same sheet, whatever the user's settings.
     settings: dict[Any, Any] = {
         "font.family": _FONT,
         "path.simplify": False,
@@ -79,7 +68,9 @@ def _style() -> Iterator[None]:
     with DRAWING, mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(settings)
-        yield
+        buffer = io.BytesIO()
+        _figure(sheet).savefig(buffer, format=kind, dpi=dpi or "figure", metadata=metadata)
+    return buffer.getvalue()
 
 
 def _figure(sheet: Sheet) -> Figure:

@@ -62,17 +62,6 @@ class Sheet:
     text_mm: tuple[float, float]  # Top left corner of the text.
 
 
-@dataclass(frozen=True)
-class _Room:
-    """Space that a board needs: margins on its left, top and right, and in total [mm]."""
-
-    left: float
-    top: float
-    right: float
-    width: float
-    height: float
-
-
 def pages_named(text: str, landscape: bool | None) -> tuple[Page, ...]:
     """Pages by name or size.
 
@@ -120,11 +109,10 @@ def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
     """Arranges a target on the first page with enough room; raises DataError."""
     pattern = draw_pattern(target)
     for page in pages:
-        room = _room(target, pattern, page)
-        if room.width <= page.width_mm and room.height <= page.height_mm:
-            return _centred(target, pattern, page, room)
+        if _fits(target, pattern, page):
+            return _centred(target, pattern, page)
     left, top, right, bottom = pattern.box
-    needed = _room(target, pattern, pages[0])
+    width_mm, height_mm = _needed_mm(target, pattern, pages[0])
     largest = largest_side_mm(target, pages)
     smaller = (
         f", or a {kind_of(target).unit} of {largest} mm, the largest that fits" if largest else ""
@@ -132,7 +120,7 @@ def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
     raise DataError(
         f"{target.name} does not fit on {', '.join(map(str, pages))}: the print measures "
         f"{1e3 * (right - left):g} x {1e3 * (bottom - top):g} mm, and with the white around it, "
-        f"the rulers and the text it needs {needed.width:.1f} x {needed.height:.1f} mm.",
+        f"the rulers and the text it needs {width_mm:.1f} x {height_mm:.1f} mm.",
         culprits=[target.name],
         next_step=f"Take a larger page (--page){smaller}.",
     )
@@ -149,34 +137,41 @@ def largest_side_mm(target: Target, pages: tuple[Page, ...]) -> int:
         scale = 1e-3 * middle / target.square_m
         tried = kind_of(target).scaled(target, scale)
         pattern = draw_pattern(tried)
-        rooms = [(_room(tried, pattern, page), page) for page in pages]
-        if any(
-            room.width <= page.width_mm and room.height <= page.height_mm for room, page in rooms
-        ):
+        if any(_fits(tried, pattern, page) for page in pages):
             fits = middle
         else:
             fails = middle
     return fits
 
 
-def _room(target: Target, pattern: Pattern, page: Page) -> _Room:
+def _fits(target: Target, pattern: Pattern, page: Page) -> bool:
+    width_mm, height_mm = _needed_mm(target, pattern, page)
+    return width_mm <= page.width_mm and height_mm <= page.height_mm
+
+
+def _needed_mm(target: Target, pattern: Pattern, page: Page) -> tuple[float, float]:
+    """Width and height that a board takes with the white around it, rulers and text."""
     left, top, right, bottom = (1e3 * side for side in pattern.box)
-    quiet_mm = 1e3 * pattern.quiet_m
+    before, behind = _margins_mm(pattern)
     lines = _lines(target, _text_width_mm(right - left, page))
+    below = 1e3 * pattern.quiet_m + _GAP_MM + LINE_MM * len(lines) + EDGE_MM
+    return before + right - left + behind, before + bottom - top + below
+
+
+def _margins_mm(pattern: Pattern) -> tuple[float, float]:
+    """Margins at the print's left and top, and at its right."""
+    quiet_mm = 1e3 * pattern.quiet_m
     # 4 mm for a ruler, its ticks and its label.
-    above = EDGE_MM + 4.0 + quiet_mm
-    beside = max(EDGE_MM, quiet_mm)
-    below = quiet_mm + _GAP_MM + LINE_MM * len(lines) + EDGE_MM
-    width, height = above + right - left + beside, above + bottom - top + below
-    return _Room(above, above, beside, width, height)
+    return EDGE_MM + 4.0 + quiet_mm, max(EDGE_MM, quiet_mm)
 
 
-def _centred(target: Target, pattern: Pattern, page: Page, room: _Room) -> Sheet:
+def _centred(target: Target, pattern: Pattern, page: Page) -> Sheet:
     """Centres the print on a page with enough room."""
+    before, behind = _margins_mm(pattern)
     left, top, right, bottom = (1e3 * side for side in pattern.box)
     width, height = right - left, bottom - top
-    x = min(max((page.width_mm - width) / 2, room.left), page.width_mm - width - room.right)
-    y = (page.height_mm - room.height) / 2 + room.top
+    x = min(max((page.width_mm - width) / 2, before), page.width_mm - width - behind)
+    y = (page.height_mm - _needed_mm(target, pattern, page)[1]) / 2 + before
     text_width = _text_width_mm(width, page)
     lines = _lines(target, text_width)
     ruler_x = _ruler_mm(page.width_mm - (x - left))
