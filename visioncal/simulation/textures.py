@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from visioncal.core.types import FloatArray, Image, Mask, Target
 from visioncal.simulation.boards import unit_m
-from visioncal.vision.boards import kind_of
+from visioncal.vision.printing.pattern import dark_cells, dark_discs
 from visioncal.vision.targets import extent_m
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
@@ -106,9 +106,9 @@ def _dark_shares(target: Target, shape: tuple[int, int], texel_m: float) -> Floa
     """Dark share of each texel of the print, of `shape` texels down and across."""
     dark = np.zeros(shape, np.float32)
     low, _ = extent_m(target)
-    for grid in kind_of(target).cells(target):
+    for grid in dark_cells(target):
         _stamp(dark, grid.dark, (grid.corner_m - low) / texel_m, grid.cell_m / texel_m)
-    for disc in (kind_of(target).discs(target) - [*low, 0.0]) / texel_m:
+    for disc in (dark_discs(target) - [*low, 0.0]) / texel_m:
         centre, radius = disc[:2], float(disc[2])
         # Circles' edges are straight within a texel.
         start, end = (

@@ -6,7 +6,7 @@ import rerun as rr
 
 from visioncal.core.types import Image, Target
 from visioncal.present.recording import colours
-from visioncal.vision.boards import kind_of
+from visioncal.vision.printing.pattern import dark_cells, dark_discs
 from visioncal.vision.targets import corner_positions, extent_m, outline
 
 
@@ -38,7 +38,7 @@ def picture(target: Target) -> Image:
     scale = side_px / target.square_m
     width, height = np.rint(scale * (high - low)).astype(int).tolist()
     page = np.full((height, width), 255, dtype=np.uint8)
-    for grid in kind_of(target).cells(target):
+    for grid in dark_cells(target):
         left, top = np.rint(scale * (grid.corner_m - low)).astype(int).tolist()
         rows, columns = (max(round(scale * grid.cell_m * value), 1) for value in grid.dark.shape)
         # More cells than pixels are averaged to grey.
@@ -47,7 +47,7 @@ def picture(target: Target) -> Image:
         region = page[top : top + rows, left : left + columns]
         resized = cv2.resize(brightness, (columns, rows), interpolation=interpolation)
         np.minimum(region, resized[: region.shape[0], : region.shape[1]], out=region)
-    discs = scale * (kind_of(target).discs(target) - [*low, 0.0]) - [0.5, 0.5, 0.0]
+    discs = scale * (dark_discs(target) - [*low, 0.0]) - [0.5, 0.5, 0.0]
     for x, y, radius in np.rint(16.0 * discs).astype(int).tolist():
         cv2.circle(page, (x, y), radius, 0.0, -1, cv2.LINE_AA, shift=4)
     return page
