@@ -222,7 +222,7 @@ def test_the_cause_its_cost_and_what_to_do_come_first() -> None:
 
 def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     verdict = judge(changed(SOUND, warnings=(EXCHANGED,), stops=8))
-    document = json.loads(json.dumps(write(VerdictForm, VerdictForm.of(verdict))))
+    document = json.loads(json.dumps(write(VerdictForm, verdict)))
     assert read(VerdictForm, document, "verdict").verdict("verdict") == verdict
     named = verdict.with_paths(tmp_path / "my cell", "out")
     command = f"visioncal calibrate '{tmp_path}/my cell' -o out"

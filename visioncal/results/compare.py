@@ -329,38 +329,30 @@ def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
 
 
 # Keys of the document where they differ from the fields' names; None for those by name.
-_KEYS = {"a": "first", "b": "second", "significance": "test", "name": None}
+_KEYS = {
+    "a": "first",
+    "b": "second",
+    "only_in_a": "only_in_first",
+    "only_in_b": "only_in_second",
+    "lens": "camera",
+    "significance": "test",
+} | dict.fromkeys(("name", "edges", "noise"))
 
 
 def to_document(comparison: Comparison) -> dict[str, Any]:
     """Document of `visioncal diff --json`; what was not computed is absent."""
-    document: dict[str, Any] = {
-        "is_change": comparison.is_change,
-        "findings": list(comparison.findings),
-        "same_session": comparison.same_session,
-        "mounts": list(comparison.mounts),
-        "verdicts": list(comparison.verdicts),
-        "transforms": {
-            edge.name: _written(edge) | {"sigma_mm": edge.sigma_mm, "sigma_deg": edge.sigma_deg}
-            for edge in comparison.edges
-        },
-        "only_in_first": list(comparison.only_in_a),
-        "only_in_second": list(comparison.only_in_b),
-        "noise": {
-            name: {
-                key: level
-                for key, level in zip(("first", "second"), levels, strict=True)
-                if level is not None
-            }
-            for name, levels in comparison.noise.items()
-        },
+    transforms = {
+        edge.name: _written(edge) | {"sigma_mm": edge.sigma_mm, "sigma_deg": edge.sigma_deg}
+        for edge in comparison.edges
     }
-    return (
-        document if comparison.lens is None else {**document, "camera": _written(comparison.lens)}
-    )
+    noise = {
+        name: {key: level for key, level in (("first", a), ("second", b)) if level is not None}
+        for name, (a, b) in comparison.noise.items()
+    }
+    return {**_written(comparison), "transforms": transforms, "noise": noise}
 
 
-def _written(value: Any) -> Any:  # noqa: ANN401 - a field of any of the dataclasses here
+def _written(value: Any) -> Any:  # noqa: ANN401 - any of the dataclasses here, or their fields
     """JSON of a value; dataclasses with whether they are a change."""
     if isinstance(value, np.ndarray | tuple):
         return np.asarray(value).tolist()

@@ -156,17 +156,19 @@ class EdgeForm(PoseForm):
     sigma_deg: float  # Root of the trace of the rotation's covariance [deg].
 
 
-def _edge_form(edge: Edge) -> EdgeForm:
-    pose = vars(PoseForm.of(edge.matrix))
-    return EdgeForm(
-        **pose, covariance=edge.covariance, sigma_mm=edge.sigma_mm, sigma_deg=edge.sigma_deg
-    )
-
-
 StoredPose = Annotated[FloatArray, WrittenForm(PoseForm.of, PoseForm.pose, PoseForm)]
 StoredEdge = Annotated[
     Edge,
-    WrittenForm(_edge_form, lambda item, path: Edge(item.pose(path), item.covariance), EdgeForm),
+    WrittenForm(
+        lambda edge: EdgeForm(
+            **vars(PoseForm.of(edge.matrix)),
+            covariance=edge.covariance,
+            sigma_mm=edge.sigma_mm,
+            sigma_deg=edge.sigma_deg,
+        ),
+        lambda item, path: Edge(item.pose(path), item.covariance),
+        EdgeForm,
+    ),
 ]
 
 

@@ -110,6 +110,10 @@ class CauseForm:
         )
 
 
+# Causes derive from the findings, and are written for other readers.
+_CAUSE_FORM = WrittenForm(CauseForm.of, lambda form, _: form, CauseForm)
+
+
 @dataclass(frozen=True, kw_only=True)
 class VerdictForm:
     """Verdict of a result."""
@@ -121,24 +125,15 @@ class VerdictForm:
     # The same by the controller's own poses, where the arm was calibrated along; `good_for_mm` then
     # is for corrected targets.
     good_for_mm_uncorrected: float | None = None
-    causes: tuple[CauseForm, ...] = ()  # Probable causes why it is not good, most probable first.
+    # Probable causes why it is not good, most probable first.
+    causes: tuple[Annotated[Finding, _CAUSE_FORM], ...] = ()
     findings: tuple[Finding, ...] = ()  # The findings behind the reasons.
-
-    @classmethod
-    def of(cls, verdict: Verdict) -> "VerdictForm":
-        """Form of a verdict."""
-        return cls(
-            status=verdict.status,
-            reasons=verdict.reasons,
-            good_for_mm=verdict.good_for_mm,
-            good_for_mm_uncorrected=verdict.good_for_mm_uncorrected,
-            causes=tuple(map(CauseForm.of, verdict.causes)),
-            findings=verdict.findings,
-        )
 
     def verdict(self, _: str) -> Verdict:
         """The verdict."""
         return Verdict(self.status, self.findings, self.good_for_mm, self.good_for_mm_uncorrected)
 
 
-StoredVerdict = Annotated[Verdict, WrittenForm(VerdictForm.of, VerdictForm.verdict, VerdictForm)]
+StoredVerdict = Annotated[
+    Verdict, WrittenForm(lambda verdict: verdict, VerdictForm.verdict, VerdictForm)
+]

@@ -139,12 +139,7 @@ def _content(
     if camera is None:
         camera = {} if resolution is None else {"resolution": resolution}
     elif isinstance(camera, Camera):
-        camera = {
-            "resolution": camera.resolution,
-            "model": camera.model,
-            "matrix": camera.matrix,
-            "distortion": camera.distortion,
-        }
+        camera = vars(camera)
     document: dict[str, Any] = {
         "schema": 1,
         "name": cell.get("name", "session"),

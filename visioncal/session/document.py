@@ -1,7 +1,7 @@
 """Tables of session.toml: fields, types and ranges."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal, Self, TypeAlias, cast
 
 import numpy as np
@@ -265,7 +265,7 @@ def read_declaration(
     try:
         declaration = Declaration.model_validate(dict(document))
     except ValidationError as error:
-        problems = [(_dotted(entry["loc"]), _error_message(entry)) for entry in error.errors()]
+        problems = [_problem(entry) for entry in error.errors()]
     else:
         problems = list(_contradictions(declaration, observed))
         hints = [key for key in _unknown_keys(declaration, "", label) if "Did you mean" in key]
@@ -278,12 +278,6 @@ def read_declaration(
     return declaration
 
 
-def _dotted(location: Sequence[int | str]) -> str:
-    """Dotted path of a place in the document: `camera.matrix[2]`."""
-    path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
-    return path.removeprefix(".")
-
-
 _MISSING = {
     "schema": " (schema = 1)",
     "name": ' (name = "...")',
@@ -292,15 +286,17 @@ _MISSING = {
 }
 
 
-def _error_message(entry: Mapping[str, Any]) -> str:
-    """Message for a field, from an entry of pydantic's list of errors."""
+def _problem(entry: Mapping[str, Any]) -> tuple[str, str]:
+    """Path of a field, `camera.matrix[2]`, and message, from an entry of pydantic's list."""
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in entry["loc"])
+    path = "".join(parts).removeprefix(".")
     if entry["type"] == "missing":
-        return f"is missing{_MISSING.get(str(entry['loc'][-1]), '')}"
+        return path, f"is missing{_MISSING.get(str(entry['loc'][-1]), '')}"
     if entry["type"] == "value_error":
-        return str(entry["ctx"]["error"])
+        return path, str(entry["ctx"]["error"])
     is_table = entry["type"] in ("model_type", "dict_type")
     needed = "must be a table" if is_table else entry["msg"].replace("Input should", "must")
-    return f"is {entry['input']!r}, but {needed}"
+    return path, f"is {entry['input']!r}, but {needed}"
 
 
 def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[str, str]]:

@@ -90,12 +90,8 @@ def robots_between(frames: Mapping[str, str], first: str, second: str) -> tuple[
         while frame != CELL:
             not_shared ^= {frame}
             frame = frames[frame]  # noqa: PLW2901 - up to the cell
-    flanges = sorted(name for name in not_shared if _is_flange(name))
+    flanges = sorted(frames_of_kind(not_shared, "flange"))
     return tuple(flange.removeprefix("flange").removeprefix("_") for flange in flanges)
-
-
-def _is_flange(frame: str) -> bool:
-    return frame == "flange" or frame.startswith("flange_")
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +169,7 @@ class _DeclaredTree:
             parent = _carrier(declared, child, self)
             if self.frames.get(child, ("", ""))[0] != "camera" or parent is None:
                 continue
-            if _is_flange(parent) != (mount == "eye-in-hand"):
+            if bool(frames_of_kind([parent], "flange")) != (mount == "eye-in-hand"):
                 where = "on a flange" if mount == "eye-in-hand" else "beside the robots"
                 raise _contradiction(
                     f'{child} hangs on {parent}, but mount = "{mount}" has the cameras {where}',

@@ -20,8 +20,7 @@ from visioncal.session.images import image_path
 _MOST_VIEWS = 20_000
 # Columns that observe without an image.
 _OBSERVED = ("cft_x_m", "meas_x_m")
-_CENTRE = tuple(f"payload_{axis}_m" for axis in "xyz")
-_FORCE = tuple(f"force_{axis}_n" for axis in "xyz")
+_CENTRE, _FORCE = cols.LOAD[1:4], cols.LOAD[4:]
 # Approach direction of the joints to a stop, by the cells of column approach.
 SIDES = {"+": 1.0, "-": -1.0, "": 0.0}
 

@@ -12,8 +12,6 @@ from visioncal.core.choices import WIDEST_RAD as WIDEST_RAD
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M, WIDE_RAD
 from visioncal.core.transforms import (
-    LAST_ROW,
-    RIGID,
     compose,
     invert,
     nearest_rotation,
@@ -216,19 +214,20 @@ def correct(
     chain, inverse = arm.real.chain, arm.inverse
     seeds = chain.effective(given_seeds)
     seeded = np.asarray(np.isfinite(given_seeds).all(axis=1))
+    # Without a seed, the branch nearest to the middle of the limits is taken.
+    limited = np.isfinite(arm.real.lower_rad) & np.isfinite(arm.real.upper_rad)
+    ends = [np.where(limited, each, 0.0) for each in (arm.real.lower_rad, arm.real.upper_rad)]
+    middle = chain.effective((0.5 * (ends[0] + ends[1]))[None])[0]
     previous: FloatArray | None = None
     postures: list[Posture] = []
     starts = np.empty_like(seeds)
     for at, target in enumerate(wanted):
         start = seeds[at] if seeded[at] else previous
-        if start is None:
-            # Without a seed, the branch nearest to the middle of the limits is taken.
-            postures.append(inverse.solve(target, _middle(arm.real), widest_rad=0.0))
-            starts[at] = postures[-1].positions
-        else:
-            postures.append(inverse.solve(target, start, widest_rad=widest_rad))
-            starts[at] = start
-        previous = postures[-1].positions if postures[-1].reached else start
+        begin, widest = (middle, 0.0) if start is None else (start, widest_rad)
+        posture = inverse.solve(target, begin, widest_rad=widest)
+        postures.append(posture)
+        starts[at] = posture.positions if start is None else start
+        previous = posture.positions if posture.reached else start
     positions = np.array([posture.positions for posture in postures]).reshape(seeds.shape)
     q = arm.unbent(chain.encoded(positions), loads)
     return Corrected(
@@ -242,13 +241,6 @@ def correct(
     )
 
 
-def _middle(robot: Robot) -> FloatArray:
-    """(n,) effective positions in the middle of the limits, zero without limits [rad or m]."""
-    limited = np.isfinite(robot.lower_rad) & np.isfinite(robot.upper_rad)
-    ends = [np.where(limited, array, 0.0) for array in (robot.lower_rad, robot.upper_rad)]
-    return np.asarray(robot.chain.effective((0.5 * (ends[0] + ends[1]))[None])[0])
-
-
 def _matrices(poses: Poses) -> FloatArray:
     """(m, 4, 4) the checked targets."""
     given = poses.as_matrix() if isinstance(poses, RigidTransform) else poses
@@ -256,28 +248,22 @@ def _matrices(poses: Poses) -> FloatArray:
     matrices = matrices[None] if matrices.ndim == 2 else matrices
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
         raise DataError(f"correct: targets of shape (m, 4, 4) are needed, not {np.shape(given)}.")
-    rotations = matrices[:, :3, :3]
-    off = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    rigid = (off < RIGID) & (np.abs(matrices[:, 3] - LAST_ROW).max(axis=1, initial=0.0) < RIGID)
-    if rigid.all():
-        rigid = np.linalg.det(rotations) > 0.0
-    if not rigid.all():
-        at = int(np.argmin(rigid))
-        raise DataError(
-            f"correct: target {at} is no rigid transform: {rigid_fault(matrices[at])}.",
-            culprits=[f"target {at}"],
-        )
-    extent_m = np.abs(matrices[:, :3, 3]).max(axis=1, initial=0.0)
-    reachable = extent_m < FAR_M
-    if not reachable.all():
-        at = int(np.argmin(reachable))
-        raise DataError(
-            f"correct: target {at} is {extent_m[at]:.4g} m from the base, and no arm reaches "
-            f"{FAR_M:g} m.",
-            culprits=[f"target {at}"],
-            next_step="Positions are in metres.",
-        )
+    for at, matrix in enumerate(matrices):
+        if fault := rigid_fault(matrix):
+            raise DataError(
+                f"correct: target {at} is no rigid transform: {fault}.", culprits=[f"target {at}"]
+            )
+        extent_m = np.abs(matrix[:3, 3]).max()
+        if extent_m >= FAR_M:
+            raise DataError(
+                f"correct: target {at} is {extent_m:.4g} m from the base, and no arm reaches "
+                f"{FAR_M:g} m.",
+                culprits=[f"target {at}"],
+                next_step="Positions are in metres.",
+            )
     # Matrices written with few digits are made orthonormal.
+    rotations = matrices[:, :3, :3]
+    off = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3))
     if off.max(initial=0.0) > 1e-12:
         return compose(nearest_rotation(rotations), matrices[:, :3, 3])
     return matrices
