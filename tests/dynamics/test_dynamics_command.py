@@ -262,7 +262,7 @@ def test_identified_inertias_are_exported(written, run, form, tmp_path):
     assert visioncal("export", written, "--to", form, "-o", path).status == 0
     again = load_robot(str(path), tip="tool0")
     assert again.inertias.values == pytest.approx(run.identified.inertias.values, abs=1e-9)
-    assert again.torque_nm.tolist() == run.identified.robot.torque_nm.tolist()
+    assert again.rates.torque.tolist() == run.identified.robot.rates.torque.tolist()
     visioncal("export", written, "--to", "ros").refused("robot-urdf and robot-json")
 
 

@@ -53,7 +53,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
 
     After an exception it is removed, and `path` is unchanged; OSErrors become DataErrors.
     """
-    with named_errors(path), temporary_file(path.parent) as aside:
+    with named_errors(path), temporary(path.parent, is_folder=False) as (aside, _):
         yield aside
         aside.replace(path)
 
@@ -424,29 +424,14 @@ def free_name(folder: Path) -> Path:
 
 
 @contextmanager
-def temporary_file(folder: Path) -> Iterator[Path]:
-    """Yields an empty temporary file, which is removed at the end if it still exists."""
-    with _temporary(folder, is_folder=False) as (path, _):
-        yield path
+def temporary(folder: Path, *, is_folder: bool) -> Iterator[tuple[Path, bool]]:
+    """Yields an empty file or folder `.HEX.tmp`, removed at the end if it still exists.
 
-
-@contextmanager
-def temporary_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
-    """Yields a temporary folder, which is removed at the end if it still exists.
+    A lock (flock) on it ends with its process: an unlocked one is abandoned, and the next writer in
+    the same folder removes it. Without such locks (Windows, some network drives) they stay.
 
     Yields:
-        Its path, and whether it is locked, which needs a file system with locks.
-    """
-    with _temporary(folder, is_folder=True) as made:
-        yield made
-
-
-@contextmanager
-def _temporary(folder: Path, *, is_folder: bool) -> Iterator[tuple[Path, bool]]:
-    """Yields a file or folder `.HEX.tmp` under a lock (flock) that ends with its process.
-
-    An unlocked one is abandoned, and the next writer in the same folder removes it. Without such
-    locks (Windows, some network drives) they stay.
+        Its path, and whether it is locked.
     """
     remove_abandoned(folder)
     while True:
@@ -563,7 +548,7 @@ def write_generation(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _recover(folder, wait=False)
-        with temporary_folder(folder) as (aside, is_locked):
+        with temporary(folder, is_folder=True) as (aside, is_locked):
             new = aside / _NEW
             new.mkdir()
             with _final_paths_in_errors(new, folder):

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cache, wraps
 from threading import Lock, RLock
-from types import FrameType
 from typing import ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -23,16 +22,12 @@ def signals_as_interrupts(*names: str) -> Iterator[None]:
     """
     present = [name for name in names or ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     numbers = [getattr(signal, name) for name in present]
-    previous = {number: signal.signal(number, _interrupt) for number in numbers}
+    previous = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
     try:
         yield
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - signal's interface
-    raise KeyboardInterrupt
 
 
 Given = ParamSpec("Given")

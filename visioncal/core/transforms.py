@@ -211,8 +211,10 @@ def rigid_fault(matrix: FloatArray, most: float = RIGID) -> str:
     if not np.allclose(matrix[3], LAST_ROW, atol=most):
         row = ", ".join(f"{value:.4g}" for value in matrix[3])
         return f"its last row is [{row}], and [0, 0, 0, 1] is needed; it may be transposed"
-    error = np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max()
-    if error >= most:
+    # Squares of the largest numbers overflow.
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max()
+    if not error < most:
         return (
             "the columns of its rotation are no unit vectors at right angles: they are off by "
             f"{error:.2g}, and {most:g} is allowed"

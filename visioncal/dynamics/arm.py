@@ -5,7 +5,6 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import Friction
@@ -33,16 +32,7 @@ class ArmDynamics:
         Raises:
             DataError: They have none, because the robot's own inertias were not known.
         """
-        robot = identified.robot
-        if identified.consistent is None:
-            raise DataError(
-                f"dynamics: nothing was known of the inertias of {robot.name}, so there are no "
-                "links that are bodies.",
-                culprits=[robot.name],
-                next_step="State mass_kg, com_m and inertia_kg_m2 of its joints, and identify "
-                "again.",
-            )
-        parameters = identified.consistent.values
+        robot, parameters = identified.robot, identified.standard.values
         links = 10 * robot.joint_count
         own = dict(zip(identified.base.model.names[links:], parameters[links:], strict=True))
 

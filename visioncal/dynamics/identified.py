@@ -148,20 +148,26 @@ class Identified:
         """Consistent inertias of the links; None where the robot's own were not known."""
         return None if self.consistent is None else self.consistent.inertias(self.robot.joint_count)
 
+    @property
+    def standard(self) -> Consistent:
+        """The consistent standard parameters; raises DataError where there are none."""
+        if self.consistent is None:
+            raise DataError(
+                f"dynamics: nothing was known of the inertias of {self.robot.name}, so there are "
+                "no links that are bodies.",
+                culprits=[self.robot.name],
+                next_step="State mass_kg, com_m and inertia_kg_m2 of its joints, and identify "
+                "again.",
+            )
+        return self.consistent
+
     def torques(self, motion: JointMotion) -> FloatArray:
         """Drive torques (m, n) by the base parameters [N m]."""
         return np.asarray(self.base.regressor(motion) @ self.values + self.stribeck.torques(motion))
 
     def consistent_torques(self, motion: JointMotion) -> FloatArray:
         """Drive torques (m, n) by the consistent standard parameters [N m], or DataError."""
-        if self.consistent is None:
-            raise DataError(
-                f"dynamics: nothing was known of the inertias of {self.robot.name}, so there are "
-                "no standard parameters.",
-                culprits=[self.robot.name],
-                next_step="State mass_kg, com_m and inertia_kg_m2 of its joints.",
-            )
-        values = self.base.of(self.consistent.values)
+        values = self.base.of(self.standard.values)
         return np.asarray(self.base.regressor(motion) @ values + self.stribeck.torques(motion))
 
 

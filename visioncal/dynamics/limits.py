@@ -132,8 +132,8 @@ def motion_limits(
     rates = [
         np.where(np.isfinite(stated), stated, np.inf if instead is None else instead)
         for stated, instead in (
-            (robot.velocity_rad_s, missing.speed_rad_s),
-            (robot.acceleration_rad_s2, missing.acceleration_rad_s2),
+            (robot.rates.velocity, missing.speed_rad_s),
+            (robot.rates.acceleration, missing.acceleration_rad_s2),
         )
     ]
     _check_stated(robot, np.minimum(-lower, upper), *rates)
@@ -143,7 +143,7 @@ def motion_limits(
         upper - share.margin_rad,
         share.speed * rates[0],
         share.acceleration * rates[1],
-        robot.torque_nm / share.torque,
+        robot.rates.torque / share.torque,
         robot.inertias,
         (*arm_bodies(robot), *bodies),
         share,
@@ -256,7 +256,12 @@ class MotionExtremes:
 def motion_extremes(allowed: MotionLimits, motion: JointMotion) -> MotionExtremes:
     """Computes the extremes of a densely sampled motion."""
     torques = allowed.torques(motion)
-    apart_m, nearest, row = _nearest(allowed, motion.q)
+    collisions, apart_m, row = allowed.collisions, np.inf, 0
+    nearest: tuple[str, ...] = ()
+    if collisions.names:
+        excess = np.array([collisions.distances(q) for q in motion.q]) - collisions.needed_m()
+        row, pair = divmod(int(excess.argmin()), excess.shape[1])
+        apart_m, nearest = float(excess[row, pair]), collisions.names[pair]
     return MotionExtremes(
         allowed,
         motion.q.min(axis=0),
@@ -268,13 +273,3 @@ def motion_extremes(allowed: MotionLimits, motion: JointMotion) -> MotionExtreme
         nearest,
         float(motion.times_s[row]),
     )
-
-
-def _nearest(allowed: MotionLimits, q: FloatArray) -> tuple[float, tuple[str, ...], int]:
-    """Least excess of the distances at (m, n) postures [m], its pair, and its posture's index."""
-    collisions = allowed.collisions
-    if not collisions.names:
-        return np.inf, (), 0
-    excess = np.array([collisions.distances(value) for value in q]) - collisions.needed_m()
-    row, pair = np.unravel_index(int(excess.argmin()), excess.shape)
-    return float(excess[row, pair]), collisions.names[pair], int(row)

@@ -70,9 +70,11 @@ def read_recorded(
         DataError: Columns of a joint are missing, there are columns of more joints than the robot
             has, currents have no gains, too few samples are complete, or stamps are not in seconds.
     """
-    names = {name: _names(name, count) for name in ("q", "tau", "current", "dq")}
+    units = {"q": "rad", "tau": "nm", "current": "a", "dq": "rad_s"}
+    joints = range(1, count + 1)
+    names = {name: [f"{name}{joint}_{unit}" for joint in joints] for name, unit in units.items()}
     present = {word: [name in stream for name in names[word]] for word in names}
-    known = {name for kind in ("q", "dq", "tau", "current") for name in _names(kind, count)}
+    known = {name for columns in names.values() for name in columns}
     beyond = [
         column for column in stream.columns if _NUMBERED.fullmatch(column) and column not in known
     ]
@@ -113,11 +115,6 @@ def read_recorded(
         raise too_far_apart(label, usual_s, _SLOWEST_S)
     q, torques, dq = (values[:, at * count : (at + 1) * count] for at in range(3))
     return RecordedSamples(label, times_s, q, dq if with_dq else None, gains * torques, of_currents)
-
-
-def _names(kind: str, count: int) -> list[str]:
-    unit = {"q": "rad", "dq": "rad_s", "tau": "nm", "current": "a"}[kind]
-    return [f"{kind}{joint}_{unit}" for joint in range(1, count + 1)]
 
 
 def _gains(label: str, count: int, gains_nm_a: Sequence[float]) -> FloatArray:

@@ -248,7 +248,7 @@ def _read(
 def _conditioned(
     robot: Robot, recorded: RecordedSamples, request: IdentificationRequest
 ) -> Conditioned:
-    conditioned = condition(recorded, request.cutoff_hz, robot.torque_nm)
+    conditioned = condition(recorded, request.cutoff_hz, robot.rates.torque)
     return conditioned.lag_corrected(request.lag_s) if request.lag_s else conditioned
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
-from visioncal.core.transforms import exp, skew
+from visioncal.core.transforms import LAST_ROW, exp, rigid_fault, skew
 from visioncal.core.types import FloatArray, Mask
 
 # Columns of a joint's function: offset, ratio, sine, cosine.
@@ -263,17 +263,10 @@ def _placement(row: DocumentTable) -> FloatArray:
         raise row.refuse("placement", rows, needed)
     tables = [DocumentTable({"placement": value}, row.label) for value in rows]
     matrix = np.array([table.numbers("placement", 4) for table in tables])
-    rotation = matrix[:3, :3]
-    if (
-        # Squares of the largest numbers overflow.
-        np.abs(rotation).max() > 1.0 + _ROTATION_TOLERANCE
-        or np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE
-        or np.linalg.det(rotation) < 0
-        or matrix[3].tolist() != [0, 0, 0, 1]
-    ):
+    if fault := rigid_fault(matrix, _ROTATION_TOLERANCE):
         raise DataError(
-            f"{row.label}: placement is no rigid transform: a rotation, a position [m] and the "
-            "last row 0, 0, 0, 1 are needed.",
+            f"{row.label}: placement is no rigid transform [m]: {fault}.",
             culprits=[f"{row.label}: placement"],
         )
+    matrix[3] = LAST_ROW
     return matrix

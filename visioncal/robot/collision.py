@@ -297,11 +297,10 @@ class Collisions:
         postures = chain.effective(rng.uniform(lower, upper, (300, len(chain))))
         margin_m = np.array([self._distances(posture) for posture in postures]) - pairs.needed_m
         near_share = (margin_m < SLACK_M).mean(axis=0)
-        of_arm = np.array([*(body.of_arm for body in bodies), False])[pairs.bodies].all(axis=1)
-        moving = np.array([*(body.link > 0 for body in bodies), False])[pairs.bodies].all(axis=1)
-        on_first_link = np.array([*(body.link == 1 for body in bodies), False])[pairs.bodies].any(
-            axis=1
-        )
+        kinds = [(body.of_arm, body.link > 0, body.link == 1) for body in bodies]
+        both = np.array([*kinds, (False, False, False)])[pairs.bodies]
+        of_arm, moving, _ = np.asarray(both.all(axis=1)).T
+        on_first_link = both[..., 2].any(axis=1)
         # A cell body that a later link touches in every posture is an error, and must be reported.
         always_near = (near_share == 1.0) & (of_arm | moving | on_first_link)
         # Parts that are near in a larger share of postures are so by design: the joints' limits

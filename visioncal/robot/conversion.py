@@ -5,10 +5,7 @@ screw about the next axis (rotation about it, translation along it), which commu
 joint and goes into its row.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -148,33 +145,24 @@ def with_base(robot: Robot, parent_from_base: FloatArray) -> Robot:
     """Builds the same arm in a new base frame, in which its base is at (4, 4) [m]."""
     gravity = {"gravity_m_s2": (parent_from_base[:3, :3] @ robot.gravity).tolist()}
     table = _described(robot)
-    if table is not None:
-        return _of_table(robot, replace(table, base=parent_from_base @ table.base), gravity)
-    placements = robot.chain.placements.copy()
-    placements[0] = parent_from_base @ placements[0]
-    chain = replace(robot.chain, placements=placements)
-    document = robot.weighted(chain_document(robot.name, robot.tip, chain))
-    return Robot.from_document(document | gravity)
+    if table is None:
+        placements = robot.chain.placements.copy()
+        placements[0] = parent_from_base @ placements[0]
+        chain = replace(robot.chain, placements=placements)
+        document = robot.weighted(chain_document(robot.name, robot.tip, chain))
+        return Robot.from_document(document | gravity)
+    source = str(robot.document.get("source", ""))
+    document = table_document(replace(table, base=parent_from_base @ table.base), source)
+    # A mass is stated in the frame in which a joint's row ends, and stays in it.
+    for row, known in zip(document["joint"], robot.document["joint"], strict=True):
+        row |= {key: known[key] for key in LINK_KEYS if key in known}
+    kept = {name: robot.document[name] for name in ARM_KEYS if name in robot.document}
+    return Robot.from_document(document | kept | gravity)
 
 
 def _described(robot: Robot) -> DHTable | None:
     """The table that describes a robot; None where it has another description."""
     return table_from_document(robot.document) if "convention" in robot.document else None
-
-
-def _of_table(
-    robot: Robot, table: DHTable, gravity: Mapping[str, Any] = MappingProxyType({})
-) -> Robot:
-    """The robot with the numbers of another table of its convention, and its own link data.
-
-    A mass is stated in the frame in which a joint's row ends, and stays in it.
-    """
-    source = str(robot.document.get("source", ""))
-    document = table_document(table, source)
-    for row, known in zip(document["joint"], robot.document["joint"], strict=True):
-        row |= {key: known[key] for key in LINK_KEYS if key in known}
-    kept = {name: robot.document[name] for name in ARM_KEYS if name in robot.document}
-    return Robot.from_document(document | kept | dict(gravity))
 
 
 def parallel_axes(robot: Robot) -> Mask:

@@ -153,24 +153,6 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
     return gravity
 
 
-def load_torques(robot: "Robot", q: FloatArray, loads: Loads | None = None) -> FloatArray:
-    """Torques (m, n) of weight, payload and force on the joints [N m, or N for a prismatic joint].
-
-    That of the links' weight is the negative of the generalised gravity (Featherstone 2008, section
-    5.3), zero where masses are unknown; those at the flange follow by the transpose of the
-    geometric Jacobian.
-    """
-    torques = -robot.gravity_torques(q)
-    if loads is None or not loads.any:
-        return torques
-    base_from_flange = robot.base_from_flange(q)
-    flange_from_base = np.swapaxes(base_from_flange[:, :3, :3], 1, 2)
-    weight = np.einsum("mij,mj->mi", flange_from_base, loads.payload_kg[:, None] * robot.gravity)
-    push = np.einsum("mij,mj->mi", flange_from_base, loads.force_n)
-    wrench = np.concatenate([np.cross(loads.payload_m, weight), weight + push], axis=1)
-    return np.asarray(torques + np.einsum("mij,mi->mj", robot.axis_jacobian(q), wrench))
-
-
 def deflected_joints(
     robot: "Robot",
     q: FloatArray,
@@ -209,7 +191,7 @@ def joint_deflections(
     moments: FloatArray | None = None,
 ) -> FloatArray:
     """Joint deflections (m, n) under load at (m, n) angles [rad]; see `deflected_joints`."""
-    deflections = compliance * load_torques(robot, q, loads)
+    deflections = compliance * robot.load_torques(q, loads)
     if moments is None:
         return np.asarray(deflections)
     return np.asarray(deflections + np.einsum("mjk,jk->mj", robot.weight_jacobian(q), moments))

@@ -25,7 +25,6 @@ from visioncal.robot.loads import (
     Loads,
     Masses,
     gravity_of,
-    load_torques,
     masses_of_rows,
 )
 from visioncal.robot.tables import chain_of_table, row_frames, table_from_document
@@ -123,21 +122,6 @@ class Robot:
     def upper_rad(self) -> FloatArray:
         """(n,) upper limits [rad]; inf for a joint without limits."""
         return self.chain.upper
-
-    @property
-    def velocity_rad_s(self) -> FloatArray:
-        """(n,) greatest speeds [rad/s]; inf where unknown."""
-        return self.rates.velocity
-
-    @property
-    def acceleration_rad_s2(self) -> FloatArray:
-        """(n,) greatest accelerations [rad/s^2]; inf where unknown."""
-        return self.rates.acceleration
-
-    @property
-    def torque_nm(self) -> FloatArray:
-        """(n,) greatest torques [N m]; inf where unknown."""
-        return self.rates.torque
 
     @cached_property
     def pinocchio_model(self) -> "pin.Model":
@@ -268,8 +252,21 @@ class Robot:
         return rows.reshape(len(positions), count, 4 * count)
 
     def load_torques(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
-        """Torques of weight, payload and force on the joints; see `loads.load_torques`."""
-        return load_torques(self, q, loads)
+        """Torques (m, n) of weight, payload and force on the joints [N m; N if prismatic].
+
+        That of the links' weight is the negative of the generalised gravity (Featherstone 2008,
+        section 5.3), zero where masses are unknown; those at the flange follow by the transpose of
+        the geometric Jacobian.
+        """
+        torques = -self.gravity_torques(q)
+        if loads is None or not loads.any:
+            return torques
+        base_from_flange = self.base_from_flange(q)
+        flange_from_base = np.swapaxes(base_from_flange[:, :3, :3], 1, 2)
+        weight = np.einsum("mij,mj->mi", flange_from_base, loads.payload_kg[:, None] * self.gravity)
+        push = np.einsum("mij,mj->mi", flange_from_base, loads.force_n)
+        wrench = np.concatenate([np.cross(loads.payload_m, weight), weight + push], axis=1)
+        return np.asarray(torques + np.einsum("mij,mi->mj", self.axis_jacobian(q), wrench))
 
     def harmonic_jacobian(self, q: FloatArray, orders: int) -> FloatArray:
         """Jacobian of the flange over the harmonics of the joint functions.

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
@@ -16,7 +15,7 @@ from visioncal.core.files import one_line
 from visioncal.core.transforms import compose, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import FUNCTION_NAMES, IDENTITY_FUNCTION, chain_document
-from visioncal.robot.conversion import has_ur_axes, table_of
+from visioncal.robot.conversion import has_ur_axes, table_of, with_base
 from visioncal.robot.inertia import Inertias
 from visioncal.robot.model import Robot
 from visioncal.robot.tables import DHTable, row_frames, table_document, table_from_document
@@ -74,7 +73,8 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
     if robot.inertias is not None:
         _add_inertials(elements[1:-1], robot.inertias)
     # A URDF needs both; zero means unknown.
-    rates = np.nan_to_num(np.stack([robot.torque_nm, robot.velocity_rad_s], axis=1), posinf=0.0)
+    drives = np.stack([robot.rates.torque, robot.rates.velocity], axis=1)
+    rates = np.nan_to_num(drives, posinf=0.0)
     for index, name in enumerate(chain.joint_names):
         limits = (chain.lower[index], chain.upper[index])
         bounded = bool(np.isfinite(limits).all())
@@ -188,17 +188,10 @@ def _ur_table(robot: Robot, like: DHTable | None) -> DHTable:
             culprits=[robot.name],
             next_step="Write another robot as a URDF or a joint table.",
         )
-    return table_of(_in_controllers_base(robot), "hayati", like=like)
-
-
-def _in_controllers_base(robot: Robot) -> Robot:
-    """The UR in the controller's base, where it points along -x at zero; in ROS's along x."""
-    chain = robot.chain
-    if robot.base_from_flange(np.zeros((1, len(chain))))[0, 0, 3] <= 0.0:
-        return robot
-    placements = np.array([_HALF_TURN @ chain.placements[0], *chain.placements[1:]])
-    turned = replace(chain, placements=placements)
-    return Robot.from_document(robot.weighted(chain_document(robot.name, robot.tip, turned)))
+    # At zero a UR points along -x in the controller's base, and along x in ROS's.
+    if robot.base_from_flange(np.zeros((1, 6)))[0, 0, 3] > 0.0:
+        robot = with_base(robot, _HALF_TURN)
+    return table_of(robot, "hayati", like=like)
 
 
 def without_functions(robot: Robot) -> Robot:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import sha256, temporary_folder, write_atomically
+from visioncal.core.files import sha256, temporary, write_atomically
 from visioncal.robot.files import robot_file
 from visioncal.robot.model import LINK_KEYS
 from visioncal.session.corners import FILE as CORNERS
@@ -51,7 +51,7 @@ def save_session(session: "Session", folder: Path) -> None:
     refuse_filled(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with temporary_folder(folder.parent) as (aside, _):
+        with temporary(folder.parent, is_folder=True) as (aside, _):
             new = aside / "new"
             new.mkdir()
             for path in dict.fromkeys(view.image for view in session.views if view.image):
