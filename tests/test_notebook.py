@@ -71,8 +71,7 @@ def test_a_name_that_is_not_there_suggests_the_nearest():
     transforms = made_up().calibration.transforms
     with pytest.raises(KeyError, match="Did you mean flange_from_cam"):
         transforms["flange_from_camera"]
-    with pytest.raises(DataError, match="base_from_target"):
-        made_up().calibration.covariance("base_from_board")
+    raised(DataError, "base_from_target", made_up().calibration.covariance, "base_from_board")
     assert transforms.get("flange_from_camera") is None
 
 
@@ -124,9 +123,7 @@ def test_views_without_corners_keep_their_place():
     ],
 )
 def test_corners_that_are_none_are_refused_by_array_and_index(corners, words):
-    with pytest.raises(DataError, match=words) as caught:
-        from_corners(corners)
-    assert "corners.csv" not in str(caught.value)
+    assert "corners.csv" not in str(raised(DataError, words, from_corners, corners))
 
 
 @pytest.mark.parametrize(

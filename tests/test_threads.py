@@ -9,6 +9,7 @@ from threading import Barrier
 import cv2
 import pytest
 from support.kept import assert_same_evidence
+from support.refusals import raised
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from visioncal.calibration.run import calibrate, run
@@ -76,8 +77,7 @@ def test_threads_change_no_digit(tmp_path, monkeypatch):
     )
     assert asked == [1, 3]
     assert to_document(one) == to_document(three)
-    with pytest.raises(DataError, match="threads is 0; at least 1"):
-        calibrate(tmp_path / "cell", threads=0)
+    raised(DataError, "threads is 0; at least 1", calibrate, tmp_path / "cell", threads=0)
 
 
 def test_a_shared_setting_is_made_by_the_first_and_undone_by_the_last():
@@ -109,8 +109,7 @@ def test_dynamics_are_identified_on_one_thread(monkeypatch):
     monkeypatch.setattr(dynamics, "select_arm", look)
     with threadpool_limits(2, user_api="blas"):
         before = settings()
-        with pytest.raises(DataError, match="Enough"):
-            dynamics.identify_session(None)
+        raised(DataError, "Enough", dynamics.identify_session, None)
         assert settings() == before
     assert within
     assert {count for _, count in within} == {1}

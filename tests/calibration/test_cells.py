@@ -121,10 +121,8 @@ def test_any_frame_is_placed_in_any_other_with_the_covariance_of_the_chain(clean
     expected = jacobian @ found.joint_covariance @ jacobian.T
     # Forward differences of 1e-6 are exact to 1e-6 of themselves.
     np.testing.assert_allclose(chain.covariance, expected, rtol=1e-4, atol=1e-13)
-    with pytest.raises(DataError, match="moves with robot 'b': its pose is needed"):
-        found.between(*ends)
-    with pytest.raises(DataError, match="no frame 'cam_lft'"):
-        found.between("cam_lft", "base_a")
+    raised(DataError, "moves with robot 'b': its pose is needed", found.between, *ends)
+    raised(DataError, "no frame 'cam_lft'", found.between, "cam_lft", "base_a")
 
 
 def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
@@ -300,8 +298,7 @@ def test_a_robot_without_joints_stays_as_it_reports_itself():
     bare = replace(session, views=tuple(bare))
     found = solved(cell, bare, level="offsets")
     assert sum("stays as it reports itself" in reason for reason in found.verdict.reasons) == 2
-    with pytest.raises(DataError, match="level 'all'"):
-        calibrate(bare, level="all")
+    raised(DataError, "level 'all'", calibrate, bare, level="all")
 
 
 def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
@@ -470,8 +467,7 @@ def test_an_arm_of_a_cell_drifts_with_its_own_temperatures(warm, tmp_path):
     assert 0.0 < budget["temperature of a"] < budget["total"]
     with pytest.raises(DataError, match=r"robot a: level 'thermal' needs .* temp1_c"):
         solved(cell, replace(session_of(cell), streams={}), "thermal")
-    with pytest.raises(DataError, match="warms up needs pace_s"):
-        replace(cell.options, pace_s=0.0)
+    raised(DataError, "warms up needs pace_s", replace, cell.options, pace_s=0.0)
 
 
 def test_a_camera_that_sees_a_moving_robot_by_a_clock_of_its_own_is_placed():
@@ -566,5 +562,4 @@ def test_two_images_that_are_exchanged_have_a_command_that_mends_them(three):
     now, was = ({view.number: view.numbers for view in it.views} for it in (mended, three))
     assert now == was
     other = next(view.number for view in three.views if view.text["target"] != "plate_b")
-    with pytest.raises(DataError, match=r"another .*target"):
-        exchange_views(three, first, other)
+    raised(DataError, r"another .*target", exchange_views, three, first, other)

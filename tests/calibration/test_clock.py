@@ -174,8 +174,7 @@ def test_times_that_are_not_those_of_the_images_are_refused(session):
 
 def test_a_stream_of_another_time_is_named(session):
     late = with_robot_stamps(session, lambda s: s + 1e6)
-    with pytest.raises(DataError, match=r"No view lies within streams/robot.csv"):
-        calibrate(late)
+    raised(DataError, r"No view lies within streams/robot.csv", calibrate, late)
     # Whoever states about how far they are apart is told the rest.
     clock = clocked_of(stating(late, 1.0 - 1e6)).clock
     # Stamps of a million seconds have digits of a tenth of a nanosecond.
@@ -349,8 +348,7 @@ def test_motion_that_repeats_itself_is_refused_unless_the_offset_is_stated():
 
 
 def test_motion_that_does_not_tell_the_offset_is_refused_unless_it_is_stated():
-    with pytest.raises(DegenerateError, match=r"is left open by 420 views, of which 0 .* at rest"):
-        calibrate(going())
+    raised(DegenerateError, r"is left open by 420 views, of which 0 .* at rest", calibrate, going())
     clocked = clocked_of(stating(going(), 0.02))
     assert (clocked.clock.method, clocked.clock.sigma_s) == ("stated", 1e-3)
     assert "is taken as stated, +20 ms, to 1 ms" in clocked.warnings[0].words
@@ -364,11 +362,9 @@ def test_times_in_another_unit_and_times_that_are_missing_are_named(session):
     for per_s, apart_s in ((1e3, 8), (1e6, 8000)):
         both = with_robot_stamps(session, lambda s, by=per_s: by * s)
         words = rf"streams/robot\.csv: by stamp_s its samples are {apart_s} s apart; .* in seconds"
-        with pytest.raises(DataError, match=words):
-            calibrate(restamped(both, lambda s, by=per_s: by * s))
+        raised(DataError, words, calibrate, restamped(both, lambda s, by=per_s: by * s))
     rows = [{k: v for k, v in view.numbers.items() if k != "stamp_s"} for view in session.views]
-    with pytest.raises(DataError, match="where a stream has the poses, stamp_s"):
-        calibrate(with_rows(session, rows))
+    raised(DataError, "where a stream has the poses, stamp_s", calibrate, with_rows(session, rows))
 
 
 def test_what_is_open_about_the_clocks_counts(session):

@@ -9,6 +9,7 @@ import pytest
 from support.boards import charuco, circles
 from support.commands import visioncal as command
 from support.fuzz.broken_sessions import BROKEN, Mistake, broken_session, edit, sound_session
+from support.refusals import raised
 from support.rendered import Shot, photograph
 
 import visioncal
@@ -96,9 +97,8 @@ def test_what_cannot_be_read_is_refused_with_what_to_type(tmp_path, name):
 
 def test_a_board_that_is_not_declared_is_named_by_calibrate(tmp_path):
     folder = broken_session(tmp_path / "session", BROKEN["another size of board"])
-    with pytest.raises(DataError, match="ChArUco board of 9 x 6 squares") as caught:
-        visioncal.calibrate(folder)
-    assert "target check SESSION/images" in caught.value.next_step
+    caught = raised(DataError, "ChArUco board of 9 x 6 squares", visioncal.calibrate, folder)
+    assert "target check SESSION/images" in caught.next_step
 
 
 @pytest.mark.slow
@@ -111,9 +111,8 @@ def test_squares_in_the_place_of_inner_corners_are_named(tmp_path):
     (found,) = visioncal.doctor(folder).findings
     assert found.kind == "other_board"
     assert "checkerboard of 9 x 6" in found.words
-    with pytest.raises(DataError, match="checkerboard of 9 x 6") as caught:
-        visioncal.calibrate(folder)
-    assert "In the target's .toml, write columns = 9 and rows = 6" in caught.value.next_step
+    caught = raised(DataError, "checkerboard of 9 x 6", visioncal.calibrate, folder)
+    assert "In the target's .toml, write columns = 9 and rows = 6" in caught.next_step
 
 
 def test_rotations_of_another_form_are_loaded_in_doubt(tmp_path):

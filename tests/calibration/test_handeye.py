@@ -211,8 +211,7 @@ def test_near_views_have_one_pose_and_no_pose_has_itself_for_a_rival():
 
 
 def test_a_lens_that_views_leave_open_is_refused():
-    with pytest.raises(DegenerateError, match="focal length open to"):
-        estimate(cell_with(wide_camera(), 4, **FLAT))
+    raised(DegenerateError, "focal length open to", estimate, cell_with(wide_camera(), 4, **FLAT))
     for views, words in ((1, "1 view shows"), (2, "2 views show")):
         with pytest.raises(DataError, match=f"{words} the target, and at least 3"):
             estimate(cell_with(wide_camera(), 6, views=views))

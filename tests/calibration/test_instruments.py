@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import visioncal as command
+from support.refusals import raised
 from support.tracked import errors_of, known_of
 
 import visioncal
@@ -102,8 +103,7 @@ def test_known_instruments_grow_noisy_with_distance_and_unknown_ones_are_refused
         ({"name": "leica-at96"}, "not in the table .* Did you mean leica-at960"),
         (ours, "noise is not stated. State sigma_m .*zeiss-contura"),
     ):
-        with pytest.raises(DataError, match=words):
-            stated_instrument(InstrumentTable(**table))
+        raised(DataError, words, stated_instrument, InstrumentTable(**table))
 
 
 def test_without_a_model_poses_give_the_frames_alone():
@@ -120,8 +120,7 @@ def test_without_a_model_poses_give_the_frames_alone():
 def test_outputs_are_whole_and_the_recording_gives_them_again(tmp_path):
     session_of(tracked(replace(PROBE, **WRONG))).save(tmp_path / "shop")
     out = tmp_path / "out"
-    done = command("calibrate", tmp_path / "shop", "-o", out)
-    assert done.status == 0, done.err
+    command("calibrate", tmp_path / "shop", "-o", out).good()
     text = (out / "calibration.json").read_text()
     document = json.loads(text)
     assert "null" not in text
@@ -199,8 +198,7 @@ def by_photographs(session):
     ],
 )
 def test_what_cannot_be_calibrated_is_refused_by_name(options, change, words):
-    with pytest.raises(DataError, match=words):
-        known_of(change(session_of(tracked(options))))
+    raised(DataError, words, known_of, change(session_of(tracked(options))))
 
 
 def test_a_misspelt_point_is_named_and_measured_poses_come_before_readings():

@@ -287,8 +287,7 @@ def test_what_is_advised_runs_as_it_is_printed_and_mends_it(tmp_path, monkeypatc
         " && visioncal calibrate 'my cell-fixed' -o out"
     )
     for command in first.split(" && "):
-        again = typed(*shlex.split(command)[1:])
-        assert again.status == 0, again.err
+        typed(*shlex.split(command)[1:]).good()
     assert Calibration.load(Path("out/calibration.json")).verdict.status == "good"
 
 

@@ -199,11 +199,9 @@ def test_the_compensator_refuses_what_does_not_fit():
     following = OnlineCompensator(model())
     with pytest.raises(DataError, match="no sample"):
         _ = following.robot
-    with pytest.raises(DataError, match="fitted to currents"):
-        following.feed(0.0, temperatures_c=np.full(6, 30.0))
+    raised(DataError, "fitted to currents", following.feed, 0.0, temperatures_c=np.full(6, 30.0))
     following.feed(0.0, currents_a=np.ones(6))
-    with pytest.raises(DataError, match="does not come after"):
-        following.feed(0.0, currents_a=np.ones(6))
+    raised(DataError, "does not come after", following.feed, 0.0, currents_a=np.ones(6))
 
 
 def test_the_report_shows_the_drift(learnt):
@@ -275,8 +273,7 @@ def of_the_first_hour(session):
     ],
 )
 def test_a_session_without_temperatures_is_refused_by_what_it_needs(learnt, change, words):
-    with pytest.raises(DataError, match=words):
-        calibrate(change(learnt["temperatures"].session), level="thermal")
+    raised(DataError, words, calibrate, change(learnt["temperatures"].session), level="thermal")
 
 
 def test_sessions_in_which_nothing_warms_up_are_refused():
@@ -306,9 +303,7 @@ def test_correct_goes_by_the_temperatures_and_kelvin_is_no_celsius(learnt, tmp_p
     # The warm arm is at the target with the joints that the target was made of.
     assert [sent[f"q{at}_rad"] for at in range(1, 7)] == pytest.approx(q[0], abs=1e-6)
     kelvin = ",".join(["300"] * 6)
-    refused = run("correct", table, "--against", tmp_path, "--temperatures", kelvin)
-    assert refused.status == 2
-    assert "no kelvin" in refused.err
+    run("correct", table, "--against", tmp_path, "--temperatures", kelvin).refused("no kelvin")
     session.save(tmp_path / "warm")
     path = tmp_path / "warm" / "streams" / "heat.csv"
     head, *rows = (line.split(",") for line in path.read_text(encoding="utf-8").splitlines())

@@ -131,8 +131,7 @@ def pairs(tmp_path_factory):
 def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     out = pairs / "out"
     assert Calibration.load(out).means == {"ambient_c": 20.0}
-    done = visioncal("verify", pairs / "later", "--against", out, "-o", tmp_path / "check")
-    assert done.status == 0
+    done = visioncal("verify", pairs / "later", "--against", out, "-o", tmp_path / "check").good()
     assert done.out.startswith("pass")
     assert "the ambient temperature's change, 0 K (limit 10)" in done.out
     written = json.loads((tmp_path / "check/verify.json").read_text())
@@ -142,9 +141,7 @@ def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     assert "The calibration still holds" in page.words
     assert all(reference.startswith(("#", "data:")) for reference in page.references)
     # A check has no business with the files of a calibration.
-    refused = visioncal("verify", pairs / "later", "--against", out, "-o", out)
-    assert refused.status == 2
-    assert "holds a calibration" in refused.err
+    visioncal("verify", pairs / "later", "--against", out, "-o", out).refused("holds a calibration")
     session = Session.load(pairs / "later")
     # The camera's poses as if it had been knocked by 20 mm along its own x.
     pushed = tuple(
@@ -312,8 +309,7 @@ def test_other_cells_are_refused_by_what_differs(place):
         (replace(session, target=replace(session.target, columns=11)), "columns = 11"),
         (replace(session, robot_document=load_robot("ur10e").document), "another robot"),
     ):
-        with pytest.raises(DataError, match=words):
-            predict_stops(wrong, prior)
+        raised(DataError, words, predict_stops, wrong, prior)
     board, wider = session.target, replace(session.target, columns=11)
     several = replace(prior, targets={"floor": board, "wall": replace(board, rows=8)})
     for target, words in ((None, "which of the targets"), (wider, "is none of those")):
@@ -324,9 +320,7 @@ def test_other_cells_are_refused_by_what_differs(place):
         (known.with_robot("", replace(known.reported, matched=None)), "no joint angles"),
         (known.with_camera("cam", small), "640 x 480"),
     ):
-        with pytest.raises(DataError, match=words):
-            predict_detected(wrong, prior)
+        raised(DataError, words, predict_detected, wrong, prior)
     spoilt = replace(place.calibration.joint_fit, covariance=np.eye(1))
     for fit, words in ((None, "holds no fit"), (spoilt, "joint_fit cannot be read")):
-        with pytest.raises(DataError, match=words):
-            CalibrationPrior.of(replace(place.calibration, joint_fit=fit))
+        raised(DataError, words, CalibrationPrior.of, replace(place.calibration, joint_fit=fit))

@@ -25,8 +25,7 @@ MOST, MOST_OF_THREE = 22.5, 16.3
 
 
 def done(*arguments):
-    result = visioncal(*arguments)
-    assert result.status == 0, result.err
+    result = visioncal(*arguments).good()
     return result.out
 
 
@@ -84,9 +83,7 @@ def test_touches_or_a_tool_of_a_cell_say_which_robot_is_meant(place, tmp_path):
     named = ("--tool", f"{out}:pen", "--name", "jig", "-o", tmp_path / "jig.json")
     done("fixture", jig, *named, "--robot", "b")
     bare = write_poses(tmp_path / "bare.csv", turned_poses(rng, places, tip, np.eye(3)))
-    refused = visioncal("tcp", bare, "--robot", "b")
-    assert refused.status == 2
-    assert "--robot" in refused.err
+    visioncal("tcp", bare, "--robot", "b").refused("--robot")
 
 
 def test_stops_are_added_to_one_pair(place, tmp_path):
@@ -128,9 +125,7 @@ def test_targets_are_corrected_for_the_robot_that_is_named(place, tmp_path):
     np.testing.assert_allclose(found.q, q, atol=1e-6)
     table = write_poses(tmp_path / "targets.csv", wanted)
     assert len(told("correct", table, "--against", tmp_path, "--robot", "b")["targets"]) == 2
-    refused = visioncal("correct", table, "--against", tmp_path, "--robot", "a")
-    assert refused.status == 2
-    assert "no calibrated arm" in refused.err
+    visioncal("correct", table, "--against", tmp_path, "--robot", "a").refused("no calibrated arm")
 
 
 def of(camera, robot="", target=""):
@@ -189,9 +184,7 @@ def test_boards_and_pixels_are_located_in_the_base_of_any_robot(cell, place):
     (seen,) = told("locate", *words, "--plane", "floor", *of("left", "b"))
     floor = whole.between("base_b", "target_floor").matrix
     assert abs((np.array(seen["p_base_m"]) - floor[:3, 3]) @ floor[:3, 2]) < 1e-9
-    ambiguous = visioncal("locate", *words, "--plane", "z=20", *of("left"))
-    assert ambiguous.status == 2
-    assert "several robots (a, b)" in ambiguous.err
+    visioncal("locate", *words, "--plane", "z=20", *of("left")).refused("several robots (a, b)")
 
 
 def test_a_target_is_placed_on_any_flange_and_in_any_base(cell, place, tmp_path):

@@ -62,8 +62,7 @@ def test_calibrate_writes_three_files_and_says_how_good_it_is(rendered, tmp_path
 def test_demo_compares_itself_with_the_truth(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for _ in range(2):  # a second run replaces the first
-        done = visioncal("demo", "--views", 8)
-        assert done.status == 0, done.err
+        done = visioncal("demo", "--views", 8).good()
     assert "against the truth" in done.out
     # What to do next can be typed as it is printed.
     assert "visioncal plan demo/session --add 5" in done.out
@@ -135,8 +134,7 @@ def test_no_result_is_status_2_with_one_message_and_leaves_the_folder_alone(poor
     assert "Traceback" not in done.err
     assert [path.name for path in out.iterdir()] == ["calibration.json"]
     assert (out / "calibration.json").read_text() == "an earlier result"
-    done = visioncal("calibrate", poor, "-o", tmp_path / "new", "--json")
-    assert done.status == 2
+    done = visioncal("calibrate", poor, "-o", tmp_path / "new", "--json").refused()
     error = json.loads(done.out)["error"]
     assert error["class"] == "DegenerateError"
     assert error["culprits"]
@@ -164,9 +162,7 @@ def test_what_stands_in_the_way_is_named(pairs, tmp_path, monkeypatch):
         (("calibrate", pairs, "-o", tmp_path / "taken"), "taken"),
         (("simulate", tmp_path), "exists and is not empty"),
     ):
-        done = visioncal(*words)
-        assert done.status == 2
-        assert said in done.err
+        done = visioncal(*words).refused(said)
         assert "Traceback" not in done.err
 
 
@@ -192,8 +188,7 @@ def test_errors_as_json_have_one_form(poor, tmp_path, monkeypatch):
     assert len(with_json) == 18
     for name in with_json:
         source = [] if name == "record" else ["nowhere"]
-        done = visioncal(*name.split(), *source, *NEEDED.get(name, ()), "--json")
-        assert done.status == 2, name
+        done = visioncal(*name.split(), *source, *NEEDED.get(name, ()), "--json").refused()
         error = json.loads(done.out)["error"]
         # Who logs stderr sees it, too.
         assert error["message"] in done.err
@@ -210,8 +205,7 @@ def test_errors_as_json_have_one_form(poor, tmp_path, monkeypatch):
 
 
 def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
-    warm = visioncal("simulate", tmp_path / "warm", "--warm-up", "--currents", "--views", 12)
-    assert warm.status == 0, warm.err
+    visioncal("simulate", tmp_path / "warm", "--warm-up", "--currents", "--views", 12).good()
     session = Session.load(tmp_path / "warm")
     # Twelve views of a cold arm, and then six of them again every five minutes for 100 minutes.
     assert len(session.views) == 12 + 19 * 6
@@ -399,8 +393,7 @@ def test_what_cannot_be_read_is_no_bug_and_is_not_waited_for(name, tmp_path, mon
     if name.startswith("pipe"):
         os.mkfifo(name)
     for command in READERS.split(";"):
-        done = visioncal(*(word.format(tmp_path / name) for word in command.split()))
-        assert done.status == 2, command
+        done = visioncal(*(word.format(tmp_path / name) for word in command.split())).refused()
         assert done.err.startswith("error: ")
     assert not (tmp_path / "out").exists()
 
@@ -426,8 +419,7 @@ def test_a_name_does_not_steer_the_terminal(pairs, tmp_path):
             written = re.sub(r'"name": ".*?\[31m', r'"name": "\\u001b[31m', result.read_text())
             assert r"\u001b[31m" in written
             result.write_text(written)
-        done = visioncal(*call)
-        assert done.status == 0
+        done = visioncal(*call).good()
         assert not STEERING.search(done.out + done.err), call
     pages = [page.read_text() for page in sorted(tmp_path.rglob("*.html"))]
     assert len(pages) >= 3
@@ -496,8 +488,7 @@ def test_of_what_is_given_in_the_wrong_place(place, name):
         assert visioncal("simulate", "tracker", "--instrument", "point").status == 0
     if "tracked" in words:
         assert visioncal("calibrate", "tracker", "-o", "tracked").status == 0
-    done = visioncal(*words)
-    assert done.status == 2
+    done = visioncal(*words).refused()
     assert said in done.said
     assert advised in done.said
     assert list(failures(done.said)) == []
@@ -530,8 +521,7 @@ def test_of_a_tool(place):
         ("tcp", "inverse.csv", "-o", "frames.json"),
         ("tcp", "touches.csv", "-o", "frames.json", "--force", "--touch-noise-mm", "0.01"),
     ):
-        done = visioncal(*words)
-        assert done.status == 0
+        done = visioncal(*words).good()
         assert printed_commands(done.said), done.said
         assert list(failures(done.said)) == []
 
@@ -550,8 +540,7 @@ def test_of_a_fixture(place):
         (*asked, "--name", "tray", "--touch-noise-mm", "0.005"),
         (*asked, "--name", "bin", "--touch-noise-mm=0.005"),
     ):
-        done = visioncal(*words)
-        assert done.status == 0
+        done = visioncal(*words).good()
         (again,) = printed_commands(done.said)
         # The advice's value stands behind what was typed, and counts.
         assert ("--touch-noise-mm" in again) == ("--touch-noise" in words[-1] + words[-2])
@@ -572,7 +561,6 @@ def test_of_dynamics(place, monkeypatch):
     built = real_dynamics("ur5e", rng)
     streams = {"sweeps": record(built, slow_sweep(6, rng, seconds=30.0), rng)}
     exercise_session("ur5e", streams).save(place / "session")
-    done = visioncal("dynamics", "identify", "session", "-o", "out")
-    assert done.status == 0
+    done = visioncal("dynamics", "identify", "session", "-o", "out").good()
     assert "visioncal dynamics plan ur5e -o motions" in printed_commands(done.said)
     assert list(failures(done.said)) == []

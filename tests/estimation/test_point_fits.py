@@ -17,6 +17,7 @@ from support.parts import (
     some_drawing,
     some_frame,
 )
+from support.refusals import raised
 from support.touched import POINTS, TIP, TURN, Job, error_of, relabelled, slipped
 from support.touched import touched as touches_of
 
@@ -185,8 +186,7 @@ def test_touches_that_tell_no_direction_are_refused(local, axis, words, off_m):
     frame, points = some_frame(np.random.default_rng(9)), np.array(local)
     points[axis] = off_m
     touches = replace(featured(9, ONE_EACH)[1], measured=placed(frame, points))
-    with pytest.raises(DegenerateError, match=words):
-        fit_features(touches)
+    raised(DegenerateError, words, fit_features, touches)
 
 
 @pytest.mark.parametrize("kind", ["x", "xy"])

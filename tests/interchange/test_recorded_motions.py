@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.bags import FORMS, BagOptions, write_bag
 from support.lerobot import KEY, write_dataset
+from support.refusals import raised
 
 from visioncal import calibrate
 from visioncal.calibration.stages.motion import motion_of
@@ -91,9 +92,8 @@ def test_cameras_of_a_bag_are_a_whole_cell(source, rendered, tmp_path):
 )
 def test_what_a_bag_lacks_is_said(options, message, step, source, rendered, tmp_path):
     path = bag(tmp_path / "b", source, rendered, is_compressed=True, **options)
-    with pytest.raises(DataError, match=message) as caught:
-        convert(path, tmp_path / "out", requested=BOARD)
-    assert step in caught.value.next_step
+    caught = raised(DataError, message, convert, path, tmp_path / "out", requested=BOARD)
+    assert step in caught.next_step
     assert not (tmp_path / "out").exists()
 
 
@@ -111,9 +111,8 @@ def test_poses_frames_and_lenses_may_be_named(source, rendered, tmp_path):
     assert session.declaration.camera.matrix == LENS["matrix"]
     frames = bag(tmp_path / "frames", source, rendered, is_compressed=True)
     wrong = replace(BOARD, robot=PoseImportOptions(("base_link", "tool1")))
-    with pytest.raises(DataError, match="no 'tool1'") as caught:
-        convert(frames, tmp_path / "none", requested=wrong)
-    assert "tool0" in caught.value.next_step
+    caught = raised(DataError, "no 'tool1'", convert, frames, tmp_path / "none", requested=wrong)
+    assert "tool0" in caught.next_step
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
@@ -149,16 +148,13 @@ def test_image_files_of_a_data_set_are_read_inside_its_folder(source, rendered, 
             session = convert(path, tmp_path / "out", requested=BOARD)
             assert session.images.read(session.views[0].image) == image.read_bytes()
             assert session.images.read(session.views[-1].image) == later
-    with pytest.raises(DataError, match="leaves the folder"):
-        convert(path, tmp_path / "none", requested=BOARD)
+    raised(DataError, "leaves the folder", convert, path, tmp_path / "none", requested=BOARD)
 
 
 def test_what_is_damaged_is_refused(source, rendered, tmp_path):
     path = bag(tmp_path / "b.bag", source, rendered, form="ros1", is_compressed=True)
     path.write_bytes(path.read_bytes()[:100_000])
-    with pytest.raises(DataError, match="cannot be read as a bag"):
-        convert(path, tmp_path / "out", requested=BOARD)
+    raised(DataError, "cannot be read as a bag", convert, path, tmp_path / "out", requested=BOARD)
     path = write_dataset(tmp_path / "set", source, rendered, "v3.0", "ur10e")
     next((path / "data").rglob("*.parquet")).write_text("version https://git-lfs.github.com")
-    with pytest.raises(DataError, match="cannot be read as parquet"):
-        convert(path, tmp_path / "out", requested=BOARD)
+    raised(DataError, "cannot be read as parquet", convert, path, tmp_path / "out", requested=BOARD)

@@ -196,8 +196,7 @@ def test_commands_enter_what_they_did(site, tmp_path):
     """Into the file that is named, then into the one above the session; it costs no result."""
     session, out, file = site / "line" / "monday", tmp_path / "out", site / SITE_FILE
     bare = ("--no-report", "--no-recording", "-o", out)
-    done = visioncal("calibrate", session, *bare, "--history", site / "no" / "x.db")
-    assert done.status == 0
+    done = visioncal("calibrate", session, *bare, "--history", site / "no" / "x.db").good()
     assert (out / "calibration.json").exists()
     assert f"visioncal history {site / 'no' / 'x.db'} --add {out}" in done.err
     visioncal("calibrate", session, *bare, "--history", file, "--cell", "line 4").good()

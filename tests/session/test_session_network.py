@@ -205,11 +205,10 @@ def test_of_one_robot_what_its_camera_sees_is_in_the_cell(tmp_path):
 def test_what_takes_one_camera_and_robot_says_how_one_is_chosen(folder):
     session = Session.load(folder)
     raised(DataError, r"several robots \(a, b\)", touches_of, session)
-    with pytest.raises(
-        DataError, match=r"several cameras \(left, right\) and several robots"
-    ) as caught:
-        check_one_of_each(session)
-    assert "--robot" in caught.value.next_step
+    caught = raised(
+        DataError, r"several cameras \(left, right\) and several robots", check_one_of_each, session
+    )
+    assert "--robot" in caught.next_step
 
 
 def test_robots_of_six_and_of_seven_joints_share_columns(tmp_path):

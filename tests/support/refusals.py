@@ -9,7 +9,7 @@ from visioncal.core.errors import VisioncalError
 
 
 def raised(
-    kind: type[VisioncalError], words: str, call: Callable[..., Any], *arguments, **options
+    kind: type[VisioncalError], words: str, call: Callable[..., Any], /, *arguments, **options
 ) -> VisioncalError:
     """The error that a call ends with: of this class, with words that match."""
     with pytest.raises(kind, match=words) as caught:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from support.refusals import raised
 
 from visioncal.calibration.stages.detect import detect
 from visioncal.core.errors import DataError
@@ -180,8 +181,7 @@ def test_an_image_of_another_size_is_named_with_the_sizes(charuco):
     session = session_of(
         {"a.png": encoded(images[0]), "b.png": encoded(small)}, cell.options.target
     )
-    with pytest.raises(DataError, match=r"view 1: b\.png is 640 x 400 px.*1280 x 800"):
-        detect(session)
+    raised(DataError, r"view 1: b\.png is 640 x 400 px.*1280 x 800", detect, session)
 
 
 def claiming(width, height):

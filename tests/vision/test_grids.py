@@ -227,8 +227,7 @@ def test_a_cell_is_calibrated_with_it(tmp_path, board, mount):
 def dots(tmp_path_factory):
     """A printed board, by the files that its printing wrote."""
     folder = tmp_path_factory.mktemp("board")
-    done = visioncal("target", "make", "--kind", "dots", "-o", folder)
-    assert done.status == 0, done.err
+    visioncal("target", "make", "--kind", "dots", "-o", folder).good()
     (path,) = folder.glob("*.toml")
     assert path.with_suffix(".pdf").stat().st_size > 0
     return load_target(path)
