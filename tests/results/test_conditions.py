@@ -1,10 +1,11 @@
-"""What a result is valid for: the condition goes with every output of a calibrated arm."""
+"""What a result is valid for: the condition goes with every output."""
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from support.cells import calibrated
+from support.cells import calibrated, showing
 from support.wrong_arms import WRONG_LINKS
 
 from visioncal.calibration.pipeline.result import result_of
@@ -12,12 +13,15 @@ from visioncal.calibration.suspects.judge import judge
 from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import controller_form
 from visioncal.core.number_format import figure, rounded_up
+from visioncal.core.transforms import invert, log
 from visioncal.core.types import Need
 from visioncal.interchange.exports import EXPORT_FORMATS, Selection, document
 from visioncal.present.recording.notes import verdict_markdown
 from visioncal.present.report.page import write_certificate
-from visioncal.simulation import simulate
-from visioncal.simulation.boards import centre_m
+from visioncal.results.lens import sensor_tilt
+from visioncal.simulation import CellOptions, simulate
+from visioncal.simulation.boards import centre_m, corners_m
+from visioncal.vision.camera import matrix_3x3
 
 # A board whose size is known, so that picks err by the arm and not by the board.
 SURE = replace(WRONG_LINKS, target=replace(WRONG_LINKS.target, square_sigma_m=1e-7), seed=1)
@@ -106,3 +110,56 @@ def test_a_nominal_arm_has_no_condition():
 )
 def test_the_controllers_notation_by_the_robots_name(model, form):
     assert controller_form(model) is (None if form is None else POSE_FORMS[form])
+
+
+NAME = "flange_from_cam"
+# A sensor tilted by a degree about each of its axes, behind a lens that is not decentred.
+TILT_DEG = np.array([1.0, 1.0])
+ORDINARY = CellOptions(
+    views=20, state_intrinsics=False, pixel_sigma_px=0.05, robot_sigma_m=5e-5, robot_sigma_rad=1e-4
+)
+
+
+@pytest.fixture(scope="module")
+def tilted_cell():
+    """A cell whose camera shows what it sees by a tilted sensor, without decentring."""
+    made = simulate(replace(ORDINARY, seed=1))
+    rng, camera, board = np.random.default_rng(1), made.options.camera, corners_m(made.board())
+    # OpenCV's 14 coefficients.
+    lens = np.zeros(14)
+    lens[[0, 1, 4]], lens[12:] = camera.distortion[[0, 1, 4]], np.deg2rad(TILT_DEG)
+    shown, zero = [], np.zeros(3)
+    for pose, corners in zip(made.cam_from_target, made.corners, strict=True):
+        points = board[corners.ids] @ pose[:3, :3].T + pose[:3, 3]
+        px, _ = cv2.projectPoints(points, zero, zero, matrix_3x3(camera), lens)
+        noise = rng.normal(0.0, made.options.pixel_sigma_px, (len(points), 2))
+        shown.append(replace(corners, px=px[:, 0] + noise))
+    return showing(made, shown)
+
+
+@pytest.fixture(scope="module")
+def tilted(tilted_cell):
+    return result_of(calibrated(tilted_cell, joints=False))
+
+
+def test_a_tilted_sensor_is_a_condition_with_its_size(tilted_cell, tilted):
+    (condition,) = tilted.conditions
+    assert condition.kind == "own-lens"
+    error_deg = np.rad2deg(
+        np.linalg.norm(log(invert(tilted.edges[NAME].matrix) @ tilted_cell.transforms[NAME])[:3])
+    )
+    assert error_deg == pytest.approx(np.linalg.norm(TILT_DEG), rel=0.1)
+    assert error_deg > 10.0 * tilted.edges[NAME].sigma_deg
+    tilt = sensor_tilt(tilted.camera)
+    # The noise, and a tenth for the orders of distortion that decentring does not follow.
+    within = 3.0 * tilt.sigma_rad + 0.1 * np.deg2rad(error_deg)
+    assert tilt.rad == pytest.approx(np.deg2rad(error_deg), abs=within)
+
+
+def test_every_output_carries_it(tilted, tmp_path):
+    (condition,) = tilted.conditions
+    write_certificate(tmp_path / "page.html", tilted, None, {})
+    assert "own lens" in (tmp_path / "page.html").read_text()
+    assert "own lens" in tilted._repr_html_()
+    for name in ("ur", "kuka", "urdf", "easy-handeye", "zivid"):
+        assert condition.words in document(tilted, name).warnings, name
