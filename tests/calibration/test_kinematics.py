@@ -9,6 +9,7 @@ from support.cells import arm_found, calibrated, known_of, reporting
 from support.live_cell import postures_in_view, true_cell
 from support.marks import slow
 from support.refusals import raised
+from support.slopes import jacobian, twists
 from support.tracked import known_of as tracked_known
 from support.wrong_arms import CARRIED, COBOT, GOOD, SAGGING, WRONG_LINKS, error_m, target_in_camera
 
@@ -192,21 +193,18 @@ def test_predictions_move_as_their_derivatives_say(wrong):
     mount, edges = cell.options.mount, known.assessment.state.edges
     arm = known.robot_arm.at(np.arange(3))
     model, q = arm.model, arm.joints_rad
-    size, step = 12 + len(model.values), 1e-6
     middle = invert(target_in_camera(mount, *edges, model.robot.base_from_flange(q)))
     problem = known.assessment.problem.with_effects([])
     pair = ArmPair.of(problem, State(edges, np.zeros(0)), ROBOT)
-    jacobian = pair.jacobian(model.base_from_flange(q), model.basis(q))[1]
+    expected = pair.jacobian(model.base_from_flange(q), model.basis(q))[1]
 
     def seen(change):
         moved = edges @ exp(change[:12].reshape(2, 6))
         flange = model.moved(change[12:]).robot.base_from_flange(q)
         return log(middle @ target_in_camera(mount, *moved, flange))
 
-    for at, change in enumerate(step * np.eye(size)):
-        # Steps are composed with values of some mrad, whose product is left out.
-        slope = (seen(change) - seen(-change)) / (2 * step)
-        assert slope == pytest.approx(jacobian[:, :, at], abs=5e-3)
+    # Steps are composed with values of some mrad, whose product is left out.
+    assert jacobian(seen, 12 + len(model.values)) == pytest.approx(expected, abs=5e-3)
 
 
 def rms(rows, name):
@@ -523,16 +521,9 @@ def test_predictions_move_with_springs_as_their_derivatives_say():
     robot, q = load_robot("ur10e"), postures(load_robot("ur10e"))[:3]
     loads = Loads.alike(3, 5.0, (0.0, 0.02, 0.1), (3.0, 0.0, -20.0))
     model = ArmModel(robot, np.eye(4), {"compliance": 1.0}, np.full(6, 1e-2), 200.0)
-    middle, step = invert(model.base_from_flange(q, loads)), 1e-6
-    jacobian = model.basis(q, loads)
-    for at in range(6):
-        change = step * np.eye(6)[at]
-        ends = [
-            log(middle @ model.moved(value).base_from_flange(q, loads))
-            for value in (change, -change)
-        ]
-        # An arm that bends more has other levers, by as much as it bends: left out.
-        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(jacobian[:, :, at], abs=0.02)
+    slopes = twists(lambda by: model.moved(by).base_from_flange(q, loads), 6)
+    # An arm that bends more has other levers, by as much as it bends: left out.
+    assert slopes == pytest.approx(model.basis(q, loads), abs=0.02)
 
 
 def test_a_right_arm_stays_nominal_and_without_joints_no_level_can_be_asked_for():

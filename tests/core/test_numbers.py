@@ -8,6 +8,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, f, t
+from support.slopes import jacobian
 from typing_extensions import TypeAliasType
 
 import visioncal
@@ -51,15 +52,13 @@ def test_inverse_right_jacobian_agrees_with_central_differences():
     rng = np.random.default_rng(6)
     twists = rng.uniform(-1, 1, (20, 6))
     twists[:, :3] *= 0.5 / np.linalg.norm(twists[:, :3], axis=1, keepdims=True)
-    analytic = transforms.inverse_right_jacobian(twists)
-    step = 1e-5
-    for axis in range(6):
-        shift = np.zeros(6)
-        shift[axis] = step
-        ahead = transforms.log(transforms.exp(twists) @ transforms.exp(shift))
-        behind = transforms.log(transforms.exp(twists) @ transforms.exp(-shift))
-        # Truncation step^2 = 1e-10 and rounding 1e-16 / step = 1e-11, times terms of order ten.
-        np.testing.assert_allclose(analytic[:, :, axis], (ahead - behind) / (2 * step), atol=2e-9)
+
+    def moved(by):
+        return transforms.log(transforms.exp(twists) @ transforms.exp(by))
+
+    # Truncation step^2 = 1e-10 and rounding 1e-16 / step = 1e-11, times terms of order ten.
+    slopes = jacobian(moved, 6, 1e-5)
+    np.testing.assert_allclose(transforms.inverse_right_jacobian(twists), slopes, atol=2e-9)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, np.pi - 1e-9, np.pi])

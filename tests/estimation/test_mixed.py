@@ -8,6 +8,7 @@ from scipy.linalg import block_diag
 from support.cells import calibrated, known_of
 from support.problems import observed as observed_world
 from support.problems import world
+from support.slopes import jacobian
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
@@ -140,16 +141,11 @@ LOGS = np.log([0.5, 0.8, 0.3, 1.2, 0.7])
 
 
 def test_the_curvature_is_the_average_information():
-    example, step = _Example(), 1e-6
+    example = _Example()
     matrix, _ = example.projection(LOGS)
     pulled = matrix @ example.residuals
-    working = np.array(
-        [
-            (example.covariance(LOGS + shift) - example.covariance(LOGS - shift)) @ pulled
-            for shift in step * np.eye(SIZES)
-        ]
-    ) / (2 * step)
-    expected = 0.5 * working @ matrix @ working.T + example.prior.at(LOGS).curvature
+    working = jacobian(lambda by: example.covariance(LOGS + by) @ pulled, SIZES)
+    expected = 0.5 * working.T @ matrix @ working + example.prior.at(LOGS).curvature
     np.testing.assert_allclose(example.model.at(LOGS).curvature, expected, atol=1e-6)
 
 
@@ -158,11 +154,11 @@ def test_the_unknowns_are_the_best_prediction_with_its_covariance():
     here = example.model.at(LOGS, is_sloped=False)
     squares, is_random = np.exp(2.0 * LOGS), example.shares.any(axis=1)
     own = np.where(is_random, example.shares @ squares, 0.0)
-    jacobian = example.jacobian
-    noise = example.covariance(LOGS) - (jacobian * own) @ jacobian.T
-    information = jacobian.T @ np.linalg.solve(noise, jacobian)
+    slopes = example.jacobian
+    noise = example.covariance(LOGS) - (slopes * own) @ slopes.T
+    information = slopes.T @ np.linalg.solve(noise, slopes)
     information[is_random, is_random] += 1.0 / own[is_random]
-    gradient = jacobian.T @ np.linalg.solve(noise, example.residuals)
+    gradient = slopes.T @ np.linalg.solve(noise, example.residuals)
     np.testing.assert_allclose(here.values, np.linalg.solve(information, gradient), atol=1e-9)
     np.testing.assert_allclose(here.root @ here.root.T, np.linalg.inv(information), atol=1e-9)
 
@@ -275,8 +271,8 @@ def test_what_is_eliminated_is_noise_that_corners_share(corners):
         by_poses[rows, :, 6 * view : 6 * view + 6] = now.by_pose[rows]
         zoom = np.where(rows[:, None], stack.zooms, 0.0).ravel()
         covariance += np.outer(zoom, zoom)
-    jacobian = np.concatenate([by_poses, shared], axis=2).reshape(len(covariance), -1)
-    normal = jacobian.T @ np.linalg.solve(covariance, jacobian)
+    slopes = np.concatenate([by_poses, shared], axis=2).reshape(len(covariance), -1)
+    normal = slopes.T @ np.linalg.solve(covariance, slopes)
     inner, size = normal[: 6 * views, : 6 * views], 6 * views
     left = normal[size:, size:] - normal[size:, :size] @ np.linalg.solve(
         inner, normal[:size, size:]
@@ -614,11 +610,8 @@ def test_wrong_corners_and_views_go_and_noise_passes():
 
 
 def test_likelihood_and_slope_are_those_of_all_rows():
-    example, step = _Example(), 1e-5
+    example = _Example()
     for logs in (LOGS, LOGS + 0.4):
         assert example.model.at(logs).value == pytest.approx(example.value(logs), abs=1e-9)
-    slopes = [
-        (example.value(LOGS + shift) - example.value(LOGS - shift)) / (2 * step)
-        for shift in step * np.eye(SIZES)
-    ]
-    assert example.model.at(LOGS).gradient == pytest.approx(np.array(slopes), abs=1e-6)
+    slopes = jacobian(lambda by: example.value(LOGS + by), SIZES, 1e-5)
+    assert example.model.at(LOGS).gradient == pytest.approx(slopes, abs=1e-6)

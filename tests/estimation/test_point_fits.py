@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from support.parts import (
     away,
     even,
-    jacobian,
     moved,
     noise_of,
     pairs_of,
@@ -18,6 +17,7 @@ from support.parts import (
     some_frame,
 )
 from support.refusals import raised
+from support.slopes import jacobian
 from support.touched import POINTS, TIP, TURN, Job, error_of, relabelled, slipped
 from support.touched import touched as touches_of
 

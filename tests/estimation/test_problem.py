@@ -9,6 +9,7 @@ from scipy.linalg import block_diag
 from support.cells import calibrated
 from support.edges import inliers_of
 from support.problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
+from support.slopes import jacobian
 
 from visioncal.calibration.stages.init_frames import init_network
 from visioncal.calibration.stages.pairwise import Candidates
@@ -102,14 +103,12 @@ def test_derivatives_are_those_of_central_differences(kind):
         problem = with_values(problem, np.random.default_rng(2))
     state = true_state(cell, problem.tree)
     state = State(state.edges, np.full(problem.size - 6 * len(state.edges), 0.3))
-    found, step = problem.linear(state).jacobian, 1e-6
-    for at, column in enumerate(np.eye(problem.size) * step):
-        ends = [problem.linear(state.moved(value)).residuals for value in (column, -column)]
-        # Differences of 1e-6 are exact to 1e-9. Of a place alone, a turn of the frame that it is
-        # in counts by the place's own error, 0.1 mm, which is left out; and an effect's values move
-        # as their last step does, which is its own square, 1e-6, off.
-        away_by = np.abs((ends[0] - ends[1]) / (2 * step) - found[:, :, at]).max()
-        assert away_by < {"poses": 1e-8, "places": 5e-4, "values": 5e-6}[kind]
+    found = problem.linear(state).jacobian
+    slopes = jacobian(lambda by: problem.linear(state.moved(by)).residuals, problem.size)
+    # Differences of 1e-6 are exact to 1e-9. Of a place alone, a turn of the frame that it is in
+    # counts by the place's own error, 0.1 mm, which is left out; and an effect's values move as
+    # their last step does, which is its own square, 1e-6, off.
+    assert np.abs(slopes - found).max() < {"poses": 1e-8, "places": 5e-4, "values": 5e-6}[kind]
 
 
 def test_equations_from_a_stop_on_are_those_of_its_observations_alone():
@@ -208,17 +207,17 @@ def test_a_prior_of_an_edge_pulls_it_by_its_share_of_the_information():
 def test_priors_of_frames_have_the_jacobian_of_central_differences():
     cell, problem = problem_of(15, stops=4)
     rotation = pose((4, -2, -58), (0.0, 0.0, 0.0))[:3, :3]
-    state, step = true_state(cell, problem.tree), 1e-6
+    state = true_state(cell, problem.tree)
     for prior in (
         # Up to the cell and down again, along two axes; and an edge by itself, with its rotation.
         FramePrior("cam_left", "cam_right", (0, 2), (0.1, 0.2), 1e-3),
         FramePrior("flange_b", "target_b", (0, 1, 2), (0.0, 0.0, 0.1), 1e-3, rotation, 2e-3),
     ):
-        _, jacobian = problem.prior_rows(prior, state)
-        for at, column in enumerate(np.eye(problem.size) * step):
-            ends = [problem.prior_rows(prior, state.moved(value))[0] for value in (column, -column)]
-            # In units of sigmas of a millimetre: rounding of 1e-16 m over steps of 1e-6.
-            np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), jacobian[:, at], atol=1e-6)
+        slopes = jacobian(
+            lambda by, prior=prior: problem.prior_rows(prior, state.moved(by))[0], problem.size
+        )
+        # In units of sigmas of a millimetre: rounding of 1e-16 m over steps of 1e-6.
+        np.testing.assert_allclose(slopes, problem.prior_rows(prior, state)[1], atol=1e-6)
 
 
 def test_repeated_views_of_a_still_board_count_as_one():
@@ -277,13 +276,13 @@ def test_shared_errors_of_flanges_are_eliminated_exactly():
     by_errors = by_errors.reshape(6 * len(problem), -1)
     noise = block_diag(*problem.covariance(NETWORK_NOISE))
     noise += by_errors @ block_diag(*problem.error_covariance(NETWORK_NOISE)) @ by_errors.T
-    jacobian, residuals = linear.jacobian.reshape(len(noise), -1), linear.residuals.ravel()
+    slopes, residuals = linear.jacobian.reshape(len(noise), -1), linear.residuals.ravel()
     known = problem.prior_information(state)
-    weighted = np.linalg.solve(noise, jacobian)
+    weighted = np.linalg.solve(noise, slopes)
     whitening = Whitening.of(problem, NETWORK_NOISE, linear.by_errors)
     information, gradient, cost, _ = whitening.equations(problem, state, linear)
     scale = np.sqrt(np.diag(information))
-    away = (information - known.information - jacobian.T @ weighted) / np.outer(scale, scale)
+    away = (information - known.information - slopes.T @ weighted) / np.outer(scale, scale)
     # Rounding, of numbers whose squares differ by ten powers of ten.
     np.testing.assert_allclose(away, 0.0, atol=1e-8)
     away = gradient - known.gradient - weighted.T @ residuals
@@ -307,18 +306,16 @@ def test_stops_move_with_a_change_as_its_derivatives_say(mount, size):
     data, state = stops_of(mount, rng)
     for cause in causes_of(data, rng):
         at = size * np.ones(len(cause.units)) / np.sqrt(6.0)
-        beginning, step = with_change(state, cause), 1e-6
-        by_cause = undone(data, cause, at).linear(beginning).jacobian[:, :, 12:]
-        for unknown, shift in enumerate(step * np.eye(len(at))):
-            ahead, behind = (
-                undone(data, cause, value).linear(beginning).residuals
-                for value in (at + shift, at - shift)
-            )
-            # The series of the right Jacobian is cut where it is exact to 1e-9 up to 0.5 rad, and
-            # to some 1e-3 at two radians.
-            assert by_cause[:, :, unknown] == pytest.approx(
-                (ahead - behind) / (2 * step), abs=1e-7 if size < 1 else 2e-2
-            )
+        beginning = with_change(state, cause)
+
+        def changed(by, cause=cause, at=at, beginning=beginning):
+            return undone(data, cause, at + by).linear(beginning)
+
+        by_cause = changed(0.0).jacobian[:, :, 12:]
+        slopes = jacobian(lambda by, changed=changed: changed(by).residuals, len(at))
+        # The series of the right Jacobian is cut where it is exact to 1e-9 up to 0.5 rad, and to
+        # some 1e-3 at two radians.
+        assert by_cause == pytest.approx(slopes, abs=1e-7 if size < 1 else 2e-2)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -489,14 +486,15 @@ def test_the_offset_moves_the_chain_as_its_column_says(mount) -> None:
     moved, at_s = sampled(500), np.linspace(0.5, 9.5, 40)
     robot = swung(at_s) if mount == "eye-in-hand" else invert(swung(at_s))
     frames = ImageTimes(mount, at_s, invert(robot @ x) @ z @ exp(1e-3 * rng.normal(size=(40, 6))))
-    state, step_s = State(np.stack([x, z]), np.zeros(1)), 1e-4
-    residuals = [
-        clock_problem(moved, frames, value).linear(state).residuals for value in (-step_s, step_s)
-    ]
-    column = clock_problem(moved, frames, 0.0).linear(state).jacobian[:, :, 12]
-    difference = (residuals[1] - residuals[0]) / (2 * step_s)
+    state = State(np.stack([x, z]), np.zeros(1))
+
+    def late(by_s):
+        return clock_problem(moved, frames, by_s).linear(state)
+
+    slope = jacobian(lambda by_s: late(by_s[0]).residuals, 1, 1e-4)[..., 0]
     # Speeds are means over 0.04 s: 2e-3 of the fastest, which a lever of metres enlarges.
-    np.testing.assert_allclose(column, difference, atol=4e-3 * np.abs(difference).max())
+    found = late(0.0).jacobian[:, :, 12]
+    np.testing.assert_allclose(found, slope, atol=4e-3 * np.abs(slope).max())
 
 
 @pytest.mark.parametrize("rate_hz", [10, 50])

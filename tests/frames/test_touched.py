@@ -13,11 +13,12 @@ from support import placed as made
 from support.commands import turned_poses, visioncal, write_poses, write_table
 from support.parts import away, placed, some_frame
 from support.refusals import raised
+from support.slopes import twists
 from support.touched import TIP, Job, error_of, slipped, touched
 
 from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.transforms import compose, exp, invert, skew
 from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.fixture import FitSettings, drawn_fixture, touched_fixture
 from visioncal.frames.touches import NominalPoints, Tool, TouchRows, touched_points
@@ -248,29 +249,22 @@ def test_errors_that_points_share_are_carried_to_the_answer():
     measured = touched_points(rows, tool(), Noise.of_robot(0.0, 1e-6), None)
     # As if the whole set were turned about the base, and shifted.
     sigmas = np.array([1e-4, 2e-4, 3e-4, 1e-4, 1e-4, 5e-5])
-    jacobian = np.concatenate([sigmas * _turning(point) for point in measured.points])
+    jacobian = np.concatenate(
+        [sigmas * np.hstack([-skew(point), np.eye(3)]) for point in measured.points]
+    )
     shared = replace(measured, common=jacobian @ jacobian.T)
-    found = drawn_fixture(shared, drawing(1e-3 * CAD_MM), FitSettings()).edge
-    moves = []
-    for step in np.diag(sigmas):
-        moved = [placed(exp(sign * step), measured.points) for sign in (1.0, -1.0)]
-        ahead, behind = (
-            drawn_fixture(
-                replace(measured, points=array), drawing(1e-3 * CAD_MM), FitSettings()
-            ).edge
-            for array in moved
-        )
-        moves.append(0.5 * away(behind.matrix, ahead.matrix))
+
+    def fitted(points):
+        return drawn_fixture(points, drawing(1e-3 * CAD_MM), FitSettings()).edge
+
+    def moved(step):
+        turned = replace(measured, points=placed(exp(sigmas * step), measured.points))
+        return fitted(turned).matrix[None]
+
+    by_sigma = twists(moved, 6, 1.0)[0]
     # What is each point's own is a hundredth of it: 1e-4 of the variance.
-    expected = np.array(moves).T @ np.array(moves)
-    assert np.abs(found.covariance - expected).max() < 1e-3 * np.abs(expected).max()
-
-
-def _turning(point):
-    """How a point (3,) of the base moves with a small (6,) motion of the whole base."""
-    x, y, z = point
-    cross = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-    return np.hstack([cross, np.eye(3)])
+    expected = by_sigma @ by_sigma.T
+    assert np.abs(fitted(shared).covariance - expected).max() < 1e-3 * np.abs(expected).max()
 
 
 # --- The command.

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.refusals import raised
+from support.slopes import jacobian, twists
 from support.urdf_arm import of_urdf, some_changes, some_joints
 
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import exp, invert, log
+from visioncal.core.transforms import exp
 from visioncal.robot import Robot, load_robot
 from visioncal.robot.chain import chain_document
 from visioncal.robot.files import read_robot_document, robot_file, robot_names
@@ -184,16 +185,8 @@ def other(robot):
     return robot.corrected(*some_changes(robot))
 
 
-def slope(poses, size):
-    """Central differences (m, 6, size) of poses(step), a function of (size,) changes."""
-    step, columns = 1e-5, []
-    middle = invert(poses(np.zeros(size)))
-    for at in range(size):
-        change = np.zeros(size)
-        change[at] = step
-        columns.append((log(middle @ poses(change)) - log(middle @ poses(-change))) / (2 * step))
-    return np.stack(columns, axis=-1)
-
+# Of central differences.
+STEP = 1e-5
 
 # Flange with all joints at zero, as drawings and pendants of the makers have it [mm].
 _AT_ZERO = {
@@ -239,11 +232,11 @@ def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot):
 
     # The third order of a step of 1e-5, and rounding of 1e-16 over it: 1e-10 for metres.
     tolerance = {"rtol": 0, "atol": 1e-9}
-    joints = slope(lambda change: robot.base_from_flange(q + change), count)
+    joints = twists(lambda change: robot.base_from_flange(q + change), count, STEP)
     np.testing.assert_allclose(robot.joint_jacobian(q), joints, **tolerance)
-    links = slope(placed, 6 * (count + 1))
+    links = twists(placed, 6 * (count + 1), STEP)
     np.testing.assert_allclose(robot.placement_jacobian(q), links, **tolerance)
-    functions = slope(functioning, 4 * count)
+    functions = twists(functioning, 4 * count, STEP)
     np.testing.assert_allclose(robot.function_jacobian(q), functions, **tolerance)
 
 
@@ -391,27 +384,23 @@ def test_they_turn_each_joint_as_they_say():
 
 
 def test_their_jacobian_is_that_of_the_forward_kinematics(wavy):
-    q, step = some_joints(wavy), 1e-5
-    middle = invert(wavy.base_from_flange(q))
-    jacobian = wavy.harmonic_jacobian(q, 7)
-    rng = np.random.default_rng(3)
-    for _ in range(3):
-        change = rng.standard_normal((wavy.joint_count, 7, 2))
-        ends = [
-            log(middle @ wavy.corrected(harmonics=value * change).base_from_flange(q))
-            for value in (step, -step)
-        ]
-        # The third order of the step, and rounding over it.
-        slope = (ends[0] - ends[1]) / (2 * step)
-        np.testing.assert_allclose(jacobian @ change.ravel(), slope, rtol=0, atol=1e-8)
+    q, shape = some_joints(wavy), (wavy.joint_count, 7, 2)
+
+    def turned(change):
+        return wavy.corrected(harmonics=change.reshape(shape)).base_from_flange(q)
+
+    # The third order of the step, and rounding over it.
+    slopes = twists(turned, int(np.prod(shape)), STEP)
+    np.testing.assert_allclose(wavy.harmonic_jacobian(q, 7), slopes, rtol=0, atol=1e-8)
 
 
 def test_encoders_tell_again_where_the_joints_stand(wavy):
     q = some_joints(wavy)
     # Newton's last step squares what it was off by.
     np.testing.assert_allclose(wavy.chain.encoded(wavy.chain.effective(q)), q, atol=1e-13)
-    step = 1e-6
-    slopes = (wavy.chain.effective(q + step) - wavy.chain.effective(q - step)) / (2 * step)
-    np.testing.assert_allclose(wavy.chain.jacobian(q), slopes, atol=1e-8)
-    bends = (wavy.chain.jacobian(q + step) - wavy.chain.jacobian(q - step)) / (2 * step)
-    np.testing.assert_allclose(wavy.chain.curvatures(q), bends, atol=1e-8)
+    for function, slope in (
+        (wavy.chain.effective, wavy.chain.jacobian),
+        (wavy.chain.jacobian, wavy.chain.curvatures),
+    ):
+        slopes = jacobian(lambda by, function=function: function(q + by), 1)[..., 0]
+        np.testing.assert_allclose(slope(q), slopes, atol=1e-8)

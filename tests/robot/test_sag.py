@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.refusals import raised
+from support.slopes import jacobian
 
 from visioncal.core.errors import DataError
 from visioncal.robot import Loads, Robot, load_robot
@@ -44,12 +45,8 @@ def test_a_torque_is_the_change_of_height_of_what_is_lifted():
     weightless = replace(robot, masses=None)
     load = Payload(3.0, (0.05, 0.02, 0.2))
     torques = weightless.load_torques(q, loads_of(load, len(q)))
-    step = 1e-6
-    for joint in range(6):
-        moved = [robot.base_from_flange(q + sign * step * np.eye(6)[joint]) for sign in (1, -1)]
-        heights = [array[:, 2, :3] @ load.centre_m + array[:, 2, 3] for array in moved]
-        work = -load.kg * 9.80665 * (heights[0] - heights[1]) / (2 * step)
-        assert torques[:, joint] == pytest.approx(work, abs=1e-6)
+    heights = jacobian(lambda by: (robot.base_from_flange(q + by) @ [*load.centre_m, 1.0])[:, 2], 6)
+    assert torques == pytest.approx(-load.kg * 9.80665 * heights, abs=1e-6)
 
 
 def test_masses_survive_what_becomes_of_a_robot():

@@ -1,16 +1,11 @@
 """Parts with known places: points of a drawing and touches of features, with noise as asked for."""
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.linalg import expm
 
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
 from visioncal.estimation.pointfit import PointPairs
-
-# Derivatives by central differences are exact to 1e-8 at this step, of lengths near a metre.
-_STEP = 1e-6
 
 
 def moved(frame: FloatArray, step: FloatArray) -> FloatArray:
@@ -65,9 +60,3 @@ def pairs_of(
         nominal,
         np.zeros(count),
     )
-
-
-def jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatArray:
-    """Derivatives (..., size) of a function of (size,) numbers at zero, by central differences."""
-    steps = _STEP * np.eye(size)
-    return np.stack([(function(step) - function(-step)) / (2 * _STEP) for step in steps], axis=-1)

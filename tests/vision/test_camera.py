@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from support.slopes import jacobian
 
 from visioncal.core.types import Camera
 from visioncal.vision.camera import (
@@ -54,22 +55,15 @@ def test_jacobians_agree_with_central_differences(camera, points):
     # Central differences: truncation about step^2 times third derivatives (1e3 px), rounding
     # about 1e-13 px / step; 1e-5 balances the two near 1e-7 relative to slopes of 1e3 px.
     step, tolerance = 1e-5, 1e-4
-    for axis in range(3):
-        shift = np.zeros(3)
-        shift[axis] = step
-        slope = (project(camera, points + shift) - project(camera, points - shift)) / (2 * step)
-        np.testing.assert_allclose(projection.jacobian_point[:, :, axis], slope, atol=tolerance)
+    slopes = jacobian(lambda by: project(camera, points + by), 3, step)
+    np.testing.assert_allclose(projection.jacobian_point, slopes, atol=tolerance)
     values = intrinsics(camera)
-    for index in range(len(values)):
-        shift = np.zeros(len(values))
-        shift[index] = step
-        slope = (
-            project(with_intrinsics(camera, values + shift), points)
-            - project(with_intrinsics(camera, values - shift), points)
-        ) / (2 * step)
-        np.testing.assert_allclose(
-            projection.jacobian_intrinsics[:, :, index], slope, atol=tolerance
-        )
+
+    def through(by):
+        return project(with_intrinsics(camera, values + by), points)
+
+    slopes = jacobian(through, len(values), step)
+    np.testing.assert_allclose(projection.jacobian_intrinsics, slopes, atol=tolerance)
 
 
 def test_points_behind_the_camera_are_not_projected(camera):
