@@ -19,6 +19,7 @@ poor solution here; it is refused later, where the Fisher information is known.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import wraps
 from types import MappingProxyType
 from typing import TypeAlias
 
@@ -52,8 +53,19 @@ class HandEye:
 
 
 Solver: TypeAlias = Callable[[FloatArray, FloatArray], HandEye]
-# Of robot and camera poses (m, 4, 4): the rotation of X (3, 3), or those of X and Z (2, 3, 3).
-_Rotations: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
+# Of robot and camera poses (m, 4, 4): the rotation of X (3, 3), or those of X and Z.
+_Rotations: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray | tuple[FloatArray, ...]]
+
+
+def _completed(rotations: _Rotations) -> Solver:
+    """Decorates rotations to a solver of two views or more."""
+
+    @wraps(rotations)
+    def solve(robot: FloatArray, camera: FloatArray) -> HandEye:
+        found = rotations(robot, camera)
+        return complete(robot, camera, *(found if isinstance(found, tuple) else (found,)))
+
+    return solve
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +114,8 @@ def _rotation(quaternion: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
 
 
-def _tsai(robot: FloatArray, camera: FloatArray) -> FloatArray:
+@_completed
+def tsai(robot: FloatArray, camera: FloatArray) -> FloatArray:
     """R. Y. Tsai, R. K. Lenz, IEEE Trans. Robotics and Automation 5(3), 1989.
 
     A pair obeys (P_g + P_c) x P' = P_c - P_g (eq. 12), with P = 2 sin(angle / 2) axis of both
@@ -132,7 +145,8 @@ def _tsai(robot: FloatArray, camera: FloatArray) -> FloatArray:
     return frame
 
 
-def _park(robot: FloatArray, camera: FloatArray) -> FloatArray:
+@_completed
+def park(robot: FloatArray, camera: FloatArray) -> FloatArray:
     """F. C. Park, B. J. Martin, IEEE Trans. Robotics and Automation 10(5), 1994.
 
     With log A = [alpha], log B = [beta] a pair obeys alpha = R_X beta. The least squares solution
@@ -151,7 +165,8 @@ def _half_logarithms(unit: FloatArray) -> FloatArray:
     return np.asarray(angle / np.maximum(sine, np.finfo(float).tiny) * unit[..., 1:, :])
 
 
-def _horaud(robot: FloatArray, camera: FloatArray) -> FloatArray:
+@_completed
+def horaud(robot: FloatArray, camera: FloatArray) -> FloatArray:
     """R. Horaud, F. Dornaika, International Journal of Robotics Research 14(3), 1995.
 
     A pair obeys a q = q b with the vector parts a and b. The quaternion q that minimises the sum of
@@ -162,7 +177,8 @@ def _horaud(robot: FloatArray, camera: FloatArray) -> FloatArray:
     return nearest_rotation(rotation_pairs(robot, camera).matched)
 
 
-def _daniilidis(robot: FloatArray, camera: FloatArray) -> FloatArray:
+@_completed
+def daniilidis(robot: FloatArray, camera: FloatArray) -> FloatArray:
     """K. Daniilidis, International Journal of Robotics Research 18(3), 1999.
 
     With a, b the vector parts of a pair's quaternions and a', b' those of their dual parts, X's
@@ -208,7 +224,8 @@ def _study_point(plane: FloatArray) -> FloatArray:
     return np.asarray(zeros[:, (zeros[:4] ** 2).sum(axis=0).argmax()])
 
 
-def _andreff(robot: FloatArray, camera: FloatArray) -> FloatArray:
+@_completed
+def andreff(robot: FloatArray, camera: FloatArray) -> FloatArray:
     """N. Andreff, R. Horaud, B. Espiau, 3-D Digital Imaging and Modeling, 1999.
 
     A pair obeys (I - kron(A_R, B_R)) vec(R_X) = 0 and kron(I, t_B^T) vec(R_X) + (I - A_R) t_X = t_A
@@ -223,7 +240,8 @@ def _andreff(robot: FloatArray, camera: FloatArray) -> FloatArray:
     return np.asarray(_rotations(_least_scatter(_rotation_maps(robot, camera), rows))[0])
 
 
-def _shah(robot: FloatArray, camera: FloatArray) -> FloatArray:
+@_completed
+def shah(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, ...]:
     """M. Shah, Journal of Mechanisms and Robotics 5(3), 2013.
 
     R_i R_X C_i = R_Z makes vec(R_X) and vec(R_Z) the singular vectors of K = sum kron(R_i, C_i^T)
@@ -233,14 +251,15 @@ def _shah(robot: FloatArray, camera: FloatArray) -> FloatArray:
     """
     maps = _rotation_maps(robot, camera)
     vector_x = _least_scatter(maps)
-    return _rotations(vector_x, (maps @ vector_x).sum(axis=0))
+    return tuple(_rotations(vector_x, (maps @ vector_x).sum(axis=0)))
 
 
-def _li(robot: FloatArray, camera: FloatArray) -> FloatArray:
+@_completed
+def li(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, ...]:
     """A. Li, L. Wang, D. Wu, International Journal of the Physical Sciences 5(10), 2010.
 
     With D_i = inv(C_i) a view obeys kron(R_i, C_i^T) vec(R_X) = vec(R_Z) and R_i t_X + t_i = R_Z
-    d_i + t_Z (eq. 19, where A = R_i and B = D_i), solved up to scale as in `_andreff`.
+    d_i + t_Z (eq. 19, where A = R_i and B = D_i), solved up to scale as in `andreff`.
     """
     rows = np.zeros((len(robot), 3, 13))
     rows[:, :, :4] = robot[:, :3, :]
@@ -250,7 +269,7 @@ def _li(robot: FloatArray, camera: FloatArray) -> FloatArray:
         rows[:, axis, 4 + 3 * axis : 7 + 3 * axis] = origins
     to_x = _rotation_maps(robot, camera).swapaxes(1, 2)
     vector_z = _least_scatter(to_x, rows)
-    return _rotations((to_x @ vector_z).sum(axis=0), vector_z)
+    return tuple(_rotations((to_x @ vector_z).sum(axis=0), vector_z))
 
 
 def _rotation_maps(robot: FloatArray, camera: FloatArray) -> FloatArray:
@@ -291,7 +310,8 @@ def _rotations(*vectors: FloatArray) -> FloatArray:
     return nearest_rotation(np.copysign(1.0, np.linalg.det(matrices[0])) * matrices)
 
 
-def _lone_axis(robot: FloatArray, camera: FloatArray) -> FloatArray:
+@_completed
+def lone_axis(robot: FloatArray, camera: FloatArray) -> FloatArray:
     """Rotation about one axis only, as of an arm with four axes.
 
     X's rotation is known up to one about the robot's axis. The robot's translations determine that:
@@ -390,27 +410,7 @@ def complete(
     return HandEye(x, compose(rotation_z, translation_z))
 
 
-def _solver(rotations: _Rotations) -> Solver:
-    """A solver of two views or more, by its rotations."""
-
-    def solve(robot: FloatArray, camera: FloatArray) -> HandEye:
-        found = rotations(robot, camera)
-        of_both = rotations in {_shah, _li}
-        return complete(robot, camera, *found) if of_both else complete(robot, camera, found)
-
-    return solve
-
-
-# Those for general motion, and the one for rotation about one axis.
+# Those for general motion; `lone_axis` is for rotation about one axis.
 SOLVERS: Mapping[str, Solver] = MappingProxyType(
-    {
-        "tsai": _solver(_tsai),
-        "park": _solver(_park),
-        "horaud": _solver(_horaud),
-        "daniilidis": _solver(_daniilidis),
-        "andreff": _solver(_andreff),
-        "shah": _solver(_shah),
-        "li": _solver(_li),
-    }
+    {solver.__name__: solver for solver in (tsai, park, horaud, daniilidis, andreff, shah, li)}
 )
-lone_axis = _solver(_lone_axis)

@@ -75,9 +75,10 @@ def find_inlier_groups(
         doubtful = _doubtful(problem, fit)
         if doubtful.any():
             fit = fit_groups(problem, fit.used | doubtful, fit.state)
-    explained = not doubtful.any() and (
-        expected_sigma is None or _is_explained(fit, expected_sigma)
-    )
+    explained = not doubtful.any()
+    if explained and expected_sigma is not None and fit.freedom > 0:
+        misfit = _misfit(fit.groups.subset(fit.used), expected_sigma)
+        explained = misfit <= float(chi2_limit(FALSE_REJECTION, fit.freedom))
     return GroupInliers(fit, distances(fit).beyond, doubtful, explained)
 
 
@@ -161,10 +162,3 @@ def _misfit(inside: Groups, sigma: float) -> float:
     """Sum of the whitened squared residuals at a noise level [m]."""
     white = np.linalg.solve(inside.covariance(sigma), inside.residuals[..., None])[..., 0]
     return float(np.sum(inside.residuals * white))
-
-
-def _is_explained(fit: GroupFit, expected_sigma: float) -> bool:
-    if fit.freedom < 1:
-        return True
-    misfit = _misfit(fit.groups.subset(fit.used), expected_sigma)
-    return misfit <= float(chi2_limit(FALSE_REJECTION, fit.freedom))

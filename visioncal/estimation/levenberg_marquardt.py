@@ -58,9 +58,11 @@ def levenberg_marquardt(
             return now.state if predicted <= _NOTHING * tolerance else now.step(damping), True
         trial = linearise(now.step(damping))
         if trial.cost <= now.cost:
-            decrease = now.cost - trial.cost
-            damping = max(damping * _change(decrease, predicted), NEAR_DAMPING)
-            now = trial
+            decrease, factor = now.cost - trial.cost, 0.1
+            # By the gain over what was predicted (Nielsen 1999).
+            if 0.0 < predicted < np.inf:
+                factor = max(0.1, 1.0 - (2.0 * min(decrease / predicted, 1.0) - 1.0) ** 3)
+            now, damping = trial, max(damping * factor, NEAR_DAMPING)
             if decrease <= tolerance:
                 return now.state, True
         else:
@@ -72,11 +74,3 @@ def levenberg_marquardt(
             if damping > 1.0 / NEAR_DAMPING:
                 return now.state, True
     return now.state, False
-
-
-def _change(decrease: float, predicted: float) -> float:
-    """Factor of the damping after a step that lowered the cost, by its gain (Nielsen 1999)."""
-    if not 0.0 < predicted < np.inf:
-        return 0.1
-    gain = min(decrease / predicted, 1.0)
-    return max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)

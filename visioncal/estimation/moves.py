@@ -65,12 +65,6 @@ def _noise_limit(among: int) -> float:
     return float(chi2_limit(FALSE_REJECTION / among, 6))
 
 
-def _weighted_mean(twists: FloatArray, weights: FloatArray) -> FloatArray:
-    """(6,) weighted mean of (n, 6) twists, by their (n, 6, 6) information."""
-    weighted_sum = np.einsum("nij,nj->i", weights, twists)
-    return np.asarray(np.linalg.solve(weights.sum(axis=0), weighted_sum))
-
-
 def fitted_change(
     problem: Problem, fit: Solution, known: FloatArray, frame: str, twin: str
 ) -> tuple[FloatArray, FloatArray]:
@@ -115,7 +109,11 @@ def _best_move(
     part = problem.subset(rows)
     order = np.argsort(part.observations.stops, kind="stable")
     changes = part.change_of(frame, fit.state)[order]
-    covariance = _change_covariance(part, fit, frame)[order]
+    # Covariances of the changes that the observations imply.
+    linear = part.linear(fit.state, ideal=True)
+    inverse = np.linalg.inv(linear.jacobian[:, :, part.edge_columns(frame)])
+    residual_covariance = part.total_covariance(linear, fit.noise)
+    covariance = (inverse @ residual_covariance @ np.swapaxes(inverse, 1, 2))[order]
     stops, explained = part.observations.stops[order], agrees[rows][order]
     outliers = np.flatnonzero(~explained)
     tried = outliers[np.linspace(0, len(outliers) - 1, min(_CANDIDATES, len(outliers))).astype(int)]
@@ -140,14 +138,7 @@ def _best_move(
     ):
         return []
     # The mean over all observations that agree with this step.
-    weights = np.asarray(np.linalg.inv(covariance[after]), dtype=float)
-    mean = _weighted_mean(differences[candidate, after], weights)
+    weights = np.linalg.inv(covariance[after])
+    weighted_sum = np.einsum("nij,nj->i", weights, differences[candidate, after])
+    mean = np.linalg.solve(weights.sum(axis=0), weighted_sum)
     return [(gain, int(stops[begin]), changes[tried[candidate]] @ exp(mean))]
-
-
-def _change_covariance(problem: Problem, fit: Solution, frame: str) -> FloatArray:
-    """Covariances (n, 6, 6) of the changes of a frame implied by observations."""
-    linear = problem.linear(fit.state, ideal=True)
-    covariance = problem.total_covariance(linear, fit.noise)
-    inverse = np.linalg.inv(linear.jacobian[:, :, problem.edge_columns(frame)])
-    return np.asarray(inverse @ covariance @ np.swapaxes(inverse, 1, 2))

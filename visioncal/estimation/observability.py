@@ -62,12 +62,11 @@ class Direction:
         """Whether it is not determined at all."""
         return self.sigma > _OPEN
 
-    @property
-    def fault(self) -> str:
-        """What is wrong with it at a typical noise."""
+    def fault(self, at: str) -> str:
+        """What is wrong with it, at a noise in words."""
         if self.is_open:
             return "is not determined at all"
-        return f"has a predicted sigma of {self.figure} at a typical noise"
+        return f"has a predicted sigma of {self.figure}{at}"
 
 
 @dataclass(frozen=True)
@@ -298,8 +297,9 @@ def _refuse_open(
     ]
     if beyond:
         frame, worst = beyond[0]
+        fault = worst.fault(" at a typical noise")
         raise DegenerateError(
-            f"{words.title}: {worst.words} {worst.fault}: {words.motion(frame)}.",
+            f"{words.title}: {worst.words} {fault}: {words.motion(frame)}.",
             culprits=[direction.words for _, direction in beyond],
             next_step=words.advice(frame, worst.words if worst.is_open else ""),
         )
@@ -330,19 +330,14 @@ def edge_directions(
 
     def worst(block: slice, limit: float, *, is_rotation: bool) -> Direction:
         values, vectors = np.linalg.eigh(covariance[block, block])
-        words = _words(thing, frame, matrix[:3, :3] @ vectors[:, -1], is_rotation=is_rotation)
+        quantity = "rotation about" if is_rotation else "offset along"
+        words = f"{thing}'s {quantity} {frame}'s {axis_words(matrix[:3, :3] @ vectors[:, -1])}"
         if values[1] > _OPEN**2:
             words = f"{thing}'s {'rotation' if is_rotation else 'offset from ' + frame}"
         return Direction(words, float(np.sqrt(max(values[-1], 0.0))), limit, is_rotation)
 
     offset = worst(slice(3, 6), SIGMA_LIMIT_M, is_rotation=False)
     return offset, worst(slice(0, 3), SIGMA_LIMIT_RAD, is_rotation=True)
-
-
-def _words(thing: str, frame: str, direction: FloatArray, *, is_rotation: bool) -> str:
-    """Words for a direction of an edge, in its parent frame."""
-    quantity = "rotation about" if is_rotation else "offset along"
-    return f"{thing}'s {quantity} {frame}'s {axis_words(direction)}"
 
 
 def axis_words(direction: FloatArray) -> str:

@@ -127,7 +127,10 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
     """Finds the inliers and the clear moves in a first pass; `refine_inliers` refines both."""
     if not movable:
         return find_inliers(problem, state)
-    used, fit = _trimmed_core(problem, state, _early(problem))
+    # The observations of the earliest stops.
+    stops = problem.observations.stops
+    last = max(EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:FEWEST_STOPS][-1]))
+    used, fit = _trimmed_core(problem, state, stops <= last)
     moves: list[Move] = []
     used, fit = widened(_ObservationSearch(problem), used, fit)
     while len(moves) < _MOST_MOVES:
@@ -245,13 +248,6 @@ def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
     for group in problem.groups if len(problem.groups) > 1 else ():
         nearest[group.rows[np.argsort(distance[group.rows])][: (len(group.rows) + 1) // 2]] = True
     return nearest & _near(problem, state, mask)
-
-
-def _early(problem: Problem) -> Mask:
-    """(n,) the observations of the earliest stops."""
-    stops = problem.observations.stops
-    last = max(EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:FEWEST_STOPS][-1]))
-    return np.asarray(stops <= last)
 
 
 def _lever_distances(problem: Problem, state: State) -> FloatArray:

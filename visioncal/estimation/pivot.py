@@ -133,8 +133,12 @@ def tool_problem(touches: Touches, noise: Noise = _NO_NOISE, *, oriented: bool) 
 
 def _start(touches: Touches, rows: IntArray, *, oriented: bool) -> Placement:
     """Start with the tip by some touches of kind `point`."""
-    tip = _linear_tip(touches.base_from_flange[rows], touches.points[rows])
     poses, are_tips = touches.base_from_flange, touches.are("point")
+    # Linear least squares of `R_i tip - point = -t_i`, of minimum norm where that is undetermined.
+    names, index = np.unique(touches.points[rows], return_inverse=True)
+    by_points = -np.kron(np.eye(len(names))[index], np.eye(3))
+    system = np.hstack([poses[rows, :3, :3].reshape(-1, 3), by_points])
+    tip = np.asarray(np.linalg.lstsq(system, -poses[rows, :3, 3].ravel(), rcond=None)[0][:3])
     tips = poses[:, :3, :3] @ tip + poses[:, :3, 3]
     points = [
         np.median(tips[are_tips & (touches.points == index)], axis=0)
@@ -160,22 +164,6 @@ def _main_direction(vectors: FloatArray) -> FloatArray:
     direction = np.linalg.svd(vectors, full_matrices=False)[2][0]
     side = np.sign(vectors @ direction)
     return np.asarray(direction * (1.0 if side.sum() + 0.5 * side[0] >= 0.0 else -1.0))
-
-
-def _linear_tip(base_from_flange: FloatArray, points: IntArray) -> FloatArray:
-    """The tip (3,) [m] in the flange by linear least squares: `R_i tip - point = -t_i`.
-
-    The minimum-norm solution where the touches leave it undetermined.
-
-    Args:
-        base_from_flange: (n, 4, 4) poses of the flange [m].
-        points: (n,) the point that the tip met.
-    """
-    names, index = np.unique(points, return_inverse=True)
-    by_points = -np.kron(np.eye(len(names))[index], np.eye(3))
-    system = np.hstack([base_from_flange[:, :3, :3].reshape(-1, 3), by_points])
-    target = -base_from_flange[:, :3, 3].ravel()
-    return np.asarray(np.linalg.lstsq(system, target, rcond=None)[0][:3])
 
 
 def fit_pivot(

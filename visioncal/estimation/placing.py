@@ -148,12 +148,9 @@ def refuse_poor(
     if wild is not None and fit.sigma > SIGMA_LIMIT_M:
         raise wild
     first = beyond[0]
-    fault = "is not determined at all"
-    if not first.is_open:
-        fault = f"has a predicted sigma of {first.figure}"
     words, next_step = cause(first)
     raise DegenerateError(
-        f"{label}: {first.words} {fault}: {words}.",
+        f"{label}: {first.words} {first.fault('')}: {words}.",
         culprits=[*(direction.words for direction in beyond), *culprits],
         next_step=next_step,
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from visioncal.core.transforms import exp, skew
+from visioncal.core.transforms import compose, exp, skew
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.estimation.corners import CornerStack, Reprojection, reproject
 from visioncal.estimation.levenberg_marquardt import NEAR_DAMPING, START_DAMPING
@@ -60,7 +60,7 @@ def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
             flags=cv2.SOLVEPNP_SQPNP if flat is None else cv2.SOLVEPNP_IPPE,
         )
         solutions = [
-            _pose(np.asarray(rotation, float), np.asarray(translation, float))
+            compose(np.asarray(cv2.Rodrigues(rotation)[0], float), np.ravel(translation))
             for rotation, translation in zip(rotations, translations, strict=True)
         ]
         if solutions and np.isfinite(solutions).all():
@@ -93,13 +93,6 @@ def determines_pose(points: FloatArray) -> bool:
     distances = np.linalg.norm((points - starts[:, None]) @ skew(along), axis=2)
     is_off = distances > _ON_LINE * span * np.linalg.norm(along, axis=1)[:, None]
     return bool(np.all(is_off.sum(axis=1) >= 2))
-
-
-def _pose(rotation_vector: FloatArray, translation: FloatArray) -> FloatArray:
-    pose = np.eye(4)
-    pose[:3, :3] = cv2.Rodrigues(rotation_vector)[0]
-    pose[:3, 3] = translation.ravel()
-    return pose
 
 
 @dataclass(frozen=True, eq=False)

@@ -111,17 +111,14 @@ def joints_of(problem: Problem, offsets: Mapping[str, FloatArray]) -> list[Candi
 
 
 def sizes_of(problem: Problem, fit: Solution) -> list[Candidate]:
-    """Boards that may have been exchanged for one of another size."""
-    return [
-        Candidate(
-            SIZE,
-            frame,
-            _between(problem, problem.observations.involves(frame)),
-            _size_effect(problem, fit, frame),
-        )
-        for frame in problem.unknown
-        if frame.startswith("target")
-    ]
+    """Boards that may have been exchanged for one of another size, in proportion to distance."""
+    by_sizes, candidates = by_size(problem.measured(fit.state)), []
+    for frame in (name for name in problem.unknown if name.startswith("target")):
+        rows = np.array([name == frame for name in problem.observations.observed])
+        jacobian = np.where(rows[:, None], by_sizes, 0.0)[:, :, None]
+        effect = Effect.free(f"size of {frame}", PriorInformation.flat(1), jacobian)
+        candidates.append(Candidate(SIZE, frame, _between(problem, rows), effect))
+    return candidates
 
 
 def drift_of(problem: Problem, robot: str) -> Candidate:
@@ -140,13 +137,6 @@ def drift_of(problem: Problem, robot: str) -> Candidate:
 def _between(problem: Problem, rows: Mask) -> IntArray:
     """Stops with enough stops of (n,) some observations before and after."""
     return np.asarray(np.unique(problem.observations.stops[rows])[FEWEST_VIEWS : 1 - FEWEST_VIEWS])
-
-
-def _size_effect(problem: Problem, fit: Solution, board: str) -> Effect:
-    """A board's size as an effect: in proportion to its distance."""
-    rows = np.array([frame == board for frame in problem.observations.observed])
-    jacobian = np.where(rows[:, None], by_size(problem.measured(fit.state)), 0.0)[:, :, None]
-    return Effect.free(f"size of {board}", PriorInformation.flat(1), jacobian)
 
 
 def find_steps(

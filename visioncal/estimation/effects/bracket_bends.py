@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import mm_and_deg
 from visioncal.core.types import FloatArray
 from visioncal.estimation.effects.random_effect import RandomEffect, Stops
 
@@ -10,33 +10,30 @@ from visioncal.estimation.effects.random_effect import RandomEffect, Stops
 _LENGTH_M = 0.1
 
 
-def _columns(stops: Stops) -> FloatArray:
-    """Turns times a length, and shifts, of what the flange carries by the direction of gravity.
+class BracketBends(RandomEffect):
+    """A bracket at the flange that bends with gravity."""
 
-    Each is linear in the components of the downward direction along the flange's axes [m].
-    """
-    down = -stops.base_from_flange[:, 2, :3]
-    columns = np.zeros((len(down), 6, 18))
-    for axis in range(6):
-        scale = 1.0 / _LENGTH_M if axis < 3 else 1.0
-        columns[:, axis, 3 * axis : 3 * axis + 3] = scale * down
-    return columns
+    kind, typical = "bracket_bends", 1e-4
+    do = "Stiffen the bracket, or record and work in the same attitudes."
 
+    def columns(self, stops: Stops) -> FloatArray:
+        """Turns times a length, and shifts, of what the flange carries by the direction of gravity.
 
-def _says(values: FloatArray) -> str:
-    shift = np.linalg.norm(values.reshape(6, 3)[3:], ord=2)
-    turn = np.linalg.norm(values.reshape(6, 3)[:3], ord=2) / _LENGTH_M
-    return (
-        "What the flange carries bends with its weight, by up to "
-        f"{figure(1e3 * float(shift))} mm and {figure(float(np.rad2deg(turn)))} deg. The result is "
-        "that of the views' mean attitude."
-    )
+        Each is linear in the components of the downward direction along the flange's axes [m].
+        """
+        down = -stops.base_from_flange[:, 2, :3]
+        columns = np.zeros((len(down), 6, 18))
+        for axis in range(6):
+            scale = 1.0 / _LENGTH_M if axis < 3 else 1.0
+            columns[:, axis, 3 * axis : 3 * axis + 3] = scale * down
+        return columns
 
-
-BRACKET_BENDS = RandomEffect(
-    "bracket_bends",
-    1e-4,
-    _columns,
-    _says,
-    "Stiffen the bracket, or record and work in the same attitudes.",
-)
+    def says(self, values: FloatArray) -> str:
+        """What they mean."""
+        shift = np.linalg.norm(values.reshape(6, 3)[3:], ord=2)
+        turn = np.linalg.norm(values.reshape(6, 3)[:3], ord=2) / _LENGTH_M
+        return (
+            "What the flange carries bends with its weight, by up to "
+            f"{mm_and_deg(1e3 * float(shift), float(np.rad2deg(turn)))}. The result is that of the "
+            "views' mean attitude."
+        )

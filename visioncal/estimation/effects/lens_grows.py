@@ -10,26 +10,23 @@ from visioncal.estimation.effects.random_effect import RandomEffect, Stops
 _CONSTANTS = 3.0
 
 
-def _columns(stops: Stops) -> FloatArray:
-    """Relative growth of the focal length over the session, towards a final value."""
-    grown = 1.0 - np.exp(-_CONSTANTS * stops.time)
-    return np.asarray((grown[:, None] * stops.by_focal)[:, :, None])
+class LensGrows(RandomEffect):
+    """A lens whose focal length grows with time: a camera that warms up."""
 
+    kind, typical = "lens_grows", 1e-3
+    do = "Let the camera run for half an hour before it is calibrated and used."
+    is_of_sensor = True
 
-def _says(values: FloatArray) -> str:
-    way = "grew" if values[0] > 0.0 else "shrank"
-    share = figure(100.0 * abs(float(values[0])) * (1.0 - np.exp(-_CONSTANTS)))
-    return (
-        f"The lens's focal length {way} by {share} % during the session, as of a camera that warms "
-        "up. The result is that of its beginning."
-    )
+    def columns(self, stops: Stops) -> FloatArray:
+        """Relative growth of the focal length over the session, towards a final value."""
+        grown = 1.0 - np.exp(-_CONSTANTS * stops.time)
+        return np.asarray((grown[:, None] * stops.by_focal)[:, :, None])
 
-
-LENS_GROWS = RandomEffect(
-    "lens_grows",
-    1e-3,
-    _columns,
-    _says,
-    "Let the camera run for half an hour before it is calibrated and used.",
-    is_of_sensor=True,
-)
+    def says(self, values: FloatArray) -> str:
+        """What they mean."""
+        way = "grew" if values[0] > 0.0 else "shrank"
+        share = figure(100.0 * abs(float(values[0])) * (1.0 - np.exp(-_CONSTANTS)))
+        return (
+            f"The lens's focal length {way} by {share} % during the session, as of a camera that "
+            "warms up. The result is that of its beginning."
+        )

@@ -286,12 +286,9 @@ class LinearisedCorners:
     @property
     def by_field(self) -> FloatArray:
         """Jacobian (v, 6, m) of all views' poses by the coefficients of lens errors."""
-        moves, at = np.zeros((len(self.views), 6, sum(self.field_sizes))), 0
-        for name, compressed in zip(self.camera_parameters.problems, self.compressed, strict=True):
-            size = compressed.by_field.shape[2]
-            moves[self.camera_parameters.rows(name), :, at : at + size] = compressed.by_field
-            at += size
-        return moves
+        own = [compressed.by_field for compressed in self.compressed]
+        flat = block_diag(*(array.reshape(6 * len(array), array.shape[2]) for array in own))
+        return np.asarray(flat.reshape(len(self.views), 6, flat.shape[1]))
 
     def effect(self, rows: IntArray) -> Effect:
         """The free values, then the coefficients of `by_field`, as an effect on observations.

@@ -5,8 +5,10 @@ together in the restricted likelihood of the robots' noise, beside errors of the
 an effect with a size is an unknown of the fit, whose prior is that size.
 """
 
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -39,17 +41,21 @@ class Stops:
     by_focal: FloatArray
 
 
-@dataclass(frozen=True)
-class RandomEffect:
+class RandomEffect(ABC):
     """A kind of error, with columns of one size."""
 
-    kind: str  # The kind of its finding, and its name in the budget.
-    typical: float  # Its typical size, in the unit of its values.
-    # (s, 6, k) right Jacobian by its k values, of the flange at s stops or of s measured poses.
-    columns: Callable[[Stops], FloatArray]
-    says: Callable[[FloatArray], str]  # What (k,) estimated values mean, as a sentence.
-    do: str  # Advice.
-    is_of_sensor: bool = False  # Whether it moves the measured poses, not the flange.
+    kind: ClassVar[str]  # The kind of its finding, and its name in the budget.
+    typical: ClassVar[float]  # Its typical size, in the unit of its values.
+    do: ClassVar[str]  # Advice.
+    is_of_sensor: ClassVar[bool] = False  # Whether it moves the measured poses, not the flange.
+
+    @abstractmethod
+    def columns(self, stops: Stops) -> FloatArray:
+        """(s, 6, k) right Jacobian by its k values, of the flange at s stops or of s poses."""
+
+    @abstractmethod
+    def says(self, values: FloatArray) -> str:
+        """What (k,) estimated values mean, as a sentence."""
 
 
 def find_random_effects(
