@@ -23,7 +23,6 @@ HAND_EYE: Mapping[Mount, str] = {
     "eye-to-hand": "base_from_cam",
     "instrument": "base_from_instrument",
 }
-WORST_FIRST = ("bad", "check", "good")
 _COMMANDS: Mapping[str, str] = {"tool": "visioncal tcp", "fixture": "visioncal fixture"}
 
 
@@ -154,6 +153,11 @@ def placements(source: Source, camera: str | None = None) -> Placements:
     return Placements(edges | frames, tuple(frames), "this cell", None, lens, source, lenses)
 
 
+def worst_of(verdicts: Iterable[Verdict]) -> Verdict:
+    """The first of the worst verdicts."""
+    return min(verdicts, key=lambda verdict: ("bad", "check", "good").index(verdict.status))
+
+
 def _in_cell(source: Calibration, edge: Edge) -> Placement:
     origin = f"aligned by visioncal from {source.session_name!r}, {source.created}"
     return Placement(edge, origin, source.verdict, conditions=source.conditions)
@@ -164,10 +168,9 @@ def _between(source: Calibration, first: str, second: str) -> Placement:
     tree = source.tree
     placement = _in_cell(source, tree.between(first, second))
     for parent, frame in filter(None, (tree.placement(first), tree.placement(second))):
-        if WORST_FIRST.index(frame.verdict.status) < WORST_FIRST.index(placement.verdict.status):
-            placement = replace(placement, verdict=frame.verdict)
         origin = f"{placement.origin}; {_of_frame(frame).origin}"
-        placement = replace(placement, origin=origin)
+        verdict = worst_of((placement.verdict, frame.verdict))
+        placement = replace(placement, origin=origin, verdict=verdict)
         if not frame.oriented:
             placement = replace(placement, oriented=False, rotation_of=parent)
     return placement

@@ -16,7 +16,6 @@ from visioncal.interchange.exports.arm import ARMS, ArmFormat, select_arm, write
 from visioncal.interchange.exports.content import (
     HAND_EYE,
     OF_TRANSFORMS,
-    WORST_FIRST,
     Content,
     ExportFormat,
     Placements,
@@ -24,6 +23,7 @@ from visioncal.interchange.exports.content import (
     Source,
     is_kind,
     placements,
+    worst_of,
 )
 from visioncal.interchange.exports.mujoco import MUJOCO
 from visioncal.interchange.exports.robots import ROBOTS
@@ -108,8 +108,7 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     else:
         contents = (select(source, selection, form),)
         text = form.write(contents[0])
-    verdicts = {content.verdict.status: content.verdict for content in contents}
-    worst = next(verdicts[one] for one in WORST_FIRST if one in verdicts)
+    worst = worst_of(content.verdict for content in contents)
     conditions = (condition.words for content in contents for condition in content.conditions)
     warnings = (words for content in contents for words in form.warn(content))
     return Document(text, worst, (*dict.fromkeys(conditions), *warnings))
@@ -208,17 +207,13 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         )
     if available.cell is not None:
         lens = available.lenses.get(frames[1], lens)
+    conditions = tuple(
+        condition
+        for condition in placement.conditions
+        if form.holds != "lens" and (of_camera or condition.kind != "own-lens")
+    )
     return Content(
-        edge=edge,
-        origin=placement.origin,
-        verdict=placement.verdict,
-        oriented=placement.oriented,
-        rotation_of=rotation_of,
-        conditions=tuple(
-            condition
-            for condition in placement.conditions
-            if form.holds != "lens" and (of_camera or condition.kind != "own-lens")
-        ),
+        **vars(replace(placement, edge=edge, rotation_of=rotation_of, conditions=conditions)),
         name=name,
         parent=parent,
         child=child,

@@ -154,23 +154,10 @@ def _write_zivid(content: Content) -> str:
     return version + yaml_text({"FloatMatrix": {"Data": rows(matrix_mm)}}, short_lists=True)
 
 
+_LENS_FORMAT = partial(ExportFormat, holds="lens", frames={"cam": "camera"}, warn=_warn_of_field)
 FILES = (
-    ExportFormat(
-        "camera-info",
-        "the lens as ROS's camera_info YAML [px]",
-        _write_camera_info,
-        holds="lens",
-        frames={"cam": "camera"},
-        warn=_warn_of_field,
-    ),
-    ExportFormat(
-        "kalibr",
-        "the lens as Kalibr's camchain.yaml [px]",
-        _write_kalibr,
-        holds="lens",
-        frames={"cam": "camera"},
-        warn=_warn_of_field,
-    ),
+    _LENS_FORMAT("camera-info", "the lens as ROS's camera_info YAML [px]", _write_camera_info),
+    _LENS_FORMAT("kalibr", "the lens as Kalibr's camchain.yaml [px]", _write_kalibr),
     ExportFormat(
         "opencv",
         "OpenCV's FileStorage: transform, R, t and any lens [m]",
@@ -322,41 +309,37 @@ def _ros_notes(content: Content) -> list[str]:
     return [*content.notes, *meanings]
 
 
+_ROS_FORMAT = partial(ExportFormat, frames=ROS_FRAMES)
 ROS_FORMATS = (
-    ExportFormat(
+    _ROS_FORMAT(
         "ros",
         "YAML with the fields of ROS 2's TransformStamped [m, quaternion x, y, z, w]",
         _write_transform,
-        frames=ROS_FRAMES,
         # A document of YAML for each transform.
         write_all=lambda contents: "---\n".join(map(_write_transform, contents)),
     ),
-    ExportFormat(
+    _ROS_FORMAT(
         "ros-launch",
         "a ROS 2 launch file with a static_transform_publisher [m, quaternion]",
         lambda content: _write_launch([content]),
-        frames=ROS_FRAMES,
         write_all=_write_launch,
     ),
-    ExportFormat(
+    _ROS_FORMAT(
         "easy-handeye",
         "a calibration of ROS 1's easy_handeye, YAML [m, quaternion x, y, z, w]",
         partial(_write_easy_handeye, 1),
         holds="hand-eye",
-        frames=ROS_FRAMES,
     ),
-    ExportFormat(
+    _ROS_FORMAT(
         "easy-handeye2",
         "a .calib of easy_handeye2 [m, quaternion x, y, z, w]",
         partial(_write_easy_handeye, 2),
         holds="hand-eye",
-        frames=ROS_FRAMES,
     ),
-    ExportFormat(
+    _ROS_FORMAT(
         "urdf",
         "a link and a fixed joint for a URDF or xacro [m, rad about fixed x, y, z]",
         lambda content: _write_urdf_all([content]),
-        frames=ROS_FRAMES,
         write_all=_write_urdf_all,
     ),
 )

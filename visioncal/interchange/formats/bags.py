@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypeAlias
@@ -269,10 +269,6 @@ def _add_image(contents: _Contents, topic: str, message: Message, received_ns: i
     images.received_ns.append(received_ns)
 
 
-def _add_lens(contents: _Contents, topic: str, message: Message, _: int) -> None:
-    contents.lenses.setdefault(topic, message)
-
-
 def _add_joints(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
     if len(message.position) == len(message.name) > 0:
         rows = contents.joints.setdefault(topic, {})
@@ -305,7 +301,9 @@ def _add_description(contents: _Contents, topic: str, message: Message, _: int) 
 _READERS = {
     "sensor_msgs/msg/Image": _add_image,
     "sensor_msgs/msg/CompressedImage": _add_image,
-    "sensor_msgs/msg/CameraInfo": _add_lens,
+    "sensor_msgs/msg/CameraInfo": lambda contents, topic, message, _: contents.lenses.setdefault(
+        topic, message
+    ),
     "sensor_msgs/msg/JointState": _add_joints,
     "geometry_msgs/msg/PoseStamped": _add_pose,
     "tf2_msgs/msg/TFMessage": _add_frames,
@@ -429,8 +427,13 @@ def _rows(values: "array[float]") -> tuple[FloatArray, FloatArray]:
 
 def _ends(contents: _Contents) -> tuple[str, str]:
     """The frames of the arm's base and tip: the ends of the longest chain of moving frames."""
+
+    def moves(link: tuple[str, str]) -> bool:
+        return link[::-1] in contents.moving
+
     links = {
-        child: [*_moving_above(contents, child)]
+        # A frame and those above it, as long as each moves in the next.
+        child: [child, *(above for _, above in takewhile(moves, pairwise(contents.chain(child))))]
         for _, child in contents.moving
         if not any(parent == child for parent, _ in contents.moving)
     }
@@ -450,15 +453,6 @@ def _ends(contents: _Contents) -> tuple[str, str]:
         next((name for name in _BASES if name in above), base),
         next((name for name in _TIPS if name in below), tip),
     )
-
-
-def _moving_above(contents: _Contents, frame: str) -> Iterator[str]:
-    """A frame and those above it, as long as each moves in the next."""
-    yield frame
-    for child, parent in pairwise(contents.chain(frame)):
-        if (parent, child) not in contents.moving:
-            return
-        yield parent
 
 
 def _between(contents: _Contents, base: str, tip: str) -> tuple[FloatArray, FloatArray]:

@@ -45,7 +45,7 @@ def _quaternions(*names: str, inverse: bool | None = None) -> PoseImportOptions:
 def _easy_handeye_file(path: Path) -> Path | None:
     """The file of samples: `path` itself, or the only one in a folder."""
     found = []
-    for file in files_in(path) if path.is_dir() else (path,):
+    for file in files_in(path) or (path,):
         words = head(file) if file.suffix in (".samples", ".yaml", ".yml") else ""
         pair = ("robot:", "tracking:") if "robot:" in words else _SAMPLE_LISTS
         if file.suffix == ".samples" or all(word in words for word in ("samples:", *pair)):
@@ -143,18 +143,15 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def _hand_eye_file(path: Path) -> Path | None:
-    files = files_in(path) if path.is_dir() else (path,)
-    for file in files:
-        if file.suffix.lower() in (".yaml", ".yml"):
-            words = head(file)
-            if "data:" in words and "image:" in words and _NAMED_POSE.search(words):
-                return file
+    for file in files_in(path) or (path,):
+        words = head(file) if file.suffix.lower() in (".yaml", ".yml") else ""
+        if "data:" in words and "image:" in words and _NAMED_POSE.search(words):
+            return file
     return None
 
 
 def _kinematic_file(path: Path) -> Path | None:
-    files = files_in(path) if path.is_dir() else (path,)
-    return next((file for file in files if "target_joints:" in head(file)), None)
+    return next((at for at in files_in(path) or (path,) if "target_joints:" in head(at)), None)
 
 
 def _read_hand_eye(path: Path, requested: ImportOptions) -> ForeignRecording:

@@ -74,15 +74,8 @@ _MATRIX_KEYS = (
     *("K", "k", "mtx", "M1", "intrinsic"),
 )
 _DISTORTION_KEYS = (
-    *(
-        "distortion_coefficients",
-        "distortion_coeffs",
-        "dist_coeffs",
-        "distCoeffs",
-        "distortion",
-        "dist",
-    ),
-    *("D", "d", "D1"),
+    *("distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distCoeffs", "distortion"),
+    *("dist", "D", "d", "D1"),
 )
 _FOUR = ("fx", "fy", "cx", "cy")
 _SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))

@@ -161,7 +161,11 @@ def fields_of_records(
             empty = np.full(shape, np.nan)
             numbers[key] = np.array([empty if value is None else value for value in values], float)
             if not shape:
-                texts[key] = _cells(numbers[key])
+                # As cells of a table: whole numbers without a decimal point.
+                texts[key] = tuple(
+                    "" if np.isnan(each) else str(int(each)) if each % 1 == 0 else repr(each)
+                    for each in numbers[key].tolist()
+                )
     return Fields(name, folder, tuple(places), numbers, texts, views, ragged)
 
 
@@ -188,14 +192,6 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
     except (ValueError, TypeError, OverflowError):
         return {name: record}
     return {name: array} if record is not None and array.size <= _MOST_NUMBERS else {}
-
-
-def _cells(numbers: FloatArray) -> tuple[str, ...]:
-    """Writes (n,) numbers as cells of a table; whole numbers without a decimal point."""
-    return tuple(
-        "" if np.isnan(number) else str(int(number)) if number % 1 == 0 else repr(number)
-        for number in numbers.tolist()
-    )
 
 
 def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:

@@ -5,7 +5,7 @@ Among them ViSP's YAML with a camera XML, and Zivid's YAML with 4 x 4 matrices [
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.interchange.formats.reading import (
     DOCUMENTS,
     ENDINGS,
+    Fields,
     fields_of_records,
     flattened,
     read_document,
@@ -47,8 +48,13 @@ _ZIVID_NAME = re.compile(r"(pos|pose|robot_pose)_?[0-9]+\.ya?ml", re.IGNORECASE)
 
 def _named(path: Path, name: re.Pattern[str]) -> tuple[Path, ...]:
     """Files of a folder whose names match; none of another path."""
-    files = files_in(path) if path.is_dir() else ()
-    return tuple(file for file in files if name.fullmatch(file.name))
+    return tuple(file for file in files_in(path) if name.fullmatch(file.name))
+
+
+def _fields(path: Path, files: Sequence[Path], records: Sequence[Mapping[str, object]]) -> Fields:
+    """The fields of a folder with one file a view."""
+    views = tuple(number_in(file.name) or 0 for file in files)
+    return fields_of_records(records, [at.name for at in files], path.resolve().name, path, views)
 
 
 def _is_zivid(path: Path) -> bool:
@@ -66,38 +72,27 @@ def _read_zivid(path: Path, requested: ImportOptions) -> ForeignRecording:
         records.append(
             flattened({"matrix": stated.get("Data") if isinstance(stated, dict) else stated})
         )
-    views = tuple(number_in(file.name) or 0 for file in files)
-    fields = fields_of_records(
-        records, [file.name for file in files], path.resolve().name, path, views
-    )
+    fields = _fields(path, files, records)
     stated = PoseImportOptions(("matrix",), unit="mm")
     return foreign_from(fields, requested.with_poses(stated, PoseImportOptions()), images=path)
 
 
-ZIVID = ForeignFormat(
-    "zivid",
-    "Zivid's pos01.yaml ... in millimetres",
-    _is_zivid,
-    _read_zivid,
-)
+ZIVID = ForeignFormat("zivid", "Zivid's pos01.yaml ... in millimetres", _is_zivid, _read_zivid)
 
 
 def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector)."""
     files = _named(path, _POSE_NAME)
-    views = tuple(number_in(file.name) or 0 for file in files)
     cameras = {number_in(file.name): file for file in _named(path, _CAMERA_POSE_NAME)}
     records = [
         {
             name: as_numbers(mapping(read_yaml(at), str(at)).get("data"), f"{at}: data").reshape(-1)
-            for name, at in (("robot", file), ("camera", cameras.get(view)))
+            for name, at in (("robot", file), ("camera", cameras.get(number_in(file.name))))
             if at is not None
         }
-        for view, file in zip(views, files, strict=True)
+        for file in files
     ]
-    fields = fields_of_records(
-        records, [file.name for file in files], path.resolve().name, path, views
-    )
+    fields = _fields(path, files, records)
     robot, camera = (
         PoseImportOptions((name,), "rotation-vector", "m") for name in ("robot", "camera")
     )
