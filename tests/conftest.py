@@ -106,7 +106,7 @@ def figures(request):
 @pytest.fixture
 def patient(monkeypatch) -> None:
     """Lets a UR's driver wait for a simulated controller as long as a busy computer makes it."""
-    for module, names in ((ur, "_CALL _BEGIN _SILENCE"), (ur_net, "_CONNECT _ANSWER _WAIT")):
+    for module, names in ((ur, "_CALL _BEGIN _SILENCE"), (ur_net, "_CONNECT _ANSWER")):
         for name in names.split():
             monkeypatch.setattr(module, f"{name}_S", 10.0)
     monkeypatch.setattr(ur_net.Dashboard.__init__, "__defaults__", (10.0,))

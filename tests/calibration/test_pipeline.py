@@ -23,7 +23,7 @@ from visioncal.frames.session_observations import detect_session_target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.live.planning.information import predict_worlds
 from visioncal.live.planning.purposes import PURPOSES
-from visioncal.live.planning.recorded import PartialCalibration, start_from_session
+from visioncal.live.planning.recorded import start_from_session
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
@@ -196,7 +196,7 @@ def test_a_plan_counts_what_was_measured():
     cell = simulate(CellOptions(robot="ur5e", motion="one_axis", views=8, seed=4))
     place = cell.transforms["flange_from_cam"][:3, 3].tolist()
     prior = dict(zip(("x_m", "y_m", "z_m"), place, strict=True)) | {"sigma_m": SIGMA_M}
-    begun = start_from_session(PartialCalibration(run_with(cell, {"flange_from_cam": prior})))
+    begun = start_from_session(run_with(cell, {"flange_from_cam": prior}))
     (world,) = predict_worlds(
         [begun.cell], PURPOSES["hand-eye"], cell.robot.joints[:1], recorded=begun.recorded
     )

@@ -12,6 +12,7 @@ from support.live_cell import postures_in_view, true_cell
 from support.marks import slow
 from support.refusals import raised
 
+from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
@@ -24,7 +25,7 @@ from visioncal.live.planning.design import Design, choose_stops
 from visioncal.live.planning.information import WORLDS, predict_worlds, stop_factors
 from visioncal.live.planning.path import order_stops
 from visioncal.live.planning.purposes import PURPOSES, Purpose
-from visioncal.live.planning.recorded import PartialCalibration, SessionStart, start_from_session
+from visioncal.live.planning.recorded import SessionStart, start_from_session
 from visioncal.live.planning.visibility import FieldOfView
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
@@ -48,8 +49,8 @@ def next_best(begun: SessionStart, purpose: Purpose, q: FloatArray, worlds: int 
     return choose_stops(predict_worlds(cells, purpose, q, recorded=begun.recorded), 3)
 
 
-def so_far_of(cell: SimulatedCell, **changes) -> PartialCalibration:
-    """What is known of a cell's views, as far as they tell it."""
+def so_far_of(cell: SimulatedCell, **changes) -> tuple[RunState, str]:
+    """What is known of a cell's views, as far as they tell it, and why no more."""
     known = known_of(cell, level="hand-eye", **changes)
     for stage in STAGES:
         if stage.name in ("robot", "detect"):
@@ -57,8 +58,8 @@ def so_far_of(cell: SimulatedCell, **changes) -> PartialCalibration:
         try:
             known = stage.run(known)
         except DegenerateError as error:
-            return PartialCalibration(known, error.message)
-    return PartialCalibration(known)
+            return known, error.message
+    return known, ""
 
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -81,7 +82,7 @@ def in_view():
 def test_predicted_information_is_that_of_the_recorded_views(mount):
     """A plan is made of the estimator's own numbers, at the same poses."""
     options = exact(replace(CELL, mount=mount, views=6, cut_views=0.0))
-    seen = so_far_of(simulate(options)).known
+    seen = so_far_of(simulate(options))[0]
     cell = replace(true_cell(options), noise=Noise.of_robot(5e-5, 3e-5), pixel_px=0.05)
     q = simulate(options).robot.joints
     factors = stop_factors(cell, HAND_EYE, q)
@@ -158,10 +159,10 @@ def test_thirty_planned_stops_are_expected_better_than_random_ones():
 def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
     cell = simulate(options)
     found = so_far_of(cell)
-    begun = start_from_session(found)
+    begun = start_from_session(*found)
     q = cell.robot.joints[:3]
     world = predict_worlds([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
-    solved = found.known.assessment
+    solved = found[0].assessment
     # How well levels of noise are known is told of data alone.
     covariance = solved.covariance - solved.covariance_by_source["noise_level"]
     sigmas = np.sqrt(np.diag(covariance)[:6])
@@ -176,10 +177,10 @@ ERRING = replace(CELL, views=30, seed=5, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
 
 def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
     found = so_far_of(simulate(ERRING))
-    known = found.known
+    known = found[0]
     assert known.robot_arm.errors.is_significant
     assert known.robot_arm.errors.is_estimated
-    begun, q = start_from_session(found), postures_in_view(CELL, 40)
+    begun, q = start_from_session(*found), postures_in_view(CELL, 40)
     design = next_best(begun, HAND_EYE, q)
     # How well the sizes of the arm's errors and of the noise are known cannot be told beforehand.
     beside = ("size of arm errors", "noise_level")
@@ -195,7 +196,7 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
 
 
 def test_stops_for_the_arm_need_joint_angles():
-    begun = start_from_session(so_far_of(simulate(replace(ERRING, views=12))))
+    begun = start_from_session(*so_far_of(simulate(replace(ERRING, views=12))))
     q = postures_in_view(CELL, 60)
     added = next_best(begun, KINEMATICS, q, worlds=2)
     assert added.predicted.mm < added.before.mm
@@ -205,7 +206,7 @@ def test_stops_for_the_arm_need_joint_angles():
 
 def test_two_stops_are_too_few_to_add_to():
     found = so_far_of(simulate(replace(CELL, views=2)))
-    raised(DataError, "not even roughly", start_from_session, found)
+    raised(DataError, "not even roughly", start_from_session, *found)
 
 
 def cell_of(options: CellOptions, **changes) -> PlanCell:

@@ -318,8 +318,8 @@ def begun_session(
             target_document=session.target_document,
             robot_document=load_robot(words.robot).document,
         )
-    recorded = calibrate_partially(session, progress=progress)
-    begun = start_from_session(recorded, limits=kept[0], boxes=kept[1])
+    run, refusal = calibrate_partially(session, progress=progress)
+    begun = start_from_session(run, refusal, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))
 
 

@@ -67,14 +67,8 @@ class CameraForm:
     distortion: Vector  # The coefficients in OpenCV's order.
 
 
-_StoredCamera = Annotated[
-    Camera,
-    INLINE,
-    WrittenForm(
-        lambda item: item,
-        lambda item, _: Camera(item.model, item.resolution, item.matrix, item.distortion),
-        CameraForm,
-    ),
+StoredCamera = Annotated[
+    Camera, WrittenForm(lambda item: item, lambda item, _: Camera(**vars(item)), CameraForm)
 ]
 
 
@@ -82,7 +76,7 @@ _StoredCamera = Annotated[
 class CameraResult:
     """Camera of a result."""
 
-    camera: _StoredCamera  # The intrinsics.
+    camera: Annotated[StoredCamera, INLINE]  # The intrinsics.
     estimated: bool  # Whether they were estimated from this session's images.
     # (k, k) of fx, fy, cx, cy and the distortion, where estimated.
     covariance: Covariance | None = None

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from visioncal.session.session import Session
 
 
-def refuse_filled(folder: Path) -> None:
-    """Checks that a session can be written to a folder; raises DataError."""
+def refuse_filled(folder: Path, more: str = "") -> None:
+    """Checks that a session can be written to a folder; raises DataError, with a further step."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError(
             f"{folder} exists and is not empty; a session is written to a new folder.",
             culprits=[str(folder)],
-            next_step="Choose another name, or remove it first.",
+            next_step=f"Choose another name, or remove it first{more}.",
         )
 
 

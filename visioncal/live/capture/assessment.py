@@ -1,6 +1,6 @@
 """What the views so far amount to: coverage, advice, predicted accuracy, joints against poses."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -16,8 +16,6 @@ from visioncal.live.planning.information import predict_worlds
 from visioncal.live.planning.plan_file import PlanFile
 from visioncal.robot import Robot
 
-# Cells of the image in which coverage is counted.
-_ACROSS, _DOWN = 8, 5
 # Greatest deviation of a controller's calibrated arm from the nominal model [m, rad].
 _SAME_M, _SAME_RAD = 1e-2, 2e-2
 
@@ -33,7 +31,7 @@ class Coach:
     resolution: tuple[int, int]  # (width, height) of the images [px].
     camera: Camera | None  # Intrinsics for tilt and distance; None where they are not known.
     # (rows, columns) parts of the image in which a view shows the board.
-    covered: Mask = field(default_factory=lambda: np.zeros((_DOWN, _ACROSS), dtype=bool))
+    covered: Mask = field(default_factory=lambda: np.zeros((5, 8), dtype=bool))
     # (4, 4) `cam_from_target` of the views; through a usual lens, where it is not known [m].
     poses: list[FloatArray] = field(default_factory=list)
     _views: int = 0
@@ -50,8 +48,9 @@ class Coach:
     def add(self, corners: Corners) -> None:
         """Takes a view into account."""
         self._views += 1
-        cells = np.floor(corners.px * [_ACROSS, _DOWN] / self.resolution).astype(int)
-        columns, rows = np.clip(cells, 0, [_ACROSS - 1, _DOWN - 1]).T
+        counts = np.array(self.covered.shape[::-1])
+        cells = np.floor(corners.px * counts / self.resolution).astype(int)
+        columns, rows = np.clip(cells, 0, counts - 1).T
         self.covered[rows, columns] = True
         try:
             by_view = {corners.view: corners}
@@ -83,21 +82,18 @@ class Coach:
 
     def advice(self) -> str:
         """Advice for the next view, where a person chooses it; empty where nothing is missing."""
-        return next(self._advice(), "")
-
-    def _advice(self) -> Iterator[str]:
         if self._views < 3:
-            yield "another place, with the board large in the image"
-            return
+            return "another place, with the board large in the image"
         if self.poses and self.camera is not None:
             tilts = self._tilts
             # Tilted views separate the board's distance from the focal length.
             if tilts.max() < 20.0:
-                yield f"tilt the camera: the steepest view leans by {tilts.max():.0f} deg only"
+                return f"tilt the camera: the steepest view leans by {tilts.max():.0f} deg only"
             if max(self._distances) < 1.25 * min(self._distances):
-                yield f"another distance: all views are about {self._distances[0]:.2f} m away"
+                return f"another distance: all views are about {self._distances[0]:.2f} m away"
         if self.covered.mean() < 0.8:
-            yield "bring the board to where it was not yet in the image, near the edges too"
+            return "bring the board to where it was not yet in the image, near the edges too"
+        return ""
 
 
 @dataclass(eq=False)

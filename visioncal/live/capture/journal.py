@@ -33,6 +33,7 @@ from visioncal.robot import Robot, load_robot
 from visioncal.robot.files import robot_file, robot_names
 from visioncal.session import Session, View
 from visioncal.session.columns import pose_row
+from visioncal.session.saving import refuse_filled
 from visioncal.session.table import write_csv
 from visioncal.vision.targets import load_target, stored_target, target_document, target_names
 
@@ -200,19 +201,10 @@ class Journal:
         Raises:
             DataError: The folder holds something, cannot be written, or has no room for the views.
         """
-        with named_errors(folder):
-            occupied = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-        if occupied:
-            recorded = (folder / PROVENANCE).is_file()
-            raise DataError(
-                f"{folder} exists and is not empty; a session is recorded into a new folder.",
-                culprits=[str(folder)],
-                next_step="Go on with its recording by --resume, or choose another name."
-                if recorded
-                else "Choose another name.",
-            )
         journal = cls(folder, facts, unix_offset_s)
+        resumes = (folder / PROVENANCE).is_file()
         with named_errors(folder):
+            refuse_filled(folder, "; or go on with its recording by --resume" if resumes else "")
             folder.mkdir(parents=True, exist_ok=True)
         width, height = facts.resolution
         journal._check_room(views * width * height, f"{views} views")

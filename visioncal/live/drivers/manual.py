@@ -33,16 +33,13 @@ class ManualArm:
         DriverError: There is no such form.
     """
 
+    name = "poses typed by hand"
+
     def __init__(
         self, ask: Callable[[str], str], form: str | None = None, *, answers: bool = True
     ) -> None:
         self._ask, self.answers = ask, answers
         self._form = None if form is None else form_name(form)
-
-    @property
-    def name(self) -> str:
-        """Name in messages."""
-        return "poses typed by hand"
 
     @property
     def invitation(self) -> str:

@@ -19,8 +19,8 @@ from visioncal.core.types import Camera, Image
 from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
 
 # The longest wait, in intervals between this camera's pictures: one under way at the request, the
-# requested one, and one more for network jitter; and the pictures of which the mean counts.
-_INTERVALS, _PACED = 3.0, 50
+# requested one, and one more for network jitter.
+_INTERVALS = 3.0
 # Time for automatic exposure, focus and the like before they are held [s].
 SETTLE_S = 1.5
 _STEP = "Look at its cable, its power and its network."
@@ -65,7 +65,8 @@ class StreamingCamera:
         self.settings = MappingProxyType(settings)
         # 0 where it is not known.
         self._exposure_s = 1e-6 * float(settings.get("exposure_us", requested.exposure_us or 0))
-        self._arrivals_s: deque[float] = deque(maxlen=_PACED)
+        # Of so many pictures the mean interval counts.
+        self._arrivals_s: deque[float] = deque(maxlen=50)
         self._news = threading.Condition()
         # The moment after which the exposure of a requested picture begins, how many were too old
         # for it, and the picture with its stamp.

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from contextlib import suppress
+from contextlib import closing, suppress
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -39,7 +39,6 @@ _EXTRA = "ur"
 _RATE_HZ = 125.0
 # Timeout of a call [s]; it takes three or four states, 30 ms.
 _CALL_S = 0.9
-_CLOSE_S = 0.9
 # The controller ends its program, and stops the arm, where this computer is silent for 1 s.
 _LEAST_HZ, _KICK_S = 1.0, 0.1
 # Timeout of the start of an asynchronous motion [s].
@@ -54,15 +53,8 @@ _RATES_HZ, _LATER_HZ = {3: 125.0}, 500.0
 # Only names in the client's own table of variables: an unknown one would silently shift all that
 # follow.
 _VARIABLES = (
-    "timestamp",
-    "actual_q",
-    "actual_qd",
-    "actual_current",
-    "actual_TCP_pose",
-    "joint_temperatures",
-    "robot_mode",
-    "runtime_state",
-    "robot_status_bits",
+    *("timestamp", "actual_q", "actual_qd", "actual_current", "actual_TCP_pose"),
+    *("joint_temperatures", "robot_mode", "runtime_state", "robot_status_bits"),
     "safety_status_bits",
 )
 # Variables of newer controllers, and the first version, by major version.
@@ -85,8 +77,8 @@ class CallThread:
         # A daemon: a call that never returns must not keep the program from ending.
         threading.Thread(target=self._work, name=name, daemon=True).start()
 
-    def call(self, work: Callable[[], T], *, limit_s: float, what: str) -> T:
-        """Runs a call in the thread, with a timeout [s]; `what` it does is for messages.
+    def call(self, work: Callable[[], T], what: str) -> T:
+        """Runs a call in the thread, with a timeout; `what` it does is for messages.
 
         Raises:
             DriverError: It threw, or did not return in time.
@@ -103,9 +95,9 @@ class CallThread:
         waiting = Stopwatch()
         try:
             while not wait([future], 0.05).done:
-                if waiting.read() > limit_s:
+                if waiting.read() > _CALL_S:
                     raise DriverError(
-                        f"{self._name} did not {what} within {limit_s:.1f} s.",
+                        f"{self._name} did not {what} within {_CALL_S:.1f} s.",
                         culprits=[self._name],
                         next_step="Look at the pendant and at the network cable.",
                     )
@@ -243,7 +235,9 @@ class UrArm:
         control = None if watch_only else client_library("rtde_control", _EXTRA)
         self._host = host
         condition = check_controller(self._host, moves=not watch_only)
-        self._name, self._model = f"{condition.model} at {host}", condition.model.lower()
+        self.name = f"{condition.model} at {host}"
+        # Visioncal's name of the model, such as `ur10e`.
+        self.model = condition.model.lower()
         self.rate_hz = _RATES_HZ.get(condition.version[0], _LATER_HZ) if full_rate else _RATE_HZ
         self._states = StateStream(receive, self._host, condition.version, self.rate_hz)
         self._control: Any = None
@@ -254,7 +248,7 @@ class UrArm:
         if condition.is_polyscope_x and self._states.client.getRobotMode() not in _REPORTING:
             self.close()
             raise DriverError(
-                f"The {self._name} does not know where its joints are: it is not switched on.",
+                f"The {self.name} does not know where its joints are: it is not switched on.",
                 culprits=[host],
                 next_step="Switch it on at the pendant, and release its brakes.",
             )
@@ -266,25 +260,13 @@ class UrArm:
                 self._control = control.RTDEControlInterface(self._host, _RATE_HZ)
             except RuntimeError as error:
                 raise self._explained_error(f"does not take the control script: {error}") from error
-            self._line = CallThread(self._name, self._kick_watchdog, _KICK_S)
-            offset = self._line.call(
-                self._control.getTCPOffset, limit_s=_CALL_S, what="report its tool offset"
-            )
+            self._line = CallThread(self.name, self._kick_watchdog, _KICK_S)
+            offset = self._line.call(self._control.getTCPOffset, "report its tool offset")
             self._flange_from_tool = _matrix(offset)
             self._enable_watchdog(self._line)
         except DriverError:
             self.close()
             raise
-
-    @property
-    def name(self) -> str:
-        """Model and address of the arm."""
-        return self._name
-
-    @property
-    def model(self) -> str:
-        """Visioncal's name of the model, such as `ur10e`."""
-        return self._model
 
     def state(self) -> ArmState:
         """Waits for the next state that the controller sends.
@@ -343,15 +325,15 @@ class UrArm:
         line = self._line
         if line is None:
             raise DriverError(
-                f"The {self._name} is only watched; it cannot be moved from here.",
-                culprits=[self._name],
+                f"The {self.name} is only watched; it cannot be moved from here.",
+                culprits=[self.name],
                 next_step="Move it by hand, or open it for moving.",
             )
         self._states.check()
         self._check_safety()
         if not self._control.isProgramRunning():
             read_condition(self._host).check_moves()
-            line.call(self._control.reuploadScript, limit_s=_CALL_S, what="take the control script")
+            line.call(self._control.reuploadScript, "take the control script")
             timer = Stopwatch()
             while not self._control.isProgramRunning():
                 if timer.read() > _CALL_S:
@@ -360,9 +342,7 @@ class UrArm:
             self._enable_watchdog(line)
         before = self._control.getAsyncOperationProgressEx().changeCount()
         accepted = line.call(
-            lambda: self._control.moveJ(goal.tolist(), speed, acceleration, True),
-            limit_s=_CALL_S,
-            what="take a motion",
+            lambda: self._control.moveJ(goal.tolist(), speed, acceleration, True), "take a motion"
         )
         if not accepted:
             raise self._explained_error("refused a motion")
@@ -407,12 +387,10 @@ class UrArm:
             with suppress(DriverError):
                 # The call returns when the arm starts to brake, by 4 rad/s^2: a joint at 1 rad/s
                 # stops within a quarter of a second.
-                self._line.call(
-                    lambda: self._control.stopJ(4.0, True), limit_s=_CALL_S, what="stop"
-                )
+                self._line.call(lambda: self._control.stopJ(4.0, True), "stop")
                 return
         # A controller whose states no longer arrive may still receive commands, within 0.3 s.
-        with suppress(DriverError), Dashboard(self._host, 0.3) as dashboard:
+        with suppress(DriverError), closing(Dashboard(self._host, 0.3)) as dashboard:
             dashboard.ask("stop")
 
     def close(self) -> None:
@@ -424,21 +402,17 @@ class UrArm:
         self._closed = True
         # Each disconnection sleeps for half a second, so they run in parallel.
         disconnecting_states = self._states.disconnect()
-        ends_s = time.monotonic() + _CLOSE_S
+        ends_s = time.monotonic() + _CALL_S
         if self._line is not None:
             keep(self._control)
             with suppress(DriverError):
-                self._line.call(self._disconnect_control, limit_s=_CLOSE_S, what="close")
+                self._line.call(self._disconnect_control, "close")
             self._line.end()
         disconnecting_states.join(max(0.0, ends_s - time.monotonic()))
 
     def _enable_watchdog(self, line: CallThread) -> None:
         """Makes the controller stop the arm if this computer falls silent."""
-        line.call(
-            lambda: self._control.setWatchdog(_LEAST_HZ),
-            limit_s=_CALL_S,
-            what="set its watchdog",
-        )
+        line.call(lambda: self._control.setWatchdog(_LEAST_HZ), "set its watchdog")
 
     def _kick_watchdog(self) -> None:
         """Resets the controller's watchdog."""
@@ -453,7 +427,7 @@ class UrArm:
 
     def _check_open(self) -> None:
         if self._closed:
-            raise DriverError(f"The {self._name} was closed.", culprits=[self._name])
+            raise DriverError(f"The {self.name} was closed.", culprits=[self.name])
 
     def _check_safety(self) -> None:
         safety = self._states.safety
@@ -468,8 +442,8 @@ class UrArm:
         except DriverError as error:
             return error
         return DriverError(
-            f"The {self._name} {what}.",
-            culprits=[self._name],
+            f"The {self.name} {what}.",
+            culprits=[self.name],
             next_step="Read the pendant's log, and see that no other program or computer drives "
             "the arm.",
         )

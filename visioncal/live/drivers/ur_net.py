@@ -10,9 +10,9 @@ import re
 import socket
 import struct
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
-from typing import BinaryIO, Self
+from typing import BinaryIO
 
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import Safety
@@ -21,7 +21,6 @@ DASHBOARD_PORT, SCRIPT_PORT, RTDE_PORT = 29999, 30003, 30004
 # A controller in the same network answers within milliseconds.
 _CONNECT_S = 0.8
 _ANSWER_S = 1.0
-_WAIT_S = 1.0
 _BANNER = "Universal Robots Dashboard Server"
 _HEADER = struct.Struct(">HB")
 # Types of RTDE's frames: request of its version, of the controller's, output recipe, start, state.
@@ -137,12 +136,6 @@ class Dashboard:
         self._file.close()
         self._socket.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _line(self) -> str:
         try:
             line = self._file.readline(1000)
@@ -198,7 +191,7 @@ def _read(file: BinaryIO) -> tuple[int, bytes]:
 
 def read_tool_offset(host: str) -> list[float]:
     """Reads the active tool offset: x, y, z [m] and a rotation vector [rad]; raises DriverError."""
-    ends_s = time.monotonic() + _WAIT_S
+    ends_s = time.monotonic() + _ANSWER_S
     try:
         link = connect(host, PRIMARY_PORTS[0], "the primary interface")
     except DriverError:
@@ -286,7 +279,7 @@ def read_condition(host: str) -> Condition:
             raise
         words = ".".join(map(str, version))
         return Condition(host, version, f"UR with PolyScope X {words}", "", "", remote=False)
-    with opened as dashboard:
+    with closing(opened) as dashboard:
         version = _read_version(host, dashboard.ask("PolyscopeVersion"))
         model = dashboard.ask("get robot model")
         mode = dashboard.ask("robotmode").rpartition(":")[2].strip()
@@ -324,15 +317,14 @@ def safety_of(bits: int) -> Safety:
 
 def _read_version(host: str, text: str) -> tuple[int, int, int]:
     match = _VERSION.search(text)
-    version = tuple(map(int, match.groups())) if match else ()
-    if len(version) != 3:
+    if match is None:
         raise DriverError(
             f"The controller at {host} answers {text[:60]!r} when asked for its version; four "
             "numbers are needed, as in URSoftware 5.11.0.108249.",
             culprits=[host],
             next_step="Check that the address is a UR's with PolyScope 3 or 5.",
         )
-    major, minor, patch = version
+    major, minor, patch = map(int, match.groups())
     if major not in _LEAST or (major, minor) < _LEAST[major]:
         raise DriverError(
             f"The controller at {host} has PolyScope {major}.{minor}.{patch}; ur-rtde needs 3.4 or "

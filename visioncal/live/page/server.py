@@ -89,6 +89,7 @@ class _Page:
         self._station, self._text = station, text
         self._shown: Snapshot | None = None
         self._inputs: dict[str, ui.input] = {}
+        setup = station.snapshot.setup
         with ui.row().classes("w-full items-center gap-4"):
             ui.label(text.title).classes("text-2xl")
             self._light = ui.html("", sanitize=False)
@@ -96,24 +97,19 @@ class _Page:
         self._problem = ui.label("").classes("text-red-700 text-lg").props("role=alert")
         self._note = ui.label("").classes("text-sm")
         with ui.card().classes("w-full") as self._setup:
-            self._build_setup()
+            for name, (label, choices) in text.fields.items():
+                self._inputs[name] = (
+                    ui.input(label, value=getattr(setup, name), autocomplete=[*choices])
+                    .props(f'clearable hint="{", ".join(choices)}"')
+                    .classes("w-full")
+                )
+            ui.button("Start", on_click=self._begin)
         self._outcome = ui.card().classes("w-full gap-1")
         with ui.row().classes("w-full gap-4 items-start") as self._live:
             self._build_live()
         self._history = ui.column().classes("w-full")
         self._refresh()
         ui.timer(0.2, self._refresh)
-
-    def _build_setup(self) -> None:
-        setup = self._station.snapshot.setup
-        for name, (label, choices) in self._text.fields.items():
-            value = getattr(setup, name)
-            self._inputs[name] = (
-                ui.input(label, value=value, autocomplete=[*choices])
-                .props(f'clearable hint="{", ".join(choices)}"')
-                .classes("w-full")
-            )
-        ui.button("Start", on_click=self._begin)
 
     def _begin(self) -> None:
         chosen = {name: str(field.value or "") for name, field in self._inputs.items()}
@@ -207,7 +203,12 @@ class _Page:
         if before is None or now.coverage != before.coverage:
             self._coverage.content = now.coverage
         if before is None or (now.next_pose, now.pose_form) != (before.next_pose, before.pose_form):
-            self._show_next(now)
+            pose = now.next_pose
+            self._next.text = "" if pose is None else pose.words
+            flange = None if pose is None else pose.base_from_flange
+            self._next_pose.visible = self._warned.visible = flange is not None
+            if flange is not None:
+                self._next_pose.text = pendant_words(flange, POSE_FORMS[now.pose_form])
         if before is None or now.views != before.views:
             self._views.clear()
             with self._views:
@@ -226,14 +227,6 @@ class _Page:
         if now.phase == "stopped":
             return f"on the disk: {counted(len(now.views), 'view')}"
         return f"{now.arm}: {counted(len(now.views), 'view')}" if now.phase == "live" else ""
-
-    def _show_next(self, now: Snapshot) -> None:
-        pose = now.next_pose
-        self._next.text = "" if pose is None else pose.words
-        flange = None if pose is None else pose.base_from_flange
-        self._next_pose.visible = self._warned.visible = flange is not None
-        if flange is not None:
-            self._next_pose.text = pendant_words(flange, POSE_FORMS[now.pose_form])
 
     def _show_outcome(self, now: Snapshot) -> None:
         shown: Outcome | None = now.outcome or now.trial

@@ -182,11 +182,27 @@ class Station:
 
     def undo(self, seen: Snapshot) -> None:
         """Removes the last view."""
-        self._put(seen, self._undo)
+
+        def undo() -> None:
+            capture = self._capture
+            if capture.journal.views:
+                capture.journal.undo()
+                self._start(capture.cell, capture.journal, capture.coach.camera)
+                self._publish(views=self.snapshot.views[:-1], missed="", trial=None, outcome=None)
+                self._after_change()
+
+        self._put(seen, undo)
 
     def skip(self, seen: Snapshot) -> None:
         """Suggests another pose."""
-        self._put(seen, self._skip)
+
+        def skip() -> None:
+            pose = self.snapshot.next_pose
+            if pose is not None and pose.cam_from_target is not None:
+                self._rejected.append(pose.cam_from_target)
+            self._advise()
+
+        self._put(seen, skip)
 
     def finish(self, seen: Snapshot) -> None:
         """Judges the views, also after the devices are closed."""
@@ -323,15 +339,6 @@ class Station:
         self._publish(views=views, missed="", outcome=None, pose_form=form)
         self._after_change()
 
-    def _undo(self) -> None:
-        capture = self._capture
-        if not capture.journal.views:
-            return
-        capture.journal.undo()
-        self._start(capture.cell, capture.journal, capture.coach.camera)
-        self._publish(views=self.snapshot.views[:-1], missed="", trial=None, outcome=None)
-        self._after_change()
-
     def _after_change(self) -> None:
         count = len(self._capture.journal.views)
         if self._task.count and count >= self._task.count:
@@ -369,12 +376,6 @@ class Station:
                 lens = Camera(fitted["model"], capture.coach.resolution, *numbers)
                 self._start(capture.cell, capture.journal, lens)
             self._advise()
-
-    def _skip(self) -> None:
-        pose = self.snapshot.next_pose
-        if pose is not None and pose.cam_from_target is not None:
-            self._rejected.append(pose.cam_from_target)
-        self._advise()
 
     def _advise(self) -> None:
         """Publishes the coverage, and the next pose."""

@@ -8,11 +8,12 @@ import numpy as np
 from visioncal.core.codec import Array, Vector, WrittenForm
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, rigid_fault
-from visioncal.core.types import Camera, FloatArray, Mount, Target
+from visioncal.core.types import FloatArray, Mount, Target
 from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.touches import robot_noise
 from visioncal.results import Calibration
-from visioncal.results.lens import CameraForm
+from visioncal.results.arm import StoredRobot
+from visioncal.results.lens import StoredCamera
 from visioncal.robot import Robot
 from visioncal.robot.collision import Body, Collisions, arm_bodies, camera_body, capsule
 from visioncal.vision.targets import (
@@ -34,11 +35,7 @@ _PLATE_M, _RIM_M = 0.01, 0.02
 
 Pose: TypeAlias = Annotated[FloatArray, Array((4, 4))]
 # Forms in plan.json. A board that comes with visioncal gets its name.
-_ROBOT = WrittenForm(
-    lambda robot: dict(robot.document), lambda content, _: Robot.from_document(content)
-)
 _TARGET = WrittenForm(target_document, lambda content, _: _named(content))
-_CAMERA = WrittenForm(lambda lens: lens, lambda form, _: Camera(**vars(form)), CameraForm)
 _NOISE = WrittenForm(
     lambda noise: noise.robots[0].tolist(), lambda sigmas, _: Noise.of_robot(*sigmas)
 )
@@ -111,8 +108,8 @@ class PlanCell:
     """A cell to plan for: its parts, rough guesses of the unknown edges, and limits."""
 
     mount: Mount
-    robot: Annotated[Robot, _ROBOT]
-    camera: Annotated[Camera, _CAMERA]
+    robot: StoredRobot
+    camera: StoredCamera
     target: Annotated[Target, _TARGET]
     # (4, 4) guess of `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
     x: Pose

@@ -221,7 +221,11 @@ def _world(
         weights = _sight_weights(cell, arm, q)
     else:
         weights = _workspace_weights(cell, purpose)
-    counted, place, turn = (_padded(array, shared_count) for array in weights)
+    # Zeros for lens and board follow the edges.
+    at = np.full(shared_count, 12)
+    counted, place, turn = (
+        np.insert(np.insert(square, at, 0.0, axis=0), at, 0.0, axis=1) for square in weights
+    )
     misfit, gradient = factors[:, :, size:], recorded_information[:size, size:]
     if recorded is not None and not purpose.blocks:
         error_root, held = recorded.edge_error_root, recorded.held.shape[1]
@@ -375,12 +379,3 @@ def _mean_square(jacobian: FloatArray) -> FloatArray:
     """Mean over m of J^T J: (m, 3, p) to (p, p)."""
     rows = jacobian.reshape(-1, jacobian.shape[2])
     return np.asarray(rows.T @ rows / len(jacobian))
-
-
-def _padded(square: FloatArray, shared_count: int) -> FloatArray:
-    """Inserts rows and columns of zeros for lens and board after those of the edges."""
-    size = len(square) + shared_count
-    wide = np.zeros((size, size))
-    rows = np.concatenate([np.arange(12), np.arange(12 + shared_count, size)])
-    wide[np.ix_(rows, rows)] = square
-    return wide

@@ -25,35 +25,20 @@ class Purpose:
     blocks: Mapping[str, float] = field(default_factory=dict)
 
 
-# Picks depend on the camera's edge alone; the target's is a nuisance parameter.
-_HAND_EYE = Purpose("hand-eye", "sight", "the camera's pose", 12)
-_OFFSETS = Purpose(
-    "offsets",
-    "workspace",
-    "the arm's place all over its workspace",
-    20,
+_ALL_OVER = "arm's place all over its workspace"
+_PURPOSES = (
+    # Picks depend on the camera's edge alone; the target's is a nuisance parameter.
+    Purpose("hand-eye", "sight", "the camera's pose", 12),
     # A lost encoder zero is set again by eye to about this.
-    {"offsets": 2e-3},
-)
-_KINEMATICS = Purpose(
-    "kinematics",
-    "workspace",
-    "the arm's place all over its workspace",
-    30,
+    Purpose("offsets", "workspace", f"the {_ALL_OVER}", 20, {"offsets": 2e-3}),
     # Arms deviate by 1 mrad and 0.5 mm per link.
-    {"links": 1e-3},
-)
-_ELASTIC = Purpose(
-    "elastic",
-    "workspace",
-    "the bending arm's place all over its workspace",
-    30,
+    Purpose("kinematics", "workspace", f"the {_ALL_OVER}", 30, {"links": 1e-3}),
     # A cobot's joints deflect by 10 mrad under the greatest torque of the arm's own weight.
-    {"links": 1e-3, "compliance": 1e-2},
+    Purpose(
+        "elastic", "workspace", f"the bending {_ALL_OVER}", 30, {"links": 1e-3, "compliance": 1e-2}
+    ),
 )
-PURPOSES: Mapping[str, Purpose] = MappingProxyType(
-    {purpose.name: purpose for purpose in (_HAND_EYE, _OFFSETS, _KINEMATICS, _ELASTIC)}
-)
+PURPOSES: Mapping[str, Purpose] = MappingProxyType({each.name: each for each in _PURPOSES})
 
 
 def purpose_of(name: str, culprit: str = "purpose") -> Purpose:

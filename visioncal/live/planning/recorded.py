@@ -1,6 +1,6 @@
 """Start of a plan that adds stops to a session: what the session determines already."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,18 +41,14 @@ class SessionStart:
     views: tuple[int, ...]  # Number of the first view of each stop.
 
 
-@dataclass(frozen=True, eq=False)
-class PartialCalibration:
-    """Run of a session as far as its stages succeed, and the reason why they end early."""
-
-    known: RunState
-    refusal: str = field(default="")
-
-
 def calibrate_partially(
     session: Session, *, progress: Progress | None = None
-) -> PartialCalibration:
-    """Calibrates the hand-eye level of a session as far as it goes; raises DataError."""
+) -> tuple[RunState, str]:
+    """Calibrates the hand-eye level of a session as far as it goes; raises DataError.
+
+    Returns:
+        The run, and why it ended early; empty where it did not.
+    """
     run = RunState(session, progress, level="hand-eye")
     for index, stage in enumerate(STAGES):
         if progress is not None:
@@ -60,12 +56,13 @@ def calibrate_partially(
         try:
             run = stage.run(run)
         except DegenerateError as error:
-            return PartialCalibration(run, error.message)
-    return PartialCalibration(run)
+            return run, error.message
+    return run, ""
 
 
 def start_from_session(
-    partial: PartialCalibration,
+    run: RunState,
+    refusal: str = "",
     *,
     limits: Limits | None = None,
     boxes: tuple[Box, ...] = (),
@@ -76,7 +73,8 @@ def start_from_session(
     board nearest to the flange.
 
     Args:
-        partial: The session, calibrated as far as it goes.
+        run: The session, calibrated as far as it goes.
+        refusal: Why that ended early; empty where it did not.
         limits: Limits of the added stops.
         boxes: Obstacles in the cell.
 
@@ -84,7 +82,6 @@ def start_from_session(
         DataError: The session lacks a robot's model, a camera or a board, or has too few
             usable views for a fit.
     """
-    run = partial.known
     robot, targets = run.robot, tuple(run.session.boards.values())
     if robot is None or not targets or run.pixel_px is None or not run.scenes:
         raise _missing_input_error(run)
@@ -123,7 +120,7 @@ def start_from_session(
     cell = replace(cell, observed_distances_m=_board_distances_m(cell, start.problem))
     first_corner = int(first_corners(targets)[start.board])
     recorded = _recorded_stops(run, start, edges, first_corner)
-    return SessionStart(cell, recorded, partial.refusal, start.views)
+    return SessionStart(cell, recorded, refusal, start.views)
 
 
 def _board_distances_m(cell: PlanCell, problem: Problem) -> tuple[float, float]:
