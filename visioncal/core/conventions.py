@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import NORM_TOLERANCE
 from visioncal.core.number_format import some_of
 from visioncal.core.transforms import compose, invert, nearest_rotation
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 
 
 @dataclass(frozen=True)
@@ -194,12 +194,7 @@ class PoseNumbers:
 
     def rows(self, rows: IntArray) -> "PoseNumbers":
         """The given rows, in their order."""
-        return replace(
-            self,
-            positions=self.positions[rows],
-            rotations=self.rotations[rows],
-            places=tuple(self.places[index] for index in rows),
-        )
+        return chosen_rows(self, rows)
 
     def read_as(self, reading: Reading) -> "PoseNumbers":
         """The same numbers under another reading."""

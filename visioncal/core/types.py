@@ -1,8 +1,8 @@
 """Data types shared by all packages."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias, get_args, get_origin
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, TypeAlias, TypeVar, cast, get_args, get_origin
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,8 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 Image: TypeAlias = npt.NDArray[np.uint8]
 Image16: TypeAlias = npt.NDArray[np.uint16]
 
+_T = TypeVar("_T")
+
 CameraKind: TypeAlias = Literal["brown", "fisheye"]
 
 
@@ -28,6 +30,22 @@ def scalar_of(hint: Any) -> Any:  # noqa: ANN401 - a type
         return get_args(inner[1])[0]
     # From NumPy 2.5 on, which needs Python 3.12, it is an alias that does not stand for another.
     return inner[0] if inner and origin is npt.NDArray else None
+
+
+def chosen_rows(record: _T, rows: Any, *others: str) -> _T:  # noqa: ANN401 - any index
+    """A dataclass with some rows of all its arrays and tuples, but of `others`, in their order.
+
+    `rows` are indices, a mask or a slice.
+    """
+    owner: Any = record
+    picked: dict[str, object] = {}
+    for name in (entry.name for entry in fields(owner) if entry.name not in others):
+        value = getattr(owner, name)
+        if isinstance(value, np.ndarray):
+            picked[name] = value[rows]
+        elif isinstance(value, tuple) and value:
+            picked[name] = tuple(value[at] for at in np.arange(len(value))[rows])
+    return cast(_T, replace(owner, **picked))
 
 
 # Called with a stage's name, its steps done, and its steps in all.
@@ -121,8 +139,7 @@ class Corners:
 
     def take(self, rows: IntArray | Mask) -> "Corners":
         """The corners of (m,) rows or of an (n,) mask."""
-        weights = None if self.weights is None else self.weights[rows]
-        return replace(self, ids=self.ids[rows], px=self.px[rows], weights=weights)
+        return chosen_rows(self, rows)
 
 
 @dataclass(frozen=True)

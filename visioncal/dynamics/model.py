@@ -5,7 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.robot import Robot
 from visioncal.robot.inertia import PARAMETER_NAMES
 from visioncal.robot.torques import torque_regressor
@@ -28,7 +28,7 @@ class JointMotion:
 
     def chosen(self, rows: slice | IntArray | Mask) -> "JointMotion":
         """The samples of given rows."""
-        return JointMotion(self.times_s[rows], self.q[rows], self.dq[rows], self.ddq[rows])
+        return chosen_rows(self, rows)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ from visioncal.dynamics.limits import MotionExtremes, MotionLimits
 from visioncal.dynamics.model import JointMotion
 from visioncal.dynamics.sweeps import Sweeps
 
-SCHEMA = 1
 MOTION_FILES = ("sweeps.csv", "excitation.csv")
 
 
@@ -56,7 +55,7 @@ def motion_document(plan: MotionPlan) -> dict[str, Any]:
     mean, sines, cosines = plan.excitation.series.coefficients
     request = plan.excitation.request
     document: dict[str, Any] = {
-        "schema": SCHEMA,
+        "schema": 1,
         "kind": "dynamics",
         "visioncal": __version__,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),

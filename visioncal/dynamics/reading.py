@@ -10,7 +10,8 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
+from visioncal.estimation.trajectory import GAP_RATIO, SHORT_GAP_S
 from visioncal.session import Stream, too_far_apart
 
 _NUMBERED = re.compile(r"(q|tau|current|dq)([1-9][0-9]*)_(rad|nm|a|rad_s)", re.ASCII)
@@ -24,8 +25,8 @@ _HOW = (
 )
 # Clocks whose jitter exceeds the first share of the usual step are resampled. Up to the second
 # share of jitter, a step of several usual ones means missing samples; on a less even clock, only a
-# step of so many times the usual one that is also longer than the last [s].
-_JITTER, _EVEN, _GAP, _GAP_S = 0.02, 0.1, 2.5, 0.02
+# gap as of a trajectory.
+_JITTER, _EVEN = 0.02, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +45,7 @@ class RecordedSamples:
 
     def part(self, begin: float, end: float) -> "RecordedSamples":
         """The samples between two fractions of the stream, 0 to 1."""
-        rows = slice(round(begin * len(self)), round(end * len(self)))
-        return replace(
-            self,
-            times_s=self.times_s[rows],
-            q=self.q[rows],
-            dq=None if self.dq is None else self.dq[rows],
-            torques_nm=self.torques_nm[rows],
-        )
+        return chosen_rows(self, slice(round(begin * len(self)), round(end * len(self))))
 
 
 def read_recorded(
@@ -147,7 +141,7 @@ class StampClock:
         counts = np.maximum(np.rint(steps / usual), 1.0)
         jitter = _jitter(steps, counts, usual)
         if jitter > _EVEN:
-            counts[steps <= max(_GAP * usual, _GAP_S)] = 1.0
+            counts[steps <= max(GAP_RATIO * usual, SHORT_GAP_S)] = 1.0
             jitter = _jitter(steps, counts, usual)
         return cls(usual, counts.astype(np.int64), jitter)
 
@@ -213,7 +207,7 @@ def gap_notes(recorded: RecordedSamples, clock: StampClock, longest_gap_s: float
 
 
 def _jitter(steps: FloatArray, counts: FloatArray, usual: float) -> float:
-    without_gaps = counts * usual <= max(_GAP * usual, _GAP_S)
+    without_gaps = counts * usual <= max(GAP_RATIO * usual, SHORT_GAP_S)
     return float(np.std((steps - counts * usual)[without_gaps])) / usual
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.transforms import invert, rotation_angle
-from visioncal.core.types import FloatArray, IntArray, Mask, Mount
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount, chosen_rows
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.trajectory import Trajectory
 
@@ -45,15 +45,9 @@ class ImageTimes:
 
     def only(self, chosen: Mask | IntArray) -> "ImageTimes":
         """Returns some of the views, in ascending order."""
-        covariance, stack = self.covariance, self.stack
-        rows = np.arange(len(self))[chosen]
-        return replace(
-            self,
-            stamps_s=self.stamps_s[chosen],
-            cam_from_target=self.cam_from_target[chosen],
-            covariance=None if covariance is None else covariance[chosen],
-            stack=None if stack is None else stack.keep(np.isin(stack.view_of, rows)),
-        )
+        stack, rows = self.stack, np.arange(len(self))[chosen]
+        kept = None if stack is None else stack.keep(np.isin(stack.view_of, rows))
+        return replace(chosen_rows(self, chosen), stack=kept)
 
 
 @dataclass(frozen=True)

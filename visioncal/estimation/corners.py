@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
-from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.field_modes import FieldModes
 from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.viewnoise import weights_by_view
@@ -77,16 +77,11 @@ class CornerStack:
         """Returns the stack of the corners in an (n,) mask, without views that have none."""
         kept_views, view_of = np.unique(self.view_of[mask], return_inverse=True)
         return replace(
-            self,
+            chosen_rows(self, mask, "views", "blurs", "starts"),
             views=tuple(self.views[at] for at in kept_views),
             blurs=tuple(self.blurs[at] for at in kept_views),
             starts=np.searchsorted(view_of, np.arange(len(kept_views))),
             view_of=view_of,
-            ids=self.ids[mask],
-            points=self.points[mask],
-            px=self.px[mask],
-            weights=None if self.weights is None else self.weights[mask],
-            zooms=None if self.zooms is None else self.zooms[mask],
         )
 
     def weighed(self, residuals: FloatArray) -> "CornerStack":

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import svd
 
+from visioncal.core.limits import DETERMINED
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armpair import ArmData
@@ -22,8 +23,6 @@ from visioncal.robot import Robot
 
 # Directions whose singular value is below this share of the largest are unidentifiable.
 _LEAST_SHARE = 1e-7
-# A parameter is determined where its sigma is below this share of its prior sigma.
-_DETERMINED = 0.7
 _WORDS = {
     "theta": "offset",
     "d": "length d",
@@ -139,7 +138,7 @@ def undetermined(
     robot: Robot,
 ) -> str:
     """Names parameters, by the errors (k, p), that other stops would determine."""
-    is_open = (stops.shares(moves) > _DETERMINED) & (anywhere.shares(moves) < _DETERMINED)
+    is_open = (stops.shares(moves) > DETERMINED) & (anywhere.shares(moves) < DETERMINED)
     things = [
         f"the {_WORDS[parameter.kind]} of {joint_words(parameter.joint, robot)}"
         for parameter, found in zip(named, is_open.tolist(), strict=True)

@@ -24,7 +24,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply_each, compose, invert, nearest_rotation
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import Direction, Turning
@@ -69,14 +69,7 @@ class Touches:
 
     def subset(self, chosen: Mask) -> "Touches":
         """Returns the touches of an (n,) mask; the points keep their numbers."""
-        rows = np.flatnonzero(chosen)
-        return replace(
-            self,
-            base_from_flange=self.base_from_flange[rows],
-            points=self.points[rows],
-            kinds=tuple(self.kinds[row] for row in rows),
-            labels=tuple(self.labels[row] for row in rows),
-        )
+        return chosen_rows(self, chosen, "names")
 
 
 @dataclass(frozen=True, eq=False)

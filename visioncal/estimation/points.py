@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from visioncal.core.transforms import apply_each, exp, skew
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import (
     NULL_SHARE,
@@ -60,9 +60,7 @@ class Groups:
 
     def subset(self, chosen: Mask) -> "Groups":
         """Returns the groups of an (m,) mask."""
-        return Groups(
-            self.residuals[chosen], self.jacobian[chosen], self.observed[chosen], self.known[chosen]
-        )
+        return chosen_rows(self, chosen)
 
     def covariance(self, sigma: float) -> FloatArray:
         """Covariances (m, d, d) at a noise level [m]; identity where nothing was observed."""

@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from visioncal.core.transforms import exp, inverse_right_jacobian, log
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.mixed import PriorInformation
 
 # Variances of undetermined directions of a pose are larger [rad^2].
@@ -46,18 +46,7 @@ class Observations:
 
     def take(self, rows: IntArray) -> "Observations":
         """Returns the observations of (m,) rows."""
-        names = (self.observers, self.observed)
-        observers, observed = (tuple(part[index] for index in rows.tolist()) for part in names)
-        return Observations(
-            observers,
-            observed,
-            self.stops[rows],
-            self.sensors[rows],
-            self.measured[rows],
-            self.covariance[rows],
-            self.has_rotation[rows],
-            self.is_uneven[rows],
-        )
+        return chosen_rows(self, rows)
 
     def renamed(self, frame: str, other: str, rows: Mask) -> "Observations":
         """Returns the observations with a frame renamed in the rows of an (n,) mask."""

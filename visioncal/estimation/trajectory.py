@@ -17,7 +17,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 
 # A gap is an interval over this multiple of the usual one, and over this time [s]; and any over the
 # longest, in which a robot can go anywhere.
-_GAP_RATIO, _SHORT_GAP_S, LONGEST_GAP_S = 2.5, 0.02, 0.25
+GAP_RATIO, SHORT_GAP_S, LONGEST_GAP_S = 2.5, 0.02, 0.25
 # Least time over which velocities are averaged, to limit the noise of reported poses [s].
 _SPEED_S = 0.04
 # Samples of the cubic, relative to the one before a time.
@@ -54,7 +54,7 @@ class Samples:
     def _joined(self) -> Mask:
         """(n - 1,) mask of the intervals without a gap."""
         steps = np.diff(self.stamps_s)
-        limit_s = max(_GAP_RATIO * self.step_s, _SHORT_GAP_S)
+        limit_s = max(GAP_RATIO * self.step_s, SHORT_GAP_S)
         return np.asarray((steps <= limit_s) & (steps < LONGEST_GAP_S))
 
     def _before(self, at_s: FloatArray) -> IntArray:

@@ -8,14 +8,13 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
+from visioncal.core.limits import NORM_TOLERANCE
 from visioncal.core.transforms import LAST_ROW, exp, rigid_fault, skew
 from visioncal.core.types import FloatArray, Mask
 
 # Columns of a joint's function: offset, ratio, sine, cosine.
 FUNCTION_NAMES = ("offset", "ratio", "sine", "cosine")
 IDENTITY_FUNCTION = (0.0, 1.0, 0.0, 0.0)
-# Tolerance of rotation matrices, which may be printed to three digits.
-_ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +250,7 @@ def joint_function(row: DocumentTable, keys: Sequence[str]) -> list[float]:
 def _axis(row: DocumentTable) -> FloatArray:
     axis = np.array(row.numbers("axis", 3))
     length = float(np.linalg.norm(axis))
-    if abs(length - 1.0) > _ROTATION_TOLERANCE:
+    if abs(length - 1.0) > NORM_TOLERANCE:
         raise row.refuse("axis", axis.tolist(), "a vector of length 1")
     return axis / length
 
@@ -263,7 +262,7 @@ def _placement(row: DocumentTable) -> FloatArray:
         raise row.refuse("placement", rows, needed)
     tables = [DocumentTable({"placement": value}, row.label) for value in rows]
     matrix = np.array([table.numbers("placement", 4) for table in tables])
-    if fault := rigid_fault(matrix, _ROTATION_TOLERANCE):
+    if fault := rigid_fault(matrix, NORM_TOLERANCE):
         raise DataError(
             f"{row.label}: placement is no rigid transform [m]: {fault}.",
             culprits=[f"{row.label}: placement"],

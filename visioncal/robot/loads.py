@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 
 if TYPE_CHECKING:
     from visioncal.robot.model import Robot
@@ -95,8 +95,7 @@ class Loads:
 
     def chosen(self, rows: IntArray | Mask) -> "Loads":
         """The loads of given stops."""
-        parts = (self.payload_kg, self.payload_m, self.force_n, self.side)
-        return Loads(*(part[rows] for part in parts))
+        return chosen_rows(self, rows)
 
     @property
     def rows(self) -> FloatArray:

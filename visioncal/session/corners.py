@@ -11,7 +11,7 @@ from visioncal.core.documents.tables import parse_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_text_inside, sha256
 from visioncal.core.number_format import did_you_mean
-from visioncal.core.types import Corners, FloatArray, IntArray, Target
+from visioncal.core.types import Corners, FloatArray, IntArray, Target, chosen_rows
 from visioncal.session.document import Declaration
 from visioncal.session.kinds import COLUMN, name_of
 from visioncal.session.table import View
@@ -66,16 +66,7 @@ class CornerTable:
 
     def of_views(self, views: Sequence[int]) -> "CornerTable":
         """The corners of some views."""
-        rows = np.flatnonzero(np.isin(self.views, views))
-        return CornerTable(
-            self.views[rows],
-            self.points[rows],
-            self.px[rows],
-            tuple(self.targets[at] for at in rows),
-            None if self.sigmas_px is None else self.sigmas_px[rows],
-            self.is_file,
-            None if self.lines is None else self.lines[rows],
-        )
+        return chosen_rows(self, np.isin(self.views, views))
 
     def without_targets(self) -> "CornerTable":
         """The corners without names of targets."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.core.transforms import invert
-from visioncal.core.types import Camera, Corners, FloatArray
+from visioncal.core.types import Camera, Corners, FloatArray, chosen_rows
 from visioncal.session import Stream, frame_name
 from visioncal.simulation.arms import DhArm, Payload
 from visioncal.simulation.layout import (
@@ -43,18 +43,8 @@ class SimulatedRobot:
 
     def only(self, stops: Sequence[int]) -> "SimulatedRobot":
         """The robot at some of its stops, renumbered."""
-        kept = list(stops)
-        return replace(
-            self,
-            joints=self.joints[kept],
-            base_from_flange=self.base_from_flange[kept],
-            true_base_from_flange=self.true_base_from_flange[kept],
-            wrong_stops=tuple(
-                stop for stop, old_stop in enumerate(kept) if old_stop in self.wrong_stops
-            ),
-            loads=tuple(self.loads[stop] for stop in kept if self.loads),
-            approach=None if self.approach is None else self.approach[kept],
-        )
+        wrong = tuple(stop for stop, old_stop in enumerate(stops) if old_stop in self.wrong_stops)
+        return replace(chosen_rows(self, list(stops), "wrong_stops"), wrong_stops=wrong)
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,8 +38,6 @@ _DRAWN_PX = 0.5
 _EDGE = cv2.BORDER_REPLICATE
 # White paper around the print, and how much of it is fitted [squares].
 _PAPER, _RIM = 2, 0.25
-# Fewest corners that are worth a view, as for detected ones.
-_FEWEST = 6
 # A corner's contrast relative to the model's, its largest shift [squares], and the largest variance
 # of its pixels over the median: elsewhere, something else is in the image.
 _CONTRAST, _MOST_SHIFT, _MOST_VARIANCE = (0.5, 2.0), 0.15, 4.0
@@ -84,7 +82,7 @@ def find_densely(image: Image, target: Target) -> DenseCorners | None:
 def _starts(image: Image, target: Target) -> Iterator[tuple[IntArray, FloatArray]]:
     """Possible positions of corners, to a third of a square; the likeliest first."""
     seen = find_target(image, target)
-    if isinstance(seen, DetectedCorners) and len(seen.ids) >= _FEWEST:
+    if isinstance(seen, DetectedCorners) and len(seen.ids) >= kind_of(target).fewest:
         yield seen.ids, seen.px
         return
     places = corner_positions(target)
@@ -212,7 +210,7 @@ class _Fit:
     def solved(self) -> tuple[FloatArray, float]:
         """The parameters that fit best, and the explained share of the board's variance."""
         used = self.used(np.append(self.start, np.zeros(10)))
-        if used.sum() < _FEWEST * _SQUARE_PX**2 / 4:
+        if used.sum() < kind_of(self.target).fewest * _SQUARE_PX**2 / 4:
             return self.start, 0.0
         cost, values = min(self.starts(used), key=lambda at: at[0])
         if not np.isfinite(cost):
@@ -268,7 +266,7 @@ class _Fit:
                 rows.append((number, at + shift, float(sigma), float(variance)))
         typical = np.median([row[3] for row in rows]) if rows else np.inf
         rows = [row for row in rows if row[3] < _MOST_VARIANCE * typical]
-        if len(rows) < _FEWEST:
+        if len(rows) < kind_of(self.target).fewest:
             return None
         ids, positions, sigmas, _ = (np.array(column) for column in zip(*rows, strict=True))
         sigma_px = np.sqrt(float(values[9]) ** 2 + _DRAWN_PX**2 - (1 - self.factor**-2) / 12)

@@ -1,7 +1,7 @@
 """Grids of circles: blobs on a lattice."""
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, ClassVar, Literal, Self
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from visioncal.core.files import DocumentTable
-from visioncal.core.types import FloatArray, Image, IntArray, Target
+from visioncal.core.types import FloatArray, Image, IntArray, Target, chosen_rows
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.imaging import shrunk
 from visioncal.vision.boards.kind import (
@@ -203,9 +203,7 @@ class Blobs:
 
     def at(self, chosen: IntArray) -> Self:
         """Some of the blobs."""
-        return replace(
-            self, px=self.px[chosen], moments=self.moments[chosen], fill=self.fill[chosen]
-        )
+        return chosen_rows(self, chosen)
 
     @property
     def diameters(self) -> FloatArray:

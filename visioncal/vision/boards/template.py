@@ -47,7 +47,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from visioncal.core.types import FloatArray, Image, IntArray, Mask
+from visioncal.core.types import FloatArray, Image, IntArray, Mask, chosen_rows
 from visioncal.vision.boards.maps import OpticalAxis, maps_about
 
 _Float32Array: TypeAlias = npt.NDArray[np.float32]
@@ -124,10 +124,7 @@ class Print:
 
     def at(self, chosen: IntArray) -> Self:
         """The print around some of the corners."""
-        lone, axes, radii = (
-            None if array is None else array[chosen] for array in (self.lone, self.axes, self.radii)
-        )
-        return replace(self, signs=self.signs[chosen], lone=lone, axes=axes, radii=radii)
+        return chosen_rows(self, chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,9 +216,7 @@ class _Windows:
         )
 
     def at(self, chosen: IntArray) -> Self:
-        return replace(
-            self, **{field.name: getattr(self, field.name)[chosen] for field in fields(self)}
-        )
+        return chosen_rows(self, chosen)
 
     def length_px(self, shift: FloatArray) -> FloatArray:
         """(n,) lengths of shifts (n, 2) [squares] in the image [px]."""
@@ -278,9 +273,7 @@ class _GaussNewtonStep:
         )
 
     def at(self, chosen: IntArray) -> Self:
-        return replace(
-            self, **{field.name: getattr(self, field.name)[chosen] for field in fields(self)}
-        )
+        return chosen_rows(self, chosen)
 
     def replace(self, chosen: IntArray, others: Self) -> None:
         for field in fields(self):

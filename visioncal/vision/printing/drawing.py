@@ -23,9 +23,6 @@ _MM_PER_INCH = 25.4
 _PT_PER_MM = 72.0 / _MM_PER_INCH
 _FONT = "DejaVu Sans"
 _GREY = "#444444"
-# Distance of the ruler's line from the quiet zone; its ticks, label and arrow [mm].
-_BASE_MM, _TICK_MM, _END_TICK_MM, _LABEL_MM = 0.8, 0.8, 2.4, 1.2
-_HEAD_MM, _HALF_HEAD_MM, _TIP_MM, _LETTER_MM = 2.2, 0.6, 4.0, 5.5
 
 
 def to_pdf(sheet: Sheet) -> bytes:
@@ -113,7 +110,7 @@ def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> 
     """Draws the ruler along one axis of the target's frame, outside the quiet zone."""
     length = sheet.ruler_mm[axis]
     across = 1 - axis
-    side = 1e3 * (sheet.pattern.box[across] - sheet.pattern.quiet_m) - _BASE_MM
+    side = 1e3 * (sheet.pattern.box[across] - sheet.pattern.quiet_m) - 0.8
 
     def at(along: float, away: float) -> FloatArray:
         position = np.array(sheet.origin_mm)
@@ -123,21 +120,18 @@ def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> 
 
     # Lines of half a point.
     half = 0.5 / _PT_PER_MM / 2
-    tip = length + _TIP_MM
+    tip = length + 4.0
+    head = tip - 2.2
     # Lines are filled rectangles, which every renderer positions exactly.
-    bars = [_bar(at(-half, -half), at(tip - _HEAD_MM, half))]
+    bars = [_bar(at(-half, -half), at(head, half))]
     for tick in np.arange(0.0, length + 1.0, 10.0):
-        tall = _END_TICK_MM if tick in (0.0, length) else _TICK_MM
+        tall = 2.4 if tick in (0.0, length) else 0.8
         bars.append(_bar(at(tick - half, 0.0), at(tick + half, tall)))
-    bars.append(
-        np.array(
-            [at(tip, 0.0), at(tip - _HEAD_MM, _HALF_HEAD_MM), at(tip - _HEAD_MM, -_HALF_HEAD_MM)]
-        )
-    )
+    bars.append(np.array([at(tip, 0.0), at(head, 0.6), at(head, -0.6)]))
     _fill(figure, bars, _GREY, on_page)
-    labels = [("xy"[axis], _LETTER_MM + length, 0.0)]
+    labels = [("xy"[axis], length + 5.5, 0.0)]
     if length > 0.0:
-        labels.append((f"{length:g} mm", length / 2, _LABEL_MM + FONT_PT / _PT_PER_MM / 2.6))
+        labels.append((f"{length:g} mm", length / 2, 1.2 + FONT_PT / _PT_PER_MM / 2.6))
     for text, along, away in labels:
         position = at(along, away)
         figure.text(
