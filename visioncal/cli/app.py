@@ -4,8 +4,8 @@ import atexit
 import gc
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from errno import ENAMETOOLONG
 from typing import Annotated, Any, ClassVar, TextIO, cast
 
@@ -95,7 +95,8 @@ def main() -> None:
     gc.set_threshold(20_000, 100)
     # The collection at exit would take as long again.
     atexit.register(gc.freeze)
-    with _guarded_streams(), _WithoutPandas():
+    messages, results = _guarded(sys.stderr, lambda _: None), _guarded(sys.stdout, _end)
+    with redirect_stderr(messages), redirect_stdout(results), _WithoutPandas():
         try:
             app()
         except VisioncalError as error:
@@ -132,14 +133,6 @@ def _refuse(error: VisioncalError) -> None:
 
     report_error(error, as_json="--json" in sys.argv[1:])
     sys.exit(EXIT_BAD if isinstance(error, VerdictError) else EXIT_NO_RESULT)
-
-
-@contextmanager
-def _guarded_streams() -> Iterator[None]:
-    """Runs a command whose streams may fail."""
-    messages, results = _guarded(sys.stderr, lambda _: None), _guarded(sys.stdout, _end)
-    with redirect_stderr(messages), redirect_stdout(results):
-        yield
 
 
 def _end(error: OSError) -> None:

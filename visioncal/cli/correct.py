@@ -69,10 +69,7 @@ def correct_command(
         _seeds(targets.q_seed, options.seed_joints),
         widest_rad=np.deg2rad(options.widest_deg),
         loads=Loads.alike(
-            len(base_from_flange),
-            options.payload_kg,
-            options.payload_m,
-            (0.0, 0.0, 0.0),
+            len(base_from_flange), options.payload_kg, options.payload_m, (0.0, 0.0, 0.0)
         ),
     )
     unreachable = []
@@ -96,10 +93,7 @@ def correct_command(
     sigma_mm = predicted_sigma_mm(calibration, base_from_flange[:, :3, 3], corrected.q)
     base_from_tool = corrected.base_from_flange @ flange_from_tool
     columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm)
-    warnings = [
-        *bad,
-        *_warn_turns(arm, targets, corrected, options.widest_deg),
-    ]
+    warnings = [*bad, *_warn_turns(arm, targets, corrected, options.widest_deg)]
     if options.payload_kg and not arm.compliance.any():
         warnings.append(
             f"--payload-kg {options.payload_kg:g} changes nothing: the calibration has no joints "
@@ -110,20 +104,16 @@ def correct_command(
     if options.as_json:
         kept = [column for column in targets.table.columns if column not in columns]
         cells = [dict(zip(targets.table.columns, row, strict=True)) for row in targets.table.rows]
-        print_json(
+        sent = [
             {
-                "targets": [
-                    {
-                        "place": targets.places[row],
-                        **{name: cells[row][name] for name in kept},
-                        **{name: float(numbers[row]) for name, numbers in columns.items()},
-                    }
-                    for row in rows
-                ],
-                "unreachable": [{"place": place, "reason": why} for place, why in unreachable],
+                "place": targets.places[row],
+                **{name: cells[row][name] for name in kept},
+                **{name: float(numbers[row]) for name, numbers in columns.items()},
             }
-            | {"warnings": warnings}
-        )
+            for row in rows
+        ]
+        left_out = [{"place": place, "reason": why} for place, why in unreachable]
+        print_json({"targets": sent, "unreachable": left_out, "warnings": warnings})
         return
     if file is None:
         typer.echo(table_to_send(targets, columns, rows), nl=False)

@@ -13,7 +13,7 @@ from visioncal.cli.session_options import (
 )
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
-from visioncal.core.number_format import did_you_mean
+from visioncal.core.number_format import known_name
 from visioncal.vision.boards import KINDS
 from visioncal.vision.boards.identify import describe, identify, to_document, to_toml
 from visioncal.vision.boards.imaging import read_image
@@ -64,12 +64,8 @@ def target_make_command(options: TargetMakeOptions) -> None:
 def _refuse_unused(kind: str | None, board: Mapping[str, object]) -> None:
     """Refuses options that have no effect."""
     made = [name for name, board_kind in KINDS.items() if board_kind.options]
-    if kind is not None and kind not in made:
-        raise DataError(
-            f"--kind is {kind[:40]!r}; {', '.join(made)} are made.",
-            culprits=["--kind"],
-            next_step=did_you_mean(kind, made),
-        )
+    if kind is not None:
+        known_name("kind of board", kind, made, "--kind")
     used = KINDS[kind].options.split() if kind is not None else []
     default = vars(BoardOptions())
     given = [name for name, value in board.items() if value != default[name] and name != "kind"]

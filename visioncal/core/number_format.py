@@ -2,8 +2,13 @@
 
 import difflib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from decimal import ROUND_CEILING, Decimal
+from typing import TypeVar
+
+from visioncal.core.errors import DataError
+
+_Name = TypeVar("_Name", bound=str)
 
 # Least figures in sentences, and in tables [mm, deg or px]: smaller ones do not matter.
 _LEAST, _SMALLEST = 1e-3, 1e-4
@@ -112,6 +117,20 @@ def some_of(names: Sequence[str], most: int = 8) -> str:
     """Joins words, shortened: `a, b and 3 more`."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def known_name(
+    what: str, name: str, known: Collection[_Name], culprit: str = "", next_step: str = ""
+) -> _Name:
+    """The name, if it is among known ones; else raises DataError with a similar one."""
+    for each in known:
+        if each == name:
+            return each
+    raise DataError(
+        f"There is no {what} named {name[:80]!r}; the names are {some_of([*known], 20)}.",
+        culprits=[culprit or name],
+        next_step=did_you_mean(name, known) or next_step,
+    )
 
 
 def did_you_mean(word: str, known: Iterable[str], least: float = 0.6) -> str:

@@ -1,7 +1,5 @@
 """The history of a site's cells: one SQLite file to which every act is appended."""
 
-import csv
-import io
 import json
 import math
 import sqlite3
@@ -17,6 +15,7 @@ import numpy as np
 from visioncal.core.choices import SITE_FILE, ActKind
 from visioncal.core.codec import REST, Key, read, reading, write
 from visioncal.core.documents.jsons import parse_stored
+from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line, sha256
 from visioncal.core.types import Need
@@ -112,12 +111,8 @@ class Entry:
 def table_of(entries: Iterable[Entry]) -> str:
     """Entries as CSV, a row an entry; see `Entry.columns`."""
     rows = [entry.columns for entry in entries]
-    text = io.StringIO()
     names = dict.fromkeys(name for row in rows for name in row)
-    table = csv.DictWriter(text, names, restval="", lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    return text.getvalue()
+    return csv_text([names, *([row.get(name, "") for name in names] for row in rows)])
 
 
 def entries_of(calibration: Calibration) -> Iterator[Entry]:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.core.documents.columns import Column, TableReader, as_whole
-from visioncal.core.documents.tables import TextTable, parse_table
+from visioncal.core.documents.tables import TextTable, csv_text, parse_table
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
@@ -149,13 +149,7 @@ def parse_csv(text: str, label: str) -> TextTable:
 
 def write_csv(columns: Sequence[str], views: Sequence[View]) -> str:
     """Text of a views.csv with the columns in the given order."""
-
-    def quoted(cell: str) -> str:
-        # csv.writer does not quote a lone carriage return.
-        return '"' + cell.replace('"', '""') + '"' if {*cell} & {*',"\r\n'} else cell
-
-    rows = [columns, *([view.cell(column) for column in columns] for view in views)]
-    return "".join(",".join(map(quoted, row)) + "\n" for row in rows)
+    return csv_text([columns, *([view.cell(column) for column in columns] for view in views)])
 
 
 def read_views(table: TextTable, *, with_corners: bool = False) -> tuple[View, ...]:

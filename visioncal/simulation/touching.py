@@ -1,7 +1,5 @@
 """Simulated touches with a tool's tip: of a fixed point and of a fixture."""
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.transforms import compose, exp, invert
@@ -210,8 +209,4 @@ def write_touches(touched: Mapping[str, Touching], folder: Path) -> None:
 
 
 def _csv(rows: Sequence[Mapping[str, object]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text([rows[0], *([row.get(name, "") for name in rows[0]] for row in rows)])

@@ -86,6 +86,17 @@ def _split(
         ) from error
 
 
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Formats rows as CSV with the line ends of UNIX."""
+
+    def quoted(cell: object) -> str:
+        # csv.writer does not quote a lone carriage return.
+        text = str(cell)
+        return '"' + text.replace('"', '""') + '"' if {*text} & {*',"\r\n'} else text
+
+    return "".join(",".join(map(quoted, row)) + "\n" for row in rows)
+
+
 def is_number(cell: str) -> bool:
     """Whether a cell is a number, NaN and inf included."""
     return _NUMBER.fullmatch(cell) is not None

@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.core.choices import CONVENTIONS, Convention
 from visioncal.core.errors import DataError
 from visioncal.core.files import json_text
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, known_name
 from visioncal.core.transforms import log
 from visioncal.dynamics import ArmDynamics, Identified
 from visioncal.estimation.workspace import postures
@@ -139,12 +139,9 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
             next_step="A calibration has one if its session has q1_rad ... and [robot] model, and "
             "stops all over the workspace show errors of the arm.",
         )
-    if selection.convention is not None and selection.convention not in CONVENTIONS:
-        raise DataError(
-            f"There is no convention {selection.convention!r}; the names are "
-            f"{', '.join(CONVENTIONS)}.",
-            culprits=["--convention"],
-        )
+    convention: Convention | None = None
+    if selection.convention is not None:
+        convention = known_name("convention", selection.convention, CONVENTIONS, "--convention")
     links = None
     if form.links_alone and (unexportable_functions(arm.robot) or _sag_mm(source)):
         robot = without_functions(arm.robot)
@@ -169,8 +166,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
             errors.append(f"{figure(rms_mm)} mm rms, {figure(most_mm)} mm at the most")
         places = ["where the arm was measured", "over the workspace"][-len(errors) :]
         links = fitted, ", ".join(map(" ".join, zip(errors, places, strict=True)))
-    convention, known_hash = selection.convention, selection.calibration_hash
-    return ArmContent(source, nominal, arm.robot, convention, known_hash, links)
+    return ArmContent(source, nominal, arm.robot, convention, selection.calibration_hash, links)
 
 
 def _sag_mm(calibration: Calibration) -> float:

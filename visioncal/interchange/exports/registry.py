@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import did_you_mean
+from visioncal.core.number_format import known_name
 from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified
 from visioncal.dynamics.identified import judge
@@ -77,13 +77,8 @@ def export(source: Source | Identified, to: str, selection: Selection = _EVERYTH
 def document(source: Source | Identified, to: str, selection: Selection = _EVERYTHING) -> Document:
     """Writes a result as `export` does, together with its warnings; raises DataError."""
     by_name = {form.name: form for form in EXPORT_FORMATS}
-    if to not in by_name:
-        raise DataError(
-            f"There is no format named {to!r}; the names are {', '.join(by_name)}.",
-            culprits=[to],
-            next_step=did_you_mean(to, by_name) or "visioncal export --list says what each is.",
-        )
-    form = by_name[to]
+    step = "visioncal export --list says what each is."
+    form = by_name[known_name("format", to, by_name, next_step=step)]
     if isinstance(source, Identified):
         return Document(write_dynamics(source, to, selection), judge(source))
     source, selection = _robot_part(source, selection, form)

@@ -1,6 +1,6 @@
 """A foreign recording as its numbers are written, its format, and the user's options for it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -8,8 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
-from visioncal.core.errors import DataError
-from visioncal.core.number_format import did_you_mean, some_of
+from visioncal.core.number_format import known_name
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress
 from visioncal.estimation.clock_correlation import evenly
 from visioncal.session import ImageStore
@@ -42,25 +41,16 @@ class PoseImportOptions:
         if self.form is not None:
             maker = POSE_FORMS.get(self.form)
             rotation = self.form if maker is None else maker.rotation
-            _check("form of poses", rotation, [*POSE_FORMS, *ROTATION_FORMS])
+            known_name("form of poses", rotation, [*POSE_FORMS, *ROTATION_FORMS])
             reading = replace(
                 reading, rotation=rotation, unit=maker.unit if maker else reading.unit
             )
         if self.unit is not None:
-            _check("unit of length", self.unit, list(UNITS_M))
+            known_name("unit of length", self.unit, UNITS_M)
             reading = replace(reading, unit=self.unit)
         if self.inverse is not None:
             reading = replace(reading, inverse=self.inverse)
         return reading
-
-
-def _check(what: str, name: str, names: Sequence[str]) -> None:
-    if name not in names:
-        raise DataError(
-            f"There is no {what} named {name!r}; the names are {some_of(names, 20)}.",
-            culprits=[name],
-            next_step=did_you_mean(name, names),
-        )
 
 
 @dataclass(frozen=True)

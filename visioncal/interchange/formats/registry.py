@@ -9,7 +9,7 @@ from visioncal.calibration.guess import Candidate
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
-from visioncal.core.number_format import did_you_mean
+from visioncal.core.number_format import known_name
 from visioncal.interchange.formats.assemble import assemble, with_user_options
 from visioncal.interchange.formats.bags import BAG
 from visioncal.interchange.formats.columns import TABLE
@@ -181,12 +181,8 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
             next_step="Check the path and its spelling.",
         )
     names = [foreign_format.name for foreign_format in FOREIGN_FORMATS]
-    if form is not None and form not in names:
-        raise DataError(
-            f"There is no format named {form!r}; the names are {', '.join(names)}.",
-            culprits=[form],
-            next_step=did_you_mean(form, names),
-        )
+    if form is not None:
+        known_name("format", form, names)
     for candidate in FOREIGN_FORMATS:
         if form in (None, candidate.name) and candidate.recognises(source):
             return candidate

@@ -1,7 +1,5 @@
 """Files of a plan: table of stops, program for a UR controller, and plan.json with its reader."""
 
-import csv
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,6 +10,7 @@ from typing import Annotated, Any
 from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.codec import Key, Vector, WrittenForm, read, reading, write
 from visioncal.core.documents.jsons import parse_stored
+from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable, one_line, read_text, sha256
 from visioncal.core.types import Need
@@ -27,15 +26,13 @@ _FILE, _SCHEMA = "plan.json", 1
 
 def stops_table(plan: Plan) -> str:
     """Writes the stops as a views.csv, with poses by the robot's model and names for the images."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     joints = [f"q{index + 1}_rad" for index in range(plan.cell.robot.joint_count)]
-    writer.writerow(["view", "image", *joints, *POSE, "why"])
+    rows: list[list[object]] = [["view", "image", *joints, *POSE, "why"]]
     for stop in plan.stops:
         numbers = [*stop.q.tolist(), *pose_row(stop.base_from_flange).values()]
         cells = [f"{number:.9f}" for number in numbers]
-        writer.writerow([stop.view, _image_of(stop), *cells, stop.words])
-    return text.getvalue()
+        rows.append([stop.view, _image_of(stop), *cells, stop.words])
+    return csv_text(rows)
 
 
 def _image_of(stop: PlannedStop) -> str:

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
-from visioncal.core.errors import DataError
-from visioncal.core.number_format import did_you_mean
+from visioncal.core.number_format import known_name
 
 # Errors of a point that the camera observes, or of what the arm carries all over its workspace.
 Judged: TypeAlias = Literal["sight", "workspace"]
@@ -43,10 +42,4 @@ PURPOSES: Mapping[str, Purpose] = MappingProxyType({each.name: each for each in 
 
 def purpose_of(name: str, culprit: str = "purpose") -> Purpose:
     """Finds a purpose by its name; raises DataError."""
-    if name not in PURPOSES:
-        raise DataError(
-            f"{culprit} is {name!r}; stops can be planned for {', '.join(PURPOSES)}.",
-            culprits=[culprit],
-            next_step=did_you_mean(name, PURPOSES),
-        )
-    return PURPOSES[name]
+    return PURPOSES[known_name("purpose", name, PURPOSES, culprit)]

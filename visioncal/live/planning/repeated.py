@@ -1,11 +1,10 @@
 """Stops of a calibration that a later verification repeats: the robot has stood there."""
 
-import csv
-import io
 from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
@@ -25,15 +24,13 @@ class CalibratedStops:
 
     def table(self) -> str:
         """The stops as a table of poses and joint angles, by the views of the calibration."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
         angles = np.zeros((len(self.views), 0)) if self.q is None else self.q
         joints = [f"q{index + 1}_rad" for index in range(angles.shape[1])]
-        writer.writerow(["view", *joints, *POSE])
+        rows: list[list[object]] = [["view", *joints, *POSE]]
         for view, q, pose in zip(self.views, angles, self.poses, strict=True):
             numbers = [*q.tolist(), *pose_row(pose).values()]
-            writer.writerow([view, *(f"{number:.9f}" for number in numbers)])
-        return text.getvalue()
+            rows.append([view, *(f"{number:.9f}" for number in numbers)])
+        return csv_text(rows)
 
 
 def stops_to_repeat(

@@ -1,7 +1,5 @@
 """Tables of targets: read with the columns of views.csv, and written with the corrections."""
 
-import csv
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.documents.columns import Column, TableReader
-from visioncal.core.documents.tables import TextTable, read_table
+from visioncal.core.documents.tables import TextTable, csv_text, read_table
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import compose, invert, rotation_angle
@@ -126,14 +124,12 @@ def table_to_send(targets: Targets, columns: Mapping[str, FloatArray], rows: Int
     """Formats rows, by index, as CSV with all their columns, corrected values in place."""
     own = targets.table.columns
     names = [*own, *(column for column in columns if column not in own)]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
+    lines = [names]
     for row in rows:
         cells = dict(zip(own, targets.table.rows[row], strict=True))
         cells |= {name: written(name, float(numbers[row])) for name, numbers in columns.items()}
-        writer.writerow([cells[name] for name in names])
-    return text.getvalue()
+        lines.append([cells[name] for name in names])
+    return csv_text(lines)
 
 
 def written(name: str, value: float) -> str:
