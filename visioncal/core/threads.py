@@ -79,10 +79,6 @@ def on_one_blas_thread(function: Callable[Given, Answer]) -> Callable[Given, Ans
     return limited
 
 
-@cache
-def _thread_pools() -> ThreadpoolController:
-    # Cached: the search for loaded libraries takes as long as a whole fit.
-    return ThreadpoolController()
-
-
+# The search for loaded libraries takes as long as a whole fit.
+_thread_pools = cache(ThreadpoolController)
 _ONE_BLAS_THREAD = SharedSetting(lambda: _thread_pools().limit(limits=1))

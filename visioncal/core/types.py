@@ -48,6 +48,11 @@ def chosen_rows(record: _T, rows: Any, *others: str) -> _T:  # noqa: ANN401 - an
     return cast(_T, replace(owner, **picked))
 
 
+def interpolated(at: FloatArray, places: FloatArray, values: FloatArray) -> FloatArray:
+    """(m, n) columns of (k, n) values at (k,) places, interpolated linearly at (m,) places."""
+    return np.stack([np.interp(at, places, column) for column in values.T], axis=1)
+
+
 # Called with a stage's name, its steps done, and its steps in all.
 Progress: TypeAlias = Callable[[str, int, int], None]
 

@@ -9,7 +9,7 @@ from scipy.ndimage import binary_opening, uniform_filter1d
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask, interpolated
 from visioncal.dynamics.model import JointMotion, Measured
 from visioncal.dynamics.reading import (
     RecordedSamples,
@@ -238,7 +238,7 @@ class Piece:
         later_s = times_s + lag_s
 
         def at(values: FloatArray) -> FloatArray:
-            return np.stack([np.interp(later_s, times_s, column) for column in values.T], axis=1)
+            return interpolated(later_s, times_s, values)
 
         lost = at((~self.present)[:, None].astype(float))[:, 0] > 0.0
         present = ~lost & (later_s >= times_s[0]) & (later_s <= times_s[-1])

@@ -375,8 +375,14 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     # machine.
     kept = [model.names.index(str(row["name"]).split()[0]) for row in document["base"]]
     base = BaseModel.keeping(model, np.array(kept, dtype=np.int64))
-    size = base.rank + 2 * len(document["stribeck"])
-    standard = document.get("standard")
+    humps, standard, consistent = document["stribeck"], document.get("standard"), None
+    size, count = base.rank + 2 * len(humps), len(model.names)
+    if standard is not None:
+        values = _column(standard["parameters"], "value")
+        if values.shape != (count,):
+            raise ValueError(f"it has {len(values)} standard parameters instead of {count}")
+        covariance = _array(standard["covariance"], (count, count))
+        consistent = Consistent(values, covariance, standard["misfit"])
     figures = read(_Figures, document, "")
     for stream in (*figures.streams, figures.validation):
         for name, value in vars(stream).items() if stream else ():
@@ -387,8 +393,13 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "base": base,
         "values": _column(document["base"], "value"),
         "covariance": _array(document["covariance"], (size, size)),
-        "stribeck": _stribeck(document["stribeck"], terms),
-        "consistent": None if standard is None else _consistent(standard, len(base.model.names)),
+        "stribeck": Stribeck(
+            np.array([int(row["joint"]) - 1 for row in humps], dtype=np.int64),
+            _column(humps, "hump_nm"),
+            _column(humps, "speed_rad_s"),
+            terms.slow_rad_s,
+        ),
+        "consistent": consistent,
         **vars(figures),
         "facts": {name: value for name, value in document.items() if name not in _OWN_KEYS},
     }
@@ -401,22 +412,6 @@ class _Figures:
     streams: tuple[StreamStatistics, ...]
     validation: TorqueValidation | None = None
     lag: Lag | None = None
-
-
-def _stribeck(rows: Sequence[Mapping[str, Any]], terms: FrictionTerms) -> Stribeck:
-    return Stribeck(
-        np.array([int(row["joint"]) - 1 for row in rows], dtype=np.int64),
-        _column(rows, "hump_nm"),
-        _column(rows, "speed_rad_s"),
-        terms.slow_rad_s,
-    )
-
-
-def _consistent(document: Mapping[str, Any], count: int) -> Consistent:
-    values = _column(document["parameters"], "value")
-    if values.shape != (count,):
-        raise ValueError(f"it has {len(values)} standard parameters instead of {count}")
-    return Consistent(values, _array(document["covariance"], (count, count)), document["misfit"])
 
 
 def _column(rows: Sequence[Mapping[str, Any]], name: str) -> FloatArray:

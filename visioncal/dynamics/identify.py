@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from visioncal.core.limits import DynamicsLimits
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray, Mask, interpolated
 from visioncal.dynamics.base import (
     BaseModel,
     check_identifiable,
@@ -196,37 +196,20 @@ def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock])
 def _lagged(stream: Conditioned, block: NoiseBlock, lag_s: float) -> NoiseBlock:
     """The block with its torques advanced by a lag, and their derivative as one more column."""
     step_s = 1.0 / stream.rate_hz
-    y, before, after = (
-        _torques(stream, value) for value in (lag_s, lag_s - step_s, lag_s + step_s)
-    )
-    derivative = (after - before) / (2.0 * step_s)
-    used = block.used & _inside(stream, abs(lag_s) + step_s)[:, None]
-    return NoiseBlock(
-        np.concatenate([block.x, derivative[:, :, None]], axis=2), y, used, block.correlation
-    )
-
-
-def _torques(stream: Conditioned, lag_s: float) -> FloatArray:
-    """Filtered torques (k, n), advanced by a lag, over the samples present now [N m]."""
     parts = []
     for piece in stream.pieces:
-        times_s = piece.measured.motion.times_s
-        later = [
-            np.interp(times_s + lag_s, times_s, column) for column in piece.measured.torques_nm.T
-        ]
-        parts.append(piece.lowpass(np.stack(later, axis=1), piece.present))
-    return np.concatenate(parts)
-
-
-def _inside(stream: Conditioned, lag_s: float) -> Mask:
-    """(k,) filtered samples whose windows, shifted by a lag either way, are within the piece."""
-    parts = []
-    for piece in stream.pieces:
-        ends_s = piece.measured.motion.times_s[[0, -1]] + np.array([1.0, -1.0]) * (
-            piece.lowpass.half / stream.rate_hz + lag_s
+        times_s, torques_nm = piece.measured.motion.times_s, piece.measured.torques_nm
+        y, before, after = (
+            piece.lowpass(interpolated(times_s + value, times_s, torques_nm), piece.present)
+            for value in (lag_s, lag_s - step_s, lag_s + step_s)
         )
-        parts.append((piece.times_s >= ends_s[0]) & (piece.times_s <= ends_s[1]))
-    return np.concatenate(parts)
+        # Windows are within the piece, shifted by the lag either way.
+        margin_s = piece.lowpass.half / stream.rate_hz + abs(lag_s) + step_s
+        used = (piece.times_s >= times_s[0] + margin_s) & (piece.times_s <= times_s[-1] - margin_s)
+        parts.append((y, (after - before)[:, :, None] / (2.0 * step_s), used[:, None]))
+    y, derivative, used = map(np.concatenate, zip(*parts, strict=True))
+    x = np.concatenate([block.x, derivative], axis=2)
+    return NoiseBlock(x, y, block.used & used, block.correlation)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
-from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows, interpolated
 from visioncal.estimation.trajectory import GAP_RATIO, SHORT_GAP_S
 from visioncal.session import Stream, too_far_apart
 
@@ -225,7 +225,7 @@ def _resampled(
     present = (counts[before] == 1) | (distance_s < _JITTER * clock.usual_s)
 
     def at(values: FloatArray) -> FloatArray:
-        return np.stack([np.interp(even_s, times_s, column) for column in values[rows].T], axis=1)
+        return interpolated(even_s, times_s, values[rows])
 
     part = replace(
         recorded,

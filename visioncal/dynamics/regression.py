@@ -295,11 +295,18 @@ def fit_stribeck(
         The humps, and the fit with them: its parameters are those of `plain`, humps [N m], and
         logarithms of speeds, whose values are the remaining steps.
     """
+
+    def cost(humps: Stribeck) -> float:
+        """Negative log-likelihood of the fit."""
+        fit = regress(_with_humps(streams, blocks, humps))
+        pairs = zip(fit.blocks, fit.sigmas, strict=True)
+        return float(sum(block.used.sum(axis=0) @ np.log(sigma) for block, sigma in pairs))
+
     joints = np.arange(blocks[0].y.shape[1])
     while len(joints):
         ones = np.ones(len(joints))
         starts = [Stribeck(joints, ones, start * ones, slow_rad_s) for start in _STARTS]
-        humps = min(starts, key=lambda start: _cost(regress(_with_humps(streams, blocks, start))))
+        humps = min(starts, key=cost)
         # Gauss-Newton steps of the logarithms of the speeds.
         for _ in range(20):
             fit = regress(_with_humps(streams, blocks, replace(humps, hump_nm=ones)))
@@ -323,12 +330,6 @@ def fit_stribeck(
             return humps, fit
         joints = joints[significant]
     return Stribeck.none(), plain
-
-
-def _cost(fit: Regression) -> float:
-    """Negative log-likelihood of a fit."""
-    pairs = zip(fit.blocks, fit.sigmas, strict=True)
-    return float(sum(block.used.sum(axis=0) @ np.log(sigma) for block, sigma in pairs))
 
 
 def _with_humps(

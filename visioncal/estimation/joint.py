@@ -120,7 +120,18 @@ def fit_jointly(
         ConvergenceError: The fit diverges: the robot's poses do not belong to the images.
     """
     with diverging():
-        return _settled(model, _fitted(model, optics.linearised(), frames, others))
+        fitted = _fitted(model, optics.linearised(), frames, others)
+        for _ in range(8):
+            sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
+            if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
+                break
+            corners = _stepped(fitted)
+            if corners is fitted.linearised:
+                raise np.linalg.LinAlgError("the corners follow no part of the step")
+            previous, fitted = fitted, _fitted(model, corners, fitted.frames, fitted.others)
+            if not (previous.fit.settled or fitted.fit.settled):
+                break
+        return fitted
 
 
 @contextmanager
@@ -139,20 +150,6 @@ def diverging() -> Iterator[None]:
             next_step="Look at which image belongs to which pose (visioncal convert --guess tries "
             "other readings of the poses), and calibrate each camera alone.",
         ) from error
-
-
-def _settled(model: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
-    for _ in range(8):
-        sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
-        if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
-            break
-        corners = _stepped(fitted)
-        if corners is fitted.linearised:
-            raise np.linalg.LinAlgError("the corners follow no part of the step")
-        previous, fitted = fitted, _fitted(model, corners, fitted.frames, fitted.others)
-        if not (previous.fit.settled or fitted.fit.settled):
-            break
-    return fitted
 
 
 def _stepped(fitted: ConvergedFit) -> LinearisedCorners:

@@ -344,11 +344,9 @@ class _Likelihood:
         count = len(process.kernel)
         if len(blocks) == 1:
             return np.zeros((count, 6, 0))
-        if not process.lasts:
-            return _columns([process], count, np.unique(self.stops), _MOST_TIES)[0]
-        # What was before a stop, and is behind it, is independent given a process there.
-        first = np.unique([self.stops[block[0]] for block in blocks])
-        return _columns([process], count, first, _MOST_TIES)[0]
+        # What was before a stop, and is behind it, is independent given a process that lasts there.
+        stops = self.stops[[block[0] for block in blocks]] if process.lasts else self.stops
+        return _columns([process], count, np.unique(stops), _MOST_TIES)[0]
 
     def maximised(self, model: _Model) -> _Model:
         """The model with maximum-likelihood sizes, searched from its present ones."""

@@ -465,7 +465,7 @@ class Problem:
             error = back @ self.measured(state)
         places = ~rotation
         residuals, by_measured = np.zeros((len(self), 6)), np.empty((len(self), 6, 6))
-        residuals[rotation], residuals[places] = log(error[rotation]), _places(error[places])
+        residuals[rotation], residuals[places, 3:] = log(error[rotation]), error[places, :3, 3]
         by_measured[rotation] = inverse_right_jacobian(residuals[rotation])
         by_measured[places] = _place_slope(error[places])
         by_predicted = np.empty_like(by_measured)
@@ -558,11 +558,6 @@ class Problem:
 def _rows_of(array: FloatArray, rows: IntArray) -> FloatArray:
     """Selects rows in ascending order; avoids a copy of a large array if that is all of them."""
     return array if len(rows) == len(array) else array[rows]
-
-
-def _places(error: FloatArray) -> FloatArray:
-    """Residuals (n, 6) of positions alone."""
-    return np.concatenate([np.zeros_like(error[:, :3, 3]), error[:, :3, 3]], axis=1)
 
 
 def _place_slope(error: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, interpolated
 from visioncal.robot import Robot
 
 Kind: TypeAlias = Literal["temperatures", "currents"]
@@ -64,7 +64,7 @@ class Heating:
 
     def links_c(self, inputs: Inputs, at_s: FloatArray) -> FloatArray:
         """Link temperatures (m, n) at (m,) times [deg C]."""
-        return _interpolated(inputs, at_s, self.course(inputs)[:, :, 0])
+        return interpolated(at_s, inputs.stamps_s, self.course(inputs)[:, :, 0])
 
     def jacobian(self, inputs: Inputs, at_s: FloatArray) -> FloatArray:
         """Derivatives of the link temperatures over the parameters.
@@ -74,7 +74,7 @@ class Heating:
             currents, of the gain.
         """
         parts = np.moveaxis(self.course(inputs)[:, :, 1:], 2, 0)
-        return np.stack([_interpolated(inputs, at_s, part) for part in parts], axis=2)
+        return np.stack([interpolated(at_s, inputs.stamps_s, part) for part in parts], axis=2)
 
     def course(self, inputs: Inputs, start: FloatArray | None = None) -> FloatArray:
         """Link temperatures at the samples and their derivatives, (t, n, 1 + s); see `jacobian`.
@@ -97,11 +97,6 @@ class Heating:
         if has_gains:
             columns.append(_scanned(by_parameter[1], kept, (1.0 - kept) * drives))
         return np.stack(columns, axis=2)
-
-
-def _interpolated(inputs: Inputs, at_s: FloatArray, states: FloatArray) -> FloatArray:
-    """(m, n) states of (t, n) samples at (m,) times."""
-    return np.stack([np.interp(at_s, inputs.stamps_s, column) for column in states.T], axis=1)
 
 
 def _scanned(first: FloatArray, kept: FloatArray, added: FloatArray) -> FloatArray:

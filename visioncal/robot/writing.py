@@ -262,7 +262,11 @@ def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) 
             continue
         joint = _of_tip(joints, nominal) if name is None else joints[name]
         if joint is None:
-            root.extend(_corrected_tip_link(nominal.tip, joints, step))
+            # A link with a fixed joint for the corrected tip.
+            tip, link = nominal.tip, f"{nominal.tip}_corrected"
+            parent = end_of(joints[tip], "child") if tip in joints else tip
+            root.append(Element("link", name=link))
+            root.append(_joint(f"{tip}_correction", "fixed", parent, link, step))
         else:
             origin = joint.find("origin")
             attributes = {} if origin is None else origin.attrib
@@ -318,16 +322,6 @@ def _set_origin(joint: Element, placement: FloatArray) -> None:
     origin = SubElement(joint, "origin") if origin is None else origin
     for key, numbers in zip(("xyz", "rpy"), numbers_text(placement), strict=True):
         origin.set(key, " ".join(numbers))
-
-
-def _corrected_tip_link(
-    tip: str, joints: Mapping[str, Element], step: FloatArray
-) -> tuple[Element, Element]:
-    """A link with a fixed joint for the corrected tip, where no fixed joint places the tip."""
-    corrected = f"{tip}_corrected"
-    parent = end_of(joints[tip], "child") if tip in joints else tip
-    joint = _joint(f"{tip}_correction", "fixed", parent, corrected, step)
-    return Element("link", name=corrected), joint
 
 
 def with_inertias(robot: Robot, inertias: Inertias) -> Robot:

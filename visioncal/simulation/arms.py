@@ -18,7 +18,7 @@ from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import cross, exp, invert
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, interpolated
 from visioncal.session import Stream
 
 _QUARTER, _HALF_TURN = 0.5 * np.pi, np.pi
@@ -471,8 +471,7 @@ class Warming:
 
     def at(self, stamps_s: FloatArray) -> FloatArray:
         """(m, n) temperatures of the links at some times [deg C]."""
-        columns = [np.interp(stamps_s, self.stamps_s, column) for column in self.links_c.T]
-        return np.stack(columns, axis=1)
+        return interpolated(stamps_s, self.stamps_s, self.links_c)
 
     def recorded(self, *, temperatures: bool, until_s: float = np.inf) -> Stream:
         """The controller's stream up to a time: temperatures, or currents."""

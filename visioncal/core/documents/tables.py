@@ -75,7 +75,11 @@ def _split(
         ):
             if any(cell.strip() for cell in cells):
                 row = tuple(cell.strip() for cell in cells) if stripped else tuple(cells)
-                yield at[0], row if separator == "," else _with_points(row)
+                if separator != ",":
+                    row = tuple(
+                        c.replace(",", ".") if _DECIMAL_COMMA.fullmatch(c) else c for c in row
+                    )
+                yield at[0], row
             at.clear()
     except csv.Error as error:
         place = f"{label}, line {at[0]}"
@@ -180,13 +184,6 @@ def _without_margin(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
         (at for row in rows for at, name in enumerate(row, start=1) if name.strip()), default=0
     )
     return [row[:filled] + row[max(filled, width) :] for row in rows]
-
-
-def _with_points(cells: Sequence[str]) -> tuple[str, ...]:
-    """Cells with decimal commas replaced by points."""
-    return tuple(
-        cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells
-    )
 
 
 def _header_in_comments(

@@ -208,17 +208,11 @@ def _text_width_mm(width_mm: float, page: Page) -> float:
 def _lines(target: Target, width_mm: float) -> tuple[str, ...]:
     # A letter's width, rounded up [mm].
     letters = max(int(width_mm / 1.3), 10)
-    return tuple(
-        line for text in _sentences(target) for line in textwrap.wrap(text, letters) or [""]
-    )
-
-
-def _sentences(target: Target) -> tuple[str, str, str]:
-    """Description of the board, its frame, and instructions to print and measure it."""
     words, origin, measure = kind_of(target).on_sheet(target)
-    return (
+    texts = (
         f"{target.name}: {words}",
         f"Frame: origin at {origin}, level with the zeros of both rulers; x to the right, y "
         "down, z into the page.",
         "Print at 100 %, not fitted to the page, and check both rulers. " + measure,
     )
+    return tuple(line for text in texts for line in textwrap.wrap(text, letters))
