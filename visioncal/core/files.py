@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from uuid import uuid4
 
 from visioncal.core.errors import DataError
@@ -122,6 +122,24 @@ MAX_VALUES = 1_000_000
 MAX_DEPTH = 40
 
 
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """An open regular file; raises DataError where there is none, or it cannot be read."""
+    if why_not := absence(path):
+        raise DataError(
+            f"{path} {why_not}.",
+            culprits=[str(path)],
+            next_step="Check the path and its spelling.",
+        )
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise DataError(
+            f"{path} cannot be read: {error.strerror or error}.", culprits=[str(path)]
+        ) from error
+
+
 def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
     """Reads a regular file; pipes and devices may not end.
 
@@ -132,20 +150,8 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
     Raises:
         DataError: It is missing, no regular file, too large, or cannot be read.
     """
-    path = Path(path)
-    if why_not := absence(path):
-        raise DataError(
-            f"{path} {why_not}.",
-            culprits=[str(path)],
-            next_step="Check the path and its spelling.",
-        )
-    try:
-        with path.open("rb") as file:
-            data = file.read(most + 1)
-    except OSError as error:
-        raise DataError(
-            f"{path} cannot be read: {error.strerror or error}.", culprits=[str(path)]
-        ) from error
+    with opened(Path(path)) as file:
+        data = file.read(most + 1)
     if len(data) > most:
         raise DataError(
             f"{path} has more than {most / 1e6:.0f} MB; a file of its kind is read up to that "

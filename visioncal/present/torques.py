@@ -58,16 +58,12 @@ def base_parameter_table(identified: "Identified") -> Table:
         identified.determined,
         strict=True,
     ):
-        unit = _unit_of(base.model.names[index])
+        symbol = base.model.names[index]
+        unit = next(unit for start, unit in _UNITS.items() if symbol.startswith(start))
+        unit = _FIRST_MOMENT if "*" in symbol else unit
         cells = (name, matched(value, sigma), significant(sigma), unit, share)
         rows.append(TableRow(cells, _MARKS.get(share, "rejected")))
     return Table.of(("combination", "value", "sigma", "unit", "known to"), rows, (0, 3, 4))
-
-
-def _unit_of(name: str) -> str:
-    if "*" in name:
-        return _FIRST_MOMENT
-    return next(unit for start, unit in _UNITS.items() if name.startswith(start))
 
 
 def link_table(identified: "Identified") -> Table | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import sha256, temporary, write_atomically
+from visioncal.core.files import named_errors, sha256, temporary, write_atomically
 from visioncal.robot.files import robot_file
 from visioncal.robot.model import LINK_KEYS
 from visioncal.session.corners import FILE as CORNERS
@@ -49,7 +49,7 @@ def save_session(session: "Session", folder: Path) -> None:
         texts[f"{STREAMS}/{name}.csv"] = write_stream(stream)
     images = session.images
     refuse_filled(folder)
-    try:
+    with named_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with temporary(folder.parent, is_folder=True) as (aside, _):
             new = aside / "new"
@@ -63,10 +63,6 @@ def save_session(session: "Session", folder: Path) -> None:
             if folder.exists():
                 folder.rmdir()
             new.replace(folder)
-    except OSError as error:
-        raise DataError(
-            f"{folder} cannot be written: {error.strerror or error}.", culprits=[str(folder)]
-        ) from error
 
 
 def _write_below(folder: Path, path: str, data: bytes | str) -> None:

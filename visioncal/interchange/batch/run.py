@@ -28,7 +28,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.codec import read, write
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.extras import client_library
-from visioncal.core.files import natural, read_text, write_atomically
+from visioncal.core.files import named_errors, natural, read_text, write_atomically
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Progress
 from visioncal.core.verdict import need_options
@@ -282,10 +282,8 @@ def batch(
     given = [sessions] if isinstance(sessions, Path | str) else list(sessions)
     options = Options(level, need_mm, need_deg, tuple(sorted(without)))
     jobs = jobs_of(given, folder, options)
-    try:
+    with named_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder} cannot be written: {error.strerror}.") from error
     rows: list[Row] = []
     # Reported before the first result, which may take minutes.
     progress = progress or (lambda *_: None)

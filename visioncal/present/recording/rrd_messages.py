@@ -18,7 +18,7 @@ from typing import BinaryIO
 import pyarrow as pa
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import absence
+from visioncal.core.files import opened
 
 LAST, STORE_INFO, CHUNK, ACTIVATION = range(4)
 
@@ -45,25 +45,17 @@ class MessageFrame:
 
 def scan(path: Path) -> tuple[MessageFrame, ...]:
     """Locates the messages of a file, without the one of kind LAST; raises DataError."""
-    missing = absence(path)
-    if missing:
-        raise DataError(
-            f"{path} {missing}.", culprits=[str(path)], next_step="Check the path and its spelling."
-        )
-    try:
+    with opened(path) as file:
         size = path.stat().st_size
-        with path.open("rb") as file:
-            if not file.read(_START_BYTES).startswith(_MAGIC) or size < _START_BYTES:
-                raise DataError(
-                    f"{path} is no recording: it does not begin as an .rrd does.",
-                    culprits=[str(path)],
-                    next_step="Give the .rrd that visioncal wrote, or the session's folder.",
-                )
-            frames = list(_walk(file, size))
-            file.seek(max(0, size - _CLOSING_BYTES))
-            is_closed = file.read().startswith(_CLOSING_MAGIC)
-    except OSError as error:
-        raise _unreadable(path, error) from error
+        if not file.read(_START_BYTES).startswith(_MAGIC) or size < _START_BYTES:
+            raise DataError(
+                f"{path} is no recording: it does not begin as an .rrd does.",
+                culprits=[str(path)],
+                next_step="Give the .rrd that visioncal wrote, or the session's folder.",
+            )
+        frames = list(_walk(file, size))
+        file.seek(max(0, size - _CLOSING_BYTES))
+        is_closed = file.read().startswith(_CLOSING_MAGIC)
     if not (is_closed and frames and frames[-1].kind == LAST):
         end = frames[-1].end if frames else _START_BYTES
         raise DataError(
@@ -91,12 +83,9 @@ def _walk(file: BinaryIO, size: int) -> Iterator[MessageFrame]:
 
 def read_payload(path: Path, frame: MessageFrame) -> bytes:
     """Reads one message's payload; raises DataError."""
-    try:
-        with path.open("rb") as file:
-            file.seek(frame.offset)
-            payload = file.read(frame.size)
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    with opened(path) as file:
+        file.seek(frame.offset)
+        payload = file.read(frame.size)
     if len(payload) != frame.size:
         raise DataError(
             f"{path} was replaced since it was opened.",
@@ -104,16 +93,6 @@ def read_payload(path: Path, frame: MessageFrame) -> bytes:
             next_step="Load it again.",
         )
     return payload
-
-
-def _unreadable(path: Path, error: OSError) -> DataError:
-    missing = isinstance(error, FileNotFoundError)
-    problem = "does not exist" if missing else f"cannot be read: {error.strerror or error}"
-    return DataError(
-        f"{path} {problem}.",
-        culprits=[str(path)],
-        next_step="Check the path and its spelling." if missing else "",
-    )
 
 
 def record_batch(payload: bytes, entities: Container[str]) -> tuple[str, pa.RecordBatch] | None:

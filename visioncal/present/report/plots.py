@@ -135,7 +135,11 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     for index, (seer, views, (label, name, unit, limit)) in enumerate(shown):
         values = np.array([getattr(view, name) for view in views], dtype=float)
         top = index * pitch + 22.0
-        panel = _scale_of(drawing, top, views, values)
+        used = values[[view.used for view in views]]
+        # Views that were not used do not compress the scale.
+        scaled = used if len(used) else values
+        high = 1.5 * float(scaled[np.isfinite(scaled)].max(initial=0.0)) or 1.0
+        panel = Panel(drawing, top, 0.0, high)
         panel.draw_scale(label)
         _draw_views(panel, views, values, outlying)
         rms = getattr(rms_of(views), unit)
@@ -164,15 +168,6 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
 def _places(count: int) -> FloatArray:
     """Centres of equal parts of a panel's width [px]."""
     return _LEFT + (np.arange(count) + 0.5) * (WIDTH - _LEFT - _RIGHT) / count
-
-
-def _scale_of(
-    drawing: Drawing, top: float, views: Sequence[ViewResult], values: FloatArray
-) -> Panel:
-    """A scale for the used views, which those that were not used do not compress."""
-    used = values[[view.used for view in views]]
-    shown = used if len(used) else values
-    return Panel(drawing, top, 0.0, 1.5 * float(shown[np.isfinite(shown)].max(initial=0.0)) or 1.0)
 
 
 def _draw_views(
