@@ -8,6 +8,7 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from support.cells import board_numbers, calibrated, error_of, known_of, session_of
+from support.misfits import misfit
 from support.refusals import raised
 
 from visioncal.calibration.pipeline.result import result_of
@@ -326,9 +327,8 @@ def test_one_view_places_a_board_and_none_is_told():
     edges = result_of(known).edges
     edge = edges["base_from_target_second"]
     assert edge.sigma_mm > edges["base_from_target_first"].sigma_mm
-    away = log(invert(cell.transforms["base_from_target_second"]) @ edge.matrix)
     # One draw of chi-square with six degrees of freedom, at one in ten thousand.
-    assert away @ np.linalg.solve(edge.covariance, away) < chi2.ppf(1.0 - 1e-4, 6)
+    assert misfit(edge, cell.transforms["base_from_target_second"]) < chi2.ppf(1.0 - 1e-4, 6)
     # Without that view nothing places the board: it has no part in what is held out.
     assert np.isnan(known.assessment.held_out.residual_m).sum() == 1
     assert np.isfinite(known.findings.held_out.mm)

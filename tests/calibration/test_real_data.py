@@ -1,21 +1,14 @@
 """Real measurements, against what plain OpenCV and scipy scripts get from them."""
 
-import json
 import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.cells import pairs_session
-from support.fuzz.mistakes import numbers
 from support.tracked import known_of
 
 import visioncal
-from visioncal.calibration.guess import guess_reading
-from visioncal.core.conventions import PoseNumbers, Reading
-from visioncal.core.transforms import compose
 from visioncal.interchange.formats import DoubtfulSession
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
@@ -78,37 +71,6 @@ def test_a_six_axis_arm_by_a_laser(real_data):
     assert known.findings.rms.mm < 0.1
     assert known.findings.rms.deg < 0.03
     assert known.findings.held_out.mm < 0.13
-
-
-def test_pose_pairs_with_a_published_answer(real_data):
-    path = real_data / "pose_pairs_small/moveit_eye_to_hand_50.json"
-    pairs = np.array(json.loads(path.read_text()))
-    result = visioncal.calibrate(pairs_session("eye-to-hand", pairs[:, 0], pairs[:, 1]))
-    found = result.transforms["base_from_cam"].translation
-    # The published figures have three digits; 2 mm is what the data's own scatter allows.
-    np.testing.assert_allclose(found, [0.659, -0.249, 0.830], atol=2e-3)
-
-
-def test_pose_pairs_in_two_units(real_data):
-    folder = real_data / "doosan_a0509_charuco/poses"
-    robot = np.array([np.loadtxt(folder / f"pose_{at:03d}.txt") for at in range(31)])
-    boards = [np.load(folder / f"boardpose_{at:03d}.npz") for at in range(31)]
-    camera = np.array(
-        [compose(cv2.Rodrigues(board["rvec"])[0], board["tvec"].ravel()) for board in boards]
-    )
-    rows = tuple(f"pose_{at:03d}.txt" for at in range(31))
-    told = PoseNumbers(robot[:, :3, 3], robot[:, :3, :3].reshape(-1, 9), Reading("matrix"), rows)
-    guess = guess_reading(told, numbers(camera), "eye-in-hand")
-    assert guess.stands_out
-    assert guess.best.hypothesis.robot.reading == Reading("matrix", "mm")
-    assert len(guess.best.hypothesis.changes) == 1
-    # Park's solution of all views leaves 1.6 mm; these are the 70 % that agree best.
-    assert 1e3 * guess.best.fit.rms[0] < 1.6
-    robot[:, :3, 3] *= 1e-3
-    result = visioncal.calibrate(pairs_session("eye-in-hand", robot, camera))
-    assert result.solvers["park"].rms_mm == pytest.approx(1.6, abs=0.1)
-    assert result.solvers["park"].rms_deg == pytest.approx(0.42, abs=0.02)
-    assert result.rms.mm <= 1.62
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.cells import session_of
 from support.marks import slow
-from support.whole_cells import misfit
+from support.misfits import misfit
 
 from visioncal import calibrate
 from visioncal.calibration.stages.repeats import repeated_rows
@@ -165,7 +165,7 @@ def test_images_of_a_stop_share_the_robots_error():
         assert 0.55 < edge.sigma_mm / once.sigma_mm < 1.05
         assert found.verdict.status == "good", found.verdict.reasons
         # Chi-square of six exceeds this in one case of a thousand.
-        assert misfit(edge.matrix, edge.covariance, STEADY.transforms[name]) < 22.5
+        assert misfit(edge, STEADY.transforms[name]) < 22.5
 
 
 def test_images_of_what_stands_still_are_no_copies_at_other_stops():
@@ -217,7 +217,7 @@ def test_a_lens_is_not_moved_by_what_repeated_views_have_wrong_alike():
         truth = cell.mountings[name.partition("_from_")[2]]
         if name.startswith("cell"):
             truth = invert(cell.mountings["base_a"]) @ truth
-        assert misfit(edge.matrix, edge.covariance, truth) < 22.5, name
+        assert misfit(edge, truth) < 22.5, name
 
 
 KINDS = {

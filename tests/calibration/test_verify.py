@@ -10,6 +10,7 @@ from support.beyond import with_field
 from support.cells import board_numbers, calibrated, known_of, reporting, session_of
 from support.commands import visioncal
 from support.later import ANYHOW, Change, again, knock, known_again, usual
+from support.misfits import misfit
 from support.pages import Page
 from support.refusals import raised
 
@@ -371,8 +372,7 @@ def test_what_changed_is_estimated_with_its_covariance_and_the_rest_is_kept(eith
             if name not in causes:
                 assert np.array_equal(before.matrix, after.matrix)
                 continue
-            away = log(invert(moved) @ after.matrix)
-            squares.append(away @ np.linalg.solve(after.covariance, away) / 6)
+            squares.append(misfit(after, moved) / 6)
         if kind == "joint 3":
             errors = [
                 log(invert(either.cell.robot.flange_at(q + offset)) @ arm.standing(q))[:, 3:]

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from support.arm_documents import arm_of
 from support.commands import turned_poses, visioncal, write_poses
-from support.whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
+from support.misfits import misfit
+from support.whole_cells import LATER, OPTIONS, part, recorded, saved, simulated, truth
 
 from visioncal.frames.camera_chain import Plane
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.locate import locate
-from visioncal.results import Calibration, RobotResult
+from visioncal.results import Calibration, Edge, RobotResult
 from visioncal.results.compare import compare
 from visioncal.results.compensation import correct
 from visioncal.session import Session
@@ -196,15 +197,15 @@ def test_a_target_is_placed_on_any_flange_and_in_any_base(cell, place, tmp_path)
         done(command, place / "later", "-c", place / "out", *pair, *into)
         content = json.loads((tmp_path / f"{command}.json").read_text())["frames"]
         found = content[f"{ends[0]}_from_thing"]
-        matrix, covariance = np.array(found["matrix"]), np.array(found["covariance"])
-        assert misfit(matrix, covariance, truth(cell, *ends)) < MOST
+        edge = Edge(np.array(found["matrix"]), np.array(found["covariance"]))
+        assert misfit(edge, truth(cell, *ends)) < MOST
     # A fixture of one robot is known in the base of the other.
     out = copied(place, tmp_path)
     done("fixture", place / "later", "-c", out, *of("hand", "a", "floor"), "--name", "jig")
     edge, own = (
         Calibration.load(out).of("left", robot).frames["base_from_jig"].edge for robot in "ba"
     )
-    assert misfit(edge.matrix, edge.covariance, truth(cell, "base_b", "target_floor")) < MOST
+    assert misfit(edge, truth(cell, "base_b", "target_floor")) < MOST
     assert edge.sigma_mm > own.sigma_mm
     assert "base_a_from_jig" in (out / "report.html").read_text()
     # A row without the robot's pose is left out.

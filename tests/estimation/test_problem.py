@@ -60,9 +60,11 @@ SIZES = np.array([0.4, 0.5, 0.7, 0.1, 0.1, 0.1])
 
 
 def problem_of(seed, stops=20, seen=0.7, **more):
+    """A cell, what is seen of it, and its true state."""
     rng = np.random.default_rng(seed)
     cell = world(rng, stops, seen)
-    return cell, observed(cell, rng, **more)
+    problem = observed(cell, rng, **more)
+    return cell, problem, true_state(cell, problem.tree)
 
 
 def network(problem, **turned):
@@ -96,12 +98,11 @@ def with_values(problem, rng):
 
 @pytest.mark.parametrize("kind", ["poses", "places", "values"])
 def test_derivatives_are_those_of_central_differences(kind):
-    cell, problem = problem_of(1, stops=3, seen=1.0)
+    _, problem, state = problem_of(1, stops=3, seen=1.0)
     if kind == "places":
         problem = with_places_alone(problem, slice(0, 5))
     if kind == "values":
         problem = with_values(problem, np.random.default_rng(2))
-    state = true_state(cell, problem.tree)
     state = State(state.edges, np.full(problem.size - 6 * len(state.edges), 0.3))
     found = problem.linear(state).jacobian
     slopes = jacobian(lambda by: problem.linear(state.moved(by)).residuals, problem.size)
@@ -112,8 +113,8 @@ def test_derivatives_are_those_of_central_differences(kind):
 
 
 def test_equations_from_a_stop_on_are_those_of_its_observations_alone():
-    cell, problem = problem_of(4, stops=6)
-    fit = fit_problem(problem, true_state(cell, problem.tree))
+    _, problem, state = problem_of(4, stops=6)
+    fit = fit_problem(problem, state)
     stops = []
     for stop, *parts in equations_from(problem, fit, np.arange(problem.size)):
         later = problem.subset(problem.observations.stops >= stop)
@@ -126,18 +127,18 @@ def test_equations_from_a_stop_on_are_those_of_its_observations_alone():
 def test_repeats_do_not_pass_for_a_step():
     """Of fixed boards that fixed cameras see again and again, at rest."""
     for seed in range(3):
-        cell, problem = problem_of(seed, stops=16)
+        _, problem, state = problem_of(seed, stops=16)
         problem = replace(problem, with_repeats=True)
         assert problem.repeat_counts.max() > 1.0
-        fit = fit_problem(problem, true_state(cell, problem.tree))
+        fit = fit_problem(problem, state)
         assert not find_steps(problem, fit, frames_of(problem, tuple(problem.unknown)))
 
 
 def test_the_fit_is_as_good_as_its_covariance_says():
     squares, levels = [], []
     for seed in range(6):
-        cell, problem = problem_of(seed)
-        fit = fit_problem(problem, true_state(cell, problem.tree))
+        cell, problem, state = problem_of(seed)
+        fit = fit_problem(problem, state)
         assert fit.settled
         covariance = covariance_of(problem, fit)
         error = away(cell, problem, fit.state)
@@ -150,7 +151,7 @@ def test_the_fit_is_as_good_as_its_covariance_says():
 
 
 def test_the_level_of_a_sensor_is_found():
-    cell, problem = problem_of(6)
+    _, problem, state = problem_of(6)
     sensors = np.array(
         [0 if observer == "cam_left" else -1 for observer in problem.observations.observers]
     )
@@ -159,14 +160,13 @@ def test_the_level_of_a_sensor_is_found():
     problem = replace(
         problem, observations=replace(problem.observations, sensors=sensors, covariance=covariance)
     )
-    fit = fit_problem(problem, true_state(cell, problem.tree))
+    fit = fit_problem(problem, state)
     # Some 150 residuals tell it to 6 %.
     assert fit.noise.sensors[0] == pytest.approx(3.0, rel=0.2)
 
 
 def test_a_held_value_stays_and_counts_with_what_is_known_of_it():
-    cell, problem = problem_of(13)
-    state = true_state(cell, problem.tree)
+    _, problem, state = problem_of(13)
     by_sensor = np.zeros((len(problem), 6, 1))
     by_sensor[:, 3, 0] = 1e-3  # every camera measures x too long alike
     known = PriorInformation(np.eye(1), np.zeros(1))
@@ -184,8 +184,7 @@ def test_a_held_value_stays_and_counts_with_what_is_known_of_it():
 
 
 def test_a_prior_of_an_edge_pulls_it_by_its_share_of_the_information():
-    cell, problem = problem_of(14)
-    state = true_state(cell, problem.tree)
+    _, problem, state = problem_of(14)
     plain, _ = solve_problem(problem, state, NETWORK_NOISE)
     covariance = covariance_of(problem, Solution(plain, NETWORK_NOISE))[
         problem.edge_columns("target_a")
@@ -205,9 +204,8 @@ def test_a_prior_of_an_edge_pulls_it_by_its_share_of_the_information():
 
 
 def test_priors_of_frames_have_the_jacobian_of_central_differences():
-    cell, problem = problem_of(15, stops=4)
+    _, problem, state = problem_of(15, stops=4)
     rotation = pose((4, -2, -58), (0.0, 0.0, 0.0))[:3, :3]
-    state = true_state(cell, problem.tree)
     for prior in (
         # Up to the cell and down again, along two axes; and an edge by itself, with its rotation.
         FramePrior("cam_left", "cam_right", (0, 2), (0.1, 0.2), 1e-3),
@@ -264,9 +262,8 @@ def test_residuals_of_views_left_out_are_those_of_fits_without_them():
 
 def test_shared_errors_of_flanges_are_eliminated_exactly():
     """Against the covariance of all observations, written out."""
-    cell, problem = problem_of(3, stops=6)
+    _, problem, state = problem_of(3, stops=6)
     problem = with_values(problem, np.random.default_rng(5))
-    state = true_state(cell, problem.tree)
     state = State(state.edges, np.full(problem.size - 6 * len(state.edges), 0.3))
     linear, (units, members) = problem.linear(state), problem.units
     by_errors = np.zeros((len(problem), 6, 6 * len(members)))
@@ -323,7 +320,7 @@ def test_a_board_that_was_turned_over_is_told_exactly(mount):
     rng = np.random.default_rng(4)
     data, state = stops_of(mount, rng)
     change = np.array([0.0, 2.9, 0.3, 0.2, -0.1, 0.4])
-    turned = seen_as(data, data.observations.measured @ exp(change))
+    turned = seen_otherwise(data, measured=data.observations.measured @ exp(change))
     board, _ = causes_of(data, rng)
     cause = replace(board, start=log(turned.change_of("target", state)).mean(axis=0))
     found = evidence_of(turned, belief_of(state), cause)
@@ -346,14 +343,6 @@ def test_a_fit_that_runs_away_is_an_error_of_the_input(monkeypatch):
         calibrated(simulate(replace(FINE, views=6)))
 
 
-def exact(seed, stops=5):
-    """A cell that was measured without noise, and its state."""
-    rng = np.random.default_rng(seed)
-    cell = world(rng, stops, 0.8)
-    problem = observed(cell, rng, noise=0.0)
-    return problem, true_state(cell, problem.tree)
-
-
 def with_drift(problem):
     """The problem with two values that are known together, and all that counts besides."""
     by_sensor = np.zeros((len(problem), 6, 2))
@@ -365,7 +354,7 @@ def with_drift(problem):
 
 
 def test_the_parts_add_up_to_the_whole():
-    problem, state = exact(1, stops=12)
+    _, problem, state = problem_of(1, stops=12, seen=0.8, noise=0.0)
     problem = with_drift(problem)
     state = State(state.edges, np.zeros(2))
     first = 6 * len(problem.unknown)
@@ -379,7 +368,7 @@ def test_the_parts_add_up_to_the_whole():
 
 @pytest.mark.parametrize("robot", ["a", "b"])
 def test_the_part_of_a_robot_is_what_its_errors_do_to_the_answer(robot):
-    problem, state = exact(2)
+    _, problem, state = problem_of(2, stops=5, seen=0.8, noise=0.0)
     whole = covariance_of(problem, Solution(state, NETWORK_NOISE))
     sigmas, step, part = np.repeat(ROBOT_SIGMAS[robot], 3), 1e-6, np.zeros_like(whole)
     for stop in range(5):
@@ -404,10 +393,6 @@ def stops_of(mount, rng, count=5):
     covariance = np.tile(1e-10 * np.eye(6), (count, 1, 1))
     problem = chain(mount, poses, invert(robot @ x) @ z, covariance)
     return problem, State(np.stack([x, z]), np.zeros(0))
-
-
-def seen_as(problem, measured):
-    return replace(problem, observations=replace(problem.observations, measured=measured))
 
 
 def belief_of(state, freedom=np.inf):
@@ -545,18 +530,14 @@ def test_the_variance_to_be_expected_is_that_of_a_level_with_its_degrees_of_free
     assert 1e-6 < expected_levels(problem, fit.state, at)[0, 1] < 1e-4
 
 
-def combined(problem, **changes):
-    """The problem with one noise of robot and camera."""
-    unknown = np.zeros_like(problem.observations.covariance)
-    return replace(seen_otherwise(problem, covariance=unknown, **changes), is_combined=True)
-
-
 @pytest.mark.parametrize("kind", ["one a stop", "places", "combined"])
 def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind):
     problem, fit = answered(False, views=8, seed=6)
     if kind == "places":  # Which leave a flange's rotation open.
         problem = seen_otherwise(problem, has_rotation=np.zeros(len(problem), dtype=bool))
-    problem = combined(problem) if kind == "combined" else problem
+    if kind == "combined":  # One noise of robot and camera.
+        unknown = np.zeros_like(problem.observations.covariance)
+        problem = replace(seen_otherwise(problem, covariance=unknown), is_combined=True)
     moves = np.random.default_rng(0).standard_normal((8, 6, 3))
     nothing = PriorInformation(np.zeros((3, 3)), np.zeros(3))
     effect = Effect.free("arm", nothing, flange_jacobian={ROBOT: moves})

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.closed_form import SOLVERS, HandEye, Solver, lone_axis, rotation_pairs
 
@@ -57,14 +58,6 @@ def turn(vectors: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
 
 
-def rigid(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
-    matrices = np.zeros((*shape, 4, 4))
-    matrices[..., :3, :3], matrices[..., :3, 3] = rotation, translation
-    matrices[..., 3, 3] = 1.0
-    return matrices
-
-
 def random_turns(rng: np.random.Generator, count: int, largest_rad: float) -> FloatArray:
     axes = rng.normal(size=(count, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -85,25 +78,25 @@ def simulate(world: World, seed: int, m: int = 20) -> Problem:
     rotation = turn(np.stack([zero, zero, roll], axis=1)) @ tilted
     centre = rng.uniform(-0.05, 0.05, size=(m, 3))
     centre[:, 2] = rng.uniform(0.4, 0.8, size=m)
-    camera = rigid(rotation, centre - rotation @ BOARD_CENTRE_M)
+    camera = compose(rotation, centre - rotation @ BOARD_CENTRE_M)
     robot = z @ np.linalg.inv(x @ camera)
     # The error is the flange's own: at the right of base_from_flange, at the left of its inverse.
-    error = rigid(
+    error = compose(
         turn(world.robot_rad * rng.normal(size=(m, 3))), world.robot_m * rng.normal(size=(m, 3))
     )
     robot = robot @ error if world.mount == "eye-in-hand" else error @ robot
     # A pose from an image is sharp at the board's centre, not at the frame's far origin.
     centre = centre + world.camera * rng.normal(size=(m, 3))
     rotation = rotation @ turn(1.5 * world.camera * rng.normal(size=(m, 3)))
-    return Problem(robot, rigid(rotation, centre - rotation @ BOARD_CENTRE_M), x, z)
+    return Problem(robot, compose(rotation, centre - rotation @ BOARD_CENTRE_M), x, z)
 
 
 def free_poses(
     rng: np.random.Generator, views: int, largest_rad: float, reach_m: float, x: FloatArray
 ) -> Problem:
     """Exact views of no camera in particular: any orientation, translations up to `reach_m`."""
-    z = rigid(random_turns(rng, 1, np.pi)[0], rng.uniform(-reach_m, reach_m, size=3))
-    camera = rigid(
+    z = compose(random_turns(rng, 1, np.pi)[0], rng.uniform(-reach_m, reach_m, size=3))
+    camera = compose(
         random_turns(rng, views, largest_rad), rng.uniform(-reach_m, reach_m, size=(views, 3))
     )
     return Problem(z @ np.linalg.inv(x @ camera), camera, x, z)
@@ -118,12 +111,12 @@ def opencv(name: str, problem: Problem) -> FloatArray:
         if name in BOTH_AT_ONCE:
             method = getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{name.upper()}")
             *_, turned, shifted = cv2.calibrateRobotWorldHandEye(*camera, *robot, method=method)
-            return np.linalg.inv(rigid(turned, shifted.ravel()))
+            return np.linalg.inv(compose(turned, shifted.ravel()))
         method = getattr(cv2, f"CALIB_HAND_EYE_{name.upper()}")
         turned, shifted = cv2.calibrateHandEye(*robot, *camera, method=method)
     except cv2.error:
         return np.full((4, 4), np.nan)
-    return rigid(turned, shifted.ravel())
+    return compose(turned, shifted.ravel())
 
 
 def turn_error(estimate: FloatArray, truth: FloatArray) -> float:
@@ -142,7 +135,7 @@ all_solvers = pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS.ke
 
 
 def any_x(rng: np.random.Generator, reach_m: float) -> FloatArray:
-    return rigid(random_turns(rng, 1, np.pi)[0], rng.uniform(-reach_m, reach_m, size=3))
+    return compose(random_turns(rng, 1, np.pi)[0], rng.uniform(-reach_m, reach_m, size=3))
 
 
 def free(views: int, largest_rad: float = np.pi, reach_m: float = 0.5) -> Build:
@@ -154,7 +147,7 @@ def x_turned(x: float, y: float, z: float, short_of_pi: float = 0.0) -> Build:
     axis = np.array([x, y, z]) / np.linalg.norm([x, y, z])
     angle = np.pi - short_of_pi
     return lambda rng: free_poses(
-        rng, 10, 1.0, 0.5, rigid(turn(angle * axis), rng.uniform(-0.2, 0.2, size=3))
+        rng, 10, 1.0, 0.5, compose(turn(angle * axis), rng.uniform(-0.2, 0.2, size=3))
     )
 
 
@@ -166,7 +159,7 @@ def small_tilts(views: int, reach_m: float) -> Build:
         tilt = np.radians(rng.uniform(3.0, 5.0, size=views))
         vectors = np.stack([np.cos(heading), np.sin(heading), rng.uniform(-1, 1, views)], axis=1)
         shifts = rng.uniform(-reach_m, reach_m, size=(views, 3))
-        camera = rigid(turn(vectors * tilt[:, None]), shifts)
+        camera = compose(turn(vectors * tilt[:, None]), shifts)
         x, z = any_x(rng, reach_m), any_x(rng, reach_m)
         return Problem(z @ np.linalg.inv(x @ camera), camera, x, z)
 
@@ -184,7 +177,7 @@ def half_turns_between_views(rng: np.random.Generator) -> Problem:
 def turning_on_the_spot(rng: np.random.Generator) -> Problem:
     """The flange turns but does not travel: R_X = 0 would satisfy the homogeneous equations."""
     x, z = any_x(rng, 0.2), any_x(rng, 0.8)
-    robot = rigid(random_turns(rng, 12, 1.0), np.array([0.4, 0.1, 0.5]))
+    robot = compose(random_turns(rng, 12, 1.0), np.array([0.4, 0.1, 0.5]))
     return Problem(robot, np.linalg.inv(robot @ x) @ z, x, z)
 
 
@@ -202,7 +195,7 @@ EXACT: dict[str, Build] = {
     "half turn about z": x_turned(0, 0, 1),
     "half turn, oblique": x_turned(1, -1, 1),
     "almost a half turn": x_turned(0.2, 0.5, -0.9, 1e-6),
-    "no turn": lambda rng: free_poses(rng, 10, 1.0, 0.5, rigid(np.eye(3), np.full(3, 0.1))),
+    "no turn": lambda rng: free_poses(rng, 10, 1.0, 0.5, compose(np.eye(3), np.full(3, 0.1))),
     "small tilts, 3 views": small_tilts(3, 0.5),
     "small tilts": small_tilts(20, 0.5),
     "small tilts, 3 m": small_tilts(20, 3.0),
@@ -271,18 +264,23 @@ def test_dual_quaternions_are_solved_as_the_paper_does():
     np.testing.assert_allclose(ours, expected, atol=1e-9)
 
 
+def seen_so(camera: FloatArray, rng: np.random.Generator) -> Problem:
+    """Exact views with these of the camera, of any x and z."""
+    x, z = any_x(rng, 0.15), any_x(rng, 0.8)
+    return Problem(z @ np.linalg.inv(x @ camera), camera, x, z)
+
+
 def one_axis(rng: np.random.Generator) -> tuple[Problem, FloatArray]:
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
-    camera = rigid(turn(axis * rng.uniform(-1, 1, (12, 1))), rng.uniform(-0.3, 0.3, (12, 3)))
-    x, z = any_x(rng, 0.15), any_x(rng, 0.8)
-    return Problem(z @ np.linalg.inv(x @ camera), camera, x, z), x[:3, :3] @ axis
+    turns = turn(axis * rng.uniform(-1, 1, (12, 1)))
+    problem = seen_so(compose(turns, rng.uniform(-0.3, 0.3, (12, 3))), rng)
+    return problem, problem.x[:3, :3] @ axis
 
 
 def no_rotation(rng: np.random.Generator) -> Problem:
-    camera = rigid(np.eye(3), rng.uniform(-0.3, 0.3, size=(12, 3)))
-    x, z = any_x(rng, 0.15), any_x(rng, 0.8)
-    return Problem(z @ np.linalg.inv(x @ camera), camera, x, z)
+    shifts = rng.uniform(-0.3, 0.3, size=(12, 3))
+    return seen_so(compose(np.tile(np.eye(3), (12, 1, 1)), shifts), rng)
 
 
 def shaken(problem: Problem, rng: np.random.Generator) -> Problem:
@@ -290,7 +288,7 @@ def shaken(problem: Problem, rng: np.random.Generator) -> Problem:
 
     def noise() -> FloatArray:
         m = len(problem.robot)
-        return rigid(turn(3e-4 * rng.normal(size=(m, 3))), 3e-4 * rng.normal(size=(m, 3)))
+        return compose(turn(3e-4 * rng.normal(size=(m, 3))), 3e-4 * rng.normal(size=(m, 3)))
 
     return replace(problem, robot=problem.robot @ noise(), camera=problem.camera @ noise())
 
@@ -313,7 +311,7 @@ def test_what_the_robot_moves_by_determines_the_turn_about_a_lone_axis(rise_m: f
         moves[:, 2] *= rise_m / 0.15
         robot = np.array(
             [
-                rigid(turn(np.array([0.0, 0.0, angle])), np.array([0.4, 0.0, 0.5]) + move)
+                compose(turn(np.array([0.0, 0.0, angle])), np.array([0.4, 0.0, 0.5]) + move)
                 for angle, move in zip(angles, moves, strict=True)
             ]
         )
@@ -372,7 +370,7 @@ def test_frames_may_be_turned_and_views_come_in_any_order(solver: Solver, seed: 
     # The same sums in another order: rounding alone.
     np.testing.assert_allclose(shuffled.x, found.x, atol=1e-10)
     np.testing.assert_allclose(shuffled.z, found.z, atol=1e-10)
-    base, flange, cam, target = rigid(random_turns(rng, 4, np.pi), np.zeros(3))
+    base, flange, cam, target = compose(random_turns(rng, 4, np.pi), np.zeros(3))
     base[:3, 3] = rng.uniform(-1.0, 1.0, size=3)
     turned = solver(base @ problem.robot @ flange.T, cam @ problem.camera @ target)
     # R X C = Z with every frame turned: X and Z turn along. Only rounding may differ, except in

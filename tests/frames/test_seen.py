@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.cells import exact
 from support.imaged import Shot, calibrated_cell, session_of, shots
+from support.misfits import misfit
 from support.picks import Stand, calibration_of, really, seen_corners
 from support.refusals import raised
 
@@ -125,8 +126,7 @@ def test_places_follow_their_stated_covariance():
         place = place_of(cell, "base", rng)
         found = place_seen(calibration, sights_of(cell, "base", place, rng), BOARD, "base")
         assert found.inliers.all()
-        error = log(invert(place) @ found.matrix)
-        surprises.append(error @ np.linalg.solve(found.covariance, error) / 6)
+        surprises.append(misfit(found, place) / 6)
     # Five of six degrees of freedom: sqrt(2 / 30) = 0.26; the target is of the exact size, which
     # counts as known to 0.1 %, and takes one of the six.
     assert 0.4 < np.mean(surprises) < 2.0
@@ -236,9 +236,8 @@ def rows_of(mount, kind, count=VIEWS):
 def test_a_board_in_images_is_where_it_stands(mount, kind):
     cell, calibration = calibrated_cell(mount)
     frame = seen_frame(session_of(cell, rows_of(mount, kind)), calibration, kind)
-    error = log(invert(true_place(mount, kind)) @ frame.edge.matrix)
     # Six degrees of freedom at 99.9 %: 22.5. The board has its exact size, which only helps.
-    assert error @ np.linalg.solve(frame.edge.covariance, error) < 22.5
+    assert misfit(frame.edge, true_place(mount, kind)) < 22.5
     assert frame.edge.sigma_mm < 1.0
     assert frame.oriented
     assert frame.verdict.status == "good", frame.verdict.reasons
@@ -282,8 +281,7 @@ def test_a_moved_board_is_left_out_and_named():
     assert sum(observation.used for observation in frame.observations) == 5
     assert frame.verdict.status == "check"
     assert frame.verdict.reasons[0].startswith("view 32 puts the target")
-    error = log(invert(true_place(IN_HAND, "fixture")) @ frame.edge.matrix)
-    assert error @ np.linalg.solve(frame.edge.covariance, error) < 22.5
+    assert misfit(frame.edge, true_place(IN_HAND, "fixture")) < 22.5
 
 
 def test_views_that_show_nothing_are_named():

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from support.arm_documents import arm_of
 from support.commands import visioncal
+from support.misfits import misfit
 from support.refusals import raised
-from support.whole_cells import misfit, saved, simulated, truth
+from support.whole_cells import saved, simulated, truth
 
 import visioncal as package
 from visioncal.core.errors import DataError
@@ -198,7 +199,7 @@ def test_a_pair_calibrated_by_itself_agrees_with_the_whole_cell(found, folder):
     for name, edge in found.of("left", "b").edges.items():
         other = alone.edges[name]
         # Of the same corners: the whole cell is nearer to the truth than the pair.
-        assert misfit(other.matrix, other.covariance, edge.matrix) < MOST_OF_SIX
+        assert misfit(other, edge.matrix) < MOST_OF_SIX
         assert edge.sigma_mm < other.sigma_mm
 
 

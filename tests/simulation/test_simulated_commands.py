@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 from support.marks import slow
+from support.misfits import misfit
 from support.refusals import raised
 
 from visioncal import simulation
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import invert, log
+from visioncal.core.transforms import invert
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import cell_names, cell_session, read_cell, simulate
@@ -31,12 +32,6 @@ def truth_of(folder):
     content = json.loads(folder.with_name(f"{folder.name}.truth.json").read_text())
     edges = {name: np.array(value) for name, value in content.get("transforms", {}).items()}
     return content, edges
-
-
-def misfit(edge, truth, among=slice(None)):
-    """The error over its covariance, of those of the six components that were measured."""
-    error = log(invert(truth) @ edge.transform.as_matrix())[among]
-    return error @ np.linalg.solve(edge.covariance[among, among], error)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visioncal.core.transforms import invert, log
+from visioncal.core.transforms import invert
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
@@ -59,12 +59,6 @@ def saved(folder: Path, cell: SimulatedCell) -> tuple[Path, Path]:
     part(session, 0, LATER).save(folder / "session")
     part(session, LATER, OPTIONS.stops).save(folder / "later")
     return folder / "session", folder / "later"
-
-
-def misfit(matrix, covariance, truth):
-    """The squared error of a transform in units of its sigmas: chi-square of six."""
-    error = log(invert(truth) @ matrix)
-    return float(error @ np.linalg.solve(covariance, error))
 
 
 def simulated(seed: int = 0) -> SimulatedCell:
