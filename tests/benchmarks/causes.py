@@ -6,7 +6,6 @@ each kind of finding was the first cause.
     PYTHONPATH=tests python tests/benchmarks/causes.py [--quick] [SEEDS] [WORLDS, a part of a name]
 """
 
-import csv
 import os
 import re
 import tempfile
@@ -21,11 +20,13 @@ import numpy as np
 from elsewhere import World
 from results import WORDS, wished, write_section
 from scipy.spatial.transform import Rotation
+from support.edited import Rows, edit_rows
 
 import visioncal
+from visioncal.core.transforms import compose
+from visioncal.session.columns import POSE
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _COMMAND = "PYTHONPATH=tests python tests/benchmarks/causes.py"
 
 
@@ -41,23 +42,27 @@ class Fault:
 
 def exchanged(folder: Path, rng: np.random.Generator) -> None:
     """Exchanges the poses of two rows."""
-    rows = _rows(folder)
-    first, second = rng.choice(len(rows), 2, replace=False)
-    for name in POSE:
-        rows[first][name], rows[second][name] = rows[second][name], rows[first][name]
-    _write(folder, rows)
+
+    def change(rows: Rows) -> Rows:
+        first, second = rng.choice(len(rows), 2, replace=False)
+        for name in POSE:
+            rows[first][name], rows[second][name] = rows[second][name], rows[first][name]
+        return rows
+
+    edit_rows(folder, change)
 
 
 def with_joints(folder: Path, _: np.random.Generator) -> None:
     """Adds the joint angles of the reported poses, and the arm's model."""
-    rows = _rows(folder)
-    numbers = np.array([[float(row[name]) for name in POSE] for row in rows])
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, 3] = numbers[:, :3]
-    poses[:, :3, :3] = Rotation.from_quat(numbers[:, 3:]).as_matrix()
-    for row, angles in zip(rows, elsewhere.joints_at(poses), strict=True):
-        row |= {f"q{at + 1}_rad": repr(float(angle)) for at, angle in enumerate(angles)}
-    _write(folder, rows)
+
+    def change(rows: Rows) -> Rows:
+        numbers = np.array([[float(row[name]) for name in POSE] for row in rows])
+        poses = compose(Rotation.from_quat(numbers[:, 3:]).as_matrix(), numbers[:, :3])
+        for row, angles in zip(rows, elsewhere.joints_at(poses), strict=True):
+            row |= {f"q{at + 1}_rad": repr(float(angle)) for at, angle in enumerate(angles)}
+        return rows
+
+    edit_rows(folder, change)
     joints = "".join(
         f'[[joint]]\nname = "j{at}"\na_m = {a}\nalpha_rad = {alpha}\nd_m = {d}\n'
         f"theta_offset_rad = {theta}\n"
@@ -78,18 +83,6 @@ def slipping(size_rad: float) -> Callable[[np.ndarray, np.random.Generator], np.
         return elsewhere.links(q)[:, -1]
 
     return reported
-
-
-def _rows(folder: Path) -> list[dict[str, str]]:
-    with (folder / "views.csv").open() as file:
-        return [*csv.DictReader(file)]
-
-
-def _write(folder: Path, rows: list[dict[str, str]]) -> None:
-    with (folder / "views.csv").open("w") as file:
-        writer = csv.DictWriter(file, [*rows[0]])
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 FAULTS: Mapping[str, Fault] = {

@@ -19,12 +19,13 @@ import tomli_w
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import chi2, norm
 from support import kept_answers, later, touched, wrong_arms
-from support.commands import QUATERNIONS, visioncal, write_poses, write_table
+from support.commands import visioncal, write_poses, write_table
 from support.fuzz import mistakes, varied
 from support.paired import Outcome
 
 from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
+from visioncal.session.columns import POSE
 from visioncal.simulation import (
     BOARDS,
     CellOptions,
@@ -274,7 +275,7 @@ def posed(folder: Path, mount: str, robot: np.ndarray, camera: np.ndarray, **mor
          (*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat())]
         for pair in zip(robot, camera, strict=True)
     ]  # fmt: skip
-    names = [*QUATERNIONS, *(f"cft_{name}" for name in QUATERNIONS)]
+    names = [*POSE, *(f"cft_{name}" for name in POSE)]
     write_table(folder / "views.csv", names, rows, {"view": range(len(rows))})
     return folder
 

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.cells import calibrated, error_of, pairs_session
 from support.edges import solved
+from support.misfits import misfit
 from support.refusals import raised
 
 import visioncal
@@ -118,10 +119,7 @@ def test_the_noise_of_pose_pairs_is_where_it_arises(of_flange, name):
         told = flange @ noise if of_flange else flange
         found = visioncal.calibrate(pairs_session("eye-in-hand", told, seen))
         assert {level.partition("_")[0] for level in found.noise} == {name}
-        edge = found.transforms["flange_from_cam"]
-        covariance = found.covariance("flange_from_cam")
-        error = log(invert(x) @ edge.as_matrix())
-        squares.append(error @ np.linalg.solve(covariance, error))
+        squares.append(misfit(found.edges["flange_from_cam"], x))
     # Three chi-squares of six degrees of freedom: 42 is exceeded in one case of a thousand.
     assert sum(squares) < 42.3
 

@@ -39,7 +39,7 @@ from visioncal.interchange.formats import (
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.robot.conversion import with_base
-from visioncal.session import Session
+from visioncal.session import Session, View
 from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, SimulatedCell, fine_camera, simulate, write_session
 
@@ -570,9 +570,16 @@ def test_nothing_is_written_without_a_word_or_a_reading(cell, tmp_path):
     assert "fit as declared" in done.err
     assert Session.load(tmp_path / "same").digest() == Session.load(cell).digest()
     rewritten(cell, lambda _, row: row | {at: repr(1e3 * float(row[at])) for at in POSE[:3]})
-    done = converted(cell, tmp_path / "fixed")
-    assert done.status != 0
-    assert "the robot's positions in mm" in done.err
+    converted(cell, tmp_path / "fixed").refused("the robot's positions in mm", "--yes")
+    assert not (tmp_path / "fixed").exists()
+    converted(cell, tmp_path / "mended", "--yes").good()
+    same, mended = (Session.load(tmp_path / name).views for name in ("same", "mended"))
+    for old, new in zip(same, mended, strict=True):
+        assert new.text == old.text
+        for pose in (View.base_from_flange, View.cam_from_target):
+            # Multiplied by 1000 and divided again, each rounded once.
+            matrices = [pose(view).as_matrix() for view in (old, new)]
+            np.testing.assert_allclose(*matrices, atol=1e-14)
     turns = np.random.default_rng(0).normal(size=(12, 4))
     turns = (turns / np.linalg.norm(turns, axis=1, keepdims=True)).tolist()
     rewritten(cell, lambda at, row: row | dict(zip(POSE[3:], map(repr, turns[at]), strict=True)))

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from support.advice import failures, printed_commands
 from support.commands import every_command, turned_poses, visioncal, write_poses
-from support.fuzz.broken_sessions import BROKEN, broken_session, edit_rows
+from support.edited import rewritten
+from support.fuzz.broken_sessions import BROKEN, broken_session
 from support.marks import slow
 from support.samples import made_up
 from typer.main import get_command
@@ -500,11 +501,11 @@ def test_of_verify(place):
     replace(whole, views=whole.views[:15]).save(place / "fit")
     assert visioncal("calibrate", "fit", "-o", "out").status == 0
     for name, last, change in (
-        ("few", 18, lambda row: row),
-        ("knocked", 20, lambda row: row | {"x_m": str(float(row["x_m"]) + 0.01)}),
+        ("few", 18, lambda _, row: row),
+        ("knocked", 20, lambda _, row: row | {"x_m": str(float(row["x_m"]) + 0.01)}),
     ):
         replace(whole, views=whole.views[15:last]).save(place / name)
-        edit_rows(place / name, lambda rows, change=change: [*map(change, rows)])
+        rewritten(place / name, change)
         done = visioncal("verify", name, "--against", "out")
         assert printed_commands(done.said), name
         assert list(failures(done.said)) == []

@@ -18,6 +18,7 @@ from support.pages import Page
 from support.picks import before_camera, calibration_of, seen_corners, seen_point, stand
 from support.refusals import raised
 from support.samples import fixture_frame
+from support.slopes import jacobian
 
 from visioncal import calibrate
 from visioncal.core.errors import DataError
@@ -55,12 +56,9 @@ def in_hand():
     return cell, calibration_of(cell)
 
 
-STEP = 1e-3
-
-
-def slope(place, *, step=STEP):
-    """Central differences (3,) of a place, a function of a step."""
-    return (place(step).p_base - place(-step).p_base) / (2 * step)
+def slopes(place, size=1, step=1e-3):
+    """Central differences (size, 3) of a place, a function of steps."""
+    return jacobian(lambda by: place(by).p_base, size, step).T
 
 
 # Truncation is of second order in a step of a thousandth, relative; rounding is less. A lens that
@@ -68,10 +66,9 @@ def slope(place, *, step=STEP):
 PLAIN, BREATHING = 1e-4, 5e-3
 
 
-def agrees(part, slopes, share=PLAIN):
+def agrees(part, by, share=PLAIN):
     """A part of a covariance is that of these slopes."""
-    slopes = np.atleast_2d(slopes)
-    np.testing.assert_allclose(part, slopes.T @ slopes, atol=share * np.sum(slopes**2))
+    np.testing.assert_allclose(part, by.T @ by, atol=share * np.sum(by**2))
 
 
 @pytest.mark.parametrize("beyond", [False, True], ids=["model", "field"])
@@ -87,11 +84,9 @@ def test_what_moves_a_ray_agrees_with_central_differences(exact_cell, beyond):
         return locate(calibration, px, plane, at.base_from_flange, **noise)[0]
 
     parts = found(with_error(calibration, error), sigma_px=1.0).parts
-    by_error = slope(lambda step: found(moved(calibration, step * error)))
+    by_error = slopes(lambda by: found(moved(calibration, by[0] * error)))
     agrees(parts["calibration"], by_error, BREATHING if beyond else PLAIN)
-    by_px = np.array(
-        [slope(lambda step, axis=axis: found(calibration, px + step * axis)) for axis in np.eye(2)]
-    )
+    by_px = slopes(lambda by: found(calibration, px + by), 2)
     # The field is taken for flat where a pixel errs: by up to 0.3 px in a fifth of 1280.
     apart = (1e-2 if beyond else 1e-5) * np.sum(by_px**2)
     np.testing.assert_allclose(parts["pixels"], by_px.T @ by_px, atol=apart)
@@ -114,12 +109,14 @@ def test_what_moves_a_target_agrees_with_central_differences(exact_cell, beyond)
 
     # Corners that fit the pose exactly move it with the lens as the normal equations say.
     parts = found(with_error(calibration, error), sigma_px=0.1).parts
-    by_error = slope(lambda step: found(moved(calibration, step * error)))
+    by_error = slopes(lambda by: found(moved(calibration, by[0] * error)))
     agrees(parts["calibration"], by_error, BREATHING if beyond else PLAIN)
-    by_size = slope(
-        lambda step: found(calibration, replace(BOARD, square_m=(1 + step) * BOARD.square_m))
-    )
-    expected = (BOARD.square_sigma_m / BOARD.square_m) ** 2 * np.outer(by_size, by_size)
+
+    def of_size(by):
+        return found(calibration, replace(BOARD, square_m=(1 + by[0]) * BOARD.square_m))
+
+    by_size = slopes(of_size)
+    expected = (BOARD.square_sigma_m / BOARD.square_m) ** 2 * by_size.T @ by_size
     # Corners that a field of another distance displaced fit no pose exactly.
     share = 1e-2 if beyond else 1e-4
     np.testing.assert_allclose(parts["target"], expected, atol=share * np.trace(expected))
@@ -137,9 +134,9 @@ def test_the_robots_noise_at_the_stop_agrees_with_central_differences(in_hand):
 
     noise = calibration.noise
     sigma = [np.deg2rad(noise["robot_rotation_deg"]), 1e-3 * noise["robot_translation_mm"]]
-    slopes = [slope(lambda step, axis=axis: found(step * axis), step=1e-4) for axis in np.eye(6)]
+    by_twist = np.repeat(sigma, 3)[:, None] * slopes(found, 6, 1e-4)
     # Truncation: 1e-4 squared, relative.
-    agrees(found(np.zeros(6)).parts["robot"], np.repeat(sigma, 3)[:, None] * slopes, 1e-6)
+    agrees(found(np.zeros(6)).parts["robot"], by_twist, 1e-6)
 
 
 def test_an_uncertain_frames_plane_agrees_with_central_differences(in_hand):
@@ -155,7 +152,7 @@ def test_an_uncertain_frames_plane_agrees_with_central_differences(in_hand):
     def found(edge):
         return locate(calibration, px, Plane.of_frame(edge, 0.02), at.base_from_flange)[0]
 
-    by_error = slope(lambda step: found(Edge(fixture @ exp(step * error), np.zeros((6, 6)))))
+    by_error = slopes(lambda by: found(Edge(fixture @ exp(by[0] * error), np.zeros((6, 6)))))
     agrees(found(Edge(fixture, np.outer(error, error))).parts["plane"], by_error)
 
 
@@ -229,18 +226,12 @@ def test_what_cannot_be_located_is_refused_by_name(in_hand):
         ("outside", [[np.nan, 400.0]], level, flange),
         ("parallel to the plane", centre, beside, flange),
         (r"runs away from the plane: .* behind the camera", middle, behind, flange),
-        ("millimetres", middle, level, with_offset(flange, 1e3)),
+        ("millimetres", middle, level, compose(flange[:3, :3], 1e3 * flange[:3, 3])),
         ("rigid", middle, level, 2.0 * flange),
     ):
         raised(DataError, words, locate, calibration, np.array(px), plane, pose)
     with pytest.raises(DataError, match="holds no camera"):
         locate(replace(calibration, camera=None), middle, level, flange)
-
-
-def with_offset(pose, factor):
-    other = pose.copy()
-    other[:3, 3] *= factor
-    return other
 
 
 def test_what_may_mislead_is_told(in_hand):

@@ -9,13 +9,14 @@ import pytest
 from support.cells import exact
 from support.imaged import Shot, calibrated_cell, session_of, shots
 from support.misfits import misfit
-from support.picks import Stand, calibration_of, really, seen_corners
+from support.picks import calibration_of, really, seen_corners
 from support.refusals import raised
+from support.slopes import twists
 
 from visioncal.core.errors import DataError
 from visioncal.core.limits import ImageFrameLimits
-from visioncal.core.transforms import compose, exp, invert, log, skew
-from visioncal.core.types import Corners, FloatArray, Target
+from visioncal.core.transforms import compose, exp, invert, skew
+from visioncal.core.types import Target
 from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.frame_from_images import depends_on_camera, seen_frame
 from visioncal.frames.target_in_image import target_pose_candidates
@@ -23,20 +24,8 @@ from visioncal.frames.target_pose import Sight, candidate_places, place_seen
 from visioncal.results import Verdict
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
-from visioncal.simulation import BOARDS, CellOptions, SimulatedCell, simulate
+from visioncal.simulation import BOARDS, CellOptions, simulate
 from visioncal.vision.camera import intrinsics, with_intrinsics
-
-
-def corners_at(
-    cell: SimulatedCell,
-    at: Stand,
-    base_from_target: FloatArray,
-    target: Target,
-    rng: np.random.Generator,
-) -> Corners:
-    """The noisy corners of a target that stands in the base."""
-    return seen_corners(cell, invert(at.base_from_cam) @ base_from_target, target, rng)
-
 
 BOARD = BOARDS["charuco"]
 MARKER = Target("marker", "marker", 1, 1, 0.03, 3e-5, dictionary="DICT_5X5_100", marker_id=3)
@@ -75,7 +64,7 @@ def sights_of(cell, parent, place, rng, count=6, target=BOARD):
         flange = really(cell, reported, rng)
         base_from_cam = flange @ x if cell.options.mount == IN_HAND else x
         base_from_target = flange @ place if parent == "flange" else place
-        corners = corners_at(cell, Stand(reported, base_from_cam), base_from_target, target, rng)
+        corners = seen_corners(cell, invert(base_from_cam) @ base_from_target, target, rng)
         sights.append(Sight(f"image {at}", corners, reported))
     return sights
 
@@ -91,31 +80,28 @@ def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
         seen = target_pose_candidates(eye, sight.seen, target, "image", 0.1)
         return candidate_places(eye, sight, seen, parent)[0]
 
-    def with_step(step):
+    def with_step(by):
+        step = by * steps
         camera = with_intrinsics(eye.camera, intrinsics(eye.camera) + step[6:])
-        return placed(
-            replace(eye, edge=eye.edge @ exp(step[:6]), lens=replace(eye.lens, camera=camera))
-        )
+        edge = eye.edge @ exp(step[:6])
+        return placed(replace(eye, edge=edge, lens=replace(eye.lens, camera=camera))).matrix
 
-    def of_size(step):
-        return placed(target=replace(BOARD, square_m=BOARD.square_m * (1 + step)))
+    def of_size(by):
+        return placed(target=replace(BOARD, square_m=BOARD.square_m * (1 + by[0]))).matrix
 
     def standing(twist):
-        return placed(sight=replace(sight, base_from_flange=sight.base_from_flange @ exp(twist)))
-
-    def difference(found, step):
-        return log(invert(found(-step).matrix) @ found(step).matrix) / 2
+        flange = sight.base_from_flange @ exp(twist)
+        return placed(sight=replace(sight, base_from_flange=flange)).matrix
 
     here = placed()
     np.testing.assert_allclose(here.matrix, place, atol=1e-8)
-    steps = 1e-2 * np.diag([*[1e-3] * 6, *[1.0] * 4, *[1e-3] * 5])
-    differences = [difference(with_step, step) for step in steps]
+    steps = 1e-2 * np.array([*[1e-3] * 6, *[1.0] * 4, *[1e-3] * 5])
     # The fit of a pose stops at steps of 1e-6, whose next ones are a hundred times smaller.
-    np.testing.assert_allclose(here.by_common[:, :15] @ steps, np.transpose(differences), atol=3e-8)
-    scale = difference(of_size, 1e-4) / 1e-4
-    np.testing.assert_allclose(here.by_common[:, len(eye.covariance)], scale, atol=1e-4)
-    slopes = [difference(standing, twist) / 1e-4 for twist in 1e-4 * np.eye(6)]
-    np.testing.assert_allclose(here.flange_jacobian, np.transpose(slopes), atol=1e-6)
+    moved = twists(with_step, 15, 1.0)
+    np.testing.assert_allclose(here.by_common[:, :15] * steps, moved, atol=3e-8)
+    by_size = here.by_common[:, len(eye.covariance)]
+    np.testing.assert_allclose(by_size, twists(of_size, 1, 1e-4)[:, 0], atol=1e-4)
+    np.testing.assert_allclose(here.flange_jacobian, twists(standing, 6, 1e-4), atol=1e-6)
 
 
 def test_places_follow_their_stated_covariance():
@@ -184,7 +170,7 @@ def test_a_marker_seen_flat_on_may_be_tilted_the_other_way():
     x = cell.transforms["base_from_cam"]
     turn = exp(np.array([0.15, 0.1, 0.0, 0.0, 0.0, 0.0]))[:3, :3]
     place = x @ compose(turn, np.array([0.0, 0.0, 0.9]))
-    sight = Sight("flat", corners_at(cell, Stand(None, x), place, MARKER, rng))
+    sight = Sight("flat", seen_corners(cell, invert(x) @ place, MARKER, rng))
     flat = place_seen(calibration, [sight], MARKER, "base")
     assert any("tilted the other way" in warning for warning in flat.warnings)
 
@@ -242,13 +228,7 @@ def test_a_board_in_images_is_where_it_stands(mount, kind):
     assert frame.oriented
     assert frame.verdict.status == "good", frame.verdict.reasons
     assert frame.method == "ChArUco board charuco_9x6_30mm seen in 5 images"
-    assert [observation.name for observation in frame.observations] == [
-        "30",
-        "31",
-        "32",
-        "33",
-        "34",
-    ]
+    assert [int(observation.name) for observation in frame.observations] == [*range(30, 35)]
     assert all(observation.used and not observation.reason for observation in frame.observations)
     assert frame.source == "the part"
     assert depends_on_camera(frame)

@@ -27,6 +27,7 @@ from visioncal.present.recording import read_calibration
 from visioncal.results import Calibration, Edge, FrameFile, Verdict
 from visioncal.robot import load_robot
 from visioncal.session import Session
+from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, simulate, write_session
 
 TOOL_TIP = made.FLANGE_FROM_TOOL[:3, 3]
@@ -83,6 +84,10 @@ def drawn(points_mm, names, *, seed=1, noise_m=NOISE_M, cad_mm=CAD_MM, cad_names
     poses = touching(1e-3 * np.asarray(points_mm, dtype=float), rng, noise_m)
     cad = drawing(1e-3 * np.asarray(cad_mm, dtype=float), cad_names)
     return touched_fixture(touch_rows(poses, points=tuple(names)), tool(), cad, **options)
+
+
+def left_out_of(frame):
+    return [observation.name for observation in frame.observations if not observation.used]
 
 
 # --- The answer.
@@ -155,9 +160,7 @@ def test_a_wrong_point_is_left_out_and_named():
     (reason,) = frame.verdict.reasons
     assert reason.startswith("Point P5 (touches.csv, line 6) was left out: 2.")
     assert frame.verdict.status == "check"
-    assert [observation.name for observation in frame.observations if not observation.used] == [
-        "P5"
-    ]
+    assert left_out_of(frame) == ["P5"]
     # Of eight points with a noise of 0.1 mm, the others place it to 0.05 mm.
     assert np.abs(frame.edge.matrix - FRAME).max() < 5e-4
 
@@ -169,10 +172,7 @@ def test_two_exchanged_names_are_named():
     assert words.count("or named as another") == 2
     (step,) = {finding.do.words for finding in frame.verdict.findings if finding.kind == "left_out"}
     assert step.startswith("Correct the names of what is named")
-    assert {observation.name for observation in frame.observations if not observation.used} == {
-        "P3",
-        "P7",
-    }
+    assert sorted(left_out_of(frame)) == ["P3", "P7"]
     few = (0, 1, 4, 5)
     with pytest.raises(DataError, match="the points do not fit the drawing"):
         drawn(CAD_MM[[0, 1, 5, 4]], [NAMES[index] for index in few])
@@ -531,9 +531,7 @@ def test_the_rows_of_a_session_are_touches(tmp_path):
     write_poses(tmp_path / "views.csv", touches.base_from_flange, columns)
     tool = found(visioncal("tcp", tmp_path, "--json"))
     assert off_mm(tool) < NEAR_MM
-    assert [value["name"] for value in tool["observations"]] == [
-        str(index) for index in range(20, 30)
-    ]
+    assert [int(value["name"]) for value in tool["observations"]] == [*range(20, 30)]
     assert tool["source"] == "touches"
 
 
@@ -568,9 +566,7 @@ def test_another_order_of_the_quaternion_is_a_bad_tool(tmp_path):
     poses = touched(Job(), 11).touches.base_from_flange
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     rows = np.hstack([poses[:, :3, 3], np.roll(turns, 1, axis=1)]).tolist()
-    path = write_table(
-        tmp_path / "touches.csv", ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), rows
-    )
+    path = write_table(tmp_path / "touches.csv", POSE, rows)
     done = visioncal("tcp", path)
     assert done.status == 3
     assert "poses that are read wrongly (--robot-form, --robot-inverse)" in done.out

@@ -1,12 +1,14 @@
-"""Recordings of others: each form gives the same poses; what is open or wrong is told."""
+"""Sessions from sessions and from recordings of others: each form gives the same poses."""
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import yaml
+from support.commands import visioncal as typed
 from support.foreign_samples import (
     BASE_FROM_FLANGE,
     CAM_FROM_TARGET,
@@ -23,8 +25,10 @@ from support.foreign_samples import (
     vectors,
 )
 from support.refusals import raised
+from support.samples import made_up
 
 import visioncal
+from visioncal.calibration.run import calibrate
 from visioncal.core.conventions import POSE_FORMS, PoseNumbers, Reading, write_pose
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, pose_difference
@@ -39,6 +43,8 @@ from visioncal.interchange.formats.file_search import files_in, images_named
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.session import Session
 from visioncal.session.columns import POSE
+
+HAND = ImportOptions(mount="eye-in-hand")
 
 
 def poses_of(session, name):
@@ -88,25 +94,19 @@ def test_what_a_form_says_besides_poses_is_kept(tmp_path):
 def test_the_samples_of_a_camera_on_the_base_are_inverted(tmp_path):
     recording = easy_handeye(tmp_path / "in")
     requested = replace(recording.requested, mount="eye-to-hand")
-    session = convert(recording.source, tmp_path / "out", requested=requested)
-    # One inversion in double precision.
-    np.testing.assert_allclose(
-        poses_of(session, "base_from_flange"), invert(BASE_FROM_FLANGE), atol=1e-14
-    )
+    sessions = [convert(recording.source, tmp_path / "out", requested=requested)]
     as_is = replace(requested, robot=PoseImportOptions(inverse=False))
     session = convert(recording.source, tmp_path / "as is", requested=as_is)
     np.testing.assert_allclose(poses_of(session, "base_from_flange"), BASE_FROM_FLANGE, atol=1e-14)
-
-
-def test_samples_that_say_where_the_camera_is_need_no_mount(tmp_path):
-    recording = easy_handeye(tmp_path / "in")
+    # Samples that say where the camera is need no mount.
     text = recording.source.read_text()
     recording.source.write_text("parameters: {calibration_type: eye_on_base}\n" + text)
-    session = convert(recording.source, tmp_path / "out")
-    assert session.mount == "eye-to-hand"
-    np.testing.assert_allclose(
-        poses_of(session, "base_from_flange"), invert(BASE_FROM_FLANGE), atol=1e-14
-    )
+    sessions.append(convert(recording.source, tmp_path / "said"))
+    for session in sessions:
+        found = poses_of(session, "base_from_flange")
+        assert session.mount == "eye-to-hand"
+        # One inversion in double precision.
+        np.testing.assert_allclose(found, invert(BASE_FROM_FLANGE), atol=1e-14)
 
 
 def test_samples_are_found_in_their_folder_with_the_mount_beside_them(tmp_path):
@@ -122,9 +122,7 @@ def test_samples_are_found_in_their_folder_with_the_mount_beside_them(tmp_path):
         for name, part in (("hand_world_samples", "robot"), ("camera_marker_samples", "tracking"))
     }
     (tmp_path / "samples.yaml").write_text(yaml.safe_dump({"samples": lists}))
-    again = convert(
-        tmp_path / "samples.yaml", tmp_path / "again", requested=ImportOptions(mount="eye-in-hand")
-    )
+    again = convert(tmp_path / "samples.yaml", tmp_path / "again", requested=HAND)
     for name in ("base_from_flange", "cam_from_target"):
         np.testing.assert_array_equal(poses_of(again, name), poses_of(session, name))
 
@@ -182,7 +180,7 @@ def test_the_offset_of_two_clocks_is_found(tmp_path):
         np.savetxt(
             tmp_path / f"{name}.csv", rows, "%.17g", delimiter=",", header=columns, comments=""
         )
-    requested = ImportOptions(mount="eye-in-hand", camera_file=tmp_path / "camera.csv")
+    requested = replace(HAND, camera_file=tmp_path / "camera.csv")
     session = convert(tmp_path / "robot.csv", tmp_path / "out", requested=requested)
     # All of both streams is kept as it was, and nothing is stated of the clocks.
     assert len(session.views) == len(camera_s)
@@ -199,7 +197,7 @@ def test_two_files_of_stops_with_the_same_times_are_rows(tmp_path):
     stamps = 6.0 * np.arange(len(BASE_FROM_FLANGE))
     for name, poses in (("robot", BASE_FROM_FLANGE), ("camera", CAM_FROM_TARGET)):
         np.savetxt(tmp_path / f"{name}.txt", np.hstack([stamps[:, None], quaternions(poses)]))
-    requested = ImportOptions(mount="eye-in-hand", camera_file=tmp_path / "camera.txt")
+    requested = replace(HAND, camera_file=tmp_path / "camera.txt")
     session = convert(tmp_path / "robot.txt", tmp_path / "out", requested=requested)
     assert not session.streams
     for name, poses in (
@@ -214,7 +212,7 @@ def test_streams_of_different_motions_are_refused(tmp_path):
     for name, poses in (("robot", swung(stamps)), ("camera", swung(1.7 * stamps + 3))):
         rows = np.hstack([stamps[:, None], quaternions(poses)])
         np.savetxt(tmp_path / f"{name}.txt", rows, "%.17g")
-    requested = ImportOptions(mount="eye-in-hand", camera_file=tmp_path / "camera.txt")
+    requested = replace(HAND, camera_file=tmp_path / "camera.txt")
     session = convert(tmp_path / "robot.txt", tmp_path / "out", requested=requested)
     raised(DegenerateError, "of the same motion", visioncal.calibrate, session)
 
@@ -286,12 +284,9 @@ def test_as_many_images_as_poses_are_needed(tmp_path):
 def test_without_names_the_fields_are_listed(tmp_path):
     (tmp_path / "log.csv").write_text("alpha,beta\n1,2\n3,4\n")
     with pytest.raises(DataError, match="it has alpha, beta"):
-        convert(
-            tmp_path / "log.csv", tmp_path / "out", requested=ImportOptions(mount="eye-in-hand")
-        )
+        convert(tmp_path / "log.csv", tmp_path / "out", requested=HAND)
 
 
-HAND = ImportOptions(mount="eye-in-hand")
 SEEN = replace(HAND, target=CHARUCO)
 CAMERA = "cft_x_m,cft_y_m,cft_z_m,cft_qx,cft_qy,cft_qz,cft_qw"
 ORDER = [4, 0, 7, 2, 8, 1, 6, 3, 5]
@@ -357,12 +352,12 @@ def test_a_column_that_names_images_pairs_them(tmp_path, table, header, ending):
 def test_angles_beyond_a_turn_are_not_taken_for_radians(tmp_path, logged, names, form):
     degrees = np.rad2deg(1) if form == "ur" else 1.0
     poses = written(POSE_FORMS[form]) * [1, 1, 1, degrees, degrees, degrees]
-    source, hand = logged(names, poses.tolist()), ImportOptions(mount="eye-in-hand")
+    source = logged(names, poses.tolist())
     with pytest.raises(DataError, match=r"too large for radians.*kuka.*fanuc.*--guess"):
-        convert(source, tmp_path / "out", requested=hand)
+        convert(source, tmp_path / "out", requested=HAND)
     assert not (tmp_path / "out").exists()
     said = PoseImportOptions(form="rotation-vector-deg" if form == "ur" else form)
-    convert(source, tmp_path / "out", requested=replace(hand, robot=said))
+    convert(source, tmp_path / "out", requested=replace(HAND, robot=said))
 
 
 # Names in a maker's own letters, and in others.
@@ -379,7 +374,7 @@ NAMES = [
 @pytest.mark.parametrize(("form", "names"), NAMES)
 def test_the_names_of_makers_are_known(logged, form, names):
     source = logged(names, written(POSE_FORMS[form]).tolist())
-    requested = ImportOptions(mount="eye-in-hand", robot=PoseImportOptions(form=form))
+    requested = replace(HAND, robot=PoseImportOptions(form=form))
     found = read_foreign(source, requested).robot.poses()
     # One conversion to the maker's form and back, near a singularity of none.
     np.testing.assert_allclose(found, BASE_FROM_FLANGE, atol=1e-12)
@@ -389,7 +384,7 @@ def test_the_names_of_makers_are_known(logged, form, names):
 def test_numbers_of_rows_are_no_times(table, step, timed):
     pairs = zip(quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET), strict=True)
     source = table("", [[1 + step * at, *a, *b] for at, (a, b) in enumerate(pairs)])
-    foreign = read_foreign(source, ImportOptions(mount="eye-in-hand"))
+    foreign = read_foreign(source, HAND)
     assert (foreign.stamps_s is not None) == timed
     assert any("Column 1 is taken for times" in note for note in foreign.notes) == timed
 
@@ -431,7 +426,7 @@ def test_angles_of_poses_are_in_the_degrees_of_their_header(table, unit):
     header = ",".join(["X [mm]", "Y [mm]", "Z [mm]", *(f"{name} {unit}" for name in "ABC")])
     source = table(header, written(POSE_FORMS["kuka"]).tolist())
     requested = PoseImportOptions(form="kuka")
-    found = read_foreign(source, ImportOptions(mount="eye-in-hand", robot=requested))
+    found = read_foreign(source, replace(HAND, robot=requested))
     np.testing.assert_allclose(found.robot.poses(), BASE_FROM_FLANGE, atol=1e-6)
 
 
@@ -509,14 +504,16 @@ def test_an_order_that_nothing_tells_is_said(rows, form):
     fields = {
         "seven numbers": lambda at: {"robot_pose": numbers[at].tolist()},
         "a matrix": lambda at: {"robot_pose": BASE_FROM_FLANGE[at].tolist()},
-        "seven names": lambda at: dict(zip(NAMED, numbers[at].tolist(), strict=True)),
+        "seven names": lambda at: {
+            name.removesuffix("_m"): value
+            for name, value in zip(POSE, numbers[at].tolist(), strict=True)
+        },
     }[form]
     notes = " ".join(read_foreign(rows(fields), HAND).notes)
     said = "robot's quaternions are taken for x, y" in notes
     assert said == ("quaternions are taken" in notes) == (form == "seven numbers")
 
 
-NAMED = ("x", "y", "z", "qx", "qy", "qz", "qw")
 BY_ROWS = [525.0, 0, 319.5, 0, 526, 239.5, 0, 0, 1]
 BY_COLUMNS = [525.0, 0, 0, 0, 526, 0, 319.5, 239.5, 1]
 
@@ -645,3 +642,62 @@ def test_entries_without_a_pose_are_named_and_ragged_ones_refused(rows, third):
         return
     notes = " ".join(assemble(read_foreign(source, HAND)).warnings)
     assert "have no pose of the robot: log.json, entry 3" in notes
+
+
+@pytest.fixture
+def folder(tmp_path):
+    path = tmp_path / "cell, größer"
+    made_up(5).session.save(path)
+    return path
+
+
+def content(folder):
+    """The bytes of every file, by its path in the folder."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_there_and_back_again(folder, tmp_path):
+    recording, again = tmp_path / "cell.rrd", tmp_path / "again"
+    convert(folder, recording)
+    convert(recording, again)
+    assert Session.load(recording).digest() == Session.load(folder).digest()
+    assert content(again) == content(folder)
+
+
+def test_what_is_there_stays_and_force_replaces_a_recording_alone(folder, tmp_path):
+    for name in ("taken", "taken.rrd"):
+        (tmp_path / name).write_bytes(b"kept")
+        raised(DataError, "exists, and nothing is overwritten", convert, folder, tmp_path / name)
+        assert (tmp_path / name).read_bytes() == b"kept"
+    convert(folder, tmp_path / "taken.rrd", force=True)
+    assert Session.load(tmp_path / "taken.rrd").digest() == Session.load(folder).digest()
+    (tmp_path / "folder.rrd").mkdir()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/file").write_bytes(b"kept")
+    for name in ("taken", "folder.rrd", "full"):
+        raised(DataError, name, convert, folder, tmp_path / name, force=True)
+    assert (tmp_path / "taken").read_bytes() == (tmp_path / "full/file").read_bytes() == b"kept"
+
+
+def test_the_recording_that_comes_along_calibrates(tmp_path):
+    path = Path(__file__).parents[2] / "recordings" / "ur10e_charuco.rrd"
+    assert path.stat().st_size < 3_000_000
+    folder = tmp_path / "ur10e_charuco"
+    convert(path, folder)
+    calibration = calibrate(folder)
+    assert calibration.session_sha256 == Session.load(path).digest()
+    assert calibration.verdict.status == "good"
+    assert calibration.camera is not None
+    assert calibration.camera.estimated
+
+
+def test_the_command_converts_and_refuses(folder, tmp_path):
+    done = typed("convert", folder, tmp_path / "new.rrd").good()
+    assert Session.load(folder).digest() in done.err
+    typed("convert", folder, tmp_path / "new.rrd").refused("--force")
+
+
+def test_what_describes_somebody_elses_poses_is_refused_for_a_session(folder, tmp_path):
+    typed("convert", folder, tmp_path / "new", "--robot-unit", "mm").refused("is a session already")
+    assert not (tmp_path / "new").exists()

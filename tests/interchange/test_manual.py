@@ -32,31 +32,24 @@ def a_pose(rotation):
 
 
 # By the makers' own definitions, written with scipy's rotations alone.
+VECTOR = Rotation.from_rotvec([0.1, -0.2, 3.0])
+ABOUT_MOVED, ABOUT_FIXED = (
+    Rotation.from_euler(axes, [10, -20, 170], degrees=True) for axes in ("ZYX", "xyz")
+)
+W_FIRST = Rotation.from_quat([-0.5, 0.5, 0.5, 0.5])
 LINES = {
-    "p[0.4, -0.1, 0.3, 0.1, -0.2, 3.0]": Rotation.from_rotvec([0.1, -0.2, 3.0]),
-    "pose: p[.4,-1e-1,.3,0.1,-0.2,3.0] ": Rotation.from_rotvec([0.1, -0.2, 3.0]),
-    "X 400 mm Y -100 mm Z 300 mm RX 0.1 rad RY -0.2 rad RZ 3 rad": Rotation.from_rotvec(
-        [0.1, -0.2, 3.0]
-    ),
-    "{X 400.0, Y -100, Z 300.0, A 10, B -20, C 170}": Rotation.from_euler(
-        "ZYX", [10, -20, 170], degrees=True
-    ),
-    "{E6POS: X 400.0,Y -100,Z 300.0,A 10,B -20,C 170,S 6,T 50,E1 0.0,E2 0.0}": Rotation.from_euler(
-        "ZYX", [10, -20, 170], degrees=True
-    ),
-    '<Position X="400.0" Y="-100.0" Z="300" A="10.0" B="-20" C="170.0"></Position>': (
-        Rotation.from_euler("ZYX", [10, -20, 170], degrees=True)
-    ),
-    "X = 400.000 mm, Y = -100 mm, Z = 300 mm,  W = 10 deg, P = -20 deg, R = 170 deg": (
-        Rotation.from_euler("xyz", [10, -20, 170], degrees=True)
-    ),
-    "X400.0 Y-100. Z300 W10 P-20 R170": Rotation.from_euler("xyz", [10, -20, 170], degrees=True),
-    "X: 400 Y: \N{MINUS SIGN}100 Z: 300 W: 10° P: \N{MINUS SIGN}20° R: 170°": Rotation.from_euler(
-        "xyz", [10, -20, 170], degrees=True
-    ),
-    "[[400,-100,300],[0.5,-0.5,0.5,0.5]]": Rotation.from_quat([-0.5, 0.5, 0.5, 0.5]),
+    "p[0.4, -0.1, 0.3, 0.1, -0.2, 3.0]": VECTOR,
+    "pose: p[.4,-1e-1,.3,0.1,-0.2,3.0] ": VECTOR,
+    "X 400 mm Y -100 mm Z 300 mm RX 0.1 rad RY -0.2 rad RZ 3 rad": VECTOR,
+    "{X 400.0, Y -100, Z 300.0, A 10, B -20, C 170}": ABOUT_MOVED,
+    "{E6POS: X 400.0,Y -100,Z 300.0,A 10,B -20,C 170,S 6,T 50,E1 0.0,E2 0.0}": ABOUT_MOVED,
+    '<Position X="400.0" Y="-100.0" Z="300" A="10.0" B="-20" C="170.0"></Position>': ABOUT_MOVED,
+    "X = 400.000 mm, Y = -100 mm, Z = 300 mm,  W = 10 deg, P = -20 deg, R = 170 deg": ABOUT_FIXED,
+    "X400.0 Y-100. Z300 W10 P-20 R170": ABOUT_FIXED,
+    "X: 400 Y: \N{MINUS SIGN}100 Z: 300 W: 10° P: \N{MINUS SIGN}20° R: 170°": ABOUT_FIXED,
+    "[[400,-100,300],[0.5,-0.5,0.5,0.5]]": W_FIRST,
     "CONST robtarget p10:=[[400,-100,300],[0.5,-0.5,0.5,0.5],[0,-1,0,1],[9E9,9E9,9E9,9E9]];": (
-        Rotation.from_quat([-0.5, 0.5, 0.5, 0.5])
+        W_FIRST
     ),
     "posx(400, -100, 300, 10, 20, 170)": Rotation.from_euler("ZYZ", [10, 20, 170], degrees=True),
     "x_m 0.4 y_m -0.1 z_m 0.3 qx 0.5 qy -0.5 qz 0.5 qw 0.5": Rotation.from_quat(

@@ -69,13 +69,16 @@ def served(*words: object):
         assert "Traceback" not in said, said
 
 
+@contextmanager
 def opened(browser, url: str):
     """A page with a short patience, whose own errors fail the test."""
     page = browser.new_page(viewport={"width": 1300, "height": 1000})
     page.set_default_timeout(PATIENT_MS)
     page.on("pageerror", lambda error: pytest.fail(str(error)))
     page.goto(url)
-    return page
+    yield page
+    # One that stays asks for its process, and draws its pictures, for ever.
+    page.close()
 
 
 def kuka(pose, *, comma: bool = False) -> str:
@@ -114,7 +117,7 @@ def cell(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("page")
     own = ["--robot", "generic-6r-1800", "--seed", "4"]
     for words in (
-        ["seen", "--views", "12", "--with-intrinsics"],
+        ["seen", "--views", "10", "--with-intrinsics"],
         ["monday", "--views", "5", "--recording", "1"],
         ["tuesday", "--views", "5", "--recording", "2", "--camera-moved-mm", "1.5"],
     ):
@@ -128,8 +131,7 @@ def calibrated(cell, browser) -> Path:
     """A calibration made by the page alone, through a reload, a lost camera and a kill."""
     seen, out = cell / "seen", cell / "cell"
     views = Session.load(seen).views
-    with served("record", "-o", out) as (url, process):
-        page = opened(browser, url)
+    with served("record", "-o", out) as (url, process), opened(browser, url) as page:
         choose(page, "Camera", "uvc")
         page.get_by_role("button", name="Start").click()
         page.get_by_role("alert").get_by_text("cannot be opened").wait_for()
@@ -145,8 +147,8 @@ def calibrated(cell, browser) -> Path:
         page.get_by_text("view 4:").wait_for(state="detached")
         page.reload()
         page.get_by_text("view 3:").wait_for()
-        second = opened(browser, url)
-        typed(second, seen, views[3], kuka(views[3].base_from_flange()), 4)
+        with opened(browser, url) as second:
+            typed(second, seen, views[3], kuka(views[3].base_from_flange()), 4)
         page.get_by_text("view 4:").wait_for()
         (seen / "shown").unlink()
         page.get_by_text("gives no picture").wait_for()
@@ -155,8 +157,7 @@ def calibrated(cell, browser) -> Path:
         for place, view in enumerate(views[4:8], 5):
             typed(page, seen, view, kuka(view.base_from_flange()), place)
         process.kill()
-    with served("record", "-o", out) as (url, _):
-        page = opened(browser, url)
+    with served("record", "-o", out) as (url, _), opened(browser, url) as page:
         # What was chosen is still there.
         page.get_by_role("button", name="Start").click()
         page.get_by_text("view 8:").wait_for()
@@ -191,8 +192,8 @@ def test_a_robots_own_program_is_watched_on_the_page(cell, browser):
     views = Session.load(seen).views
     devices = ("--arm", f"socket:{port}", "--camera", f"played:{seen}")
     what = ("--target", "charuco_9x6_30mm", "--views", len(views))
-    with served("record", "-o", cell / "sent", *devices, *what) as (url, _):
-        page = opened(browser, url)
+    served_so = served("record", "-o", cell / "sent", *devices, *what)
+    with served_so as (url, _), opened(browser, url) as page:
         page.get_by_text("Waiting for the robot's own program").wait_for()
         assert not page.get_by_label(POSE).is_visible()
         with socket.create_connection(("127.0.0.1", port)) as robot, robot.makefile("r") as file:
@@ -208,20 +209,22 @@ def test_a_robots_own_program_is_watched_on_the_page(cell, browser):
 def test_a_check_passes_and_fails_and_is_remembered(cell, browser):
     with served("verify", cell / "checks", "--against", cell) as (url, _):
         for day, answer in (("monday", "valid"), ("tuesday", "not valid")):
-            page = opened(browser, url)
-            choose(page, "Camera", f"played:{cell / day}")
-            page.get_by_role("button", name="Start").click()
-            # Where to stand, in the form of the last typed pose or the default.
-            page.get_by_text("the board then fills the orange outline").wait_for()
-            for place, view in enumerate(Session.load(cell / day).views, 1):
-                typed(page, cell / day, view, kuka(view.base_from_flange()), place)
-            page.get_by_role("status").get_by_text(answer, exact=True).wait_for()
-            report = page.get_by_role("link", name="Open the report")
-            report.wait_for()
-            page.get_by_role("button", name="Close").click()
-            report.wait_for(state="detached")
-        page.get_by_text("The camera moved by").first.wait_for()
-        history = page.get_by_text(re.compile(r"^\d{4}-\d\d-\d\d-cell-result")).all_inner_texts()
+            with opened(browser, url) as page:
+                choose(page, "Camera", f"played:{cell / day}")
+                page.get_by_role("button", name="Start").click()
+                # Where to stand, in the form of the last typed pose or the default.
+                page.get_by_text("the board then fills the orange outline").wait_for()
+                for place, view in enumerate(Session.load(cell / day).views, 1):
+                    typed(page, cell / day, view, kuka(view.base_from_flange()), place)
+                page.get_by_role("status").get_by_text(answer, exact=True).wait_for()
+                report = page.get_by_role("link", name="Open the report")
+                report.wait_for()
+                page.get_by_role("button", name="Close").click()
+                report.wait_for(state="detached")
+                if day == "tuesday":
+                    page.get_by_text("The camera moved by").first.wait_for()
+                    lines = page.get_by_text(re.compile(r"^\d{4}-\d\d-\d\d-cell-result"))
+                    history = lines.all_inner_texts()
     assert ["agree" in line for line in history] == [False, True]
 
 

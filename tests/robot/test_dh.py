@@ -10,7 +10,7 @@ import pytest
 
 from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import exp, invert, log
+from visioncal.core.transforms import invert, log
 from visioncal.robot import Robot, load_robot
 from visioncal.robot.conversion import convert_table, other_convention, parallel_axes, table_of
 from visioncal.robot.files import robot_names
@@ -64,34 +64,6 @@ def assert_same_table(found, expected, atol):
         np.testing.assert_allclose(
             getattr(found, name), getattr(expected, name), rtol=0, atol=atol, err_msg=name
         )
-
-
-def elementary(row, order):
-    """A row's product by its textbook: Z and z turn about and go along z, X and x, Y likewise."""
-    twists = {
-        "Z": [0, 0, row.get("theta_offset_rad", 0.0), 0, 0, 0],
-        "z": [0, 0, 0, 0, 0, row["d_m"]],
-        "x": [0, 0, 0, row["a_m"], 0, 0],
-        "X": [row["alpha_rad"], 0, 0, 0, 0, 0],
-        "Y": [0, row.get("beta_rad", 0.0), 0, 0, 0, 0],
-    }
-    product = np.eye(4)
-    for letter in order:
-        product = product @ exp(np.array(twists[letter], float))
-    return product
-
-
-def test_hayatis_rows_are_the_textbooks_product():
-    rng = np.random.default_rng(3)
-    rows = [dict(zip(KEYS, rng.normal(size=4).tolist(), strict=True)) for _ in range(4)]
-    rows[1] |= {"beta_rad": 0.3}
-    document = {"schema": 1, "name": "x", "convention": "hayati", "joint": rows}
-    expected = np.eye(4)
-    for row in rows:
-        expected = expected @ elementary(row, "ZzxXY")
-    # Products of twenty transforms with entries of a few metres.
-    found = Robot.from_document(document).base_from_flange(np.zeros((1, 4)))[0]
-    np.testing.assert_allclose(found, expected, atol=1e-14 * 100)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)

@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.readers import rx, ry, rz, transform
 from support.refusals import raised
 from support.slopes import jacobian, twists
 from support.urdf_arm import of_urdf, some_changes, some_joints
 
+from visioncal.core.choices import CONVENTIONS
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
@@ -50,37 +52,26 @@ URDF = """<?xml version="1.0"?>
 """
 
 
-def elementary(axis, angle=0.0, along=0.0):
-    """A rotation about and a translation along one axis, written out."""
-    i = "xyz".index(axis)
-    j, k = (i + 1) % 3, (i + 2) % 3
-    matrix = np.eye(4)
-    matrix[j, j] = matrix[k, k] = np.cos(angle)
-    matrix[k, j], matrix[j, k] = np.sin(angle), -np.sin(angle)
-    matrix[i, 3] = along
-    return matrix
-
-
 def given(place):
     """A constant transform of a table, by its position and angles about x, y, z."""
     if place is None:
         return np.eye(4)
     roll, pitch, yaw = place["rpy_rad"]
-    turned = elementary("z", yaw) @ elementary("y", pitch) @ elementary("x", roll)
-    turned[:3, 3] = place["xyz_m"]
-    return turned
+    return transform(rz(yaw) @ ry(pitch) @ rx(roll), place["xyz_m"])
 
 
 def dh_product(document, q):
     """The textbook's product of a DH table, row by row."""
     result = given(document.get("base"))
-    rows = [(row, row.get("theta_offset_rad", 0.0)) for row in document["joint"]]
-    angles = [offset + angle for (_, offset), angle in zip(rows, q, strict=True)]
-    for (row, _), theta in zip(rows, angles, strict=True):
-        about_z = elementary("z", theta) @ elementary("z", along=row["d_m"])
-        along_x = elementary("x", along=row["a_m"]) @ elementary("x", row["alpha_rad"])
-        modified = document["convention"] == "modified"
-        result = result @ (along_x @ about_z if modified else about_z @ along_x)
+    for row, angle in zip(document["joint"], q, strict=True):
+        theta = row.get("theta_offset_rad", 0.0) + angle
+        about_z = transform(rz(theta), [0.0, 0.0, row["d_m"]])
+        along_x = transform(rx(row["alpha_rad"]), [row["a_m"], 0.0, 0.0])
+        if document["convention"] == "modified":
+            result = result @ along_x @ about_z
+        else:  # Only Hayati's rows have a beta.
+            beta = transform(ry(row.get("beta_rad", 0.0)), np.zeros(3))
+            result = result @ about_z @ along_x @ beta
     return result @ given(document.get("flange"))
 
 
@@ -94,8 +85,8 @@ def test_forward_kinematics_is_the_product_of_the_table(name):
     np.testing.assert_allclose(robot.base_from_flange(q), expected, atol=1e-13)
 
 
-@pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_offsets_and_flange_enter_in_both_conventions(convention):
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_offsets_and_flange_enter_in_all_conventions(convention):
     rng = np.random.default_rng(2)
     keys = ("a_m", "alpha_rad", "d_m", "theta_offset_rad")
     document = {
@@ -105,6 +96,8 @@ def test_offsets_and_flange_enter_in_both_conventions(convention):
         "joint": [dict(zip(keys, rng.normal(size=4).tolist(), strict=True)) for _ in range(5)],
         "flange": {"xyz_m": [0.1, 0.2, 0.3], "rpy_rad": [0.4, 0.5, 0.6]},
     }
+    if convention == "hayati":
+        document["joint"][1]["beta_rad"] = 0.3
     robot = Robot.from_document(document)
     q = rng.normal(size=(4, 5))
     expected = [dh_product(document, row) for row in q]
@@ -122,14 +115,9 @@ def test_a_urdf_is_read_up_to_the_tip(tmp_path):
     assert robot.upper_rad.tolist() == [np.inf, 2.5]
     q = np.array([[0.7, -0.4], [4.0, 1.0]])
     expected = [
-        elementary("z", along=0.5)
-        @ elementary("z", turn)
-        @ elementary("x", 0.3, 0.1)
-        @ np.linalg.inv(elementary("x", 0.3))
-        @ elementary("z", along=0.2)
-        @ elementary("x", 0.3)
-        @ elementary("y", bend)
-        @ elementary("z", along=0.4)
+        transform(rz(turn), [0.0, 0.0, 0.5])
+        @ transform(rx(0.3) @ ry(bend), [0.1, 0.0, 0.2])
+        @ transform(np.eye(3), [0.0, 0.0, 0.4])
         for turn, bend in q
     ]
     # Products of a few matrices with entries near 1: some units in the last place.

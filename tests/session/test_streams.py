@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.kept import assert_same, kept_session, kept_streams
-from support.loaded import HUNG, NOMINAL, loaded_postures
 from support.refusals import raised
 from support.tracked import known_of
 
@@ -14,11 +13,20 @@ from visioncal.interchange.formats import convert
 from visioncal.present.recording import write_recording
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session, Stream
+from visioncal.session.columns import POSE
 from visioncal.session.streams import check_stream, parse_stream, read_streams
 from visioncal.session.table import loads_of
-from visioncal.simulation.instrument_session import InstrumentOptions, session_of, tracked
+from visioncal.simulation import Payload, arm_named
+from visioncal.simulation.instrument_session import (
+    InstrumentOptions,
+    random_postures,
+    session_of,
+    tracked,
+)
 
-POSE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+# An arm that is loaded at its flange, as each of some postures is read with each load.
+HUNG = tuple(Payload(kg=load_n / 9.80665) for load_n in (0.0, 10.0, 20.0, 50.0))
+POSTURES = random_postures(arm_named("generic-6r-1800"), 6, np.random.default_rng(0))
 
 
 def stream(**columns):
@@ -186,14 +194,14 @@ def test_what_can_be_no_load_is_refused(cells, words):
 
 
 def test_a_load_that_changes_while_the_arm_stands_still_is_refused():
-    options = InstrumentOptions(robot=NOMINAL.name, payloads=HUNG)
+    options = InstrumentOptions(payloads=HUNG)
     with pytest.raises(DegenerateError, match="views are all from one pose of the robot"):
-        known_of(session_of(tracked(options, np.repeat(loaded_postures(1)[:1], 12, axis=0))))
+        known_of(session_of(tracked(options, np.repeat(POSTURES[:1], 12, axis=0))))
 
 
 def test_views_of_one_stop_share_its_load():
-    options = InstrumentOptions(robot=NOMINAL.name, payloads=HUNG)
-    session = session_of(tracked(options, loaded_postures(6)))
+    options = InstrumentOptions(payloads=HUNG)
+    session = session_of(tracked(options, np.repeat(POSTURES, 4, axis=0)))
     views = tuple(replace(view, stop=view.stop // 4) for view in session.views)
     with pytest.raises(DataError, match="views 0 and 1 are of stop 0 and differ in payload"):
         known_of(replace(session, views=views))

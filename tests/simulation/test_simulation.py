@@ -33,7 +33,6 @@ from visioncal.simulation import (
     read_truth,
     render,
     simulate,
-    ur_arm,
     wide_camera,
     write_session,
 )
@@ -46,6 +45,8 @@ from visioncal.simulation.dynamics import (
     record,
     slow_sweep,
 )
+from visioncal.vision.boards.charuco import charuco_board
+from visioncal.vision.camera import matrix_3x3
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 SMALL = replace(wide_camera(), resolution=(640, 400), matrix=np.array([457.1, 456.8, 322.4, 198.2]))
@@ -68,13 +69,8 @@ def base_from_target(cell):
     return cell.transforms["base_from_cam"] @ cell.cam_from_target
 
 
-def cv_matrix(camera):
-    fx, fy, cx, cy = camera.matrix
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
 def cv_project(camera, points):
-    matrix = cv_matrix(camera)
+    matrix = matrix_3x3(camera)
     zero = np.zeros(3)
     if camera.model == "fisheye":
         px, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, matrix, camera.distortion)
@@ -105,14 +101,6 @@ def test_noisy_chain_closes_on_the_truth_only():
     assert np.abs(truth).max() < 1e-12  # Rounding, as above.
     # Arm errors of 0.3 mm and 0.5 mrad at a metre cannot leave any report within 0.01 mm.
     assert np.linalg.norm(report[:, :3, 3], axis=1).min() > 1e-5
-
-
-def test_stretched_ur_arm_is_where_its_data_sheet_puts_it():
-    # With all joints at zero the arm lies along -x and the flange looks along -y.
-    flange = forward(ur_arm("ur10e"), np.zeros((1, 6)))[0]
-    expected = [-0.6127 - 0.57155, -0.17415 - 0.11655, 0.1807 - 0.11985]
-    np.testing.assert_allclose(flange[:3, 3], expected, atol=1e-12)  # Sums of six lengths.
-    np.testing.assert_allclose(flange[:3, 2], [0.0, -1.0, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("camera", [wide_camera(), RATIONAL, fine_camera(), fisheye_camera()])
@@ -175,22 +163,12 @@ def test_poor_motions_are_as_poor_as_they_say(mount):
     assert rotation_angle(relative).max() < 1e-8
     assert np.linalg.norm(relative[:, :3, 3], axis=1).min() > 0.005
     turned = simulate(exact(CellOptions(mount=mount, views=6, motion="one_axis")))
-    twists = log(invert(turned.robot.base_from_flange[:1]) @ turned.robot.base_from_flange[1:])[
-        :, :3
-    ]
-    angles = np.linalg.norm(twists, axis=1)
+    turns = log(invert(turned.robot.base_from_flange[:1]) @ turned.robot.base_from_flange[1:])
+    angles = np.linalg.norm(turns[:, :3], axis=1)
     assert angles.max() > 0.3
-    axes = twists / angles[:, None]
+    axes = turns[:, :3] / angles[:, None]
     cosines = np.abs(axes @ axes[0])
     assert cosines.min() > 1.0 - 1e-10  # An angle of 1e-5 rad, for the smallest turns drawn.
-
-
-def charuco_board(target):
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
-    size = (target.columns, target.rows)
-    board = cv2.aruco.CharucoBoard(size, target.square_m, target.marker_m, dictionary)
-    board.setLegacyPattern(target.legacy)
-    return board
 
 
 def found_corners(target, image):
@@ -298,7 +276,7 @@ def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
 def test_pose_pairs_spread_as_pnp_on_the_noisy_corners_does():
     options = CellOptions(views=60, pixel_sigma_px=0.3)
     cell = simulate(options)
-    matrix = cv_matrix(options.camera)
+    matrix = matrix_3x3(options.camera)
     solved = []
     for found, pose in zip(cell.corners, cell.cam_from_target, strict=True):
         points = 0.030 * np.stack([found.ids % 8 + 1, found.ids // 8 + 1, 0 * found.ids], axis=1)

@@ -20,8 +20,7 @@ from visioncal.cli import progress
 from visioncal.cli.app import app, main
 from visioncal.cli.lazy import LazyGroup
 from visioncal.core.types import FloatArray
-
-QUATERNIONS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+from visioncal.session.columns import POSE
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ def write_poses(
     path: Path,
     poses: FloatArray,
     columns: dict[str, Sequence[object]] | None = None,
-    names: Sequence[str] = QUATERNIONS,
+    names: Sequence[str] = POSE,
 ) -> Path:
     """Writes (n, 4, 4) poses as a table of touches, with other columns before them.
 

@@ -4,6 +4,8 @@ import csv
 from collections.abc import Callable
 from pathlib import Path
 
+Rows = list[dict[str, str]]
+
 
 def changed(folder: Path, name: str, old: str, new: str) -> Path:
     """Replaces a text that has to be in a file of a folder."""
@@ -13,10 +15,17 @@ def changed(folder: Path, name: str, old: str, new: str) -> Path:
     return folder
 
 
-def rewritten(folder: Path, change: Callable[[int, dict[str, str]], dict[str, str]]) -> None:
-    """Puts what a function makes of each row's number and cells in the place of views.csv."""
+def edit_rows(folder: Path, change: Callable[[Rows], Rows]) -> None:
+    """Puts what a function makes of the rows of views.csv in their place."""
     path = folder / "views.csv"
     with path.open(newline="", encoding="utf-8") as file:
-        rows = [change(at, row) for at, row in enumerate(csv.DictReader(file))]
-    lines = [list(rows[0]), *(list(row.values()) for row in rows)]
-    path.write_text("\n".join(map(",".join, lines)) + "\n", encoding="utf-8")
+        rows = change([*csv.DictReader(file)])
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*rows[0]], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def rewritten(folder: Path, change: Callable[[int, dict[str, str]], dict[str, str]]) -> None:
+    """Puts what a function makes of each row's number and cells in the place of views.csv."""
+    edit_rows(folder, lambda rows: [change(at, row) for at, row in enumerate(rows)])

@@ -155,16 +155,10 @@ def test_rotations_are_those_that_leave_the_printed_page_as_it_is(columns, rows)
         here = np.rint(centres + 0.5).astype(int)
         assert np.array_equal(page[there[:, 1], there[:, 0]], page[here[:, 1], here[:, 0]])
         assert np.linalg.det(turn[:3, :3]) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(("columns", "rows"), [(8, 6), (6, 6), (5, 5)])
-def test_permutations_belong_to_their_transforms(columns, rows):
-    target = checkerboard(columns, rows)
     positions = corner_positions(target)
     pairs = list(zip(rotations(target), rotation_transforms(target), strict=True))
     assert np.array_equal(pairs[0][0], np.arange(columns * rows))
     for permutation, turn in pairs:
-        assert sorted(permutation) == list(range(columns * rows))
         turned = positions @ turn[:3, :3].T + turn[:3, 3]
         # Exact but for the rounding of one product and one sum.
         np.testing.assert_allclose(positions[permutation], turned, atol=1e-15)

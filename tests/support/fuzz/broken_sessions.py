@@ -4,8 +4,6 @@ Every mistake is planted into the same sound session of rendered images, as file
 have: a table without joint angles, and a session.toml.
 """
 
-import csv
-import io
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -17,11 +15,11 @@ import cv2
 import numpy as np
 import tomli_w
 from scipy.spatial.transform import Rotation
+from support.edited import Rows, edit_rows
 
 from visioncal.simulation import CellOptions, simulate, write_session
 
 POSITION, QUATERNION = ("x_m", "y_m", "z_m"), ("qx", "qy", "qz", "qw")
-Rows = list[dict[str, str]]
 
 
 _CELL = replace(CellOptions(), views=15, seed=11)
@@ -67,17 +65,6 @@ def edit(folder: Path, change: Callable[[str], str], name: str = "session.toml")
     after = change(before)
     assert after != before
     file.write_text(after, "utf-8")
-
-
-def edit_rows(folder: Path, change: Callable[[Rows], Rows]) -> None:
-    """Changes the rows of views.csv."""
-    text = (folder / "views.csv").read_text("utf-8")
-    rows = change(list(csv.DictReader(io.StringIO(text))))
-    out = io.StringIO()
-    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    (folder / "views.csv").write_text(out.getvalue(), "utf-8")
 
 
 def _without(row: dict[str, str], column: str, count: int = 1) -> dict[str, str]:

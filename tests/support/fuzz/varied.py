@@ -24,6 +24,7 @@ from visioncal.core.types import Camera, Target
 from visioncal.interchange.result_files import load_calibration
 from visioncal.present.viewer import blueprint
 from visioncal.robot.files import read_robot_document
+from visioncal.session.columns import POSE
 from visioncal.simulation import BOARDS, CellOptions, Second, cell_session, simulate
 from visioncal.vision.targets import corner_positions
 
@@ -184,9 +185,7 @@ def _rewrite(rng: np.random.Generator, item: Cell, folder: Path, name: str, visi
         rows = list(csv.DictReader(file))
     begin, stride = _choice(rng, {(0, 1): 70, (1, 1): 15, (7, 10): 15})
     held_out = visit == 0 and len(rows) > 10 and _chance(rng, 0.2)
-    left_out = {"joints": ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), "both": ()}.get(
-        item.rows, tuple(f"q{at}_" for at in range(1, 7))
-    )
+    left_out = {"joints": POSE, "both": ()}.get(item.rows, tuple(f"q{at}_" for at in range(1, 7)))
     left_out += () if _chance(rng, 0.3) else ("stamp_s",)
     extra = _chance(rng, 0.3)
     written = []
