@@ -7,10 +7,9 @@ from itertools import product
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.misfits import misfit
 from support.parts import (
-    away,
     even,
-    moved,
     noise_of,
     pairs_of,
     placed,
@@ -23,7 +22,7 @@ from support.touched import POINTS, TIP, TURN, Job, error_of, relabelled, slippe
 from support.touched import touched as touches_of
 
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.estimation.group_outliers import distances, find_inlier_groups
 from visioncal.estimation.pivot import fit_pivot, tool_problem
@@ -31,6 +30,7 @@ from visioncal.estimation.pointfit import PointPairs, fit_features, fit_points, 
 from visioncal.estimation.points import Groups, Placement, fit_groups
 from visioncal.estimation.problem_parts import Noise
 from visioncal.estimation.robust import small_sets
+from visioncal.results import Edge
 
 TRUTH = np.array([0.3, -0.2, 0.5, 0.1, 0.0, -0.4])
 SIGMA = 1e-4
@@ -105,7 +105,7 @@ def feature_bound(frame: FloatArray, touches: PointPairs, sigma_m: float) -> Flo
 
         def touched(step, point=point):
             return placed(
-                moved(frame, step[:6]), (point + np.pad(step[6:], (0, 9 - len(step))))[None]
+                frame @ exp(step[:6]), (point + np.pad(step[6:], (0, 9 - len(step))))[None]
             )
 
         by_step = jacobian(touched, size)[0] / sigma_m
@@ -124,7 +124,7 @@ def uneven(rng: np.random.Generator, count: int) -> FloatArray:
 
 def point_bound(frame: FloatArray, nominal: FloatArray, spreads: FloatArray) -> FloatArray:
     """Least covariance (6, 6) of a frame from points with (n, 3, 3) covariances (Cramer-Rao)."""
-    by_step = jacobian(lambda array: placed(moved(frame, array), nominal), 6)
+    by_step = jacobian(lambda array: placed(frame @ exp(array), nominal), 6)
     return np.linalg.inv(np.einsum("nij,nik,nkl->jl", by_step, np.linalg.inv(spreads), by_step))
 
 
@@ -372,8 +372,8 @@ def test_known_and_unknown_noise_add_up():
         noise = noise_of(known + even(10, 2 * NOISE_M), rng)
         pairs = pairs_of(nominal, placed(frame, nominal) + noise, known)
         fit = fit_groups(fixture_problem(pairs))
-        error = away(fit.state.frame, frame)
-        squares.append(error @ np.linalg.solve(fit.covariance, error))
+        edge = Edge(fit.state.frame, fit.covariance)
+        squares.append(misfit(edge, frame))
         levels.append(fit.sigma)
     # Of a chi-square with six degrees, a little widened by some twenty residuals' noise level: the
     # mean of F is 6 * 20 / 18 = 6.7, and 200 draws scatter by 0.3.
@@ -388,7 +388,8 @@ def test_the_frame_moves_with_each_point_as_it_says():
 
     def moved_frame(step):
         measured = pairs.measured + step.reshape(5, 3)
-        return away(frame, fit_points(replace(pairs, measured=measured)).agreement.fit.state.frame)
+        found = fit_points(replace(pairs, measured=measured)).agreement.fit.state.frame
+        return log(invert(frame) @ found)
 
     # Of exact points; the steps of a micrometre leave 1e-8 of a gain near one, and some of its
     # slope: a frame turns by radians a metre over points of 0.1 m.

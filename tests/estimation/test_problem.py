@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import block_diag
 from support.cells import calibrated
 from support.edges import inliers_of
-from support.problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
+from support.problems import ROBOT_SIGMAS, away, observed, pose, true_state, world
 from support.slopes import jacobian
 
 from visioncal.calibration.stages.init_frames import init_network
@@ -376,7 +376,7 @@ def test_the_part_of_a_robot_is_what_its_errors_do_to_the_answer(robot):
             twist = np.zeros(6)
             twist[axis] = step
             poses = problem.poses[robot].copy()
-            poses[stop] = moved(poses[stop], twist)
+            poses[stop] = poses[stop] @ exp(twist)
             other = replace(problem, poses={**problem.poses, robot: poses})
             pulled = whole @ normal_equations(other, state, NETWORK_NOISE)[1] / step * sigmas[axis]
             part += np.outer(pulled, pulled)
@@ -506,7 +506,7 @@ def seen_otherwise(problem, **changes):
 
 
 def pushed(cell, frame, stop, twist, stops=20):
-    edge = moved(cell.truth[frame], np.array(twist))
+    edge = cell.truth[frame] @ exp(np.array(twist))
     return {(frame, at): edge for at in range(stop, stops)}
 
 

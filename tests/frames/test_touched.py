@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from support import placed as made
 from support.commands import turned_poses, visioncal, write_poses, write_table
-from support.parts import away, placed, some_frame
+from support.misfits import misfit
+from support.parts import placed, some_frame
 from support.refusals import raised
 from support.slopes import twists
 from support.touched import TIP, Job, error_of, slipped, touched
@@ -141,8 +142,7 @@ def test_few_touches_that_agree_by_chance_are_not_believed():
     for seed in range(100):
         poses = touching(ON_FEATURES[chosen], np.random.default_rng(seed), NOISE_M)
         frame = touched_fixture(touch_rows(poses, kinds), tool())
-        error = away(frame.edge.matrix, FRAME)
-        squares.append(error @ np.linalg.solve(frame.edge.covariance, error))
+        squares.append(misfit(frame.edge, FRAME))
     # Chi-square of six stays under 41, five sigmas, in all but one case of a million.
     assert max(squares) < 41.0
     exact = touching(ON_FEATURES[chosen], np.random.default_rng(0))

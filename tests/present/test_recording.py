@@ -256,15 +256,8 @@ def test_camera_is_drawn_at_the_end_of_the_chain(sample, recorded):
         np.testing.assert_allclose(position[0], seen.base_from_flange[:3, 3], atol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def bare(sample, tmp_path_factory):
-    path = tmp_path_factory.mktemp("recording") / "recording.rrd"
-    write_recording(path, sample.session, sample.calibration, sample.evidence, None)
-    return path
-
-
-def test_a_cut_recording_is_refused(bare, tmp_path):
-    rng, data, cut = random.Random(3), bare.read_bytes(), tmp_path / "cut.rrd"
+def test_a_cut_recording_is_refused(recorded, tmp_path):
+    rng, data, cut = random.Random(3), recorded.read_bytes(), tmp_path / "cut.rrd"
     for size in (12, 13, len(data) - 20, *(rng.randrange(len(data)) for _ in range(30))):
         # A loss of power leaves zeros.
         for rest in (b"", bytes(len(data) - size)):
@@ -272,13 +265,13 @@ def test_a_cut_recording_is_refused(bare, tmp_path):
             raised(DataError, r"cut\.rrd (was cut off|is no recording)", Session.load, cut)
 
 
-def test_flipped_bytes_in_images_are_named(sample, bare, tmp_path):
+def test_flipped_bytes_in_images_are_named(sample, recorded, tmp_path):
     rng, broken = random.Random(4), tmp_path / "broken.rrd"
     for _ in range(20):
         view = rng.choice(sample.session.views)
         content = sample.session.images.read(view.image)
         # A PNG cannot be compressed further, so that most of it lies in the file as it is.
-        place, data = -1, bytearray(bare.read_bytes())
+        place, data = -1, bytearray(recorded.read_bytes())
         while place < 0:
             start = rng.randrange(len(content) - 16)
             place = data.find(content[start : start + 16])
@@ -288,13 +281,13 @@ def test_flipped_bytes_in_images_are_named(sample, bare, tmp_path):
 
 
 @pytest.mark.parametrize("entity", [paths.SESSION, paths.IMAGE, paths.CALIBRATION])
-def test_no_flipped_bit_changes_anything_silently(entity, sample, bare, tmp_path):
+def test_no_flipped_bit_changes_anything_silently(entity, sample, recorded, tmp_path):
     rng, broken = random.Random(5), tmp_path / "broken.rrd"
-    frames = [frame for frame, _, _ in chunks(bare, (entity,))]
+    frames = [frame for frame, _, _ in chunks(recorded, (entity,))]
     refused = 0
     for _ in range(40):
         frame = rng.choice(frames)
-        data = bytearray(bare.read_bytes())
+        data = bytearray(recorded.read_bytes())
         # The 16 bytes before the payload are the message's kind and length.
         data[rng.randrange(frame.offset - 16, frame.end)] ^= 1 << rng.randrange(8)
         broken.write_bytes(data)
@@ -310,20 +303,20 @@ def test_no_flipped_bit_changes_anything_silently(entity, sample, bare, tmp_path
     assert refused > 10
 
 
-def test_changed_result_leaves_the_session(sample, bare, tmp_path):
-    data, path = bare.read_bytes(), tmp_path / "changed.rrd"
+def test_changed_result_leaves_the_session(sample, recorded, tmp_path):
+    data, path = recorded.read_bytes(), tmp_path / "changed.rrd"
     assert data.count(b"2026-11-20T10:11:12") == 1
     path.write_bytes(data.replace(b"2026-11-20T10:11:12", b"2026-11-20T10:11:13"))
     raised(DataError, "its result cannot be read or was changed", read_calibration, path)
     assert_same(sample.session, Session.load(path))
 
 
-def test_residuals_of_views_left_out_are_drawn_to_scale(sample, bare):
+def test_residuals_of_views_left_out_are_drawn_to_scale(sample, recorded):
     overlay = Overlay.of(
         sample.session, sample.calibration, {view.view: view for view in sample.evidence}
     )
-    magnified = column(bare, paths.magnified_residuals(overlay.factor), "Arrows2D:vectors")
-    to_scale = column(bare, paths.RESIDUALS_TO_SCALE, "Arrows2D:vectors")
+    magnified = column(recorded, paths.magnified_residuals(overlay.factor), "Arrows2D:vectors")
+    to_scale = column(recorded, paths.RESIDUALS_TO_SCALE, "Arrows2D:vectors")
     assert overlay.factor > 1
     for view, used in ((4, True), (6, False)):
         seen = sample.evidence[view]

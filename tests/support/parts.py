@@ -8,28 +8,16 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.pointfit import PointPairs
 
 
-def moved(frame: FloatArray, step: FloatArray) -> FloatArray:
-    """A (4, 4) frame after a (6,) step on the right, by the matrix exponential."""
-    generator = np.zeros((4, 4))
-    generator[:3, :3], generator[:3, 3] = skew(step[:3]), step[3:]
-    return np.asarray(frame @ expm(generator))
-
-
-def away(frame: FloatArray, other: FloatArray) -> FloatArray:
-    """The small (6,) step on the right that leads from one (4, 4) frame to another."""
-    between = np.linalg.inv(frame) @ other
-    turn = 0.5 * (between[:3, :3] - between[:3, :3].T)
-    return np.concatenate([[turn[2, 1], turn[0, 2], turn[1, 0]], between[:3, 3]])
-
-
 def placed(frame: FloatArray, points: FloatArray) -> FloatArray:
     """Points (n, 3) of a part that lies at a (4, 4) frame."""
     return points @ frame[:3, :3].T + frame[:3, 3]
 
 
 def some_frame(rng: np.random.Generator) -> FloatArray:
-    """A place on a table, turned anyhow."""
-    return moved(np.eye(4), np.concatenate([rng.normal(size=3), rng.uniform(-0.8, 0.8, 3)]))
+    """A place on a table, turned anyhow, by the matrix exponential."""
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = skew(rng.normal(size=3)), rng.uniform(-0.8, 0.8, 3)
+    return np.asarray(expm(generator))
 
 
 def some_drawing(rng: np.random.Generator, count: int) -> FloatArray:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Observations, State
 from visioncal.estimation.tree import Branch, Tree
@@ -19,18 +20,8 @@ ROBOT_SIGMAS = {"a": (5e-5, 3e-5), "b": (1e-4, 8e-5)}
 
 
 def pose(rotvec_deg, place_m):
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(rotvec_deg, degrees=True).as_matrix()
-    matrix[:3, 3] = place_m
-    return matrix
-
-
-def moved(matrix, twist):
-    """A transform after a small motion on its right: rotation first, which is as good as exp."""
-    step = np.eye(4)
-    step[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
-    step[:3, 3] = twist[3:]
-    return matrix @ step
+    turn = Rotation.from_rotvec(rotvec_deg, degrees=True)
+    return compose(turn.as_matrix(), np.array(place_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,24 +97,18 @@ def world(rng, stops=40, seen=0.7):
 
 
 def observed(world, rng, changed=None, noise=1.0):
-    """Sees the world, with noise of cameras and robots.
+    """Sees the world, with a share of the usual noise of cameras and robots.
 
-    Args:
-        world: The world.
-        rng: Of the noise.
-        changed: Edges that differ from the truth at some stops, by frame and stop.
-        noise: Share of the usual noise.
+    `changed` are edges that differ from the truth at some stops, by frame and stop.
     """
     reported, rows = {}, []
-    erring = {}
     for robot, flanges in world.flanges.items():
         sigma = np.repeat(world.robot_sigmas[robot], 3) * noise
         twists = rng.normal(size=(len(flanges), 6)) * sigma
-        reported[robot] = np.array([moved(a, b) for a, b in zip(flanges, twists, strict=True)])
-        erring[robot] = flanges
+        reported[robot] = flanges @ exp(twists)
     for cam, target, stop in world.pairs:
         true = np.linalg.inv(world.place(cam, stop, changed)) @ world.place(target, stop, changed)
-        rows.append(moved(true, rng.normal(size=6) * CAMERA_SIGMAS * noise))
+        rows.append(true @ exp(rng.normal(size=6) * CAMERA_SIGMAS * noise))
     count = len(rows)
     observations = Observations(
         tuple(pair[0] for pair in world.pairs),
@@ -144,9 +129,5 @@ def true_state(world, tree):
 
 def away(world, problem, state):
     """(6 e,) twists of the estimated edges from the true ones, on their right."""
-    found = []
-    for name, edge in zip(problem.tree.unknown, state.edges, strict=True):
-        between = np.linalg.inv(world.truth[name]) @ edge
-        turn = Rotation.from_matrix(between[:3, :3]).as_rotvec()
-        found.append(np.concatenate([turn, between[:3, 3]]))
-    return np.concatenate(found)
+    truth = np.array([world.truth[name] for name in problem.tree.unknown])
+    return log(invert(truth) @ state.edges).ravel()
