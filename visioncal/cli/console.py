@@ -23,23 +23,19 @@ if TYPE_CHECKING:
 _EXIT_BUG, EXIT_NO_RESULT, EXIT_BAD = 1, 2, 3
 
 
-def messages() -> "Console":
-    """The console for messages: stderr."""
+def console(*, is_answer: bool = False) -> "Console":
+    """The console for messages, stderr; or for results, stdout."""
     from rich.console import Console
 
-    return Console(stderr=True, highlight=False, soft_wrap=True)
+    return Console(stderr=not is_answer, highlight=False, soft_wrap=True)
 
 
-def answers() -> "Console":
-    """The console for results: stdout."""
-    from rich.console import Console
+def say(words: str, label: str = "", style: str = "bold", *, is_answer: bool = False) -> None:
+    """Prints a message, or a line of the result, as it is, after a label in a style."""
+    from rich.text import Text
 
-    return Console(highlight=False, soft_wrap=True)
-
-
-def say(words: str, label: str = "", style: str = "bold") -> None:
-    """Prints a message as it is, after a label in a style."""
-    _print(messages(), words, label, style)
+    # No markup: names and texts of files may have brackets.
+    console(is_answer=is_answer).print(Text.assemble((label, style), words))
 
 
 def warn(words: str) -> None:
@@ -48,15 +44,8 @@ def warn(words: str) -> None:
 
 
 def answer(words: str, label: str = "", style: str = "bold") -> None:
-    """Prints a line of the result as it is, after a label in a style."""
-    _print(answers(), words, label, style)
-
-
-def _print(console: "Console", words: str, label: str, style: str) -> None:
-    from rich.text import Text
-
-    # No markup: names and texts of files may have brackets.
-    console.print(Text.assemble((label, style), words))
+    """Prints a line of the result; see `say`."""
+    say(words, label, style, is_answer=True)
 
 
 def print_json(document: object) -> None:
@@ -81,10 +70,10 @@ def print_table(
     table = Table(*columns, box=None, pad_edge=False, caption=caption, caption_justify="left")
     for at, cells in enumerate(rows):
         table.add_row(*map(Text, cells), style="bold green" if at == bold else "")
-    console = messages() if is_message else answers()
+    shown = console(is_answer=not is_message)
     # Names of cells' frames are long, and are not truncated.
-    console.width = max(console.width, 110)
-    console.print(table)
+    shown.width = max(shown.width, 110)
+    shown.print(table)
 
 
 def asked(question: str) -> str:
@@ -93,7 +82,7 @@ def asked(question: str) -> str:
     Raises:
         EOFError: The input has ended.
     """
-    messages().print(question, markup=False, end="")
+    console().print(question, markup=False, end="")
     line = sys.stdin.readline()
     if not line:
         raise EOFError

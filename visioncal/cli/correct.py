@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import typer
 
-from visioncal.cli.console import answer, check_usable, print_json, say, warn
+from visioncal.cli.console import check_usable, print_json, say, warn
 from visioncal.cli.parsing import numbers_in
 from visioncal.cli.result_options import CorrectOptions
 from visioncal.core.errors import DataError
@@ -197,7 +197,7 @@ def _report(
     if "sigma_mm" in columns:
         words += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"
     # Where stdout has no table, this is the command's answer.
-    (answer if is_answer else say)(words)
+    say(words, is_answer=is_answer)
     for place, why in unreachable[:_MOST_SHOWN]:
         say(f"{place}: {why}", "left out: ", "bold yellow")
     if len(unreachable) > _MOST_SHOWN:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Event, Thread
 
-from visioncal.cli.console import messages
+from visioncal.cli.console import console
 
 # Descriptions of steps; other names are words already.
 WORDS = {
@@ -64,7 +64,7 @@ def shown_progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
     if quiet:
         yield steps.report
         return
-    shown = _bar if messages().is_terminal else _lines
+    shown = _bar if console().is_terminal else _lines
     with shown(steps) as report:
         yield report
 
@@ -74,7 +74,7 @@ def _bar(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), console=messages(), transient=True) as bar:
+    with Progress(*columns, TimeElapsedColumn(), console=console(), transient=True) as bar:
         task = bar.add_task("begin", total=None)
 
         def report(name: str, done: int, total: int) -> None:
@@ -95,7 +95,7 @@ def _lines(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
         while not over.wait(PAUSE_S):
             if steps.line != last:
                 last = steps.line
-                messages().print(f"{last} ({time.monotonic() - start_s:.0f} s)", markup=False)
+                console().print(f"{last} ({time.monotonic() - start_s:.0f} s)", markup=False)
 
     printer = Thread(target=say, daemon=True)
     printer.start()

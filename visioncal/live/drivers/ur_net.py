@@ -22,9 +22,10 @@ DASHBOARD_PORT, SCRIPT_PORT, RTDE_PORT = 29999, 30003, 30004
 _CONNECT_S = 0.8
 _ANSWER_S = 1.0
 _BANNER = "Universal Robots Dashboard Server"
-_HEADER = struct.Struct(">HB")
-# Types of RTDE's frames: request of its version, of the controller's, output recipe, start, state.
-_PROTOCOL, _VERSION_OF, _OUTPUTS, _START, _DATA = b"VvOSU"
+HEADER = struct.Struct(">HB")
+# Types of RTDE's frames: request of its version, of the controller's, recipes of outputs and of
+# inputs, start, pause, state.
+PROTOCOL, VERSION_OF, OUTPUTS, INPUTS, START, PAUSE, DATA = b"VvOISPU"
 # First major version of PolyScope X: RTDE and the primary interface, but no dashboard.
 _POLYSCOPE_X = 10
 # Primary interface: the read-only port is open where the other may not be.
@@ -158,18 +159,18 @@ def check_states_come(host: str) -> None:
     label = f"{host}:{RTDE_PORT}"
     with connect(host, RTDE_PORT, "RTDE") as link, link.makefile("rb") as file:
         try:
-            link.sendall(_frame(_PROTOCOL, struct.pack(">H", 2)))
+            link.sendall(frame(PROTOCOL, struct.pack(">H", 2)))
             kind, reply = _read(file)
-            if kind != _PROTOCOL or reply != b"\x01":
+            if kind != PROTOCOL or reply != b"\x01":
                 raise DriverError(
                     f"{label} does not speak version 2 of RTDE: a UR controller with PolyScope "
                     "3.4 or newer is needed.",
                     culprits=[label],
                     next_step="Check the address; update PolyScope where it is older.",
                 )
-            link.sendall(_frame(_OUTPUTS, struct.pack(">d", 125.0) + b"timestamp"))
-            link.sendall(_frame(_START))
-            while kind != _DATA:
+            link.sendall(frame(OUTPUTS, struct.pack(">d", 125.0) + b"timestamp"))
+            link.sendall(frame(START))
+            while kind != DATA:
                 kind, _ = _read(file)
         except (OSError, struct.error) as error:
             raise DriverError(
@@ -179,14 +180,15 @@ def check_states_come(host: str) -> None:
             ) from error
 
 
-def _frame(kind: int, payload: bytes = b"") -> bytes:
-    return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
+def frame(kind: int, payload: bytes = b"") -> bytes:
+    """A frame of RTDE: its whole size, its type and its payload."""
+    return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
 
 def _read(file: BinaryIO) -> tuple[int, bytes]:
     """Reads a frame's type and payload; raises `struct.error` at the end of the stream."""
-    size, kind = _HEADER.unpack(file.read(_HEADER.size))
-    return kind, file.read(size - _HEADER.size)
+    size, kind = HEADER.unpack(file.read(HEADER.size))
+    return kind, file.read(size - HEADER.size)
 
 
 def read_tool_offset(host: str) -> list[float]:
@@ -301,10 +303,10 @@ def _version_by_rtde(host: str) -> tuple[int, int, int] | None:
         connect(host, RTDE_PORT, "RTDE") as link,
         link.makefile("rb") as file,
     ):
-        link.sendall(_frame(_PROTOCOL, struct.pack(">H", 2)) + _frame(_VERSION_OF))
+        link.sendall(frame(PROTOCOL, struct.pack(">H", 2)) + frame(VERSION_OF))
         _read(file)
         kind, payload = _read(file)
-        if kind == _VERSION_OF:
+        if kind == VERSION_OF:
             major, minor, patch, _ = struct.unpack(">4I", payload)
             return major, minor, patch
     return None

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from visioncal.core.errors import DataError
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent
-from visioncal.core.transforms import skew
+from visioncal.core.transforms import adjoint, compose
 from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.tolerance_probability import chance_within
 from visioncal.live.planning.cell import PlanCell
@@ -132,16 +132,10 @@ def _pick_covariances(
     middle = corner_positions(cell.target).mean(axis=0)
     points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
     turn = cell.x[:3, :3]
-
-    def by_frame(points: FloatArray) -> FloatArray:
-        """Jacobians (k, 6, 6) of poses at (k, 3) points in the pose of the frame they are in."""
-        jacobians = np.tile(np.eye(6), (len(points), 1, 1))
-        jacobians[:, 3:, :3] = -skew(points)
-        return jacobians
-
-    jacobian = block_diag(turn, turn) @ by_frame(points)
+    # Poses at points move with the frame that these are in.
+    jacobian = block_diag(turn, turn) @ adjoint(compose(np.eye(3), -points))
     covariances = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2) + np.diag(noise)
     if cell.mount == "eye-in-hand":
-        by_flange = by_frame(points @ turn.T + cell.x[:3, 3])
+        by_flange = adjoint(compose(np.eye(3), -(points @ turn.T + cell.x[:3, 3])))
         covariances = covariances + (by_flange * noise) @ np.swapaxes(by_flange, 1, 2)
     return np.asarray(covariances)

@@ -28,7 +28,7 @@ from visioncal.live.planning.pick_probability import (
     need_planned,
     words_of,
 )
-from visioncal.live.planning.purposes import Purpose
+from visioncal.live.planning.purposes import Purpose, purpose_of
 from visioncal.live.planning.recorded import SessionStart
 
 # Most rounds in which stops without a safe path are replaced: an arm that folds far back needs up
@@ -36,18 +36,31 @@ from visioncal.live.planning.recorded import SessionStart
 _ROUNDS = 12
 
 
+StoredPurpose = Annotated[
+    Purpose, WrittenForm(lambda purpose: purpose.name, lambda name, _: purpose_of(name))
+]
+# A need in plan.json: its tolerances alone.
+_NEED = WrittenForm(
+    lambda need: {
+        name: value for name, value in (("mm", need.mm), ("deg", need.deg)) if value is not None
+    },
+    lambda document, _: Need(**document),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
     """Request for a plan."""
 
-    purpose: Purpose
-    count: int  # Most stops.
+    purpose: StoredPurpose
+    count: Annotated[int, Key("stops")]  # Most stops.
     candidates: int = 1500
     # (n,) present joint angles of the arm [rad]; None where they are not known, and the path to the
     # first stop is not checked.
-    start_q: FloatArray | None = None
+    start_q: Vector | None = None
     seed: int = 0
-    need: Need | None = None  # Tolerance of picks at which fewer are enough; None for none.
+    # Tolerance of picks at which fewer are enough; None for none.
+    need: Annotated[Need, _NEED] | None = None
 
 
 # An accuracy in plan.json; open where a direction is not determined.

@@ -8,16 +8,21 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
-from visioncal.core.codec import Key, Vector, WrittenForm, read, reading, write
+from visioncal.core.codec import Key, Vector, read, reading, write
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable, one_line, read_text, sha256
-from visioncal.core.types import Need
 from visioncal.core.version import __version__
 from visioncal.live.planning.cell import PlanCell
-from visioncal.live.planning.plan import ACCURACY, Plan, PlannedStop, Stop
-from visioncal.live.planning.purposes import Purpose, purpose_of
+from visioncal.live.planning.plan import (
+    ACCURACY,
+    Plan,
+    PlannedStop,
+    PlanRequest,
+    Stop,
+    StoredPurpose,
+)
 from visioncal.robot.conversion import has_ur_axes
 from visioncal.session.columns import POSE, pose_row
 
@@ -43,17 +48,8 @@ def _image_of(stop: PlannedStop) -> str:
 def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
     """Builds the content of plan.json; `source` says where the cell comes from."""
     request, design, need = plan.request, plan.design, plan.need
-    wanted: dict[str, Any] = {
-        "purpose": request.purpose.name,
-        "stops": request.count,
-        "candidates": request.candidates,
-        "seed": request.seed,
-    }
-    if request.need is not None:
-        wanted["need"] = _stated_values(request.need)
-    if request.start_q is not None:
-        wanted["start_q"] = request.start_q.tolist()
-    inputs: dict[str, Any] = {"cell": write(PlanCell, plan.cell), "request": wanted}
+    inputs: dict[str, Any] = {"cell": write(PlanCell, plan.cell)}
+    inputs["request"] = write(PlanRequest, request)
     predicted = {"after": ACCURACY.write(design.predicted)}
     predicted["all_candidates"] = ACCURACY.write(design.best)
     if plan.start is not None:
@@ -78,7 +74,7 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
     if plan.start is not None and plan.start.refusal:
         document["refusal_before"] = plan.start.refusal
     if need is not None:
-        document["need"] = _stated_values(need.need) | {
+        document["need"] = inputs["request"]["need"] | {
             "probability": need.probability,
             "probability_before": need.before,
             "probability_of_all_candidates": need.best,
@@ -88,10 +84,6 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
     if plan.in_the_way:
         document["exchanged_because_of"] = list(plan.in_the_way)
     return document
-
-
-def _stated_values(need: Need) -> dict[str, float]:
-    return {name: value for name in ("mm", "deg") if (value := getattr(need, name)) is not None}
 
 
 def program_of(plan: Plan) -> str:
@@ -141,9 +133,7 @@ class PlanFile:
     """A plan read from its file."""
 
     cell: PlanCell
-    purpose: Annotated[
-        Purpose, WrittenForm(lambda purpose: purpose.name, lambda name, _: purpose_of(name))
-    ]
+    purpose: StoredPurpose
     stops: tuple[Stop, ...]  # In driving order.
     digest: Annotated[str, Key("inputs_sha256")]  # SHA-256 of the plan's inputs.
     # (n,) joint angles before the first stop [rad]; None where they were not stated, and the path

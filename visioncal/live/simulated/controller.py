@@ -32,7 +32,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
-from visioncal.live.drivers.ur_net import DASHBOARD_PORT, PRIMARY_PORTS, RTDE_PORT, SCRIPT_PORT
+from visioncal.live.drivers import ur_net
 from visioncal.simulation.arms import ArmOptions, DhArm, forward, ur_arm
 
 # `none` mends all others.
@@ -61,9 +61,6 @@ _STATE, _PROGRESS = "output_int_register_0", "output_int_register_2"
 _READY, _DONE, _REGISTERS = 1, 2, 48
 _MOVE_JOINTS, _STOP_JOINTS, _SET_WATCHDOG, _GET_TOOL_OFFSET, _STOP = 1, 34, 35, 40, 255
 
-_HEADER = struct.Struct(">HB")
-# Types of frames.
-_PROTOCOL, _VERSION, _DATA, _OUTPUTS, _INPUTS, _START, _PAUSE = b"VvUOISP"
 _YES = b"\x01"
 _SAFETY = {
     "normal": ("NORMAL", 1 << 0),
@@ -352,9 +349,9 @@ class _Server:
         self._loop = asyncio.get_running_loop()
         handlers = (self._serve_rtde, self._serve_dashboard, self._take_script, self._send_primary)
         with ExitStack() as servers:
-            ports = RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORTS[0]
-            for port, handler in zip(ports, handlers, strict=True):
-                if port == DASHBOARD_PORT and self._polyscope[0] >= 10:
+            ports = ur_net.RTDE_PORT, ur_net.DASHBOARD_PORT, ur_net.SCRIPT_PORT
+            for port, handler in zip((*ports, ur_net.PRIMARY_PORTS[0]), handlers, strict=True):
+                if port == ur_net.DASHBOARD_PORT and self._polyscope[0] >= 10:
                     continue
                 server = await asyncio.start_server(_tolerant(handler), self._host, port)
                 servers.callback(server.close)
@@ -385,29 +382,29 @@ class _Server:
         self._clients.append(client)
         try:
             while True:
-                size, kind = _HEADER.unpack(await reader.readexactly(_HEADER.size))
-                payload = await reader.readexactly(size - _HEADER.size)
-                if kind == _DATA:
+                size, kind = ur_net.HEADER.unpack(await reader.readexactly(ur_net.HEADER.size))
+                payload = await reader.readexactly(size - ur_net.HEADER.size)
+                if kind == ur_net.DATA:
                     self._receive(client, payload)
                 else:
-                    writer.write(_frame(kind, self._answer_rtde(client, kind, payload)))
+                    writer.write(ur_net.frame(kind, self._answer_rtde(client, kind, payload)))
         finally:
             self._clients.remove(client)
 
     def _answer_rtde(self, client: _Client, kind: int, payload: bytes) -> bytes:
         """Content of the answer to a frame."""
-        if kind == _VERSION:
+        if kind == ur_net.VERSION_OF:
             return struct.pack(">4I", *self._polyscope)
-        if kind in (_START, _PAUSE):
-            client.due_s = 0.0 if kind == _START else np.inf
-        if kind not in (_OUTPUTS, _INPUTS):
+        if kind in (ur_net.START, ur_net.PAUSE):
+            client.due_s = 0.0 if kind == ur_net.START else np.inf
+        if kind not in (ur_net.OUTPUTS, ur_net.INPUTS):
             return _YES
-        text = payload[8:] if kind == _OUTPUTS else payload
+        text = payload[8:] if kind == ur_net.OUTPUTS else payload
         # The last may be followed by a comma.
         names = tuple(part for part in text.decode("ascii").split(",") if part)
         values = self.machine.reported(time.monotonic())
         types = ",".join(_type(values[name]) if name in values else "NOT_FOUND" for name in names)
-        if kind == _OUTPUTS:
+        if kind == ur_net.OUTPUTS:
             client.every_s = 1.0 / struct.unpack_from(">d", payload)[0]
             client.outputs = tuple(name for name in names if name in values)
             return _YES + types.encode()
@@ -436,7 +433,7 @@ class _Server:
                 numbers = [number for name in client.outputs for number in values[name]]
                 form = "".join("i" if isinstance(number, int) else "d" for number in numbers)
                 packed = struct.pack(f">{form}", *numbers)
-                client.writer.write(_frame(_DATA, _YES + packed))
+                client.writer.write(ur_net.frame(ur_net.DATA, _YES + packed))
 
     async def _serve_dashboard(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
@@ -494,10 +491,6 @@ def _type(values: Sequence[float]) -> str:
     return (
         f"VECTOR{len(values)}D" if values[1:] else "INT32" if type(values[0]) is int else "DOUBLE"
     )
-
-
-def _frame(kind: int, payload: bytes) -> bytes:
-    return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
 
 
 @dataclass(frozen=True, eq=False)
@@ -558,13 +551,13 @@ class SimulatedController:
                 ) from error
 
 
-def spawn(options: ControllerOptions | None = None, host: str | None = None) -> SimulatedController:
-    """Starts a simulated controller at a loopback address such as `127.0.0.2`; None for its own.
+def spawn(options: ControllerOptions | None = None) -> SimulatedController:
+    """Starts a simulated controller at a loopback address of its own.
 
     Raises:
         DriverError: It does not start, for example because a port is taken.
     """
-    host = host or free_host()
+    host = free_host()
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     arguments = (options or ControllerOptions(), host, there)
