@@ -310,14 +310,8 @@ def begun_session(
             **session.document,
             "robot": {**session.document.get("robot", {}), "model": words.robot},
         }
-        session = Session.assemble(
-            document,
-            session.columns,
-            [[view.cell(column) for column in session.columns] for view in session.views],
-            session.images,
-            target_document=session.target_document,
-            robot_document=load_robot(words.robot).document,
-        )
+        model = load_robot(words.robot).document
+        session = session.with_content(document=document, robot_document=model)
     run, refusal = calibrate_partially(session, progress=progress)
     begun = start_from_session(run, refusal, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))

@@ -267,16 +267,10 @@ def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
         or (view.stop in stops and has_robot_state(view) and not is_camera_observation(view))
     ]
     table = session.corner_table
-    selected = session.assemble(
-        session.document,
-        session.columns,
-        [[view.cell(column) for column in session.columns] for view in kept],
-        session.images,
-        target_document=session.target_document,
-        robot_document=session.robot_document,
+    return session.with_content(
+        cells=[[view.cell(column) for column in session.columns] for view in kept],
         corners=None if table is None else table.of_views([view.number for view in kept]),
     )
-    return selected.with_streams(session.streams)
 
 
 def streams_of(session: "Session", robot: str) -> dict[str, Stream]:

@@ -191,6 +191,20 @@ class Session:
             corners=corners,
         )
 
+    def with_content(self, **changes: object) -> "Session":
+        """The session with other arguments of `assemble`, and its streams; raises DataError."""
+        content: dict[str, Any] = {
+            "document": self.document,
+            "columns": self.columns,
+            "cells": [[view.cell(column) for column in self.columns] for view in self.views],
+            "images": self.images,
+            "target_document": self.target_document,
+            "robot_document": self.robot_document,
+            "corners": self.corner_table,
+        }
+        content.update(changes)
+        return self.assemble(**content).with_streams(self.streams)
+
     @classmethod
     @typed
     def from_arrays(

@@ -36,7 +36,6 @@ from visioncal.session.columns import (
     joint_columns,
     position_columns,
 )
-from visioncal.session.corners import CornerTable
 from visioncal.session.table import parse_csv
 from visioncal.vision.boards.kind import LARGEST_M
 
@@ -195,8 +194,11 @@ def reread(
         target = _scaled(target, candidate.board_scale)
         document["target"] = "target.toml"
     streams = {name: _reread_stream(stream, reading) for name, stream in session.streams.items()}
-    reread = _rewritten(session, document, cells, changes, session.corner_table, target)
-    reread = reread.with_streams(streams)
+    reread = session.with_content(
+        document=_noting(session, document, changes),
+        cells=[[row[name] for name in session.columns] for row in cells],
+        target_document=target,
+    ).with_streams(streams)
     # Assumptions that the reading replaces.
     kept = (note for note in session.warnings if not changes or " taken for " not in note)
     mount = () if doubtful.knows_mount else (f"The mount is taken for {reading.mount}.",)
@@ -204,26 +206,12 @@ def reread(
     return replace(reread, warnings=tuple(notes))
 
 
-def _rewritten(
-    session: Session,
-    document: Mapping[str, Any],
-    cells: Sequence[Mapping[str, str]],
-    changes: Sequence[str],
-    corners: CornerTable | None,
-    target: Mapping[str, Any] | None,
-) -> Session:
-    """A session with other cells, corners and target; it notes the changes in `corrected`."""
-    if changes:
-        document = {**document, "corrected": [*session.declaration.corrected, *changes]}
-    return Session.assemble(
-        document,
-        session.columns,
-        [[row[name] for name in session.columns] for row in cells],
-        session.images,
-        target_document=target,
-        robot_document=session.robot_document,
-        corners=corners,
-    )
+def _noting(
+    session: Session, document: Mapping[str, Any], changes: Sequence[str]
+) -> Mapping[str, Any]:
+    """A session's document that notes changes in `corrected`."""
+    corrected = [*session.declaration.corrected, *changes]
+    return {**document, "corrected": corrected} if changes else document
 
 
 def _reread_stream(stream: Stream, reading: Hypothesis) -> Stream:
@@ -305,7 +293,8 @@ def exchange_views(session: Session, first: int, second: int) -> Session:
         views = np.where(is_first, second, np.where(is_second, first, corners.views))
         corners = replace(corners, views=views)
     note = f"the images of views {first} and {second} were exchanged"
-    rewritten = _rewritten(
-        session, session.document, [*cells.values()], [note], corners, session.target_document
+    return session.with_content(
+        document=_noting(session, session.document, [note]),
+        cells=[[row[name] for name in session.columns] for row in cells.values()],
+        corners=corners,
     )
-    return rewritten.with_streams(session.streams)
