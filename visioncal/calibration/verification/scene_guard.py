@@ -8,9 +8,8 @@ with S the harmless motion from look to look, C_k the registration's covariance 
 look c. The statistic is that of Shiryaev and Roberts (Pollak 1987), the sum over c of the
 likelihood ratios of a change to none, averaged over sizes of changes. r_g and m are integrated out.
 A look is bounded to the length that noise exceeds in one look of a hundred, as it may be of a thing
-that moved: no single one raises an alarm. Without a change the statistic so grows in the mean by at
-most the ratio of one bounded look, by which it is divided: a false alarm comes after as many looks
-as the limit, or more (2 to 13 times as many in simulation).
+that moved: no single one raises an alarm. Without a change the statistic grows by about one a look
+in the mean, and a false alarm comes after as many looks as its limit, and more by the overshoot.
 """
 
 from collections.abc import Iterator
@@ -18,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtr
 
 from visioncal.calibration.stages.detect import image_of
 from visioncal.calibration.verification.guard_detector import log_ratios
@@ -31,8 +29,11 @@ from visioncal.session import Session, View
 from visioncal.session.observations import moved
 from visioncal.vision.scene import Registration, nothing, register
 
-# Sizes of changes, as sigmas of each component [px].
-_SIZES_PX = np.array([0.3, 1.0, 3.0])
+# Sizes of changes, as sigmas of each component in those of a look: larger ones are found as soon,
+# as a look's length is bounded.
+_SIZES = np.array([0.3, 1.0])
+# Inverse mean of the statistic over its limit at false alarms, in simulation.
+_OVERSHOOT = 0.6
 # Probability of a longer look by noise alone.
 _RARE = 0.01
 
@@ -70,7 +71,7 @@ class SceneWatch:
     Args:
         unit: (p,) the motion of each component that moves the image by 1 px.
         steady_px: Sigma of harmless motion from look to look, by each component [px].
-        false_alarm_looks: Mean number of looks from one false alarm to the next, at least.
+        false_alarm_looks: Mean number of looks from one false alarm to the next.
     """
 
     def __init__(self, unit: FloatArray, steady_px: float, false_alarm_looks: float) -> None:
@@ -80,7 +81,7 @@ class SceneWatch:
         self._groups, self._priors = np.zeros(0, int), dict[int, FloatArray]()
         self._turns = np.zeros((0, size))  # (n, p) what is left of each look's turn [px].
         self._weights = np.zeros((0, size, size))  # (n, p, p) inverse covariances.
-        self._starts = np.zeros(0)  # (n,) mean ratio of a change at each look, by noise alone.
+        self._sizes = np.zeros(0)  # (n,) sigma of each look, mean of its components [px].
         self.holds, self.evidence = True, 0.0  # The statistic over its limit.
 
     def update(self, group: int, turn: FloatArray, covariance: FloatArray) -> None:
@@ -96,15 +97,11 @@ class SceneWatch:
         # One look may be of a thing that moved: however far off it is, it is bounded.
         bound = float(chi2_limit(_RARE, size))
         off *= min(1.0, float(np.sqrt(bound / length2)))
-        # Without the bound a ratio would be one in the mean; the longest looks make most of it.
-        grown = 1.0 + _SIZES_PX**2 / np.linalg.det(spread) ** (1.0 / size)
-        at_bound = np.exp(0.5 * bound * (1.0 - 1.0 / grown)) / grown ** (0.5 * size)
-        start = float(np.mean(chdtr(size, bound / grown) + _RARE * at_bound))
-        self._starts = np.append(self._starts, start)
+        self._sizes = np.append(self._sizes, np.linalg.det(noise) ** (0.5 / size))
         self._groups = np.append(self._groups, group)
         self._turns = np.concatenate([self._turns, [expected + off]])
         self._weights = np.concatenate([self._weights, [weight]])
-        self.evidence = self._statistic() / (self._limit * float(self._starts.mean()))
+        self.evidence = self._statistic() / (_OVERSHOOT * self._limit)
         self.holds = self.holds and self.evidence < 1.0
 
     def _statistic(self) -> float:
@@ -120,8 +117,8 @@ class SceneWatch:
             gain = after @ np.linalg.inv(prior + after[0])
             information += after - gain @ after
             score += by_after - gain @ by_after[0]
-        sizes_px = np.repeat(_SIZES_PX[:, None], len(self._unit), axis=1)
-        ratios = log_ratios(information, score, sizes_px)
+        sizes = np.exp(np.log(self._sizes).mean()) * np.ones_like(self._unit)
+        ratios = log_ratios(information, score, _SIZES[:, None] * sizes)
         return float(np.exp(np.minimum(ratios, 600.0)).mean(axis=0).sum())
 
 
@@ -146,7 +143,7 @@ def scene_looks(
         plane: The scene's plane, to fit the camera's offset too: `board`, or its distance along the
             camera's axis [mm]; empty for the turn alone.
         steady_px: Sigma of the image's harmless motion from look to look [px].
-        false_alarm_looks: Mean number of looks from one false alarm to the next, at least.
+        false_alarm_looks: Mean number of looks from one false alarm to the next.
 
     Raises:
         DataError: The calibration has no camera, the mask another size, the plane is not known, or
