@@ -7,10 +7,14 @@ the pose, of Student's t with 5 degrees of freedom; repeatability of the arm; on
 wrong by 20 mm and more. No faults: camera and board move with the heat of the day, which differs
 from day to day, and with the machine, which is off at weekends.
 
+One in 10,000 looks is a rate of one alarm in seven years; it is measured over five times as long.
+Seeds are others than those by which constants of the detector were chosen.
+
     PYTHONPATH=tests python tests/benchmarks/guard.py [YEARS [faults]] [--quick]
 """
 
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -28,10 +32,10 @@ from visioncal.simulation import SimulatedCell, project, simulate
 from visioncal.simulation.boards import corners_m
 
 YEARS, A_DAY, POSTURES = wished(300), 4, few(40, 8)
-STATED = (1000.0, 10_000.0)  # Looks to a false alarm: of false alarms, and of faults.
-WARM, TRIALS, LONGEST = few(2000, 60), few(8, 1), few(500, 200)
+STATED = {1000.0: 1, 10_000.0: 5}  # Looks to a false alarm, and the factor of the years.
+WARM, TRIALS, LONGEST = few(2000, 60), few(4, 1), few(500, 200)
 CELLS = [(mount, arm, seed) for mount in ("eye-in-hand", "eye-to-hand")
-         for arm in ("calibrated", "reported") for seed in few((1, 2), (1,))]  # fmt: skip
+         for arm in ("calibrated", "reported") for seed in few(range(101, 105), (1,))]  # fmt: skip
 FAULTS = ("camera", "board", "joint")
 DAY_S = 86400.0
 _COMMAND = "PYTHONPATH=tests python tests/benchmarks/guard.py"
@@ -125,18 +129,18 @@ def world(mount, arm, seed):
     return World(cell, guard, rows, np.array(predicted), np.array(noise), heat)
 
 
-def false_alarms(place, looks_between):
-    """Looks of a cell without a fault; each alarm's limit over its statistic, and wrong looks."""
+def false_alarms(job):
+    """Looks of a cell without a fault; the number of each look that is an alarm."""
+    place, looks_between = job
     cell = world(*place)
     guard = Guard(cell.guard.prior.calibration, false_alarm_looks=looks_between)
     rng, alarms = np.random.default_rng(place[2]), []
-    total = int(YEARS * 365 * A_DAY / len(CELLS))
+    total = int(STATED[looks_between] * YEARS * 365 * A_DAY / len(CELLS))
     for start in range(0, total, 20_000):
         looks = cell.looks(rng, start * DAY_S / A_DAY, min(total - start, 20_000))
         for rows in looks:
             if not (answer := guard.take(rows)).holds:
-                is_wrong = bool(np.linalg.norm(rows.residual[3:]) > 8e-3)
-                alarms.append((1.0 / answer.evidence, is_wrong))
+                alarms.append(answer.look)
                 guard.acknowledge()
     return total, alarms
 
@@ -259,9 +263,10 @@ def rows_of(found):
 
 def main() -> None:
     """Prints the tables and keeps them."""
-    if WORDS[1:] != ("faults",):
-        write_false_alarms()
-    found = [row for place in CELLS for row in faults(place)]
+    with ProcessPoolExecutor() as pool:
+        if WORDS[1:] != ("faults",):
+            write_false_alarms(pool)
+        found = [row for rows in pool.map(faults, CELLS) for row in rows]
     head = ["fault", "size", "looks to the alarm", "CUSUM that knows all", "at 5 sigma",
             "cause first", "oracle's cause first", "estimated size, median"]  # fmt: skip
     by_pose, by_corners = speed()
@@ -280,25 +285,31 @@ def main() -> None:
     write_section("The guard: faults", f"{_COMMAND} {YEARS} faults", text)
 
 
-def write_false_alarms():
+def write_false_alarms(pool):
     """Writes the table of false alarms."""
-    lines = ["| one in | cells | looks | false alarms | expected | ratio | at wrong looks |",
-             "| --- | --- | ---: | ---: | ---: | ---: | ---: |"]  # fmt: skip
-    stated = min(STATED)
-    found = [false_alarms(place, stated) for place in CELLS]
-    for name in (*dict.fromkeys(" ".join(place[:2]) for place in CELLS), ""):
-        chosen = [pair for place, pair in zip(CELLS, found, strict=True)
-                  if name in ("", " ".join(place[:2]))]  # fmt: skip
-        looks, alarms = sum(pair[0] for pair in chosen), [a for _, each in chosen for a in each]
-        expected, wrong = looks / stated, sum(alarm[1] for alarm in alarms)
-        row = (f"{stated:,.0f}", name or "all", f"{looks:,}", f"{len(alarms)}",
-               f"{expected:.0f}", f"{len(alarms) / expected:.2f}", f"{wrong}")  # fmt: skip
-        lines.append(f"| {' | '.join(row)} |")
-    print("\n".join(lines), np.mean([1 / alarm[0] for alarm in alarms] or [np.nan]), flush=True)
+    lines = ["| one in | cells | looks | false alarms | expected | ratio | at first | later |",
+             "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]  # fmt: skip
+    for stated in STATED:
+        jobs = [(place, stated) for place in CELLS]
+        found = list(pool.map(false_alarms, jobs))
+        for name in (*dict.fromkeys(" ".join(place[:2]) for place in CELLS), ""):
+            chosen = [pair for place, pair in zip(CELLS, found, strict=True)
+                      if name in ("", " ".join(place[:2]))]  # fmt: skip
+            looks, alarms = sum(pair[0] for pair in chosen), [a for _, each in chosen for a in each]
+            first = min(3000 * len(chosen), looks)
+            early = sum(look <= 3000 for look in alarms)
+            later = (len(alarms) - early) * stated / max(looks - first, 1)
+            row = (f"{stated:,.0f}", name or "all", f"{looks:,}", f"{len(alarms)}",
+                   f"{looks / stated:.0f}", f"{len(alarms) * stated / looks:.2f}",
+                   f"{early * stated / first:.2f}", f"{later:.2f}")  # fmt: skip
+            lines.append(f"| {' | '.join(row)} |")
+    print("\n".join(lines), flush=True)
     text = (
-        f"{YEARS} years, {A_DAY} looks a day at {POSTURES} postures, over {len(CELLS)} cells; one "
-        "look of 200 is wrong by 20 mm and more. Calibrated arms have joint angles; others report "
-        "poses alone. After an alarm the guard is acknowledged, and goes on.\n\n" + "\n".join(lines)
+        f"{YEARS} years, at the rarer rate {max(STATED.values()) * YEARS}, {A_DAY} looks a day at "
+        f"{POSTURES} postures, over {len(CELLS)} cells; one look of 200 is wrong by 20 mm and "
+        "more. Calibrated arms have joint angles; others report poses alone. After an alarm the "
+        "guard is acknowledged, and goes on. Ratios are of alarms to those stated; at first: in "
+        "the first 3,000 looks.\n\n" + "\n".join(lines)
     )
     write_section("The guard: false alarms", f"{_COMMAND} {YEARS}", text)
 

@@ -15,6 +15,7 @@ from support.refusals import raised
 from support.scenes import CAMERA, Scene, disturbed, turned
 
 from visioncal import Guard, Look
+from visioncal.calibration.verification.guard_detector import Detector, counted, limit
 from visioncal.calibration.verification.scene_guard import SceneWatch, scene_plane
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
@@ -90,11 +91,30 @@ def test_false_alarms_are_as_rare_as_stated():
     assert 3 <= alarms <= 30 + 4 * np.sqrt(30)
 
 
+@pytest.mark.parametrize("tail", [0.6, 1.2])
+def test_the_limit_follows_the_tail_of_the_statistic(tail):
+    rng, count = np.random.default_rng(3), 40_000
+    state = Detector.of(np.eye(12), 1e-5, np.zeros(0))
+    # At first as in theory.
+    assert limit(state, 700.0) == pytest.approx(700.0)
+    values = 5.0 * rng.random(count) ** (-1.0 / tail)
+    for at, value in enumerate(values, 1):
+        # Every look is a candidate of its own.
+        born = np.array([[at, 0.0, 0.0, 1.0]])
+        state = counted(replace(state, born=born, looks=np.array(float(at))), np.array([value]))
+    for looks_between in (100.0, 3000.0):
+        expected = 5.0 * looks_between ** (1.0 / tail)
+        # Passings of the larger limit, of which there are some hundred or more: to four sigma.
+        sigma = np.sqrt((200.0 / 5.0) ** tail / 20_000.0) / tail
+        factor = np.exp(4.0 * sigma * (1.0 + np.log(max(looks_between, 200.0) / 200.0)))
+        assert expected / factor < limit(state, looks_between) < factor * expected
+
+
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_a_change_is_named_with_its_size_and_time(mount):
     place, rng, learned = usual(mount), np.random.default_rng(1), 120
     guard = Guard(place.calibration)
-    for look in looks(place, rng, learned):
+    for look in looks(place, rng, learned - 1):
         assert guard.update(look).holds
     kept = json.loads(json.dumps(guard.document))
     changes = {
@@ -103,8 +123,10 @@ def test_a_change_is_named_with_its_size_and_time(mount):
         "joint 3": Change(joints_rad=np.array([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])),
     }
     for name, change in changes.items():
-        found = [guard.restore(kept).update(look) for look in looks(place, rng, 1, change, learned)]
-        found += [guard.update(look) for look in looks(place, rng, 24, change, learned + 1)]
+        # The last look before it is wrong: it is no part of the change.
+        wrong = looks(place, rng, 1, Change(board=knock(rng, 20.0, 1.0)), learned - 1)
+        assert guard.restore(kept).update(next(wrong)).holds
+        found = [guard.update(look) for look in looks(place, rng, 25, change, learned)]
         late = [answer.holds for answer in found].index(False)
         last = found[-1]
         best = last.causes[0]
@@ -114,8 +136,7 @@ def test_a_change_is_named_with_its_size_and_time(mount):
         assert best.probability > 0.9
         assert sum(cause.probability for cause in last.causes) == pytest.approx(1.0)
         after, by = last.changed_s
-        assert after <= HOUR_S * learned
-        assert by >= HOUR_S * learned
+        assert HOUR_S * (learned - 2) <= after <= HOUR_S * learned <= by
         size, sigma = (best.deg, best.sigma_deg) if "joint" in name else (best.mm, best.sigma_mm)
         true = np.rad2deg(1e-3) if "joint" in name else 0.6
         # What is estimated of a length has a bias of its sigma at most.

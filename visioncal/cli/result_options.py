@@ -154,7 +154,7 @@ class GuardOptions(PartOptions):
     )
     slow_mm: float = option(
         "Expected motion by heat, over hours (sigma, mm); it is learned.",
-        default=0.02,
+        default=0.05,
         min=0.0,
         max=10.0,
     )

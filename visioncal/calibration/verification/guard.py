@@ -15,7 +15,9 @@ from visioncal.calibration.verification.guard_detector import (
     ChangeKind,
     Detector,
     LookRows,
+    counted,
     estimate,
+    limit,
     step,
     weighed,
 )
@@ -36,9 +38,6 @@ from visioncal.results import Calibration
 from visioncal.vision.targets import first_corners
 
 NONE = "none of these"
-# Inverse mean of `statistic / limit` at false alarms, the overshoot: 1.5 in simulated white noise,
-# where the limit is exact. In other noise it is larger, by alarms that come too early.
-_OVERSHOOT = 0.67
 # Share of the arm's error, in variance, that counts as noise of the look in any case.
 _NEW = 0.1
 
@@ -120,7 +119,7 @@ class Guard:
         calibration: Calibration | Path | str,
         *,
         false_alarm_looks: float = 10_000.0,
-        slow_mm: float = 0.02,
+        slow_mm: float = 0.05,
         camera: str | None = None,
         robot: str | None = None,
         target: str | None = None,
@@ -149,7 +148,7 @@ class Guard:
                 culprits=["false_alarm_looks", "slow_mm"],
             )
         self.prior = prior = CalibrationPrior.of(calibration.of(camera, robot, target))
-        self.limit, self._is_changed = _OVERSHOOT * false_alarm_looks, False
+        self._looks, self._is_changed = false_alarm_looks, False
         # The lens's errors that go with those of the frames, and what is left of them.
         edges = 6 * len(prior.state.edges)
         own, cross = prior.covariance[:edges, :edges], prior.covariance[edges:, :edges]
@@ -204,8 +203,12 @@ class Guard:
                 next_step="Send looks in the order of their times, by one clock.",
             )
         state = step(self._state, rows, is_learning=not self._is_changed)
-        scores = weighed(state, self._kinds, self._units)
-        evidence = float(np.exp(min(np.logaddexp.reduce(scores, axis=None), 600.0))) / self.limit
+        # (c,) by candidates; beyond any limit, and no overflow.
+        scores = np.minimum(weighed(state, self._kinds, self._units), 300.0)
+        statistic = np.exp(scores).sum(axis=0)
+        evidence = float(statistic.sum()) / limit(state, self._looks)
+        if not self._is_changed:
+            state = counted(state, statistic)
         self._state, self._is_changed = state, self._is_changed or evidence >= 1.0
         found = self._found() if self._is_changed else {}
         return Guarded(
@@ -219,12 +222,12 @@ class Guard:
     def _found(self) -> dict[str, Any]:
         """Causes and the time of the change."""
         kinds, born = (*self._kinds, self._other), self._state.born
-        scores = weighed(self._state, kinds, self._units)
+        scores = weighed(self._state, kinds, self._units, is_raw=True)
         by_time = np.exp(scores - scores.max()).sum(axis=0)
         candidate = int(by_time.argmax())
         # What changed is judged at the likeliest time.
-        raw = weighed(self._state, kinds, self._units, is_raw=True)[:, candidate]
-        shares, causes = np.exp(raw - np.logaddexp.reduce(raw)), []
+        shares, causes = np.exp(scores[:, candidate] - scores[:, candidate].max()), []
+        shares /= shares.sum()
         for at in np.argsort(-shares).tolist():
             kind = kinds[at]
             size: dict[str, float] = {}
