@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.number_format import known_name
-from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress, chosen_rows
 from visioncal.estimation.clock_correlation import evenly
 from visioncal.session import ImageStore
 
@@ -143,15 +143,11 @@ def frames_to_take(
 
 def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:
     """Some rows of a recording, in the given order."""
-    count = len(foreign.robot)
+    views = foreign.views or tuple(range(len(foreign.robot)))
     return replace(
-        foreign,
+        chosen_rows(replace(foreign, views=views), rows, "notes"),
         robot=foreign.robot.rows(rows),
         camera=None if foreign.camera is None else foreign.camera.rows(rows),
-        images=tuple(foreign.images[index] for index in rows) if foreign.images else (),
-        joints_rad=None if foreign.joints_rad is None else foreign.joints_rad[rows],
-        stamps_s=None if foreign.stamps_s is None else foreign.stamps_s[rows],
-        views=tuple((foreign.views or tuple(range(count)))[index] for index in rows),
         columns={
             name: tuple(cells[index] for index in rows) for name, cells in foreign.columns.items()
         },

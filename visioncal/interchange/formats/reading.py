@@ -17,7 +17,7 @@ from visioncal.core.documents.tables import TextTable, is_number, read_table
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, chosen_rows
 
 _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
 # Layout of a table without a header by its number of columns: (times, robot pose, camera pose),
@@ -50,11 +50,9 @@ class Fields:
     def rows(self, chosen: Sequence[int]) -> Self:
         """The same values for some rows only."""
         return replace(
-            self,
-            places=tuple(self.places[index] for index in chosen),
+            chosen_rows(self, list(chosen)),
             numbers={name: number[list(chosen)] for name, number in self.numbers.items()},
             texts={name: tuple(text[at] for at in chosen) for name, text in self.texts.items()},
-            views=tuple(self.views[index] for index in chosen) if self.views else (),
         )
 
     def find(self, name: str) -> str:

@@ -4,7 +4,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
@@ -21,21 +20,8 @@ _STOPPED = {
 }
 
 
-class Clock(Protocol):
-    """Monotonic clock."""
-
-    def now(self) -> float:
-        """Time on the clock by which arm and camera stamp [s]."""
-
-    def sleep(self, seconds: float) -> None:
-        """Waits."""
-
-    def unix_offset_s(self) -> float:
-        """Offset from this clock to UNIX time [s]."""
-
-
 class HostClock:
-    """The host's monotonic clock."""
+    """The host's monotonic clock, by which arm and camera stamp."""
 
     def now(self) -> float:
         """The time [s]."""
@@ -56,7 +42,7 @@ class LiveCell:
 
     arm: Arm
     camera: CameraDevice
-    clock: Clock = field(default_factory=HostClock)
+    clock: HostClock = field(default_factory=HostClock)
 
     @property
     def is_stored(self) -> bool:

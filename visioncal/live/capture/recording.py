@@ -13,7 +13,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Camera, Corners, FloatArray, Target
 from visioncal.live.capture.assessment import Coach, JointPoseCheck, Prediction, planned_accuracy
-from visioncal.live.capture.cell import Clock, LiveCell
+from visioncal.live.capture.cell import HostClock, LiveCell
 from visioncal.live.capture.gate import Consent, Gate, check_same_arm, clear_path, travel_s
 from visioncal.live.capture.journal import Journal, state_of
 from visioncal.live.capture.options import CaptureOptions, Stillness
@@ -69,7 +69,7 @@ class _HeldArm:
 
     name: str
     reported: ArmState  # Its state when it was read.
-    clock: Clock  # Clock of the state's stamps.
+    clock: HostClock  # Clock of the state's stamps.
 
     def state(self) -> ArmState:
         """The state, stamped now."""

@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.core.errors import DriverError
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray
-from visioncal.live.capture.cell import Clock, HostClock, LiveCell
+from visioncal.live.capture.cell import HostClock, LiveCell
 from visioncal.live.capture.recording import CaptureEvent
 from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.protocols import Frame
@@ -54,10 +54,10 @@ class SimulatedCamera:
         *,
         rate_hz: float = 15.0,
         exposure_s: float = 0.008,
-        clock: Clock | None = None,
+        clock: HostClock | None = None,
     ) -> None:
         self._view, self._true_joints = LiveView(cell), true_joints
-        self._clock: Clock = clock or HostClock()
+        self._clock = clock or HostClock()
         self._rate_hz, self._exposure_s = rate_hz, exposure_s
         self._start = self._clock.now()
         self._last: FloatArray | None = None
