@@ -34,7 +34,6 @@ from visioncal.results import (
     CameraResult,
     CellResult,
     RobotResult,
-    SolverResult,
     UnconnectedFrame,
     Validation,
     ViewResult,
@@ -130,20 +129,14 @@ def _sections_of_pair(
 ) -> dict[str, Any]:
     """The sections of one camera and one robot, which have no names."""
     session, answer, readings, arm = run.session, run.assessment, run.readings, run.robot_arm
-    solutions = compare_solvers(answer.problem, answer.state, session.mount, run.solver)
     sections = run.assessment.arms[arm.robot].sections
     used = [view.numbers for view in session.views if view.number in run.used]
     # A single target without a name has one section.
     is_unnamed = not session.targets
     return {
-        "solvers": {
-            name: SolverResult(
-                dict(zip(names.values(), solution.edges, strict=False)),
-                1e3 * solution.rms_m,
-                None if solution.rms_rad is None else float(np.rad2deg(solution.rms_rad)),
-            )
-            for name, solution in solutions.items()
-        },
+        "solvers": compare_solvers(
+            answer.problem, answer.state, session.mount, run.solver, [*names.values()]
+        ),
         "noise": _noise(run),
         "views": _views(run),
         "camera": next(iter(_cameras(run).values()), None),

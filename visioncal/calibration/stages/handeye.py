@@ -1,31 +1,20 @@
 """Hand-eye calibration by closed forms, AX = XB and AX = ZB, for one robot and one camera."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, Mount
+from visioncal.core.types import Mount
 from visioncal.estimation.chain import robot_part, scatter
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-
-
-@dataclass(frozen=True, eq=False)
-class SolverResult:
-    """Edges (1 + b, 4, 4) by one solver, and the rms scatter of the targets.
-
-    The scatter of rotation is None where only positions were measured.
-    """
-
-    edges: FloatArray
-    rms_m: float
-    rms_rad: float | None
+from visioncal.results import SolverResult
 
 
 def compare_solvers(
-    problem: Problem, state: State, mount: Mount, solver: str
+    problem: Problem, state: State, mount: Mount, solver: str, names: Sequence[str]
 ) -> dict[str, SolverResult]:
     """Results of all solvers for the same views, by solver.
 
@@ -34,6 +23,7 @@ def compare_solvers(
         state: The fitted state.
         mount: Mount of the camera.
         solver: Solver of the fitted state.
+        names: Names of the edges in results, the camera's first.
 
     Returns:
         The joint fit's result, where it is the solver; closed forms, where poses were measured.
@@ -41,7 +31,7 @@ def compare_solvers(
     states = {"joint": state} if solver == "joint" else {}
     if not problem.points:
         states |= {name: closed_form_state(problem, name, state, mount) for name in SOLVERS}
-    return {name: _answer(problem, state) for name, state in states.items()}
+    return {name: _answer(problem, state, names) for name, state in states.items()}
 
 
 def closed_form_state(problem: Problem, solver: str, start: State, mount: Mount) -> State:
@@ -60,10 +50,11 @@ def closed_form_state(problem: Problem, solver: str, start: State, mount: Mount)
     return State(np.stack([edges.x, *(edges.z @ invert(from_first))]), start.values)
 
 
-def _answer(problem: Problem, state: State) -> SolverResult:
+def _answer(problem: Problem, state: State, names: Sequence[str]) -> SolverResult:
     residuals_m, residuals_rad = scatter(problem, problem, state)
+    rms_rad = None if problem.points else np.sqrt(np.mean(residuals_rad**2))
     return SolverResult(
-        state.edges,
-        float(np.sqrt(np.mean(residuals_m**2))),
-        None if problem.points else float(np.sqrt(np.mean(residuals_rad**2))),
+        dict(zip(names, state.edges, strict=False)),
+        1e3 * float(np.sqrt(np.mean(residuals_m**2))),
+        None if rms_rad is None else float(np.rad2deg(rms_rad)),
     )
