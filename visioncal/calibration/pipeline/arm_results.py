@@ -9,6 +9,7 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.random_effects import random_effect_rms
 from visioncal.calibration.stages.reported_poses import RobotReport
+from visioncal.calibration.stages.thermal import LEVEL
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import ArmErrors, covariance_of_size, misfit_covariance
@@ -125,23 +126,25 @@ def change_each(
 def with_drifts(
     arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, level: str
 ) -> dict[str, RobotArm]:
-    """Estimates drift with temperature, one arm after the other.
+    """Estimates drift with temperature, one arm after the other, where the session determines it.
 
     Raises:
         DataError: Drift is requested, and no arm has the data that it needs.
         DegenerateError: Drift is requested, and the temperature hardly varied.
     """
+    if level not in ("auto", LEVEL):
+        return dict(arms)
     refused = []
 
     def with_drift(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
         try:
-            return arm.with_drift(nominal, start, level)
+            return arm.with_drift(nominal, start)
         except (DataError, DegenerateError) as error:
             refused.append(error.within(f"robot {arm.robot}"))
             return arm
 
     changed = change_each(arms, problem, fit, with_drift)
-    if refused and len(refused) == len(changed):
+    if level == LEVEL and refused and len(refused) == len(changed):
         raise refused[0]
     return changed
 

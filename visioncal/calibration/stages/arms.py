@@ -6,11 +6,16 @@ from typing import Literal, Self
 
 import numpy as np
 
-from visioncal.calibration.stages import thermal
 from visioncal.calibration.stages.arm_report import ArmReport, report_of
 from visioncal.calibration.stages.joints import MatchedJoints
 from visioncal.calibration.stages.kinematics import ASKED, SelectedArmLevel, select_errors
-from visioncal.calibration.stages.thermal import HeatedStops, ThermalFit, drift_result, find_drift
+from visioncal.calibration.stages.thermal import (
+    HeatedStops,
+    ThermalFit,
+    drift_result,
+    find_drift,
+    missing_error,
+)
 from visioncal.core.choices import Convention
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import distances, invert, mean_transform
@@ -166,24 +171,17 @@ class RobotArm:
         """A problem with this arm as reported, apart from its drift."""
         return self.with_found_errors(None).applied_to(problem)
 
-    def with_drift(self, problem: Problem, start: State, asked: str) -> Self:
-        """Estimates the drift with temperature, where the session determines it.
-
-        The problem has this arm as reported; `asked` is a key of `stages.kinematics.ASKED`.
+    def with_drift(self, problem: Problem, start: State) -> Self:
+        """Estimates the drift with temperature; the problem has this arm as reported.
 
         Raises:
-            DataError: The level requires the drift, and the session lacks its inputs.
-            DegenerateError: The level requires the drift, and the temperature hardly changed.
+            DataError: The session lacks its inputs.
+            DegenerateError: The temperature hardly changed.
         """
         heat = self.at(stops_of(problem, self.robot)).heat
         if heat is None or self.matched is None:
-            if asked == thermal.LEVEL:
-                raise thermal.missing_error()
-            return self
-        inputs = heat.inputs(asked)
-        if inputs is None:
-            return self
-        drift = find_drift(problem, start, self.robot, heat, inputs, self.matched.robot)
+            raise missing_error()
+        drift = find_drift(problem, start, self.robot, heat, heat.inputs(), self.matched.robot)
         return replace(self, thermal=drift)
 
     def with_errors(self, likelihood: RobotLikelihood, robot: int) -> Self:

@@ -74,24 +74,13 @@ class HeatedStops:
         views, stamps_s = self.views[rows], self.stamps_s[rows]
         return replace(self, q=self.q[rows], views=views, stamps_s=stamps_s)
 
-    def inputs(self, asked: str) -> Inputs | None:
-        """What heats the arm; None where not requested, or not determined by the session.
+    def inputs(self) -> Inputs:
+        """What heats the arm, where it warms up during the views.
 
         Raises:
-            DataError: The level requires it, and the session lacks data.
-            DegenerateError: The level requires it, and all views were taken about equally warm.
+            DataError: The session lacks data.
+            DegenerateError: All views were taken about equally warm.
         """
-        if asked not in ("auto", LEVEL):
-            return None
-        try:
-            return self._informative_inputs()
-        except (DataError, DegenerateError):
-            if asked == LEVEL:
-                raise
-            return None
-
-    def _informative_inputs(self) -> Inputs:
-        """What heats the arm, where it warms up during the views."""
         inputs = inputs_of(self.session, self.q.shape[1], self.robot)
         if np.isnan(self.stamps_s).any():
             raise missing_error(f"view {self.views[np.isnan(self.stamps_s)][0]} has no stamp_s")
