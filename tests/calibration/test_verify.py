@@ -326,7 +326,7 @@ def test_other_cells_are_refused_by_what_differs(place):
     known = known_again(place.cell, np.random.default_rng(9))
     small = replace(known.cameras["cam"], resolution=(640, 480))
     for wrong, words in (
-        (known.with_robot("", replace(known.reported, matched=None)), "no joint angles"),
+        (replace(known, robots={"": replace(known.reported, matched=None)}), "no joint angles"),
         (known.with_camera("cam", small), "640 x 480"),
     ):
         raised(DataError, words, predict_detected, wrong, prior)

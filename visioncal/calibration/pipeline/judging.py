@@ -62,7 +62,6 @@ def findings_of(run: RunState) -> Findings:
     frames = run.cell_fit.cell.tree.branches.keys()
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {run.cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
-    is_read = all(view.seer.startswith("instrument") for view in connected)
     return Findings(
         _pairs(connected, explained, answer, alone=run.mount is not None),
         _sensors(connected, run),
@@ -70,7 +69,6 @@ def findings_of(run: RunState) -> Findings:
         _worst(run),
         (*found_in(run), *run.warnings),
         run.notes,
-        run.mount or ("instrument" if is_read else "eye-to-hand"),
         run.session.need,
         predict_picks(_pick_inputs(run, explained), run.session.need),
         run.session.corrects_targets,

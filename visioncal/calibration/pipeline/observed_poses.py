@@ -35,16 +35,19 @@ class ObservedPoses(Observed):
         """Copies the observations, with no lens, boards or arm given yet."""
         return cls(**{entry.name: getattr(observed, entry.name) for entry in fields(Observed)})
 
-    def posed(self, poses: Iterable[ViewPoses]) -> Self:
-        """Takes over poses, recomputed with lens and boards where a view has a single pose."""
+    def posed(self, poses: Iterable[ViewPoses], pixel_px: float | None) -> Self:
+        """Takes over poses, recomputed with lens and boards where a view has a single pose.
+
+        `pixel_px` is the noise of a corner's coordinate, if there are corners [px].
+        """
         given = {pose.view: pose for pose in poses}
-        if self.free is not None and self.pixel_px is not None:
+        if self.free is not None and pixel_px is not None:
             single = [
                 view
                 for view in given.values()
                 if view.corners is not None and len(view.cam_from_target) == 1
             ]
-            given |= {view.view: view for view in recompute_poses(single, self.free, self.pixel_px)}
+            given |= {view.view: view for view in recompute_poses(single, self.free, pixel_px)}
         return replace(self, poses={**self.poses, **given})
 
     @cached_property
@@ -65,11 +68,6 @@ class ObservedPoses(Observed):
         """The robot's arm at some views."""
         places = {view: at for at, view in enumerate(self.base_from_flange)}
         return self.robot_arm.at(np.array([places[view] for view in views], dtype=np.int64))
-
-    @property
-    def arm_at_stops(self) -> RobotArm:
-        """The robot's arm at the stops of the used views, by the first view of each."""
-        return self.arm_at(self.first_of_stops(self.used))
 
     def problem(self, views: Sequence[int]) -> Problem:
         """The problem of some views, each with its first or chosen pose."""

@@ -1,6 +1,6 @@
 """State of a pipeline run, to which each stage adds its results."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,10 +20,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, Mount, Progress
 from visioncal.results import Verdict
 from visioncal.results.sections import UncertaintyResult
-from visioncal.robot import Loads
 from visioncal.session import Session
 from visioncal.session.selecting import is_whole_cell
-from visioncal.session.table import loads_of
 
 _T = TypeVar("_T")
 
@@ -69,14 +67,6 @@ class RunState(Observed):
     def mount(self) -> Mount | None:
         """Mount of the camera, of one camera and one robot; None for a whole cell."""
         return None if is_whole_cell(self.session) else self.session.mount
-
-    def loads(self, views: Sequence[int]) -> Loads:
-        """Payloads and approach directions of the joints at some views."""
-        rows = {view.number: view for view in self.session.views}
-        return loads_of(
-            [rows[view].numbers for view in views],
-            [rows[view].text.get("approach", "") for view in views],
-        )
 
     @property
     def cell(self) -> Cell:

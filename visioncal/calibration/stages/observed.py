@@ -81,10 +81,6 @@ class Observed:
         """Adds or replaces one camera's observations."""
         return replace(self, cameras={**self.cameras, frame: look})
 
-    def with_robot(self, name: str, reported: RobotReport) -> Self:
-        """Adds or replaces one robot's reports."""
-        return replace(self, robots={**self.robots, name: reported})
-
     @cached_property
     def corners(self) -> Mapping[int, Corners]:
         """The corners in the images of all cameras, by view."""
@@ -149,19 +145,9 @@ class Observed:
         return None if matched is None else matched.robot
 
     @property
-    def camera(self) -> CameraResult | None:
-        """The intrinsics of the only camera, where there are images."""
-        return next(iter(self.lenses.values()), None)
-
-    @property
     def pixel_px(self) -> float | None:
         """Noise of a coordinate of the only camera's corners [px]."""
         return next((camera.pixel_px for camera in self.cameras.values()), None)
-
-    def with_noise(self, pixel_px: float) -> Self:
-        """Sets the noise of the corners."""
-        cameras = {name: replace(look, pixel_px=pixel_px) for name, look in self.cameras.items()}
-        return replace(self, cameras=cameras)
 
     @property
     def poses_of_one_board(self) -> Mapping[int, ViewPoses]:

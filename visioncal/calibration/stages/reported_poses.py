@@ -1,10 +1,9 @@
 """Flange poses as the robot reports them, or by the model from its joint angles."""
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 
@@ -37,11 +36,6 @@ class RobotReport:
         joints = self.matched.joints_rad
         known = {view: joints[view] for view in self.base_from_flange if view in joints}
         return known if len(known) == len(self.base_from_flange) else None
-
-    def without(self, views: Collection[int]) -> Self:
-        """Removes some views."""
-        kept = {key: pose for key, pose in self.base_from_flange.items() if key not in views}
-        return replace(self, base_from_flange=kept)
 
 
 def reported_poses(session: Session, robot: Robot | None) -> RobotReport:

@@ -21,9 +21,10 @@ from visioncal.core.limits import FEWEST_COMPARED
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy, remarks
-from visioncal.robot import Loads, Robot
-from visioncal.session import Observation, Session, frame_name
+from visioncal.robot import Robot
+from visioncal.session import Observation, Session, View, frame_name
 from visioncal.session.kinds import is_camera_observation, name_of
+from visioncal.session.table import loads_of
 
 T = TypeVar("T", bound=Observed)
 
@@ -89,21 +90,23 @@ def _lost_views(
             yield Rejection(row.view.number, f"{why}{of}")
 
 
-def check_loads(loads: Loads, views: Sequence[int], stops: Sequence[int | None]) -> None:
-    """Refuses views of one declared stop under different loads; `stops` has None for none.
+def check_loads(rows: Sequence[View]) -> None:
+    """Refuses views of one declared stop under different loads.
 
     Raises:
         DataError: Two views of a stop differ; it names them.
     """
-    first: dict[int, int] = {}
-    for at, stop in enumerate(stops):
-        other = at if stop is None else first.setdefault(stop, at)
-        if not np.array_equal(loads.rows[at], loads.rows[other]):
+    approaches = [view.text.get("approach", "") for view in rows]
+    loads, first = loads_of([view.numbers for view in rows], approaches).rows, dict[int, int]()
+    for at, view in enumerate(rows):
+        other = at if view.stop is None else first.setdefault(view.stop, at)
+        if not np.array_equal(loads[at], loads[other]):
+            pair = rows[other].number, view.number
             raise DataError(
-                f"views {views[other]} and {views[at]} are of stop {stop} and differ in payload, "
+                f"views {pair[0]} and {pair[1]} are of stop {view.stop} and differ in payload, "
                 "force or approach: views of one stop share the pose of the arm, which these "
                 "change.",
-                culprits=[f"view {views[other]}", f"view {views[at]}"],
+                culprits=[f"view {number}" for number in pair],
                 next_step="Give each of them a stop of its own.",
             )
 
@@ -139,8 +142,11 @@ def check_joints(observed: T, *, drops: bool) -> T:
         guess = _guessed(matched, joints, seen, {*matched.contradicting, *observed.held_back})
         if drops:
             lost = tuple(_contradicted_joints(reported, matched, guess, seen))
-            kept = reported.without({rejection.view for rejection in lost})
-            observed = observed.noting(lost).with_robot(name, kept)
+            poses = dict(reported.base_from_flange)
+            for rejection in lost:
+                del poses[rejection.view]
+            kept = {**observed.robots, name: replace(reported, base_from_flange=poses)}
+            observed = replace(observed.noting(lost), robots=kept)
         if guess is None or not guess.stands_out:
             continue
         if (zero := guess.zero) is None:

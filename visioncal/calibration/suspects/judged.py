@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from visioncal.calibration.stages.need import Picks
-from visioncal.core.types import Mount, Need, Rejection
+from visioncal.core.types import Need, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.observability import Direction
 from visioncal.results import Rms, ViewResult
-from visioncal.results.views import holdout_rms, left_out_rms, rms_of
+from visioncal.results.views import holdout_rms, left_out_rms
 from visioncal.robot.model import REPEATABILITY
 
 
@@ -82,7 +82,6 @@ class Findings:
     worst: Sequence[Direction]
     warnings: Sequence[Finding] = ()  # Findings of earlier stages.
     notes: Sequence[str] = ()  # Their remarks that are no reason for doubt.
-    mount: Mount = "eye-in-hand"  # Mount of the sensor.
     need: Need | None = None  # Required accuracy; None where it is not stated.
     # Error budgets of picks by camera and robot, with targets that are corrected where the arm was
     # calibrated; empty where they are not predicted.
@@ -107,11 +106,6 @@ class Findings:
     def views(self) -> tuple[ViewResult, ...]:
         """Result of each view."""
         return tuple(view for pair in self.pairs for view in pair.views)
-
-    @property
-    def rms(self) -> Rms:
-        """Residuals of all used views."""
-        return rms_of(self.views)
 
     @property
     def held_out(self) -> Rms:

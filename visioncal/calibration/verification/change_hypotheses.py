@@ -100,7 +100,8 @@ def nominal_model(predicted: PredictedStops, prior: CalibrationPrior) -> ArmMode
 def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[ChangeHypothesis]:
     """An offset of each joint, and a common scale of all lengths."""
     model = prior.model or nominal_model(predicted, prior)
-    q = predicted.observed.arm_at_stops.joints_rad
+    observed = predicted.observed
+    q = observed.arm_at(observed.first_of_stops(observed.used)).joints_rad
     if model is None or q is None:
         return
     offsets, arm = model.columns("offsets", q), model.robot

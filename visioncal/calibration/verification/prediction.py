@@ -185,23 +185,15 @@ def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPos
         predicted = invert(robot @ x) @ boards[order[board]]
         chosen.append(poses[view].nearest(predicted, targets[board] if targets else None))
     observed = replace(observed, used=tuple(views), boards=prior.boards, free=prior.free)
-    observed = observed.posed(chosen)
-    if observed.free is not None and all(view.corners is not None for view in chosen):
-        observed = observed.with_noise(_noise_px(observed)).posed(chosen)
+    observed = observed.posed(chosen, observed.pixel_px)
+    corners = {view.view: view.corners for view in chosen if view.corners is not None}
+    if (free := observed.free) is not None and len(corners) == len(chosen):
+        # With the noise around these poses, by calibrated lens and boards.
+        stack = CornerStack.of(corners, free.positions + free.basis @ free.appearance.board)
+        placed = np.array([observed.poses[view].cam_from_target[0] for view in corners])
+        residuals = reproject(stack, free.appearance.camera, placed).residuals
+        observed = observed.posed(chosen, stack.sigma_px(residuals, 6 * len(corners)))
     return observed
-
-
-def _noise_px(observed: ObservedPoses) -> float:
-    """Noise of a corner's coordinate around the poses, by calibrated lens and boards [px]."""
-    pairs = ((view, observed.poses[view].corners) for view in observed.used)
-    corners = {view: detected for view, detected in pairs if detected}
-    free = observed.free
-    if free is None or not corners:
-        return observed.pixel_px or 0.0
-    stack = CornerStack.of(corners, free.positions + free.basis @ free.appearance.board)
-    poses = np.array([observed.poses[view].cam_from_target[0] for view in corners])
-    residuals = reproject(stack, free.appearance.camera, poses).residuals
-    return stack.sigma_px(residuals, 6 * len(corners))
 
 
 def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Session:
