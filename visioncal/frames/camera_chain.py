@@ -278,8 +278,8 @@ def checked_pose(pose: FloatArray, name: str) -> None:
         )
 
 
-def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArray:
-    """Checks that an array is a point in metres.
+def checked_point(point_target_m: FloatArray | Sequence[float]) -> FloatArray:
+    """Checks that an array is a point of a target in metres.
 
     Returns:
         (3,) the point [m].
@@ -287,7 +287,7 @@ def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArra
     Raises:
         DataError: It is not three finite numbers, or is farther off than any arm reaches.
     """
-    point = np.asarray(point_m, dtype=float)
+    point, name = np.asarray(point_target_m, dtype=float), "point_target_m"
     if point.shape != (3,) or not np.isfinite(point).all():
         seen = f"is {point.tolist()}" if point.shape == (3,) else f"has the shape {point.shape}"
         raise DataError(f"{name} {seen}; three metres are needed.", culprits=[name])

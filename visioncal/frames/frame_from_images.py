@@ -21,8 +21,6 @@ from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.frames.session_observations import (
     SessionImages,
     detect_session_target,
-    fit_views,
-    held_out_views,
     no_usable_image,
     without_label,
 )
@@ -35,7 +33,6 @@ from visioncal.vision.boards import kind_of
 
 # Key of the detail that identifies the calibration of a frame's camera.
 SEEN_BY = "camera_calibrated"
-_ORIGIN = (0.0, 0.0, 0.0)
 _COUNTED_TWICE = (
     "the sigma holds the camera's own calibration: a pick by the same camera on a plane of this "
     "frame counts it twice"
@@ -48,7 +45,7 @@ def seen_frame(
     session: Session,
     calibration: Calibration,
     kind: FrameKind,
-    point_target_m: FloatArray | Sequence[float] = _ORIGIN,
+    point_target_m: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
     *,
     options: ImageFrameLimits | None = None,
     camera: str | None = None,
@@ -83,11 +80,10 @@ def seen_frame(
     choice = Choice(camera, robot, target)
     session, calibration = select_matching(session, calibration, choice, EYE, parted=False)
     options = options or ImageFrameLimits()
-    point = checked_point(point_target_m, "point_target_m")
+    point = checked_point(point_target_m)
     eye, parent = CalibratedCamera.of(calibration), PARENTS[kind]
-    shown = detect_session_target(
-        session, calibration, parent, among=fit_views(session), progress=progress
-    )
+    free = [view for view in session.views if not view.holdout]
+    shown = detect_session_target(session, calibration, parent, among=free, progress=progress)
     views, sights, looks, lost = [], [], [], dict(shown.lost)
     for sight, view in zip(shown.sights, shown.views, strict=True):
         try:
@@ -98,7 +94,7 @@ def seen_frame(
             lost[view.number] = without_label(error, sight)
     if not views:
         raise no_usable_image(shown, lost)
-    lost |= held_out_views(session)
+    lost |= {view.number: HELD_BACK for view in session.views if view.holdout}
     seen = place_target(eye, sights, looks, parent).at(point)
     worst = worst_of(seen.matrix, seen.covariance, kind, parent)
     _check_parent(eye, kind, shown, seen, sights, looks)
@@ -113,9 +109,13 @@ def seen_frame(
     findings = [
         *(replace(remark, is_fatal=remark.words in eye.warnings) for remark in warnings),
         *sigma_findings(worst, options.sigma_mm, options.sigma_deg, advice),
-        *view_findings(session, lost),
-        *remarks(shown.warnings),
     ]
+    missing = {view: why for view, why in lost.items() if why != HELD_BACK}
+    if len(missing) > 0.25 * len(session.views):
+        words = f"{len(missing)} of {len(session.views)} views were not used"
+        words = f"{words}: {'; '.join(by_reason(missing)[:3])}."
+        findings.append(Finding("lost_views", words, views=tuple(missing)))
+    findings += remarks(shown.warnings)
     count, board = int(seen.inliers.sum()), shown.target
     images = "one image" if count == 1 else f"{count} images"
     method = f"{kind_of(board).noun} {board.name} seen in {images}"
@@ -178,18 +178,6 @@ def _check_parent(
             f"{kind}.",
             culprits=[shown.source],
             next_step=f"Say visioncal {_COMMANDS[other]} for it.",
-        )
-
-
-def view_findings(session: Session, lost: Mapping[int, str]) -> Iterator[Finding]:
-    """Finding on a session with many unused views."""
-    missing = {view: why for view, why in lost.items() if why != HELD_BACK}
-    if len(missing) > 0.25 * len(session.views):
-        yield Finding(
-            "lost_views",
-            f"{len(missing)} of {len(session.views)} views were not used: "
-            f"{'; '.join(by_reason(missing)[:3])}.",
-            views=tuple(missing),
         )
 
 

@@ -1,7 +1,7 @@
 """Picks: position in the base of a feature in an image, with its uncertainty."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -250,7 +250,7 @@ def _located(
         f"The place is known to {figure(1e3 * worst_m)} mm only in its worst direction (limit "
         f"{1e3 * SIGMA_LIMIT_M:g}), mostly because of the {_SOURCES[located.largest]}."
     )
-    return Located(p_base, nonzero, located.freedom, (*located.warnings, warning))
+    return replace(located, warnings=(*located.warnings, warning))
 
 
 def _distance_warning(eye: CalibratedCamera, point_cam: FloatArray) -> tuple[str, ...]:
@@ -322,7 +322,7 @@ def locate_target(
     cam_pose = eye.at(base_from_flange, joints_rad)
     board = target if isinstance(target, Target) else load_target(target)
     view = target_pose_candidates(eye, seen, board, label, sigma_px)
-    point = checked_point(point_target_m, "point_target_m")
+    point = checked_point(point_target_m)
     candidates_cam = view.cam_from_target[:, :3, :3] @ point + view.cam_from_target[:, :3, 3]
     pose, point_cam = view.cam_from_target[0], candidates_cam[0]
     by_cam = cam_pose.base_from_cam[:3, :3] @ point_jacobian(pose, point)
@@ -348,4 +348,4 @@ def locate_target(
         f"{why}: the point would lie {figure(away_mm)} mm away then. Look from another side, from "
         "nearer, or at a board without symmetry."
     )
-    return Located(located.p_base, located.parts, located.freedom, (*located.warnings, warning))
+    return replace(located, warnings=(*located.warnings, warning))

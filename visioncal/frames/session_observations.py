@@ -23,7 +23,6 @@ from visioncal.session.selecting import EYE, Choice
 from visioncal.session.table import loads_of
 
 _NO_IMAGE = "it has no image"
-_ORIGIN = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,16 +115,6 @@ def detect_session_target(
     return SessionImages(session.name, target, tuple(sights), views, lost, tuple(warnings))
 
 
-def fit_views(session: Session) -> tuple[View, ...]:
-    """The views that are not held out."""
-    return tuple(view for view in session.views if not view.holdout)
-
-
-def held_out_views(session: Session) -> dict[int, str]:
-    """The held-out views by number, with the reason."""
-    return {view.number: HELD_BACK for view in session.views if view.holdout}
-
-
 def calibrated_joints(view: View, calibration: Calibration) -> FloatArray | None:
     """(n,) a view's joints [rad] where the arm is calibrated; else None."""
     arm, joints = calibration.calibrated_robot, view.joints_rad
@@ -213,7 +202,7 @@ class Picks:
 def locate_views(
     session: Session,
     calibration: Calibration,
-    point_target_m: FloatArray | Sequence[float] = _ORIGIN,
+    point_target_m: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
     *,
     among: Sequence[View] | None = None,
     sigma_px: float | None = None,
@@ -241,7 +230,7 @@ def locate_views(
     Raises:
         DataError: No view is usable, or the point is invalid.
     """
-    point = checked_point(point_target_m, "point_target_m")
+    point = checked_point(point_target_m)
     choice = Choice(camera, robot, target)
     session, calibration = select_matching(session, calibration, choice, EYE, parted=False)
     shown = detect_session_target(session, calibration, "base", among=among, progress=progress)

@@ -26,7 +26,7 @@ from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, compose, exp, invert, log, pose_difference
 from visioncal.core.types import Corners, FloatArray, Image, IntArray, Mask, Target
 from visioncal.estimation.linalg import covariance_from, squared_lengths
-from visioncal.estimation.robust import Distances, settled
+from visioncal.estimation.robust import Distances, nearest, settled, trimmed_sum
 from visioncal.frames.camera_chain import CalibratedCamera, checked_pose
 from visioncal.frames.target_in_image import PoseCandidates, target_pose_candidates
 from visioncal.results import Calibration, Edge
@@ -174,21 +174,18 @@ def _find_inliers(candidates: _CandidateViews) -> _ImageInliers:
     best: tuple[float, IntArray, FloatArray] | None = None
     half = len(candidates.views) // 2 + 1
     for seed in (place for view in candidates.views for place in view):
-        nearest, picks = _nearest(candidates, seed)
-        score = float(np.sort(nearest)[:half].sum())
+        distances, picks = _nearest(candidates, seed)
+        score = trimmed_sum(distances, half)
         # Poses of a symmetric board fit equally, apart from rounding of their fits.
         if best is None or score < (1.0 - 1e-6) * best[0] - 1e-9:
-            best = (score, picks, nearest)
+            best = (score, picks, distances)
     if best is None:
         raise RuntimeError("there are no images to agree")
-    _, picks, nearest = best
-    agrees = np.zeros(len(picks), dtype=bool)
-    agrees[np.argsort(nearest)[:half]] = True
+    _, picks, distances = best
+    agrees = nearest(distances, half)
     search = _ImageSearch(candidates, picks)
-    agrees, fit = settled(search, agrees, _fit(candidates, picks, agrees), fewest=2, suspect=0.0)
-    if 2 * int(agrees.sum()) <= len(picks):
-        return _fit(candidates, picks, np.ones(len(picks), dtype=bool))
-    return fit
+    agrees, fit = settled(search, agrees, search.fit(agrees), fewest=2, suspect=0.0)
+    return fit if 2 * int(agrees.sum()) > len(picks) else search.fit(np.ones_like(agrees))
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +195,52 @@ class _ImageSearch:
     candidates: _CandidateViews
     picks: IntArray
 
-    def fit(self, used: Mask, _: _ImageInliers) -> _ImageInliers:
-        return _fit(self.candidates, self.picks, used)
+    def fit(self, agrees: Mask, _: _ImageInliers | None = None) -> _ImageInliers:
+        """Mean pose over the inliers, and the distances of all images from it."""
+        candidates = self.candidates
+        chosen = [view[at] for view, at in zip(candidates.views, self.picks, strict=True)]
+        matrices = np.array([place.matrix for place in chosen])
+        of_images = np.array([candidates.independent(place) for place in chosen])
+        # Weighted by the images' independent errors: common errors do not average out.
+        weights = np.where(agrees[:, None, None], np.linalg.inv(of_images), 0.0)
+        of_mean = covariance_from(weights.sum(axis=0))
+        gains = of_mean @ weights
+        matrix = matrices[int(np.flatnonzero(agrees)[0])]
+        # The mean converges in a few steps, since the poses are near each other.
+        for _round in range(10):
+            step = np.einsum("mij,mj->i", gains, log(invert(matrix) @ matrices))
+            matrix = matrix @ exp(step)
+            if np.abs(step).max() < 1e-12:
+                break
+        errors = log(invert(matrix) @ matrices)
+        by_common = np.array([place.by_common for place in chosen])
+        mean_by_common = np.einsum("mij,mjk->ik", gains, by_common)
+        difference = by_common - mean_by_common
+        shared = difference @ candidates.common @ np.swapaxes(difference, 1, 2)
+        is_inlier, others = agrees[:, None, None], int(agrees.sum()) - 1
+        squared = np.einsum(
+            "mi,mi->m", errors, np.linalg.solve(of_images + shared, errors[..., None])[..., 0]
+        )
+        # Six degrees of freedom for each image beyond the first.
+        variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
+        # The residual of an image that is part of the mean has a smaller covariance.
+        covariance = of_images + shared + np.where(is_inlier, -1.0, 1.0) * of_mean
+        mahalanobis_sq = (
+            squared_lengths(errors, covariance, of_images)[0]
+            if others
+            else np.where(agrees, 0.0, squared)
+        )
+        return _ImageInliers(
+            matrix,
+            of_mean,
+            mean_by_common,
+            agrees,
+            errors,
+            mahalanobis_sq,
+            candidates.limit,
+            variance,
+            _rival(candidates, matrix, agrees, variance),
+        )
 
     def distances(self, _: Mask, fit: _ImageInliers) -> Distances:
         six = np.full(len(self.picks), 6.0)
@@ -208,64 +249,16 @@ class _ImageSearch:
 
 def _nearest(candidates: _CandidateViews, seed: TargetPlace) -> tuple[FloatArray, IntArray]:
     """Squared distance (m,) of each image's nearest candidate from a pose, and its index."""
-    independent, nearest = candidates.independent(seed), []
+    independent, found = candidates.independent(seed), []
     for view in candidates.views:
         differences = [log(invert(seed.matrix) @ place.matrix) for place in view]
         squared = [
             float(d @ np.linalg.solve(independent + candidates.independent(place), d))
             for d, place in zip(differences, view, strict=True)
         ]
-        nearest.append((min(squared), int(np.argmin(squared))))
-    return np.array([item[0] for item in nearest]), np.array(
-        [item[1] for item in nearest], dtype=np.int64
-    )
-
-
-def _fit(candidates: _CandidateViews, picks: IntArray, agrees: Mask) -> _ImageInliers:
-    """Mean pose over the inliers, and the distances of all images from it."""
-    chosen = [view[at] for view, at in zip(candidates.views, picks, strict=True)]
-    matrices = np.array([place.matrix for place in chosen])
-    of_images = np.array([candidates.independent(place) for place in chosen])
-    # Weighted by the images' independent errors: common errors do not average out.
-    weights = np.where(agrees[:, None, None], np.linalg.inv(of_images), 0.0)
-    of_mean = covariance_from(weights.sum(axis=0))
-    gains = of_mean @ weights
-    matrix = matrices[int(np.flatnonzero(agrees)[0])]
-    # The mean converges in a few steps, since the poses are near each other.
-    for _ in range(10):
-        step = np.einsum("mij,mj->i", gains, log(invert(matrix) @ matrices))
-        matrix = matrix @ exp(step)
-        if np.abs(step).max() < 1e-12:
-            break
-    errors = log(invert(matrix) @ matrices)
-    by_common = np.array([place.by_common for place in chosen])
-    mean_by_common = np.einsum("mij,mjk->ik", gains, by_common)
-    difference = by_common - mean_by_common
-    shared = difference @ candidates.common @ np.swapaxes(difference, 1, 2)
-    is_inlier, others = agrees[:, None, None], int(agrees.sum()) - 1
-    squared = np.einsum(
-        "mi,mi->m", errors, np.linalg.solve(of_images + shared, errors[..., None])[..., 0]
-    )
-    # Six degrees of freedom for each image beyond the first.
-    variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
-    # The residual of an image that is part of the mean has a smaller covariance.
-    covariance = of_images + shared + np.where(is_inlier, -1.0, 1.0) * of_mean
-    mahalanobis_sq = (
-        squared_lengths(errors, covariance, of_images)[0]
-        if others
-        else np.where(agrees, 0.0, squared)
-    )
-    return _ImageInliers(
-        matrix,
-        of_mean,
-        mean_by_common,
-        agrees,
-        errors,
-        mahalanobis_sq,
-        candidates.limit,
-        variance,
-        _rival(candidates, matrix, agrees, variance),
-    )
+        found.append((min(squared), int(np.argmin(squared))))
+    distances, picks = zip(*found, strict=True)
+    return np.array(distances), np.array(picks, dtype=np.int64)
 
 
 def _rival(
@@ -295,7 +288,6 @@ class TargetPose:
     # (6, 6) covariance by errors that all images share: the camera's transform, its lens, the
     # target's size, the arm's errors.
     common: FloatArray
-    labels: tuple[str, ...]  # (m,) the images.
     inliers: Mask  # (m,) inlier mask; outliers are not used.
     away_mm: FloatArray  # (m,) distance of each image's pose from the mean [mm].
     away_deg: FloatArray  # (m,) the same in rotation [deg].
@@ -388,7 +380,6 @@ def place_target(
         fit.matrix,
         fit.variance * fit.independent,
         fit.by_common @ common @ fit.by_common.T,
-        labels,
         fit.inliers,
         1e3 * np.linalg.norm(fit.residuals[:, 3:], axis=1),
         np.rad2deg(np.linalg.norm(fit.residuals[:, :3], axis=1)),
@@ -405,10 +396,11 @@ def _inlier_warnings(
     fit: _ImageInliers, labels: Sequence[str], looks: Sequence[PoseCandidates], stops: int | None
 ) -> Iterator[str]:
     """Warnings on the inliers of a target's images."""
-    count = len(labels)
+    count, sizes = len(labels), np.linalg.norm(fit.residuals.reshape(-1, 2, 3), axis=2)
+    away = [mm_and_deg(1e3 * shift_m, np.rad2deg(turn_rad)) for turn_rad, shift_m in sizes.tolist()]
     for at in np.flatnonzero(~fit.inliers).tolist():
         yield (
-            f"{labels[at]} puts the target {_distance_words(fit, at)} from where the others do, "
+            f"{labels[at]} puts the target {away[at]} from where the others do, "
             "and was left out: was it moved, or is the robot's pose that of another image?"
         )
     inliers = int(fit.inliers.sum())
@@ -426,7 +418,7 @@ def _inlier_warnings(
         # Images were kept although they contradict each other.
         worst = int(np.where(fit.inliers, fit.mahalanobis_sq, -1.0).argmax())
         yield (
-            f"The images disagree, by up to {_distance_words(fit, worst)}, and with {count} of "
+            f"The images disagree, by up to {away[worst]}, and with {count} of "
             "them it is not known which are right: take more."
         )
     elif fit.variance * 6 * (inliers - 1) > chi2_limit(1e-4, 6 * (inliers - 1)):
@@ -434,27 +426,16 @@ def _inlier_warnings(
             f"The images scatter {figure(np.sqrt(fit.variance))} times as much as the "
             "calibration's noise lets them; the sigmas are that much larger."
         )
-    if fit.rival is not None:
-        yield _ambiguity_warning(fit, looks)
-
-
-def _distance_words(fit: _ImageInliers, at: int) -> str:
-    residual = fit.residuals[at]
-    millimetres = 1e3 * float(np.linalg.norm(residual[3:]))
-    degrees = float(np.rad2deg(np.linalg.norm(residual[:3])))
-    return mm_and_deg(millimetres, degrees)
-
-
-def _ambiguity_warning(fit: _ImageInliers, looks: Sequence[PoseCandidates]) -> str:
-    rival = np.eye(4) if fit.rival is None else fit.rival
-    millimetres, degrees = pose_difference(fit.matrix, rival)
-    shift = f"{mm_and_deg(millimetres, degrees)} away"
+    if fit.rival is None:
+        return
+    shift = f"{mm_and_deg(*pose_difference(fit.matrix, fit.rival))} away"
     if any(len(set(look.symmetries)) > 1 for look in looks):
-        return (
+        yield (
             f"The target looks the same when it is turned: it may as well be {shift}. Use a board "
             "without symmetry, or see to it that it is not turned."
         )
-    return (
-        f"Seen so flat, the target may as well be tilted the other way, {shift}. Look from "
-        "another side, or from nearer."
-    )
+    else:
+        yield (
+            f"Seen so flat, the target may as well be tilted the other way, {shift}. Look from "
+            "another side, or from nearer."
+        )

@@ -22,7 +22,6 @@ from visioncal.frames.touches import (
     TouchRows,
     flange_poses,
     nominal_pose_findings,
-    numbered,
     refuse_copies,
     robot_noise,
 )
@@ -61,7 +60,7 @@ def touched_tool(
     rows = rows.of_kinds(TOUCH_KINDS, "point")
     poses = flange_poses(rows, robot, calibration)
     refuse_copies(poses, rows.places)
-    numbers = numbered(rows.points)
+    numbers = {name: at for at, name in enumerate(dict.fromkeys(rows.points))}
     touches = Touches(
         poses,
         np.array([numbers[point] for point in rows.points], dtype=np.int64),

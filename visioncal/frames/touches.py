@@ -1,6 +1,6 @@
 """Touches: flange poses at which the tool's tip touched a point of the cell."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -246,11 +246,6 @@ def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Ma
             "the flange without a tool.",
         )
     return has_joints, poses
-
-
-def numbered(names: Collection[str]) -> dict[str, int]:
-    """Numbers of names from 0, in the order of first appearance."""
-    return {name: at for at, name in enumerate(dict.fromkeys(names))}
 
 
 @dataclass(frozen=True, eq=False)
