@@ -22,7 +22,7 @@ from visioncal.dynamics.sweeps import Stroke, SweepRequest, plan_sweeps
 from visioncal.robot import Robot, load_robot
 from visioncal.robot.collision import Body
 from visioncal.robot.torques import joint_torques
-from visioncal.simulation.arms import ur_arm
+from visioncal.simulation.arms import arm_named
 
 pytestmark = pytest.mark.usefixtures("strict_rerun")
 
@@ -148,7 +148,7 @@ def test_a_found_motion_keeps_the_data_sheet_by_plain_differences(ur5e, found):
     assert (np.abs(hard).max(axis=0) <= 0.9 * 10.0 + 1e-6).all()
     assert np.abs(speed[[0, -1]]).max() < 1e-4
     # The least distance of tubes, by golden sections; coal's may differ by its own 1e-6.
-    apart = clearances(ur_arm("ur5e"), q[::5], 0.0, [])
+    apart = clearances(arm_named("ur5e"), q[::5], 0.0, [])
     assert apart.min() > 0.03 - 1e-5
     assert found.extremes.clearance_m == pytest.approx(apart.min(), abs=1e-3)
     assert found.extremes.breaches == ()
@@ -286,7 +286,7 @@ def test_sweeps_move_one_joint_at_a_time_within_all_limits(sweeps):
     assert (np.abs(differences).max(axis=0) <= 0.9 * np.pi).all()
     assert (np.abs(np.diff(differences, axis=0) * 250.0).max(axis=0) <= 9.0 + 1e-6).all()
     pose = compose(np.eye(3), np.array([0.5, 0.2, 0.4]))
-    apart = clearances(ur_arm("ur5e"), motion.q[::10], 0.0, [(pose, np.array([0.1, 0.1, 0.8]))])
+    apart = clearances(arm_named("ur5e"), motion.q[::10], 0.0, [(pose, np.array([0.1, 0.1, 0.8]))])
     assert apart.min() > 0.03 - 1e-5
     assert sweeps.extremes.breaches == ()
     assert sweeps.left_out == ()

@@ -29,7 +29,7 @@ from visioncal.live.planning.recorded import SessionStart, start_from_session
 from visioncal.live.planning.visibility import FieldOfView
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
-from visioncal.simulation.arms import forward, ur_arm
+from visioncal.simulation.arms import arm_named, forward
 from visioncal.simulation.boards import Sheet, centre_m, outline_m
 from visioncal.simulation.optics import sees
 from visioncal.vision.camera import project
@@ -219,7 +219,7 @@ def cell_of(options: CellOptions, **changes) -> PlanCell:
 
 def views(cell: PlanCell, q: FloatArray) -> FloatArray:
     """`cam_from_target` by the simulation's kinematics."""
-    flange = forward(ur_arm(cell.robot.name), q)
+    flange = forward(arm_named(cell.robot.name), q)
     if cell.mount == "eye-in-hand":
         return invert(flange @ cell.x) @ cell.z
     return invert(cell.x) @ flange @ cell.z
@@ -251,14 +251,14 @@ def least_clearance(cell, q):
     """By plain geometry, of arm, camera or board, floor and boxes [m]."""
     pose, size = board_plate(cell)
     boxes = [(box.base_from_box, box.size_m) for box in cell.boxes]
-    flange = forward(ur_arm("ur5e"), q)
+    flange = forward(arm_named("ur5e"), q)
     if cell.mount == "eye-in-hand":
         boxes.append((cell.z @ pose, size))
         carried = corners(flange @ cell.x @ compose(np.eye(3), np.zeros(3)), np.full(3, 0.02))
     else:
         boxes.append((cell.x, np.full(3, 0.02)))
         carried = corners(flange @ cell.z @ pose, size)
-    found = [clearances(ur_arm("ur5e"), q, cell.limits.floor_m, boxes)]
+    found = [clearances(arm_named("ur5e"), q, cell.limits.floor_m, boxes)]
     if cell.limits.floor_m is not None:
         found.append(carried[..., 2].min(axis=1) - cell.limits.floor_m)
     for base_from_box, box in boxes[:-1]:

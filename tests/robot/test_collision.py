@@ -10,7 +10,7 @@ from visioncal.core.transforms import compose, exp
 from visioncal.robot import Robot, load_robot
 from visioncal.robot.collision import Body, Collisions, arm_bodies, capsule
 from visioncal.robot.files import read_robot_document
-from visioncal.simulation.arms import ur_arm
+from visioncal.simulation.arms import arm_named
 
 POST = compose(np.eye(3), np.array([0.45, 0.1, 0.3]))
 POST_SIZE = np.array([0.1, 0.15, 0.6])
@@ -30,7 +30,7 @@ def random_joints(count, seed=0):
 def test_the_distances_are_those_of_plain_geometry():
     cell, q = ur5e_with_post(), random_joints(60)
     found = np.array([cell.distances(value).min() for value in q])
-    plain = clearances(ur_arm("ur5e"), q, 0.0, [(POST, POST_SIZE)])
+    plain = clearances(arm_named("ur5e"), q, 0.0, [(POST, POST_SIZE)])
     # Where bodies overlap the two count differently how far; golden sections end at 2e-7.
     free = found > 0.0
     assert free.sum() > 10
@@ -56,7 +56,7 @@ def test_a_clear_way_is_clear_between_all_samples():
     starts, ends = stops[:24], stops[1:25]
     shares = np.linspace(0.0, 1.0, 150)[:, None, None]
     joints = (starts + shares * (ends - starts)).reshape(-1, 6)
-    apart = clearances(ur_arm("ur5e"), joints, 0.0, [(POST, POST_SIZE)]).reshape(150, -1)
+    apart = clearances(arm_named("ur5e"), joints, 0.0, [(POST, POST_SIZE)]).reshape(150, -1)
     least = apart.min(axis=0)
     clear = np.array([cell.path_contact(*pair) < 0 for pair in zip(starts, ends, strict=True)])
     assert 3 < clear.sum() < 23

@@ -22,6 +22,7 @@ from visioncal.simulation import (
     Payload,
     RobotAt,
     Second,
+    arm_named,
     cell_session,
     fine_camera,
     fisheye_camera,

@@ -4,7 +4,7 @@ Boards are drawn as they are printed. Nothing here uses the application's camera
 estimator, so that an error in a projection or in a kinematic chain cannot cancel out.
 """
 
-from visioncal.simulation.arms import ArmOptions, Heat, Payload, arm_named, forward, ur_arm
+from visioncal.simulation.arms import ArmOptions, Heat, Payload, arm_named, forward
 from visioncal.simulation.boards import BOARDS
 from visioncal.simulation.cell import SimulatedCell
 from visioncal.simulation.cell_files import cell_names, read_cell
@@ -82,7 +82,6 @@ __all__ = [
     "sweep",
     "touch",
     "truth_path",
-    "ur_arm",
     "wide_camera",
     "write_session",
 ]

@@ -216,19 +216,16 @@ class Reach:
     dexterity: FloatArray
 
 
-def ur_arm(name: str) -> DhArm:
-    """Nominal arm of Universal Robots' e-Series by the manufacturer's values.
+def arm_named(name: str) -> DhArm:
+    """Nominal arm by name, from the controller's base frame to the flange.
 
-    Source: Universal Robots, "DH parameters for calculations of kinematics and dynamics".
-
-    Args:
-        name: `ur3e`, `ur5e` or `ur10e`.
-
-    Returns:
-        The nominal arm, from the controller's base frame to the flange.
+    Those of Universal Robots' e-Series have the manufacturer's values ("DH parameters for
+    calculations of kinematics and dynamics"). `generic-6r-1800` is no actual model: round numbers
+    in the proportions of a medium industrial robot of 1.8 m reach, with a shoulder offset from the
+    first axis and a spherical wrist.
 
     Raises:
-        DataError: Another name was given.
+        DataError: There is no arm of that name.
     """
     # d1, a2, a3, d4, d5, d6 [m]
     published = {
@@ -236,44 +233,23 @@ def ur_arm(name: str) -> DhArm:
         "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
         "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
     }
-    if name not in published:
+    offset = np.zeros(6)
+    if name == "generic-6r-1800":
+        a, d = (0.18, 0.8, 0.18, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.8, 0.0, 0.13)
+        quarters = (-1.0, 0.0, -1.0, 1.0, -1.0, 0.0)
+        offset[[1, 5]] = -_QUARTER, _HALF_TURN
+    elif name in published:
+        d1, a2, a3, d4, d5, d6 = published[name]
+        a, d = (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6)
+        quarters = (1.0, 0.0, 0.0, 1.0, -1.0, 0.0)
+    else:
         raise DataError(
             f"simulation: the arm {name!r} is not known, only {', '.join(SIMULATED_ARMS)} are.",
             culprits=["robot"],
             next_step=did_you_mean(name, SIMULATED_ARMS) or "Name one of these.",
         )
-    d1, a2, a3, d4, d5, d6 = published[name]
-    return DhArm(
-        name=name,
-        a=np.array([0.0, a2, a3, 0.0, 0.0, 0.0]),
-        d=np.array([d1, 0.0, 0.0, d4, d5, d6]),
-        alpha=np.array([_QUARTER, 0.0, 0.0, _QUARTER, -_QUARTER, 0.0]),
-        beta=np.zeros(6),
-        offset=np.zeros(6),
-        waves=np.zeros((4, 6)),
-    )
-
-
-def arm_named(name: str) -> DhArm:
-    """Nominal arm by name: Universal Robots', or `generic-6r-1800`.
-
-    The latter is no actual model: round numbers in the proportions of a medium industrial robot of
-    1.8 m reach, with a shoulder offset from the first axis and a spherical wrist.
-
-    Raises:
-        DataError: There is no arm of that name.
-    """
-    if name != "generic-6r-1800":
-        return ur_arm(name)
-    return DhArm(
-        name=name,
-        a=np.array([0.18, 0.8, 0.18, 0.0, 0.0, 0.0]),
-        d=np.array([0.5, 0.0, 0.0, 0.8, 0.0, 0.13]),
-        alpha=np.array([-_QUARTER, 0.0, -_QUARTER, _QUARTER, -_QUARTER, 0.0]),
-        beta=np.zeros(6),
-        offset=np.array([0.0, -_QUARTER, 0.0, 0.0, 0.0, np.pi]),
-        waves=np.zeros((4, 6)),
-    )
+    alpha = _QUARTER * np.array(quarters)
+    return DhArm(name, np.array(a), np.array(d), alpha, np.zeros(6), offset, np.zeros((4, 6)))
 
 
 def reach_m(arm: DhArm) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.session import Session, Stream
-from visioncal.simulation.arms import BODIES, GRAVITY, DhArm, link_frames, ur_arm
+from visioncal.simulation.arms import BODIES, GRAVITY, DhArm, arm_named, link_frames
 from visioncal.simulation.cell import SimulatedCell
 from visioncal.simulation.records import write_truth
 
@@ -108,7 +108,9 @@ def nominal_dynamics(name: str) -> DynamicArm:
         for (kg, centre), main in zip(BODIES[name], _INERTIA[name], strict=True)
     )
     zeros = np.zeros(len(bodies))
-    return DynamicArm(ur_arm(name), bodies, Gears(zeros, zeros, zeros, zeros, zeros + 1.0, zeros))
+    return DynamicArm(
+        arm_named(name), bodies, Gears(zeros, zeros, zeros, zeros, zeros + 1.0, zeros)
+    )
 
 
 def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False) -> DynamicArm:

@@ -6,7 +6,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.transforms import compose
+from visioncal.core.transforms import apply, compose
 from visioncal.core.types import Camera, FloatArray
 from visioncal.simulation.boards import (
     Sheet,
@@ -63,10 +63,10 @@ class Viewpoints:
         )
         centre = distance[:, None] * rays(self.camera, aim)
         cam_from_target = compose(rotation, centre - rotation @ centre_m(self.board))
-        outline_seen = sees(
-            self.camera, _place(cam_from_target, outline_m(self.board, 0.0)), MARGIN_PX
+        outline_seen, seen = (
+            sees(self.camera, apply(cam_from_target, points), MARGIN_PX)
+            for points in (outline_m(self.board, 0.0), corners_m(self.board))
         )
-        seen = sees(self.camera, _place(cam_from_target, corners_m(self.board)), MARGIN_PX)
         fits = outline_seen.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
         return np.asarray(cam_from_target[fits])
 
@@ -106,10 +106,3 @@ def filling_m(camera: Camera, board: Sheet) -> tuple[float, float]:
     focal, short_side = float(camera.matrix[0]), min(camera.resolution)
     full = focal * float(np.hypot(*(high - low))) / short_side
     return full / 1.15, full / 0.7
-
-
-def _place(cam_from_target: FloatArray, points: FloatArray) -> FloatArray:
-    """Maps (n, 3) points in the target frame to (k, n, 3) points in the camera frame."""
-    return np.asarray(
-        points @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2) + cam_from_target[:, None, :3, 3]
-    )

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import apply_each, compose, exp, invert
+from visioncal.core.transforms import apply, apply_each, compose, exp, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Mask
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
@@ -61,8 +61,7 @@ _OF_SEVERAL = {RandomStream.ARM: RandomStream.ARMS, RandomStream.ROBOT: RandomSt
 
 def board_in_view(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
     """(s,) mask of stops at which a board is in view and not too oblique."""
-    points = corners_m(sheet) @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2)
-    points = points + cam_from_target[:, None, :3, 3]
+    points = apply(cam_from_target, corners_m(sheet))
     directions = points / np.linalg.norm(points, axis=2, keepdims=True)
     facing = np.einsum("mni,mi->mn", directions, cam_from_target[:, :3, 2]) > _LEAST_COSINE
     visible = facing.all(axis=1) & (directions[:, :, 2] > _LEAST_COSINE).all(axis=1)
@@ -192,8 +191,7 @@ def _sight(
     cell: SimulatedCell, view: int, stop: int, camera: str, board: str, pose: FloatArray
 ) -> SimulatedSight:
     """A camera's image of a board, with the exact corners inside it."""
-    lens, points = cell.camera(camera), corners_m(cell.board(board))
-    points = points @ pose[:3, :3].T + pose[:3, 3]
+    lens, points = cell.camera(camera), apply(pose, corners_m(cell.board(board)))
     ids = np.flatnonzero(sees(lens.camera, points, EDGE_PX)).astype(np.int64)
     exact = Corners(view, ids, project(lens.camera, points[ids]), lens.blur_px)
     return SimulatedSight(view, stop, camera, board, pose, exact, exact)

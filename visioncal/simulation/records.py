@@ -14,7 +14,7 @@ import numpy as np
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import decode_text, read_bytes, write_atomically
-from visioncal.core.transforms import exp
+from visioncal.core.transforms import apply, exp
 from visioncal.core.types import Camera, FloatArray
 from visioncal.session import MemoryImages, Session, View, frame_name, target_document
 from visioncal.session.columns import POSE, pose_row
@@ -356,8 +356,7 @@ def measured_poses(cell: SimulatedCell) -> FloatArray:
             )
         # Jacobian of the pixels by the pose's right perturbation, by finite differences.
         poses = sight.cam_from_target @ _STEPS
-        turns, places = np.swapaxes(poses[..., :3, :3], -1, -2), poses[..., None, :3, 3]
-        points = corners_m(board)[ids] @ turns + places
+        points = apply(poses, corners_m(board)[ids])
         forward, backward = project(cell.camera(sight.camera).camera, points).reshape(2, 6, -1)
         # R^-1 maps white noise to noise with the covariance (R^T R)^-1.
         factor = np.linalg.qr((forward - backward).T / (2.0 * _STEP), mode="r")

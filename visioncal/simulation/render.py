@@ -8,6 +8,7 @@ fraction of the cost. `LiveView` takes images for any posture of the arm.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.interpolate import make_interp_spline
 
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import compose, invert, rotation_angle
+from visioncal.core.transforms import apply, compose, invert, rotation_angle
 from visioncal.core.types import Camera, FloatArray, Image
 from visioncal.session import frame_name
 from visioncal.simulation.arms import forward
@@ -306,8 +307,7 @@ def _draw_board(light: Float32Array, scene: RenderScene, cam_from_target: FloatA
 
 def _board_patch(camera: Camera, board: Sheet, cam_from_target: FloatArray) -> Patch:
     """Bounds of the sheet and its shadow in the image."""
-    points = outline_m(board, margin_m(board.target))
-    points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    points_cam = apply(cam_from_target, outline_m(board, margin_m(board.target)))
     width, height = camera.resolution
     # Points that the lens model folds back, or beside or behind the camera (over 84 degrees off),
     # do not bound the sheet.
@@ -388,12 +388,10 @@ def _faces(cell: SimulatedCell, cam_from_target: FloatArray) -> bool:
     """Whether the board's printed side may be in the image, at least in part."""
     board = cell.board()
     points = np.concatenate([corners_m(board), outline_m(board, margin_m(board.target))])
-    points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    points_cam = apply(cam_from_target, points)
     cosines = points_cam[:, 2] / np.linalg.norm(points_cam, axis=1)
     camera = cell.camera().camera
-    ends = (
-        np.array(np.meshgrid(*((0.0, index - 1.0) for index in camera.resolution))).reshape(2, 4).T
-    )
+    ends = np.array([*product(*((0.0, size - 1.0) for size in camera.resolution))])
     # The target's z points into the board.
     in_front = invert(cam_from_target)[2, 3] < 0.0
     return bool(in_front and cosines.max() > rays(camera, ends)[:, 2].min())

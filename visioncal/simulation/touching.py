@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.transforms import apply, compose, exp, invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
 from visioncal.session.columns import pose_row
@@ -111,7 +111,7 @@ def _touching(robot: SimulatedRobot, rng: np.random.Generator) -> Touching:
     features = ("origin",) * 3 + ("x",) * 3 + ("xy",) * 3
 
     def on_fixture(places: FloatArray, columns: Mapping[str, tuple[str, ...]]) -> Touched:
-        contacts = places @ base_from_fixture[:3, :3].T + base_from_fixture[:3, 3]
+        contacts = apply(base_from_fixture, places)
         return _touched(robot, flange_from_tool, contacts, np.zeros_like(contacts), columns, rng)
 
     names = tuple(f"P{at}" for at in range(1, len(_DRAWN_M) + 1))
@@ -135,7 +135,7 @@ def _touched(
     """Touches points in the base (n, 3) with points of the tool (n, 3) [m], at random tilts."""
     # Contact error per axis [m].
     contacts = places + 5e-5 * rng.standard_normal(places.shape)
-    on_flange = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
+    on_flange = apply(flange_from_tool, in_tool)
     down = Rotation.from_rotvec([np.pi, 0.0, 0.0])
     straight = compose(down.as_matrix(), contacts[0] - down.apply(on_flange[0]))
     home = home_posture(robot.arm, straight[None], rng)

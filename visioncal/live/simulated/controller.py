@@ -33,7 +33,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
 from visioncal.live.drivers import ur_net
-from visioncal.simulation.arms import ArmOptions, DhArm, forward, ur_arm
+from visioncal.simulation.arms import ArmOptions, DhArm, arm_named, forward
 
 # `none` mends all others.
 Fault: TypeAlias = Literal[
@@ -103,7 +103,7 @@ class ControllerOptions:
     @property
     def believed_arm(self) -> DhArm:
         """Controller's model of the arm: its data sheet."""
-        return ur_arm(self.robot)
+        return arm_named(self.robot)
 
     @property
     def true_arm(self) -> DhArm:
