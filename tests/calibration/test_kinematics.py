@@ -153,7 +153,7 @@ def test_a_wrong_gear_ratio_is_told():
     geared = reporting(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
     known = calibrated(geared)
     assert known.robot_arm.kinematics.level == "eccentricity"
-    assert "ratios" in known.robot_arm.kinematics.errors
+    assert "ratios" in known.robot_arm.kinematics.fit.errors
     # Told to a tenth beside errors of all links.
     assert known.robot_arm.model.robot.chain.functions[1:4, 1] == pytest.approx(1.001, abs=2e-4)
 
@@ -310,8 +310,8 @@ def test_functions_of_joints_are_found_and_make_the_arm_better_where_it_never_wa
     kinematics = known.robot_arm.kinematics
     assert kinematics.level == FUNCTIONS
     # One size from some hundred values, a length from a grid of factors of two.
-    assert kinematics.errors["harmonics"].sigma == pytest.approx(3e-4, rel=0.4)
-    assert 0.12 <= kinematics.functions.length_rad <= 0.5
+    assert kinematics.fit.errors["harmonics"].sigma == pytest.approx(3e-4, rel=0.4)
+    assert 0.12 <= kinematics.fit.functions.length_rad <= 0.5
     without = tracked_known(session_of(shop), level="offsets")
     squared, theirs = (np.sum(away_m(shop, it) ** 2, axis=1) for it in (known, without))
     assert np.mean(squared) < 0.25 * np.mean(theirs)
@@ -331,7 +331,7 @@ def test_functions_of_joints_are_found_and_make_the_arm_better_where_it_never_wa
     sound = tracked(replace(OPTIONS, function_sigma_rad=0.0, seed=2))
     kinematics = tracked_known(session_of(sound)).robot_arm.kinematics
     assert kinematics.level != FUNCTIONS
-    assert kinematics.functions is None
+    assert kinematics.fit.functions is None
 
 
 @pytest.fixture(scope="module")

@@ -161,11 +161,6 @@ STAGES: tuple[Stage, ...] = (
 )
 
 
-def stages_before(name: str) -> tuple[Stage, ...]:
-    """The stages before the named one."""
-    return STAGES[: [stage.name for stage in STAGES].index(name)]
-
-
 def run_stages(state: RunState, stages: Sequence[Stage] = STAGES) -> RunState:
     """Runs stages; an error is raised with its likeliest cause where that is known."""
     are_located = False

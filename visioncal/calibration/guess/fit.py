@@ -99,7 +99,15 @@ class Fit:
     @cached_property
     def log_likelihood(self) -> float:
         """Restricted log-likelihood of the views under this reading, at its own noise."""
-        return self._log_likelihood(self._estimate[0]) if self.is_readable else -np.inf
+        if not self.is_readable:
+            return -np.inf
+        inlier, outlier = self._densities(self._estimate[0])
+        # A reading explains most of the views: only the farthest ones may be outliers.
+        views = np.logaddexp(inlier, outlier)
+        views[self.kept] = inlier[self.kept]
+        lost = self.lost * (np.log(_OUTLIER_PRIOR) - 6.0 * np.log(2.0))
+        count = len(self.angle) + self.lost
+        return float(views.sum() + lost) * max(1.0 - 2.0 / max(count, 1), 0.0)
 
     @cached_property
     def agreeing(self) -> int:
@@ -129,16 +137,6 @@ class Fit:
         inlier = -3.0 * np.log(sigma).sum() - 0.5 * (self._squares.T / sigma**2).sum(axis=1)
         outlier = -3.0 * np.log1p(self._squares).sum(axis=0)
         return inlier + np.log1p(-_OUTLIER_PRIOR), outlier + np.log(_OUTLIER_PRIOR)
-
-    def _log_likelihood(self, sigma: FloatArray) -> float:
-        count = len(self.angle) + self.lost
-        lost = self.lost * (np.log(_OUTLIER_PRIOR) - 6.0 * np.log(2.0))
-        inlier, outlier = self._densities(sigma)
-        # A reading explains most of the views: only the farthest ones may be outliers.
-        views = np.logaddexp(inlier, outlier)
-        views[self.kept] = inlier[self.kept]
-        total = float(views.sum() + lost)
-        return total * max(1.0 - 2.0 / max(count, 1), 0.0)
 
 
 def is_about_one_axis(rotations: FloatArray) -> bool:

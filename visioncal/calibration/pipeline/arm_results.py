@@ -17,7 +17,6 @@ from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import Solution, covariance_of, held_shift
 from visioncal.estimation.steps import DRIFT, FRAME, SIZE, Step, with_step
 
@@ -147,16 +146,6 @@ def with_drifts(
     if level == LEVEL and refused and len(refused) == len(changed):
         raise refused[0]
     return changed
-
-
-def with_errors(
-    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
-) -> dict[str, RobotArm]:
-    """Estimates posture-dependent errors of each arm, the other arms being nominal."""
-    likelihood = robot_likelihood(problem, fit.state, fit.noise)
-    return {
-        name: arm.with_errors(likelihood, problem.robots.index(name)) for name, arm in arms.items()
-    }
 
 
 def with_pose_errors(

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState, initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
-from visioncal.calibration.run import stages_before
+from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
@@ -63,7 +64,10 @@ def doctor(session: Session | Path | str, *, progress: Progress | None = None) -
         run, error = _run_stages(run)
         findings = [*_findings(run, error)]
     if not isinstance(session, Session):
-        findings = [_with_session(finding, session) for finding in findings]
+        for at, finding in enumerate(findings):
+            if (do := finding.do) is not None:
+                words, command = (with_paths(text, session) for text in (do.words, do.command))
+                findings[at] = replace(finding, do=Remedy(words, command))
     return Checkup(run.session.name, tuple(_contents(run)), tuple(findings))
 
 
@@ -83,17 +87,9 @@ def to_document(checkup: Checkup) -> dict[str, object]:
     return {"session": checkup.session, "seen": list(checkup.seen), "findings": findings}
 
 
-def _with_session(finding: Finding, session: Path | str) -> Finding:
-    """Fills the session's path into a finding's remedy."""
-    if finding.do is None:
-        return finding
-    words, command = (with_paths(text, session) for text in (finding.do.words, finding.do.command))
-    return replace(finding, do=Remedy(words, command))
-
-
 def _run_stages(run: RunState) -> tuple[RunState, VisioncalError | None]:
     """Runs the stages before the fit up to the first error."""
-    stages = stages_before("solve")
+    stages = [*takewhile(lambda stage: stage.name != "solve", STAGES)]
     for at, stage in enumerate(stages):
         if run.progress is not None:
             run.progress(stage.name, at, len(stages))

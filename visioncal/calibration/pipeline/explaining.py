@@ -2,7 +2,7 @@
 
 from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.image_checks import because, unseen_cause
+from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.suspects.misread_poses import with_misreading
 from visioncal.calibration.suspects.ranking import add_views_remedy
 from visioncal.core.errors import DegenerateError, VisioncalError
@@ -16,7 +16,8 @@ def explained(
     error = error.with_culprits([view for view in state.lost_views if view not in error.culprits])
     cause = unseen_cause(state) or (poor_motion(state) if stage == "intrinsics" else None)
     if cause is not None:
-        return because(error, cause)
+        words, step = f"{cause.words} {error.message}", str(cause.do or "")
+        return type(error)(words, culprits=error.culprits, next_step=step)
     is_pair = state.mount is not None
     if is_pair and not are_located:
         return error

@@ -39,6 +39,7 @@ from visioncal.estimation.observability import (
 )
 from visioncal.estimation.tree import Tree
 from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
+from visioncal.robot import REPEATABILITY
 
 
 def judge_run(state: RunState) -> RunState:
@@ -228,16 +229,16 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
     for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
         arm, found = cell_fit.arms[robot], answer.arms[robot].sections.arm
         accuracy = None if found is None else found.workspace_sigma_mm
+        model = None if arm.matched is None else arm.matched.robot
         judged = JudgedArm(
             len(stops_of(problem, robot)),
             has_posture_errors=arm.errors is not None and arm.errors.is_significant,
             workspace_mm=None if accuracy is None else accuracy.median,
-            modelled=arm.matched is not None,
+            modelled=model is not None,
+            repeatability=REPEATABILITY if model is None else model.repeatability,
             can_tilt=arm.can_tilt,
             name=f"Robot {robot}" if len(problem.robots) > 1 else "",
         )
-        if arm.matched is not None:
-            judged = replace(judged, repeatability=arm.matched.robot.repeatability)
         # Of pose pairs without a stated noise, the detection's may be in the flange's.
         if not problem.is_combined and problem.observations.covariance.any():
             noise, (least_rad, least_m) = answer.sigmas[robot], intervals[:, 0].tolist()

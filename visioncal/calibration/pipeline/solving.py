@@ -11,12 +11,11 @@ from visioncal.calibration.pipeline.arm_results import (
     change_each,
     joint_offsets,
     with_drifts,
-    with_errors,
     with_pose_errors,
 )
 from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.starting import Start, find_start, sensors_of
-from visioncal.calibration.stages.arms import RobotArm, arm_effects, check_arms
+from visioncal.calibration.stages.arms import RobotArm, arm_effects, check_arms, with_link_errors
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.handeye import closed_form_state
@@ -278,15 +277,11 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
     cell_fit = replace(cell_fit, linearised_corners=None)
     if drifts := tuple(arm_effects(cell_fit.arms)):
         cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, drifts))
-    cell_fit = replace(
-        cell_fit, arms=with_errors(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit)
-    )
-    effects = (*cell_fit.other_effects, *arm_effects(cell_fit.arms))
-    return (
-        replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
-        if effects
-        else cell_fit
-    )
+    arms = with_link_errors(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit)
+    cell_fit = replace(cell_fit, arms=arms)
+    if effects := (*cell_fit.other_effects, *arm_effects(arms)):
+        cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
+    return cell_fit
 
 
 def _choose_levels(

@@ -75,7 +75,7 @@ def report_of(
         result, advice = add_parameters(result, arm, convention)
         result = replace(result, left_out=levels.left_out())
         notes += [advice] if advice else []
-    springs = elastic.elastic_of(arm, levels.errors)
+    springs = elastic.elastic_of(arm, levels.fit.errors)
     notes += elastic.play_remarks(result.backlash)
     notes += () if springs is None else elastic.remarks(springs)
     doubts = () if springs is None else tuple(elastic.doubts(springs))

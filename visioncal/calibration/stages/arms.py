@@ -108,7 +108,7 @@ class RobotArm:
     @property
     def function_gain(self) -> float:
         """Twice the gain in log-likelihood by joint error functions; zero without any."""
-        functions = None if self.kinematics is None else self.kinematics.functions
+        functions = None if self.kinematics is None else self.kinematics.fit.functions
         return 0.0 if functions is None else functions.gain
 
     def at(self, stops: IntArray) -> Self:
@@ -335,8 +335,8 @@ class RobotArm:
         if kinematics is None:
             return self
         arm = replace(self, kinematics=kinematics)
-        if kinematics.errors:
-            return arm._with_model(model.with_errors(kinematics.errors, kinematics.functions))
+        if found := kinematics.fit.errors:
+            return arm._with_model(model.with_errors(found, kinematics.fit.functions))
         if self.model is None:
             return arm
         # There are fewer inliers than when it was calibrated: errors are sought at the nominal arm.
@@ -361,7 +361,7 @@ class RobotArm:
         """The arm with a calibrated model, and its errors linearised there."""
         if self.kinematics is None:
             return self
-        arm, first = replace(self, model=model), next(iter(self.kinematics.errors.values()))
+        arm, first = replace(self, model=model), next(iter(self.kinematics.fit.errors.values()))
         return replace(arm, errors=replace(first, basis=arm.basis))
 
     def _by_stop(self, columns: FloatArray) -> FloatArray:
@@ -390,6 +390,19 @@ def arm_effects(arms: Mapping[str, RobotArm]) -> Iterator[Effect]:
     """The effects of all arms; see `RobotArm.effects`."""
     for arm in arms.values():
         yield from arm.effects()
+
+
+def with_link_errors(
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
+) -> dict[str, RobotArm]:
+    """Looks for errors of the links of the arms whose errors are not free yet."""
+    likelihood = robot_likelihood(problem, fit.state, fit.noise)
+    return {
+        name: arm
+        if arm.has_free_errors
+        else arm.with_errors(likelihood, problem.robots.index(name))
+        for name, arm in arms.items()
+    }
 
 
 def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:

@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages.arms import RobotArm, arm_effects
+from visioncal.calibration.stages.arms import RobotArm, arm_effects, with_link_errors
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.types import Corners, IntArray, Mask
 from visioncal.estimation.arm import ArmErrors
@@ -16,7 +16,6 @@ from visioncal.estimation.joint import ConvergedFit
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
-from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.scene import CornerProblem, Scene
 from visioncal.estimation.solve import fit_problem
 
@@ -67,15 +66,7 @@ class CellFrameModel:
 
     def with_errors(self, fitted: ConvergedFit) -> Self:
         """Tests for errors of the arms that are not free yet."""
-        problem, fit = fitted.problem, fitted.fit
-        likelihood = robot_likelihood(problem, fit.state, fit.noise)
-        arms = {
-            name: arm
-            if arm.has_free_errors
-            else arm.with_errors(likelihood, problem.robots.index(name))
-            for name, arm in self.arms.items()
-        }
-        return replace(self, arms=arms)
+        return replace(self, arms=with_link_errors(self.arms, fitted.problem, fitted.fit))
 
     @property
     def arms_without_joints(self) -> dict[str, RobotArm]:

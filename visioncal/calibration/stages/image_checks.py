@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Sequence
 
 from visioncal.calibration.stages.observed import Observed
-from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.errors import DataError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Image, Target
@@ -82,12 +82,6 @@ def unseen_cause(observed: Observed) -> Finding | None:
     if missing is not None and 2 * len(missing.views) > len(unseen):
         return missing
     return _other_board(observed.session, unseen)
-
-
-def because(error: VisioncalError, cause: Finding) -> VisioncalError:
-    """The same error with its cause first."""
-    message = f"{cause.words} {error.message}"
-    return type(error)(message, culprits=error.culprits, next_step=str(cause.do or ""))
 
 
 def _other_board(session: Session, unseen: Sequence[View]) -> Finding | None:

@@ -119,16 +119,6 @@ class SelectedArmLevel:
         """Its name; `nominal` where no errors explain more than chance."""
         return self.fit.result.level
 
-    @property
-    def errors(self) -> Mapping[str, ArmErrors]:
-        """The arm's errors by block."""
-        return self.fit.errors
-
-    @property
-    def functions(self) -> JointFunctions | None:
-        """Functions of the joints; None where these are not significant."""
-        return self.fit.functions
-
     def left_out(self) -> tuple[UnseenView, ...]:
         """Residuals of held-out stops with both arms, by view."""
         scale = np.array([np.rad2deg(1.0), 1e3])

@@ -40,7 +40,7 @@ from visioncal.calibration.stages.validate import HeldOutResiduals
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import adjoint, apply_each, invert, log, skew
+from visioncal.core.transforms import adjoint, apply_each, compose, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask, Need
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian
 from visioncal.estimation.problem import Problem
@@ -242,7 +242,12 @@ def _picks(
     in_base = _base_from_targets(problem, state, base)
     frames = (name.partition("@")[0] for name in seen.observed)
     middles = np.array([fitted.target_centres.get(frame, np.zeros(3)) for frame in frames])
-    carries = np.array([_is_between(problem, observer, base, robot) for observer in seen.observers])
+    carries = np.array(
+        [
+            any(step.robot == robot for step in problem.tree.path(observer, base))
+            for observer in seen.observers
+        ]
+    )
     calibrated = arm is not None and arm.model is not None
     errors = None if arm is None or calibrated else arm.errors
     as_noise = None if bias is None else errors
@@ -308,11 +313,20 @@ def _picks(
         # Who carries the camera errs at the look and at the pick.
         strays=np.tile(fitted.strays.get(camera, np.zeros((0, 2))), (1 + bool(carries.any()), 1)),
     )
-    return replace(picks, uncorrected=_uncorrected(picks, fitted, in_base, at_m, whole=whole))
+    by_controller = _uncorrected(
+        picks, fitted, in_base, at_m, whole=whole, is_carried=bool(carries.all())
+    )
+    return replace(picks, uncorrected=by_controller)
 
 
 def _uncorrected(
-    picks: Picks, fitted: PickInputs, in_base: FloatArray, at_m: FloatArray, *, whole: bool
+    picks: Picks,
+    fitted: PickInputs,
+    in_base: FloatArray,
+    at_m: FloatArray,
+    *,
+    whole: bool,
+    is_carried: bool,
 ) -> Picks | None:
     """The same picks by the controller's own poses; None where these are the arm's.
 
@@ -322,6 +336,7 @@ def _uncorrected(
         in_base: (n, 4, 4) `base_from_target`.
         at_m: (n, 3) the positions, in the targets' frames where `whole`, else in the base [m].
         whole: Whether the picks are in the targets' frames.
+        is_carried: Whether the robot carries the camera.
     """
     problem, arm = fitted.problem, fitted.arms.get(picks.robot)
     if arm is None or (arm.model is None and arm.drift is None):
@@ -332,12 +347,7 @@ def _uncorrected(
     missed = carry @ log(invert(flange) @ arm.reported[stops])[:, :, None]
     offsets = missed[:, :, 0]
     offsets[:, 3:] -= np.cross(at_m, offsets[:, :3])
-    base = problem.tree.bases[picks.robot]
-    carried = {
-        _is_between(problem, observer, base, picks.robot)
-        for observer in problem.observations.observers
-    }
-    if carried != {True} or len(offsets) < 2:
+    if not is_carried or len(offsets) < 2:
         return replace(picks, offsets=offsets)
     # It looks in the posture of one view, and picks in that of another.
     looks, after = np.arange(len(offsets)), np.arange(1, len(offsets))
@@ -371,10 +381,6 @@ def _flange_covariance(
         own_m2 = np.maximum(noise[:, 3, 3] - noise[:, 0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
         covariance[:, 3:, 3:] = own_m2[:, None, None] * np.eye(3)
     return covariance
-
-
-def _is_between(problem: Problem, observer: str, base: str, robot: str) -> bool:
-    return any(step.robot == robot for step in problem.tree.path(observer, base))
 
 
 def _base_from_targets(problem: Problem, state: State, base: str) -> FloatArray:
@@ -444,9 +450,8 @@ def _board_part(covariance: FloatArray, columns: IntArray) -> FloatArray:
 
 def _at_points(covariances: FloatArray, points_m: FloatArray) -> FloatArray:
     """(n, 6, 6) covariance of rotation and (n, 3) points, from that of their frame's twist."""
-    jacobian = np.broadcast_to(np.eye(6), covariances.shape).copy()
-    jacobian[:, 3:, :3] = -skew(points_m)
-    return np.asarray(jacobian @ covariances @ np.swapaxes(jacobian, 1, 2))
+    carry = adjoint(compose(np.eye(3), -points_m))
+    return np.asarray(carry @ covariances @ carry.mT)
 
 
 def _arm_covariances(

@@ -52,7 +52,6 @@ def read_instrument(session: Session) -> Readings:
             probes were read.
     """
     rows = [view for view in session.views if view.reading_m is not None]
-    _check_unit(rows)
     instrument = _instrument(session, rows)
     are_poses = any(view.instrument_from_probe() is not None for view in rows)
     of_point = Counter(
@@ -123,7 +122,6 @@ def read_instruments(session: Session) -> dict[int, ViewPoses]:
             rows.setdefault(observation.seer, []).append(observation.view)
     sightings = {}
     for of_instrument in rows.values():
-        _check_unit(of_instrument)
         instrument = _instrument(session, of_instrument)
         for view in of_instrument:
             probe = _probe(view)
@@ -170,7 +168,16 @@ def _probe(view: View) -> FloatArray:
 
 
 def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
-    """The instrument that read some rows."""
+    """The instrument that read some rows, which have to be in metres."""
+    distance_m = float(np.median([np.linalg.norm(_probe(view)[:3, 3]) for view in rows]))
+    if distance_m > _FARTHEST_M:
+        raise DataError(
+            f"views.csv: the median distance of the readings (meas_x_m, meas_y_m, meas_z_m) from "
+            f"the instrument is {distance_m:.4g} m, and no instrument reads farther than "
+            f"{_FARTHEST_M:g} m.",
+            culprits=["views.csv: meas_x_m, meas_y_m, meas_z_m"],
+            next_step="It looks like millimetres: multiply these columns by 0.001.",
+        )
     table = session.instruments.get(name_of(session.declaration, "instrument", rows[0]))
     if table is None:
         raise DataError(
@@ -190,15 +197,3 @@ def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
             next_step="State sigma_rad in [instrument], or leave the columns meas_qx ... out.",
         )
     return instrument
-
-
-def _check_unit(rows: Sequence[View]) -> None:
-    distance_m = float(np.median([np.linalg.norm(_probe(view)[:3, 3]) for view in rows]))
-    if distance_m > _FARTHEST_M:
-        raise DataError(
-            f"views.csv: the median distance of the readings (meas_x_m, meas_y_m, meas_z_m) from "
-            f"the instrument is {distance_m:.4g} m, and no instrument reads farther than "
-            f"{_FARTHEST_M:g} m.",
-            culprits=["views.csv: meas_x_m, meas_y_m, meas_z_m"],
-            next_step="It looks like millimetres: multiply these columns by 0.001.",
-        )

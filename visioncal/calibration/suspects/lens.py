@@ -115,7 +115,8 @@ def _beyond(run: RunState) -> Iterator[Finding]:
     """Significant errors beyond the model: of a part of the image, and changes of the focus."""
     lenses = run.assessment.lenses
     for name, lens in lenses.items():
-        of, levels, (field, *changes) = _named(name, len(lenses)), lens.levels, lens.levels.gains
+        levels, (field, *changes) = lens.levels, lens.levels.gains
+        of = "The lens" if len(lenses) == 1 else f"The lens of {name}"
         if field > SIGNIFICANT:
             yield Finding(
                 "lens_field",
@@ -143,10 +144,6 @@ def _beyond(run: RunState) -> Iterator[Finding]:
                 mahalanobis_sq=max(changes),
                 up_to_mm=10.0 * max(percents) * lens.distance_m,
             )
-
-
-def _named(camera: str, count: int) -> str:
-    return "The lens" if count == 1 else f"The lens of {camera}"
 
 
 # A held lens that the corners contradict looks like a board of another size or shape, and, by the
