@@ -24,7 +24,7 @@ import numpy as np
 from results import few, wished, write_section
 
 import visioncal
-from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
+from visioncal.simulation import CAMERAS, CellOptions, simulate, write_session
 from visioncal.vision.boards.charuco import charuco_board
 
 VIEWS = few(40, 5)
@@ -73,7 +73,7 @@ def medians(*works: Callable[[], np.ndarray]) -> np.ndarray:
 def rows_of(ending: str, quality: int | None, level: str, folder: Path) -> list[list[str]]:
     """The rows of one kind of session, by the number of threads."""
     options = CellOptions(
-        views=VIEWS, camera=fine_camera(), jpeg_quality=quality, cut_views=0.0, seed=1
+        views=VIEWS, camera=CAMERAS["fine"], jpeg_quality=quality, cut_views=0.0, seed=1
     )
     if level == "arm":
         options = replace(options, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, branches=True)

@@ -28,11 +28,11 @@ from visioncal.robot import load_robot
 from visioncal.session.columns import POSE
 from visioncal.simulation import (
     BOARDS,
+    CAMERAS,
     CellOptions,
     SimulatedCell,
     WarmUpOptions,
     cell_session,
-    fine_camera,
     simulate,
     simulate_warm_up,
 )
@@ -246,8 +246,8 @@ EVERYTHING = {
         for name, place_m in (("a", (-0.6, 0.0, 0.0)), ("b", (0.6, 0.05, 0.02)))
     ),
     "cameras": (
-        CameraAt("left", place_m=(0.0, -1.0, 1.1), camera=fine_camera()),
-        CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera()),
+        CameraAt("left", place_m=(0.0, -1.0, 1.1), camera=CAMERAS["fine"]),
+        CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=CAMERAS["fine"]),
         CameraAt("hand", "b"),
     ),
     "boards": (

@@ -24,7 +24,7 @@ from support.fuzz.broken_sessions import BROKEN, broken_session
 import visioncal as package
 from visioncal.present.recording import paths
 from visioncal.present.viewer.native import free_port, viewer_process
-from visioncal.simulation import CellOptions, cell_session, fine_camera, simulate, write_session
+from visioncal.simulation import CAMERAS, CellOptions, cell_session, simulate, write_session
 
 _FOLDER = Path(__file__).parents[2] / "recordings"
 # How long the viewer has for its drawing, without a graphics card [s].
@@ -46,7 +46,7 @@ def main() -> None:
         visioncal("calibrate", "cell-4", "-o", "out", "--need-mm", "0.5")
         visioncal("calibrate", "cell-5", "-o", "doubted")
         errors = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3}
-        options = CellOptions(robot="ur5e", **errors, views=40, camera=fine_camera())
+        options = CellOptions(robot="ur5e", **errors, views=40, camera=CAMERAS["fine"])
         cell_session(simulate(options), "cell-6", seen="corners").save(Path("cell-6"))
         visioncal("calibrate", "cell-6", "-o", "calibrated")
         signed = ("--operator", "A. Smith", "--serial", "camera=1944301", "--serial", "robot=UR-77")

@@ -24,15 +24,14 @@ from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (
     BOARDS,
+    CAMERAS,
     BoardAt,
     CameraAt,
     NetworkOptions,
     RobotAt,
     Swept,
     cell_session,
-    fine_camera,
     simulate,
-    wide_camera,
     write_session,
 )
 from visioncal.simulation.arms import Heat
@@ -101,7 +100,7 @@ def test_a_sound_cell_is_as_near_as_its_covariance_says_and_is_good(clean):
 @pytest.fixture(scope="module")
 def three():
     """The session of a cell of three cameras: two or more see by way of a robot at most stops."""
-    right = CameraAt("right", place_m=(0.3, -1.0, 1.2), camera=fine_camera())
+    right = CameraAt("right", place_m=(0.3, -1.0, 1.2), camera=CAMERAS["fine"])
     cameras = (*OPTIONS.cameras, right)
     return recorded(simulate(replace(OPTIONS, cameras=cameras, stops=16)))
 
@@ -442,7 +441,7 @@ def warm():
     cell = simulate(
         NetworkOptions(
             robots=(replace(ROBOTS[0], warms_up=True), ROBOTS[1]),
-            cameras=tuple(replace(camera, camera=fine_camera()) for camera in PLAIN.cameras),
+            cameras=tuple(replace(camera, camera=CAMERAS["fine"]) for camera in PLAIN.cameras),
             boards=PLAIN.boards,
             stops=40,
             pace_s=150.0,
@@ -500,7 +499,7 @@ def test_a_camera_that_sees_a_moving_robot_by_a_clock_of_its_own_is_placed():
 
 def wide(width, height, focal):
     matrix = np.array([focal, focal, 0.5 * width, 0.5 * height])
-    return replace(wide_camera(), resolution=(width, height), matrix=matrix)
+    return replace(CAMERAS["wide"], resolution=(width, height), matrix=matrix)
 
 
 PICTURED = NetworkOptions(

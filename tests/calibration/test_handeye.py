@@ -24,7 +24,7 @@ from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import fit_problem, solve_problem
 from visioncal.session import Session
-from visioncal.simulation import BOARDS, CellOptions, measured_poses, project, simulate, wide_camera
+from visioncal.simulation import BOARDS, CAMERAS, CellOptions, measured_poses, project, simulate
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions, rotations
 
@@ -209,20 +209,20 @@ def test_near_views_have_one_pose_and_no_pose_has_itself_for_a_rival():
 
 
 def test_a_lens_that_views_leave_open_is_refused():
-    raised(DegenerateError, "focal length open to", estimate, cell_with(wide_camera(), 4, **FLAT))
+    raised(DegenerateError, "focal length open to", estimate, cell_with(CAMERAS["wide"], 4, **FLAT))
     for views, words in ((1, "1 view shows"), (2, "2 views show")):
         with pytest.raises(DataError, match=f"{words} the target, and at least 3"):
-            estimate(cell_with(wide_camera(), 6, views=views))
+            estimate(cell_with(CAMERAS["wide"], 6, views=views))
 
 
 def test_a_robot_that_never_moved_is_named_before_the_lens_that_this_leaves_open():
-    cell, rng = cell_with(wide_camera(), 4, **FLAT), np.random.default_rng(0)
+    cell, rng = cell_with(CAMERAS["wide"], 4, **FLAT), np.random.default_rng(0)
     seen = cell.corners[0]
     session = Session.from_corners(
         [(seen.ids, seen.px + 0.1 * rng.normal(size=seen.px.shape)) for _ in range(12)],
         np.tile(cell.robot.base_from_flange[0], (12, 1, 1)),
         cell.options.target,
-        wide_camera().resolution,
+        CAMERAS["wide"].resolution,
         mount="eye-in-hand",
     )
     refused = raised(
@@ -372,7 +372,7 @@ def cell_with(camera, seed, **changes):
 
 
 def test_errors_of_a_lens_follow_the_stated_covariance():
-    seeds, camera, surprises, sigmas = 24, wide_camera(), [], []
+    seeds, camera, surprises, sigmas = 24, CAMERAS["wide"], [], []
     for seed in range(seeds):
         result = estimate(cell_with(camera, seed))
         error, count = intrinsics(result.camera) - intrinsics(camera), len(intrinsics(camera))
@@ -387,14 +387,14 @@ def test_errors_of_a_lens_follow_the_stated_covariance():
 
 
 def test_a_few_wrong_corners_do_no_harm_and_a_wrong_view_is_named():
-    cell = cell_with(wide_camera(), 3)
+    cell = cell_with(CAMERAS["wide"], 3)
     corners = {corner.view: corner for corner in cell.corners}
     for view in (2, 5):
         corners[view].px[3] += 6.0
     rng = np.random.default_rng(0)
     corners[7].px[:] += rng.normal(0.0, 12.0, corners[7].px.shape)
     result = estimate(cell)
-    clean = estimate(cell_with(wide_camera(), 3), without=(7,))
+    clean = estimate(cell_with(CAMERAS["wide"], 3), without=(7,))
     assert [rejection.view for rejection in result.rejections] == [7]
     assert "residual too large" in result.rejections[0].reason
     # Two corners of 700 less: the estimate moves by a small part of its sigma.

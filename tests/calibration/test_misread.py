@@ -41,7 +41,7 @@ from visioncal.robot import load_robot
 from visioncal.robot.conversion import with_base
 from visioncal.session import Session, View
 from visioncal.session.columns import POSE
-from visioncal.simulation import CellOptions, SimulatedCell, fine_camera, simulate, write_session
+from visioncal.simulation import CAMERAS, CellOptions, SimulatedCell, simulate, write_session
 
 
 def seen_in(cell: SimulatedCell) -> Poses:
@@ -317,7 +317,7 @@ def test_what_was_never_recorded_is_named(lost):
 ROBOT = load_robot("ur5e")
 CELL = simulate(
     CellOptions(
-        camera=fine_camera(),
+        camera=CAMERAS["fine"],
         pixel_sigma_px=0.1,
         robot="ur5e",
         views=16,

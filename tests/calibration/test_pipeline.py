@@ -29,18 +29,16 @@ from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (
     BOARDS,
+    CAMERAS,
     CellOptions,
     Second,
     SimulatedCell,
-    fine_camera,
-    fisheye_camera,
     simulate,
-    wide_camera,
     write_session,
 )
 from visioncal.simulation.records import cell_session
 
-FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
 # Simulated boards have exactly their size.
 MARKER = replace(
     FINE,
@@ -53,12 +51,14 @@ EXACT = replace(FINE, seed=2, pixel_sigma_px=0.002)
 AMBIGUOUS = replace(
     FINE,
     target=Target("sym", "checkerboard", 8, 6, 0.025, 2.5e-5),
-    camera=wide_camera(),
+    camera=CAMERAS["wide"],
     pixel_sigma_px=0.3,
     tilt_rad=(0.0, 0.3),
     seed=1,
 )
-TWO = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=16, second=Second())
+TWO = CellOptions(
+    camera=CAMERAS["fine"], pixel_sigma_px=0.1, robot="ur5e", views=16, second=Second()
+)
 SIGMA_M = 5e-4
 X = exp(np.array([0.02, -0.03, 0.4, 0.06, -0.02, 0.081]))
 Z = compose(np.diag([1.0, -1.0, -1.0]), np.array([0.4, 0.1, -0.25]))
@@ -115,7 +115,7 @@ def without(cell, views):
 
 
 def test_each_image_is_searched_for_its_own_board(tmp_path):
-    cell = simulate(replace(TWO, camera=wide_camera(), views=4, seed=11))
+    cell = simulate(replace(TWO, camera=CAMERAS["wide"], views=4, seed=11))
     session = Session.load(write_session(cell, tmp_path / "session"))
     found = detect(session)
     assert sorted(found.corners) == [0, 1, 2, 3]
@@ -283,7 +283,7 @@ def test_a_stated_lens_counts_by_its_prior_and_is_refined_where_that_helps(
 def test_a_fisheye_camera_goes_the_whole_way():
     surprises = []
     for seed in range(2):
-        options = CellOptions(camera=fisheye_camera(), state_intrinsics=False, seed=seed)
+        options = CellOptions(camera=CAMERAS["fisheye"], state_intrinsics=False, seed=seed)
         known = calibrated(cell := simulate(options))
         assert known.used == tuple(range(20))
         assert len(known.cell_fit.camera_parameters.lens_of("cam")) == 8

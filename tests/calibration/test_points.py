@@ -29,12 +29,12 @@ from visioncal.results import to_document
 from visioncal.session import Session, corners
 from visioncal.simulation import (
     BOARDS,
+    CAMERAS,
     CellOptions,
     prepare_scene,
     project,
     render,
     simulate,
-    wide_camera,
 )
 from visioncal.simulation.render import developed, encode, light_on
 from visioncal.vision.boards import NotFound, find_target
@@ -390,7 +390,7 @@ def test_corners_outside_the_stated_image_are_refused(folder):
 @pytest.mark.slow
 def test_dense_corners_bring_in_refused_views_and_leave_sharp_ones_alone():
     # A quarter of the pixels.
-    lens = replace(wide_camera(), resolution=(640, 400), matrix=wide_camera().matrix / 2)
+    lens = replace(CAMERAS["wide"], resolution=(640, 400), matrix=CAMERAS["wide"].matrix / 2)
     cell = simulate(CellOptions(views=8, seed=3, blur_px=0.5, target=CHECKERS, camera=lens))
     scene, images = prepare_scene(cell), []
     for at, pose in enumerate(cell.cam_from_target):

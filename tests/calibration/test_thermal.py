@@ -34,13 +34,13 @@ from visioncal.simulation import (
     simulate_warm_up,
 )
 from visioncal.simulation.arms import Heat, Warming, heated_poses
-from visioncal.simulation.optics import fine_camera
+from visioncal.simulation.optics import CAMERAS
 
 # What 100 minutes are to predict: the rest of five hours [s].
 TRAINED_S, END_S = 6000.0, 18000.0
 # Postures all over the workspace at which drift is judged.
 PLACES = 60
-CELL = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, branches=True, roll_rad=np.pi)
+CELL = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1, branches=True, roll_rad=np.pi)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,11 +19,11 @@ from visioncal.calibration.run import calibrate
 from visioncal.core.transforms import exp, invert
 from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.results import Calibration
-from visioncal.simulation import CellOptions, SimulatedCell, cell_session, fine_camera, simulate
+from visioncal.simulation import CAMERAS, CellOptions, SimulatedCell, cell_session, simulate
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions
 
-FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
 # So that an arm's errors count: half a millimetre and a milliradian in every parameter.
 WRONG_ARM = replace(FINE, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
 LITTLE_WRONG = replace(FINE, views=30, dh_sigma_m=2e-4, dh_sigma_rad=2e-4)
@@ -328,7 +328,7 @@ WORLDS: dict[str, World] = {
         CellOptions(
             views=14,
             board_scale=1.0007,
-            camera=fine_camera(),
+            camera=CAMERAS["fine"],
             tilt_rad=(0.15, 0.5),
             roll_rad=3.1,
             distance_m=(0.45, 0.7),

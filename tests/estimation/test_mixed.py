@@ -43,7 +43,7 @@ from visioncal.estimation.problem_parts import ROBOT
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.robot import load_robot
-from visioncal.simulation import CellOptions, fine_camera, simulate
+from visioncal.simulation import CAMERAS, CellOptions, simulate
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions
 
@@ -392,7 +392,7 @@ def test_it_rests_at_the_least_cost_in_few_steps(curvature):
     assert len(seen) < 25
 
 
-FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
 
 
 def test_an_interval_is_about_the_level_that_was_found():

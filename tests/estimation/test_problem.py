@@ -45,10 +45,10 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.steps import find_steps, frames_of
 from visioncal.estimation.trajectory import Trajectory
-from visioncal.simulation import CellOptions, fine_camera, simulate
+from visioncal.simulation import CAMERAS, CellOptions, simulate
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")
-FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
 SOURCES = Sources(
     {"cam_left": "pixels of left", "cam_right": "pixels of right"}, {"a": "robot a", "b": "robot b"}
 )

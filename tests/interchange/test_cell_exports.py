@@ -38,7 +38,7 @@ from visioncal.robot import load_robot
 from visioncal.robot.writing import without_functions
 from visioncal.session import Session
 from visioncal.session.selecting import Choice
-from visioncal.simulation import fisheye_camera, wide_camera
+from visioncal.simulation import CAMERAS
 
 SAMPLE = made_up(5).calibration
 SIGMA = WorkspaceSigma(0.123, 0.345)
@@ -292,8 +292,8 @@ def test_all_frames_are_one_tree():
 
 def test_a_lens_is_that_of_the_camera_that_is_named():
     cameras = {
-        "top": CameraResult(wide_camera(), False),
-        "hand": CameraResult(fisheye_camera(), False),
+        "top": CameraResult(CAMERAS["wide"], False),
+        "hand": CameraResult(CAMERAS["fisheye"], False),
     }
     cell = with_cell(CELL, cameras=cameras)
     for name, focal_px in (("top", 914.2), ("cam_hand", 563.0)):

@@ -14,6 +14,7 @@ from visioncal.robot.torques import body_regressor, joint_torques
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
+    CAMERAS,
     BoardAt,
     CameraAt,
     CellOptions,
@@ -22,10 +23,7 @@ from visioncal.simulation import (
     Payload,
     RobotAt,
     Second,
-    arm_named,
     cell_session,
-    fine_camera,
-    fisheye_camera,
     forward,
     measured_poses,
     prepare_scene,
@@ -34,7 +32,6 @@ from visioncal.simulation import (
     read_truth,
     render,
     simulate,
-    wide_camera,
     write_session,
 )
 from visioncal.simulation.dynamics import (
@@ -50,9 +47,11 @@ from visioncal.vision.boards.charuco import charuco_board
 from visioncal.vision.camera import matrix_3x3
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-SMALL = replace(wide_camera(), resolution=(640, 400), matrix=np.array([457.1, 456.8, 322.4, 198.2]))
+SMALL = replace(
+    CAMERAS["wide"], resolution=(640, 400), matrix=np.array([457.1, 456.8, 322.4, 198.2])
+)
 RATIONAL = replace(
-    wide_camera(), distortion=np.array([0.31, -0.12, 4e-4, -3e-4, 0.01, 0.42, -0.1, 0.02])
+    CAMERAS["wide"], distortion=np.array([0.31, -0.12, 4e-4, -3e-4, 0.01, 0.42, -0.1, 0.02])
 )
 
 
@@ -104,7 +103,7 @@ def test_noisy_chain_closes_on_the_truth_only():
     assert np.linalg.norm(report[:, :3, 3], axis=1).min() > 1e-5
 
 
-@pytest.mark.parametrize("camera", [wide_camera(), RATIONAL, fine_camera(), fisheye_camera()])
+@pytest.mark.parametrize("camera", [CAMERAS["wide"], RATIONAL, CAMERAS["fine"], CAMERAS["fisheye"]])
 def test_rays_invert_the_projection(camera):
     rng = np.random.default_rng(3)
     px = rng.uniform(0.0, 1.0, (500, 2)) * np.array(camera.resolution)
@@ -206,7 +205,7 @@ def detection_errors(options):
     "options",
     [
         CellOptions(),
-        CellOptions(camera=fisheye_camera(), tilt_rad=(0.1, 0.5)),
+        CellOptions(camera=CAMERAS["fisheye"], tilt_rad=(0.1, 0.5)),
         slow(CellOptions(target=BOARDS["checkerboard"], blur_px=1.0)),
         CellOptions(target=replace(BOARDS["charuco"], legacy=True)),
         slow(CellOptions(board_scale=1.01, board_bow_m=0.003)),
@@ -341,7 +340,7 @@ def test_recordings_have_the_noise_that_they_are_asked_for():
 
 
 def test_mistaken_intrinsics_are_off_by_what_was_asked_for():
-    for camera in (wide_camera(), fine_camera(), fisheye_camera()):
+    for camera in (CAMERAS["wide"], CAMERAS["fine"], CAMERAS["fisheye"]):
         cell = simulate(CellOptions(views=1, camera=camera, lens_mismatch_px=0.3))
         px = np.random.default_rng(5).uniform(0.0, 1.0, (500, 2)) * np.array(camera.resolution)
         away = project(cell.stated[""], rays(camera, px)) - px

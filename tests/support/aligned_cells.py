@@ -8,7 +8,7 @@ from visioncal.core.transforms import exp
 from visioncal.results import Calibration, CameraResult, CellResult, Edge, Verdict, ViewResult
 from visioncal.results.sections import CellDetails
 from visioncal.results.views import Validation, rms_of
-from visioncal.simulation import wide_camera
+from visioncal.simulation import CAMERAS
 
 FRAMES = {
     "base_a": "cell",
@@ -41,7 +41,7 @@ def made_up_cell(seed: int) -> Calibration:
             ViewResult(1, False, "blurred", seer="cam_hand", seen="target_plate", stop=4),
         ),
         tree=FRAMES,
-        cameras={"top": CameraResult(wide_camera(), False)},
+        cameras={"top": CameraResult(CAMERAS["wide"], False)},
         noise={"a": {"translation_mm": 0.03}, "cam_top": {"pixel_px": 0.05}},
         weakest="target_plate is the least known.",
     )

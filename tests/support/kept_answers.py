@@ -24,11 +24,11 @@ import visioncal
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
+    CAMERAS,
     CellOptions,
     Second,
     SweepOptions,
     cell_session,
-    fine_camera,
     instrument_session,
     simulate,
     sweep,
@@ -48,7 +48,7 @@ REAL = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 
 TO_HAND = "eye-to-hand"
 _PLAIN = CellOptions()
-_FINE = replace(_PLAIN, camera=fine_camera(), pixel_sigma_px=0.1)
+_FINE = replace(_PLAIN, camera=CAMERAS["fine"], pixel_sigma_px=0.1)
 _OPEN = replace(_PLAIN, state_intrinsics=False, pixel_sigma_px=0.1)
 _HAND = replace(_FINE, mount=TO_HAND)
 _COARSE = replace(_FINE, robot_sigma_m=3e-4, robot_sigma_rad=5e-4)

@@ -9,13 +9,13 @@ from visioncal.core.transforms import invert
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
+    CAMERAS,
     BoardAt,
     CameraAt,
     NetworkOptions,
     RobotAt,
     SimulatedCell,
     cell_session,
-    fine_camera,
     simulate,
 )
 
@@ -25,7 +25,7 @@ PLATE = replace(BOARDS["checkerboard"], square_sigma_m=1e-7)
 OPTIONS = NetworkOptions(
     robots=(RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02))),
     cameras=(
-        CameraAt("left", place_m=(0.0, -1.0, 1.1), camera=fine_camera()),
+        CameraAt("left", place_m=(0.0, -1.0, 1.1), camera=CAMERAS["fine"]),
         CameraAt("hand", on="a"),
     ),
     boards=(

@@ -6,10 +6,10 @@ import numpy as np
 
 from visioncal.core.transforms import exp, invert
 from visioncal.estimation.workspace import postures
-from visioncal.simulation import CellOptions, Payload, fine_camera
+from visioncal.simulation import CAMERAS, CellOptions, Payload
 from visioncal.simulation.boards import centre_m, corners_m
 
-GOOD = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, robot="ur5e", views=30)
+GOOD = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1, robot="ur5e", views=30)
 WRONG_LINKS = replace(GOOD, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
 # A cobot's joints, from the base to the wrist [N m/rad].
 COBOT = np.array([2e4, 1.6e4, 1.2e4, 8e3, 7e3, 6e3])

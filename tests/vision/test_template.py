@@ -11,7 +11,7 @@ from support.rendered import Shot, photograph
 
 from visioncal.core.types import Target
 from visioncal.simulation import BOARDS, CellOptions, simulate
-from visioncal.simulation.optics import fisheye_camera, project, wide_camera
+from visioncal.simulation.optics import CAMERAS, project
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target, kind_of
 from visioncal.vision.boards.maps import OpticalAxis, maps_about
 from visioncal.vision.boards.template import refine_tags
@@ -273,7 +273,7 @@ SIDE_M = 0.05
 
 # Polynomials alone leave 0.006 and 0.15 px.
 @pytest.mark.parametrize(
-    ("camera", "most_px"), [(wide_camera(), 0.0015), (fisheye_camera(), 0.006)]
+    ("camera", "most_px"), [(CAMERAS["wide"], 0.0015), (CAMERAS["fisheye"], 0.006)]
 )
 @pytest.mark.parametrize("cut_px", [(0, 0), (100, 50)])
 def test_maps_follow_the_sides_of_tags_through_a_lens(camera, most_px, cut_px):

@@ -24,11 +24,8 @@ from visioncal.simulation.layout import (
 )
 from visioncal.simulation.optics import (
     CAMERAS,
-    fine_camera,
-    fisheye_camera,
     project,
     rays,
-    wide_camera,
 )
 from visioncal.simulation.recordings import Round, WarmUpOptions, simulate, simulate_warm_up, sweep
 from visioncal.simulation.records import (
@@ -67,8 +64,6 @@ __all__ = [
     "arm_named",
     "cell_names",
     "cell_session",
-    "fine_camera",
-    "fisheye_camera",
     "forward",
     "measured_poses",
     "prepare_scene",
@@ -82,6 +77,5 @@ __all__ = [
     "sweep",
     "touch",
     "truth_path",
-    "wide_camera",
     "write_session",
 ]

@@ -14,7 +14,7 @@ from visioncal.core.types import Camera, Mount, Target
 from visioncal.session import frame_name
 from visioncal.simulation.arms import ArmOptions
 from visioncal.simulation.boards import BOARDS, TARGETS, Sheet
-from visioncal.simulation.optics import CAMERAS, fine_camera, wide_camera
+from visioncal.simulation.optics import CAMERAS
 from visioncal.simulation.poses import Motion, Viewpoints
 
 # Centre of the cell, which robots face [m].
@@ -95,7 +95,7 @@ class DrawOptions:
 class CameraOptions:
     """A camera with its stated intrinsics and the quality of its images."""
 
-    camera: Annotated[Camera, _named(CAMERAS)] = field(default_factory=wide_camera)  # True optics.
+    camera: Annotated[Camera, _named(CAMERAS)] = CAMERAS["wide"]  # True optics.
     state_intrinsics: bool = True  # Whether the session states the intrinsics.
     # Error of the stated intrinsics, as root mean square over the image [px].
     lens_mismatch_px: float = 0.0
@@ -216,7 +216,7 @@ class NetworkOptions(DrawOptions):
     # The cameras.
     cameras: tuple[CameraAt, ...] = (
         CameraAt("left", place_m=(0.0, -1.0, 1.1)),
-        CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera()),
+        CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=CAMERAS["fine"]),
     )
     # The boards.
     boards: tuple[BoardAt, ...] = (

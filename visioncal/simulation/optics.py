@@ -18,34 +18,29 @@ from visioncal.core.types import Camera, FloatArray
 _EXACT = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-13)
 
 
-def wide_camera() -> Camera:
-    """A 1280x800 camera with 70 degrees of horizontal field of view and mild distortion."""
-    return Camera(
-        model="brown",
-        resolution=(1280, 800),
-        matrix=np.array([914.2, 913.6, 645.3, 396.8]),
-        distortion=np.array([-0.115, 0.062, 0.0004, -0.0003, -0.008]),
-    )
-
-
-def fine_camera() -> Camera:
-    """A 5 MP machine-vision camera (2448x2048) with a 12 mm lens."""
-    return Camera(
-        model="brown",
-        resolution=(2448, 2048),
-        matrix=np.array([3481.0, 3480.2, 1218.6, 1031.4]),
-        distortion=np.array([-0.098, 0.121, -0.0002, 0.0003, -0.031]),
-    )
-
-
-def fisheye_camera() -> Camera:
-    """A 1280x960 fisheye camera with about 130 degrees of horizontal field of view."""
-    return Camera(
-        model="fisheye",
-        resolution=(1280, 960),
-        matrix=np.array([563.0, 562.4, 642.2, 477.1]),
-        distortion=np.array([-0.012, 0.004, -0.003, 0.0006]),
-    )
+CAMERAS: Mapping[str, Camera] = {
+    # 70 degrees of horizontal field of view and mild distortion.
+    "wide": Camera(
+        "brown",
+        (1280, 800),
+        np.array([914.2, 913.6, 645.3, 396.8]),
+        np.array([-0.115, 0.062, 0.0004, -0.0003, -0.008]),
+    ),
+    # A 5 MP machine-vision camera with a 12 mm lens.
+    "fine": Camera(
+        "brown",
+        (2448, 2048),
+        np.array([3481.0, 3480.2, 1218.6, 1031.4]),
+        np.array([-0.098, 0.121, -0.0002, 0.0003, -0.031]),
+    ),
+    # About 130 degrees of horizontal field of view.
+    "fisheye": Camera(
+        "fisheye",
+        (1280, 960),
+        np.array([563.0, 562.4, 642.2, 477.1]),
+        np.array([-0.012, 0.004, -0.003, 0.0006]),
+    ),
+}
 
 
 def inaccurate_camera(camera: Camera, rms_px: float, rng: np.random.Generator) -> Camera:
@@ -109,13 +104,6 @@ def rays(camera: Camera, px: FloatArray) -> FloatArray:
     directions = np.pad(plane.reshape(*px.shape), (*[(0, 0)] * (px.ndim - 1), (0, 1)))
     directions[..., 2] = 1.0
     return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
-
-
-CAMERAS: Mapping[str, Camera] = {
-    "wide": wide_camera(),
-    "fine": fine_camera(),
-    "fisheye": fisheye_camera(),
-}
 
 
 def sees(camera: Camera, points_cam: FloatArray, margin_px: float) -> npt.NDArray[np.bool_]:
