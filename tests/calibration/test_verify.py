@@ -19,7 +19,7 @@ from visioncal.calibration.recovery import causes_found, changed, moved_along, p
 from visioncal.calibration.verification import to_document, triggers_of, verdict_of, verify
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
-from visioncal.calibration.verification.messages import _signed_axis
+from visioncal.calibration.verification.messages import signed_axis
 from visioncal.calibration.verification.prediction import predict_detected, predict_stops
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
@@ -297,7 +297,7 @@ def test_one_of_two_boards_that_moved_is_named():
     found = check(replace(seen, problem=replace(seen.problem, observations=moved)), prior)
     assert names(found) == [f"board {tuple(prior.targets)[1]}"]
     axis = prior.state.edges[1 + prior.boards.index(1), :3, 1]
-    words = f"along the base's {_signed_axis(axis)}."
+    words = f"along the base's {signed_axis(axis)}."
     assert verdict_of(found).findings[0].words.endswith(words)
     refused = raised(DataError, "several boards", check, seen, prior, board_placed_anew=True)
     assert "the one that moved is named" in refused.next_step

@@ -1,7 +1,7 @@
 """Examination of a fit: covariance, diagnosis, left-out residuals, held-back views."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
@@ -236,6 +236,7 @@ class SeenRows:
     rows: tuple[ObservationRow, ...]  # The n observations.
     views: tuple[ViewPoses, ...]  # Their poses.
     problem: Problem  # Their problem, with the unknowns of the fit.
+    is_held: bool = False  # Whether the session holds them back from the fit.
 
     def residuals(self, cell_fit: CellFit) -> FloatArray:
         """(n, 3) residuals from what the fit predicts, NaN for none [mm], [deg], [px].
@@ -255,23 +256,16 @@ class SeenRows:
         return np.stack([1e3 * away_m, np.rad2deg(away_rad), px], axis=1)
 
 
-def fitted_rows(cell_fit: CellFit) -> SeenRows:
-    """The observations of a fit, with its outliers."""
-    return SeenRows(cell_fit.cell.rows, cell_fit.poses, cell_fit.inlier_fit.problem)
-
-
-def held_back(cell_fit: CellFit, observed: Observed) -> SeenRows | None:
-    """Held-back observations that can be compared with the fit; None for none."""
-    cell, state, frames = (
-        cell_fit.cell,
-        cell_fit.inlier_fit.fit.state,
-        cell_fit.cell.tree.branches.keys(),
-    )
+def seen_rows(cell_fit: CellFit, observed: Observed) -> Iterator[SeenRows]:
+    """The observations of a fit, with its outliers, and held-back ones that compare with it."""
+    cell, inliers = cell_fit.cell, cell_fit.inlier_fit
+    yield SeenRows(cell.rows, cell_fit.poses, inliers.problem)
+    state, frames = inliers.fit.state, cell.tree.branches.keys()
     rows = [
         row for row in cell.held if row.view in observed.poses and {row.seer, row.seen} <= frames
     ]
     if not rows:
-        return None
+        return
     cell_fit = replace(cell_fit, cell=replace(cell, rows=tuple(rows)))
     views = [observed.poses[row.view] for row in rows]
     first = _problem(cell_fit, observed, [view.chosen(0, None) for view in views])
@@ -283,7 +277,8 @@ def held_back(cell_fit: CellFit, observed: Observed) -> SeenRows | None:
             poses = fit_poses(stack, optics.camera(row.seer), view.cam_from_target)
             view = replace(view, cam_from_target=poses.cam_from_target)
         views[at] = view
-    return SeenRows(tuple(rows), tuple(views), _problem(cell_fit, observed, views))
+    problem = _problem(cell_fit, observed, views)
+    yield SeenRows(tuple(rows), tuple(views), problem, is_held=True)
 
 
 def _views(
@@ -300,9 +295,8 @@ def _views(
         [1e3 * held_out.residual_m, np.rad2deg(held_out.residual_rad), held_out.rms_px], axis=1
     )
     results: dict[int, ViewResult] = {}
-    held = held_back(cell_fit, observed)
-    for seen in (fitted_rows(cell_fit), *([] if held is None else [held])):
-        is_held = seen is held
+    for seen in seen_rows(cell_fit, observed):
+        is_held = seen.is_held
         for at, (mm, deg, px) in enumerate(map(_finite_or_none, seen.residuals(cell_fit))):
             row, corners = seen.rows[at], seen.views[at].corners
             results[row.view] = ViewResult(

@@ -39,7 +39,7 @@ from visioncal.estimation.observability import (
 )
 from visioncal.estimation.tree import Tree
 from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
-from visioncal.robot import REPEATABILITY
+from visioncal.robot.model import REPEATABILITY
 
 
 def judge_run(state: RunState) -> RunState:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.calibration.pipeline.assessment import fitted_rows, held_back
+from visioncal.calibration.pipeline.assessment import seen_rows
 from visioncal.calibration.pipeline.cell_fit import within
 from visioncal.calibration.pipeline.connectivity import connection_advice
 from visioncal.calibration.pipeline.judging import weakest_link
@@ -452,8 +452,8 @@ def _relative_indices(indices: IntArray, part: slice) -> tuple[int, ...]:
 def view_evidence(run: RunState) -> tuple[ViewEvidence, ...]:
     """Collects the evidence of each view: corners, predictions, poses."""
     cell_fit, state, boards = run.cell_fit, run.assessment.state, tuple(run.session.boards.values())
-    held, optics, evidence = held_back(cell_fit, run), cell_fit.camera_parameters, dict[int, Any]()
-    for seen in (fitted_rows(cell_fit), *([] if held is None else [held])):
+    optics, evidence = cell_fit.camera_parameters, dict[int, Any]()
+    for seen in seen_rows(cell_fit, run):
         poses = zip(seen.problem.measured(state), seen.problem.predicted(state), strict=True)
         for row, view, (measured, predicted) in zip(seen.rows, seen.views, poses, strict=True):
             px = None

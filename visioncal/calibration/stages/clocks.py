@@ -55,7 +55,6 @@ from visioncal.estimation.problem_parts import Effect
 from visioncal.results.sections import ClockResult
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
-from visioncal.session.document import ClockTable
 from visioncal.session.kinds import is_camera_observation
 from visioncal.vision.targets import numbered_positions
 
@@ -107,10 +106,7 @@ def _with_clock(seen: T, pair: ClockPair, rows: list[View]) -> T:
     is_only = max(len(session.cameras), len(session.robots)) < 2
     of = "" if is_only else pair.words
     declared = session.declaration
-    tables: dict[str, ClockTable] = {
-        frame_name("camera", name): clock for name, clock in declared.clocks.items()
-    }
-    table = tables.get(pair.camera, declared.clock)
+    table = declared.clocks.get(pair.camera.partition("_")[2], declared.clock)
     on_flange = session.frames[pair.camera] == frame_name("flange", pair.robot)
     try:
         model = None if document is None else Robot.from_document(document)
@@ -199,17 +195,12 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
     fit = clear_fit(fits, stated_s)
     changed = None if fit is None or change else clock_change(flange, frames, fit)
     if changed is not None:
-        stamped = (view for view in sweep.views if view.stamp_s is not None)
-        stamps_s = {
-            view.number: changed.corrected(np.array([view.stamp_s])).item() for view in stamped
-        }
-        corrected = tuple(
-            replace(view, numbers={**view.numbers, "stamp_s": stamps_s[view.number]})
-            if view.number in stamps_s
-            else view
-            for view in sweep.views
-        )
-        return _clocked(replace(sweep, views=corrected), change_doubt(changed, views))
+        corrected = list(sweep.views)
+        for at, view in enumerate(corrected):
+            if view.stamp_s is not None:
+                stamp_s = changed.corrected(np.array([view.stamp_s])).item()
+                corrected[at] = replace(view, numbers={**view.numbers, "stamp_s": stamp_s})
+        return _clocked(replace(sweep, views=tuple(corrected)), change_doubt(changed, views))
     clock = ClockResult(
         camera_minus_robot_s=stated_s or 0.0,
         method="rest",

@@ -36,7 +36,11 @@ def usable_corners(
     """
     size = np.array(resolution, dtype=float)
     corners = {view.number: session.corners[view.number] for view in views}
-    outside = {view: _outside(at, size) for view, at in corners.items()}
+    least, most = -_OUTSIDE * size, (1 + _OUTSIDE) * size
+    outside = {
+        view: np.asarray(((at.px < least) | (at.px > most)).any(axis=1))
+        for view, at in corners.items()
+    }
     lost = [f"view {view}" for view, mask in outside.items() if mask.any()]
     if 2 * len(lost) > len(views):
         px = np.concatenate([at.px for at in corners.values()])
@@ -60,12 +64,6 @@ def usable_corners(
                 view, "its corners in corners.csv do not lie as the target's drawing numbers them"
             )
     return usable
-
-
-def _outside(corners: Corners, size: FloatArray) -> Mask:
-    """(n,) mask of the corners far outside the image."""
-    beyond = (corners.px < -_OUTSIDE * size) | (corners.px > (1 + _OUTSIDE) * size)
-    return np.asarray(beyond.any(axis=1))
 
 
 def _usable(

@@ -147,7 +147,9 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
         robots, states = [robot for _, robot in sorted(row.robots.items())], [np.zeros(0)]
         for robot in robots:
             if robot.number not in known:
-                known[robot.number] = _state(robot)
+                # Of its pose and joints, in units of what rows of one stop may differ by.
+                q, pose = robot.joints_rad, _entries(robot.matrix(POSE))
+                known[robot.number] = [pose, *([] if q is None else [q / APART_RAD])]
             states += known[robot.number]
         # Who observes what, and what else is measured. A robot's pose in its stream is that of the
         # time.
@@ -175,12 +177,6 @@ def repeated_rows(session: Session, corners: Mapping[int, Corners]) -> dict[int,
             if is_copy and not {view.number, other.number} & repeated.keys():
                 repeated[other.number] = view.number
     return dict(sorted(repeated.items()))
-
-
-def _state(robot: View) -> list[FloatArray]:
-    """Numbers of a robot's pose and joints in units of what rows of one stop may differ by."""
-    joints = robot.joints_rad
-    return [_entries(robot.matrix(POSE)), *([] if joints is None else [joints / APART_RAD])]
 
 
 def _entries(pose: FloatArray | None) -> FloatArray:

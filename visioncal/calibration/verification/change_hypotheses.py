@@ -26,8 +26,6 @@ CAMERA, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW = (
 )
 # Two simultaneous changes.
 PAIRS = (BOTH, REPLACED)
-# Factors by which the robot's noise may have grown.
-_FACTORS = (2.0, 4.0, 8.0, 16.0, 32.0)
 # Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
 _OTHER_SIZE_PER_M = 10.0
 # Units of a twist, for a change of one metre.
@@ -72,7 +70,9 @@ def causes_of(
             causes.append(_simultaneous(BOTH, camera, place))
     causes += _joints(predicted, prior)
     if predicted.stops > 1:
-        causes.append(ChangeHypothesis(NOISE, np.zeros(0), noise_factors=_FACTORS))
+        # The robot's noise may have grown by 2 to 32 times.
+        factors = tuple((2.0 ** np.arange(1, 6)).tolist())
+        causes.append(ChangeHypothesis(NOISE, np.zeros(0), noise_factors=factors))
         causes += _views(predicted, prior, changes)
     return tuple(causes)
 

@@ -115,7 +115,10 @@ def verdict_of(check: Check) -> Verdict:
     kind, words = likeliest.cause.kind, _sentence(change_words(check, likeliest))
     # Where something else has changed, too, its probability among those compared says little.
     share, is_alone = likeliest.probability, check.explained
-    step = _remedy(check, likeliest)
+    found, step = _estimates(check, likeliest), _runnable(check, _KINDS[kind][1])
+    # No camera or board moves farther; poses in another unit seem to.
+    if found.get(CAMERA, found).get("moved_mm", 0.0) > 5e3:
+        step = _OTHER_POSES
     reasons = [Finding(kind, words, step, probability=share, by_limit=not is_alone)]
     if others:
         reasons.append(_rivals(check, likeliest, others))
@@ -124,15 +127,6 @@ def verdict_of(check: Check) -> Verdict:
         anew = _runnable(check, Remedy(_sentence(_ANEW), CALIBRATE_ANEW))
         reasons.append(Finding("unexplained", words, anew))
     return Verdict("bad", (*bad, *reasons, *(few if others else ())))
-
-
-def _remedy(check: Check, change: PossibleChange) -> Remedy:
-    """Advice on a change."""
-    found = _estimates(check, change)
-    # No camera or board moves farther; poses in another unit seem to.
-    if found.get(CAMERA, found).get("moved_mm", 0.0) > 5e3:
-        return _OTHER_POSES
-    return _runnable(check, _KINDS[change.cause.kind][1])
 
 
 def _runnable(check: Check, step: Remedy) -> Remedy:
@@ -255,12 +249,11 @@ def _length(
     length = float(np.linalg.norm(vector))
     unit = vector / length if length > 0.0 else np.full(3, 1.0 / np.sqrt(3.0))
     sigma = float(np.sqrt(max(float(unit @ covariance @ unit), 0.0)))
-    return length, sigma, _signed_axis(rotation @ unit)
+    return length, sigma, signed_axis(rotation @ unit)
 
 
-def _signed_axis(vector: FloatArray) -> str:
+def signed_axis(unit: FloatArray) -> str:
     """Names a direction with its sign: `-x`, or `direction (-0.71, 0.71, 0.00)`."""
-    unit = vector / np.linalg.norm(vector)
     words = axis_words(unit)
     if len(words) == 1:
         return words if unit["xyz".index(words)] > 0.0 else f"-{words}"
