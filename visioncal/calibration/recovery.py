@@ -324,11 +324,8 @@ def _slipped(
         The errors of its fit, and its section; the column of the joint's offset in the covariance,
         and its unit [rad].
     """
-    old, fitted = (
-        check.calibration,
-        check.prior.fit.arm or FittedArm(of="model", values=np.zeros(0)),
-    )
-    model = check.prior.model
+    old, model = check.calibration, check.prior.model
+    fitted = check.prior.fit.arm or FittedArm(of="model", values=np.zeros(0))
     if model is None:
         # Errors of the nominal arm's links, where it has any, are no part of it.
         links = {"links": 1.0} if len(fitted.values) else {}
@@ -351,12 +348,8 @@ def _slipped(
     )
     if old.arm is not None and old.arm.is_calibrated:
         # Its table of parameters is that of before.
-        return (
-            fitted,
-            replace(old.arm, robot=robot, parameters=()),
-            first + joint,
-            weights[_OFFSETS],
-        )
+        arm = replace(old.arm, robot=robot, parameters=())
+        return fitted, arm, first + joint, weights[_OFFSETS]
     (rms, off), mm = residuals, old.rms.mm
     before = ArmLevel(level=NOMINAL, unknowns=0, rms_mm=mm, held_out_mm=mm, likelihood_ratio=0.0)
     slipped = ArmLevel(

@@ -454,10 +454,8 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
         )
     options, robot = cell.options, cell.robots[swept.robot]
     index = list(cell.robots).index(swept.robot)
-    rng, stamp_noise = (
-        options.stream(RandomStream.SWEEPS, index),
-        options.stream(RandomStream.SWEEPS, index, 1),
-    )
+    rng = options.stream(RandomStream.SWEEPS, index)
+    stamp_noise = options.stream(RandomStream.SWEEPS, index, 1)
     passage = Passage.through(robot.joints[: swept.stops], swept)
     recorded = passage.reported(robot.arm, rng)
     camera, board = cell.camera(swept.camera), cell.board(swept.target)

@@ -262,11 +262,7 @@ def _draw_board(light: Float32Array, scene: RenderScene, cam_from_target: FloatA
         # points away from it.
         light_cam = np.array([0.3, 0.6, 0.74])
         brightness = 0.7 + 0.3 * max(float(cam_from_target[:3, 2] @ light_cam), 0.0)
-    raster, board, target_from_cam = (
-        trace(camera, patch),
-        scene.board,
-        invert(cam_from_target),
-    )
+    raster, board, target_from_cam = trace(camera, patch), scene.board, invert(cam_from_target)
     flat = _plane_hits(target_from_cam, raster.directions, 0.0)
     for _ in range(6 if board.bow_m != 0.0 else 0):
         # The bow is shallow: this converges by the ratio of the sheet's slope to the ray's.

@@ -207,16 +207,11 @@ def assess_fit(
 
 def _sigmas(cell_fit: CellFit) -> dict[str, dict[str, float]]:
     """Estimated standard deviations of robots by name, and of cameras and instruments by frame."""
-    fit, problem, seen = (
-        cell_fit.inlier_fit.fit,
-        cell_fit.inlier_fit.problem,
-        cell_fit.linearised_corners,
-    )
+    noise, seen = cell_fit.inlier_fit.fit.noise, cell_fit.linearised_corners
+    of_robots = zip(cell_fit.inlier_fit.problem.robots, noise.robots.tolist(), strict=True)
     results = {
         robot: {"translation_mm": 1e3 * sigma_m, "rotation_deg": float(np.rad2deg(sigma_rad))}
-        for robot, (sigma_rad, sigma_m) in zip(
-            problem.robots, fit.noise.robots.tolist(), strict=True
-        )
+        for robot, (sigma_rad, sigma_m) in of_robots
     }
     if seen is not None:
         pairs = zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True)
@@ -224,7 +219,7 @@ def _sigmas(cell_fit: CellFit) -> dict[str, dict[str, float]]:
     sensors = dict.fromkeys(
         (*sensors_of(cell_fit.cell, cell_fit.poses), *(row.seer for row in cell_fit.cell.rows))
     )
-    for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=False):
+    for frame, level in zip(sensors, noise.sensors.tolist(), strict=False):
         results[frame] = {**results.get(frame, {}), "level": level}
     return results
 

@@ -124,10 +124,8 @@ class CellFit:
     @property
     def field_columns(self) -> IntArray:
         """The problem's columns of lens errors beyond their models."""
-        columns, free = (
-            self.lens_columns,
-            0 if self.linearised_corners is None else len(self.linearised_corners.free),
-        )
+        columns, corners = self.lens_columns, self.linearised_corners
+        free = 0 if corners is None else len(corners.free)
         return np.arange(columns.start + free, columns.stop)
 
     def columns_of(self, indices: IntArray) -> IntArray:

@@ -122,7 +122,12 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
     if error is None:
         if not hint and run.mount is not None:
             yield from _motion(run, run.mount)
-        yield from _lost(run)
+        # Views that cannot be used, but for those that warnings name already.
+        named = {view for warning in run.warnings for view in warning.views}
+        lost = {view: why for view, why in run.reasons.items() if view not in named}
+        do = Remedy("Look at their images, and correct their rows in views.csv, or repeat them.")
+        for words in by_reason(lost):
+            yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", do)
 
 
 def _refused(kind: str, error: VisioncalError) -> Finding:
@@ -160,15 +165,6 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
             "the lens is not this camera's, or the poses are not of these images.",
             Remedy("Calibrate: the verdict weighs the causes.", CALIBRATE),
         )
-
-
-def _lost(run: RunState) -> Iterator[Finding]:
-    """Findings on views that cannot be used, except those that warnings name already."""
-    reported = {view for warning in run.warnings for view in warning.views}
-    reasons = {view: why for view, why in run.reasons.items() if view not in reported}
-    do = Remedy("Look at their images, and correct their rows in views.csv, or repeat them.")
-    for words in by_reason(reasons):
-        yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", do)
 
 
 def _contents(run: RunState) -> Iterator[str]:

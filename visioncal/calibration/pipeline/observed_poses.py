@@ -71,7 +71,7 @@ class ObservedPoses(Observed):
 
     def problem(self, views: Sequence[int]) -> Problem:
         """The problem of some views, each with its first or chosen pose."""
-        poses, first = [self.poses[view] for view in views], self.first_of_stops(views)
+        poses, arm = [self.poses[view] for view in views], self.arm_at(self.first_of_stops(views))
         covariance, effects = None, []
         from_corners = all(pose.corners is not None for pose in poses)
         if self.free is not None:
@@ -82,10 +82,10 @@ class ObservedPoses(Observed):
             effects = [self.free.effect(shift)]
         if from_corners:
             covariance = np.array([pose.covariance[0] for pose in poses]).reshape(-1, 6, 6)
-        effects += self.arm_at(first).effects()
+        effects += arm.effects()
         return chain(
             self.session.mount,
-            self.arm_at(first).poses,
+            arm.poses,
             np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
             covariance,
             stops=self.stops_of(views),

@@ -121,7 +121,10 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     cell_fit = replace(cell_fit, inlier_fit=with_camera_levels(cell, poses, cell_fit.inlier_fit))
     cell_fit, noise = _calibrate_arms(cell_fit, observed, final)
     if level != "hand-eye":
-        cell_fit = _with_functions(cell_fit, noise)
+        # The many unknowns of functions of the joints would slow each update of the inliers down.
+        arms = _choose_levels(cell_fit, noise, functions=True)
+        if any(arms[name] is not arm for name, arm in cell_fit.arms.items()):
+            cell_fit = _converge_arms(replace(cell_fit, arms=arms))
     cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
     problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
     return replace(cell_fit, arms=with_pose_errors(cell_fit.arms, problem, fit))
@@ -304,15 +307,6 @@ def _choose_levels(
         return arm if slips else found
 
     return change_each(cell_fit.arms, part, fit, with_level)
-
-
-def _with_functions(cell_fit: CellFit, noise: Noise) -> CellFit:
-    """Fits error functions of the joints of each arm that supports them."""
-    # Their many unknowns would slow each update of the inliers down, so that they come last.
-    arms = _choose_levels(cell_fit, noise, functions=True)
-    if all(arms[name] is arm for name, arm in cell_fit.arms.items()):
-        return cell_fit
-    return _converge_arms(replace(cell_fit, arms=arms))
 
 
 def _converge_arms(cell_fit: CellFit) -> CellFit:

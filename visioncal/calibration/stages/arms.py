@@ -320,7 +320,6 @@ class RobotArm:
             for name in blocks_of(model.nominal, self.loads)
         }
         harmonics = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
-        mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
         kinematics = select_errors(
             problem,
             start,
@@ -330,10 +329,11 @@ class RobotArm:
             asked,
             noise,
             None if harmonics is None else self._by_stop(harmonics),
-            tuple(views[index] for index in mine),
         )
         if kinematics is None:
             return self
+        mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
+        kinematics = replace(kinematics, views=tuple(views[index] for index in mine))
         arm = replace(self, kinematics=kinematics)
         if found := kinematics.fit.errors:
             return arm._with_model(model.with_errors(found, kinematics.fit.functions))

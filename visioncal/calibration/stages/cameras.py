@@ -41,8 +41,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
     Raises:
         DataError: See `detect`.
     """
-    session, several = seen.session, len(seen.session.cameras) > 1
-    boards = session.boards
+    session, boards = seen.session, seen.session.boards
     starts = dict(zip(boards, first_corners(tuple(boards.values())).tolist(), strict=True))
     # A single camera need not be declared.
     for name, table in (session.cameras or {"": CameraTable()}).items():
@@ -56,7 +55,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
         if not views:
             continue
         if given is None:
-            with _naming(frame if several else ""):
+            with _naming(seen, frame):
                 found = detect(
                     session,
                     seen.progress,
@@ -127,7 +126,7 @@ def estimate_lenses(seen: T) -> T:
         DegenerateError: The views do not determine a focal length at all.
         ConvergenceError: No start converges.
     """
-    targets, several = tuple(seen.session.boards.values()), len(seen.session.cameras) > 1
+    targets = tuple(seen.session.boards.values())
     for frame, look in seen.cameras.items():
         fitted = {view: px for view, px in look.corners.items() if view not in seen.held_back}
         if not fitted or look.resolution is None:
@@ -135,8 +134,7 @@ def estimate_lenses(seen: T) -> T:
         if look.table.stated is not None:
             lens = CameraResult(look.table.stated, estimated=False)
         else:
-            of = frame if several else ""
-            with _naming(of):
+            with _naming(seen, frame):
                 fit = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
             lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
             seen = seen.noting(fit.rejections)
@@ -162,7 +160,7 @@ def locate_targets(seen: T) -> T:
         lens, of = look.lens, frame if len(session.cameras) > 1 else ""
         if lens is None or not fitted:
             continue
-        with _naming(of):
+        with _naming(seen, frame):
             free = 0 if lens.covariance is None else len(lens.covariance)
             fit = estimate_poses(fitted, targets, lens.camera, free)
         if fit.sigma_px > CalibrationLimits().pixel_px[0] and not lens.estimated:
@@ -215,11 +213,11 @@ def _other_lens(
 
 
 @contextmanager
-def _naming(frame: str) -> Iterator[None]:
-    """Adds the camera's frame, where it is not empty, to errors."""
+def _naming(seen: Observed, frame: str) -> Iterator[None]:
+    """Adds the camera's frame, where there are several, to errors."""
     try:
         yield
     except VisioncalError as error:
-        if not frame:
+        if len(seen.session.cameras) < 2:
             raise
         raise error.within(frame) from error

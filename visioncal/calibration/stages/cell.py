@@ -7,7 +7,6 @@ import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.priors import priors_of
-from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Remedy, or_alone
@@ -136,7 +135,12 @@ def read_cell(seen: Observed) -> Cell:
             and observation.view.instrument_from_probe() is None,
         )
         for observation in observations
-        if _has_robot_poses(observation, seen.robots)
+        # The poses of all robots between have to be known.
+        if not observation.missing_robots
+        and all(
+            observation.view.number in seen.robots[name].base_from_flange
+            for name in observation.robots
+        )
     ]
     held = tuple(row for row in rows if row.view in seen.held_back)
     rows = [row for row in rows if row.view not in seen.held_back]
@@ -188,14 +192,6 @@ def pair_edges(session: Session) -> tuple[str, ...]:
 def robot_key(name: str) -> str:
     """Name of a robot where none may be empty."""
     return name or "robot"
-
-
-def _has_robot_poses(observation: Observation, robots: Mapping[str, RobotReport]) -> bool:
-    """Whether the poses of all robots in an observation's chain are known."""
-    view = observation.view.number
-    return not observation.missing_robots and all(
-        view in robots[name].base_from_flange for name in observation.robots
-    )
 
 
 def _poses(seen: Observed, observations: Sequence[Observation]) -> dict[str, FloatArray]:

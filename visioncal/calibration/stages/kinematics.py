@@ -152,8 +152,7 @@ def select_errors(
     torque_nm: float,
     asked: str,
     noise: Noise,
-    harmonics: FloatArray | None = None,
-    views: tuple[int, ...] = (),
+    harmonics: FloatArray | None,
 ) -> SelectedArmLevel | None:
     """Selects the errors of a robot's arm that its observations show.
 
@@ -169,7 +168,6 @@ def select_errors(
         asked: A key of `ASKED`.
         noise: The noise's levels to start from.
         harmonics: Jacobian by functions of the joints, or None; see `estimate_arm_sizes`.
-        views: The view of each of the robot's observations.
 
     Returns:
         The errors; with `harmonics` None where no functions of the joints are significant.
@@ -198,7 +196,7 @@ def select_errors(
             return None
         nominal = LevelFit.of(problem, state, robot, noise, None)
         fit = fitted(sizes)
-    return SelectedArmLevel(nominal, fit, asked not in ("auto", "thermal"), views)
+    return SelectedArmLevel(nominal, fit, asked not in ("auto", "thermal"))
 
 
 def check_level(asked: str) -> None:

@@ -277,7 +277,9 @@ def _picks(
         stops = seen.stops
         root = errors.sigma * adjoint(problem.poses[robot][stops]) @ errors.basis[stops]
         parts["arm"] = root @ root.mT
-    of_boards = _board_part(covariance, fitted.board_columns)
+    # The part of the covariance that is due to the boards' shapes.
+    cross = covariance[:, fitted.board_columns]
+    of_boards = cross @ np.linalg.pinv(cross[fitted.board_columns], hermitian=True) @ cross.T
     parts["calibration"] = linearised.covariance(covariance - of_boards)
     parts["board"] = linearised.covariance(of_boards)
     carried = carries[:, None, None]
@@ -440,12 +442,6 @@ def _as_things(fitted: PickInputs) -> Problem:
         return array
 
     return replace(problem, effects=_with_sensors(fitted, moved))
-
-
-def _board_part(covariance: FloatArray, columns: IntArray) -> FloatArray:
-    """(p, p) the part of a covariance that is due to the boards' shapes."""
-    cross = covariance[:, columns]
-    return np.asarray(cross @ np.linalg.pinv(cross[columns], hermitian=True) @ cross.T)
 
 
 def _at_points(covariances: FloatArray, points_m: FloatArray) -> FloatArray:

@@ -88,11 +88,6 @@ class Check:
         return not self.named
 
     @property
-    def misfit(self) -> float:
-        """Squared Mahalanobis distance of the stops from the prediction."""
-        return self.unchanged.misfit
-
-    @property
     def camera_sigma(self) -> FloatArray:
         """(6,) standard deviations of an estimated motion of the camera [rad, m]."""
         camera = next(change for change in self.compared if change.name == CAMERA)

@@ -312,7 +312,7 @@ def to_document(
         "changes": [_change(check, change) for change in check.named],
         "others": [_change(check, change) for change in others],
         "explained": check.explained,
-        "misfit": check.misfit,
+        "misfit": check.unchanged.misfit,
         "degrees_of_freedom": check.unchanged.freedom,
         "p_value": check.p_value,
         "repeated_stops": check.repeated,
