@@ -20,7 +20,7 @@ from visioncal.results.picking import check_mount, check_resolution
 from visioncal.robot import Robot
 from visioncal.session import Session, View
 from visioncal.session.selecting import EYE, Choice
-from visioncal.session.table import loads_of
+from visioncal.session.table import loads_of, reported_matrices
 
 _NO_IMAGE = "it has no image"
 
@@ -156,8 +156,7 @@ def _poses(
         reported = _flange(session, calibration, wanted)
         lost = {rejection.view: rejection.reason for rejection in reported.rejections} | lost
         return reported.base_from_flange, lost
-    poses = {view.number: pose for view in wanted if (pose := view.base_from_flange()) is not None}
-    return {view: np.asarray(value.as_matrix()) for view, value in poses.items()}, lost
+    return reported_matrices(wanted), lost
 
 
 def _flange(session: Session, calibration: Calibration, wanted: tuple[View, ...]) -> RobotReport:

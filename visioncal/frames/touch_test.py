@@ -17,7 +17,7 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.frames.frame_from_images import seen_frame
-from visioncal.frames.touches import Tool
+from visioncal.frames.touches import Tool, robot_noise
 from visioncal.results import Calibration, Edge, Frame
 from visioncal.results.sections import TouchedPoint, TouchTest
 from visioncal.robot.collision import camera_body
@@ -110,11 +110,10 @@ def touch_targets(
             next_step="Name it in session.toml.",
         )
     frame = seen_frame(session, calibration, "fixture")
-    noise = calibration.noise
-    turned = np.deg2rad(noise.get("robot_rotation_deg", 0.0)) * np.linalg.norm(tip.matrix[:3, 3])
-    shifted = 1e-3 * noise.get("robot_translation_mm", 0.0)
+    turn_rad, shift_m = robot_noise(calibration).robots[0]
     # The robot's noise at the stop and the tip's covariance.
-    independent = (shifted**2 + turned**2) * np.eye(3) + tip.covariance[3:, 3:]
+    variance = shift_m**2 + (turn_rad * np.linalg.norm(tip.matrix[:3, 3])) ** 2
+    independent = variance * np.eye(3) + tip.covariance[3:, 3:]
     rotation = frame.edge.matrix[:3, :3]
     points = []
     # The four outermost corners, and the one nearest to the middle.

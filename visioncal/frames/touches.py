@@ -18,6 +18,7 @@ from visioncal.results import Calibration, Edge, Frame, Verdict
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.selecting import ARM, Choice, check_one_of_each, select
+from visioncal.session.table import reported_matrices
 
 NO_TOOL = (
     "Find the tip with visioncal tcp first, and name its file with --tool; or say --tool none, "
@@ -76,19 +77,15 @@ def touches_of(session: Session, robot: str | None = None) -> TouchRows:
     if len(session.robots) > 1:
         session = select(session, Choice(robot=robot), ARM)
     check_one_of_each(session)
-    no_pose = np.full((4, 4), np.nan)
-    poses, joints = [], []
-    for view in session.views:
-        pose = view.base_from_flange()
-        poses.append(no_pose if pose is None else np.asarray(pose.as_matrix()))
-        joints.append(view.joints_rad)
+    reported, no_pose = reported_matrices(session.views), np.full((4, 4), np.nan)
+    joints = [view.joints_rad for view in session.views]
     size = max((len(joint) for joint in joints if joint is not None), default=0)
     no_joints = np.full(size, np.nan)
     return TouchRows(
         session.name,
         tuple(str(view.number) for view in session.views),
         tuple(f"views.csv, view {view.number}" for view in session.views),
-        np.array(poses),
+        np.array([reported.get(view.number, no_pose) for view in session.views]),
         np.array([no_joints if joint is None else joint for joint in joints]) if size else None,
         tuple(view.text.get("kind", "") for view in session.views),
         tuple(view.text.get("point", "") for view in session.views),

@@ -260,10 +260,8 @@ def _fit_with_inliers(start: CellFit, observed: Observed) -> CellFit:
 
 def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
     """Fits lenses, boards and frames, with posture-dependent errors of the arms and their drift."""
-    cell_fit = replace(
-        cell_fit, arms={name: arm.with_found_errors(None) for name, arm in cell_fit.arms.items()}
-    )
-    cell_fit = cell_fit.with_arm_poses()
+    nominal = {name: arm.as_reported for name, arm in cell_fit.arms.items()}
+    cell_fit = replace(cell_fit, arms=nominal).with_arm_poses()
     if observed.scenes and not cell_fit.inlier_fit.problem.is_combined:
         model, frames = cell_fit.frame_model, cell_fit.frames
         views = _views_by_camera(observed, cell_fit.poses)

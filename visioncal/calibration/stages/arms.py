@@ -131,10 +131,10 @@ class RobotArm:
         """Significant drift with temperature; None without one."""
         return self.thermal if self.thermal is not None and self.thermal.is_found else None
 
-    def with_found_errors(self, errors: ArmErrors | None) -> Self:
-        """The arm with errors found at some of its stops, none of them estimated yet."""
-        arm = replace(self, errors=errors, kinematics=None, model=None)
-        return arm if errors is None else replace(arm, errors=replace(errors, basis=arm.basis))
+    @property
+    def as_reported(self) -> Self:
+        """The arm as it reports itself, apart from its drift."""
+        return replace(self, errors=None, kinematics=None, model=None)
 
     @property
     def poses(self) -> FloatArray:
@@ -168,8 +168,8 @@ class RobotArm:
         return problem.with_poses(self.robot, self.poses).with_effects([*rest, *self.effects()])
 
     def without_errors(self, problem: Problem) -> Problem:
-        """A problem with this arm as reported, apart from its drift."""
-        return self.with_found_errors(None).applied_to(problem)
+        """A problem with this arm as it reports itself."""
+        return self.as_reported.applied_to(problem)
 
     def with_drift(self, problem: Problem, start: State) -> Self:
         """Estimates the drift with temperature; the problem has this arm as reported.

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
-from types import MappingProxyType
 
 import numpy as np
 
@@ -20,8 +19,8 @@ def other_stops(
     problem: Problem,
     fit: Solution,
     out: IntArray,
-    moves: Sequence[Move] = (),
-    turns: Mapping[str, FloatArray] = MappingProxyType({}),
+    moves: Sequence[Move],
+    turns: Mapping[str, FloatArray],
 ) -> dict[int, list[int]]:
     """Other stops that outliers fit, best first, by observation.
 
