@@ -136,11 +136,6 @@ class CalibratedCamera:
         return self.lens.camera
 
     @property
-    def breathes(self) -> bool:
-        """Whether the focal length follows the distance."""
-        return self.lens.field is not None and self.lens.field.breathing > 0.0
-
-    @property
     def jitter(self) -> float:
         """Standard deviation of the focal length from view to view, as a share of it."""
         return 0.0 if self.lens.field is None else self.lens.field.jitter

@@ -99,11 +99,6 @@ class FitSettings:
         limits = self.options
         return limits.touches if isinstance(limits, ToolLimits) else limits.points
 
-    @property
-    def expected_m(self) -> float:
-        """Expected repeatability of a touch, per axis [m]."""
-        return TOUCH_NOISE_M if self.touch_noise_m is None else self.touch_noise_m
-
 
 @dataclass(frozen=True, eq=False)
 class PointsFit:
@@ -322,8 +317,8 @@ def _fitted(
 
     Its worst directions are those at the points' `centre` in the fixture [m].
     """
-    fit = agreement.fit
-    noise_m = counted_noise_m(fit, setting.expected_m)
+    fit, stated_m = agreement.fit, setting.touch_noise_m
+    noise_m = counted_noise_m(fit, TOUCH_NOISE_M if stated_m is None else stated_m)
     covariance = measured.carried(fit.by_points, np.hypot(noise_m, pairs.nominal_sigma_m))
     thing = "Touch" if pairs.kinds else "Point"
     return PointsFit(

@@ -82,7 +82,7 @@ def target_pose_candidates(
         stack = CornerStack.of({kept.view: kept}, corner_positions(target))
         # Mean depth of the corners.
         distance_m = float(depths_m(stack, poses.cam_from_target[:1])[0])
-        if eye.breathes:
+        if eye.lens.field is not None and eye.lens.field.breathing > 0.0:
             in_model = replace(corners, px=eye.lens.in_model(corners.px, distance_m))
             poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
         fits = [

@@ -147,14 +147,6 @@ class SimulatedCell:
         """Detected corners in all images, by ascending view."""
         return tuple(sight.corners for sight in self.sights)
 
-    @property
-    def is_named(self) -> bool:
-        """Whether its robots and boards have names; else there is one of each kind."""
-        layout = self.layout
-        return any(
-            [*(robot.name for robot in layout.robots), *(board.name for board in layout.boards)]
-        )
-
     def camera(self, name: str = "") -> CameraAt:
         """The camera of that name, or the single one."""
         return next(camera for camera in self.layout.cameras if camera.name == name)

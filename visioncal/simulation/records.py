@@ -200,8 +200,10 @@ def cell_session(
         views[number] = _view(cell, number, stop, robot, {}, {})
     rows = [views[number] for number in sorted(views)]
     texts = dict.fromkeys(key for row in rows for key in row.text)
+    robots, boards = cell.layout.robots, cell.layout.boards
+    is_named = any([*(robot.name for robot in robots), *(board.name for board in boards)])
     columns = [
-        *(["view", "stop"] if cell.is_named else ["view"]),
+        *(["view", "stop"] if is_named else ["view"]),
         *(text for text in texts if text != "approach"),
         *(["image"] if any(row.image for row in rows) else []),
         *dict.fromkeys(key for row in rows for key in row.numbers),
@@ -216,8 +218,11 @@ def cell_session(
             np.concatenate([sight.corners.px for sight in sights]),
             ("",) * sum(counts),
         )
-    boards = [board for board in cell.layout.boards if board.name or seen != "poses"]
-    documents = {board.name: target_document(board.target) for board in boards}
+    documents = {
+        board.name: target_document(board.target)
+        for board in boards
+        if board.name or seen != "poses"
+    }
     single = next(iter(documents.values()), None)
     return Session.assemble(
         _document(cell, name, seen),

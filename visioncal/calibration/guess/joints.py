@@ -50,11 +50,6 @@ class JointReading:
     columns: tuple[int, ...] = ()  # The columns concerned, numbered from 0; empty for all.
     cost: float = 1.0  # Number of mistakes it implies; a lost zero counts more than one.
 
-    @property
-    def is_zero(self) -> bool:
-        """Whether it changes a joint's zero, and nothing else."""
-        return bool(np.any(self.zeros))
-
     def poses(self, recorded: FloatArray) -> FloatArray:
         """(m, 4, 4) `base_from_flange` [m] for (m, n) recorded angles [rad]."""
         return self.robot.base_from_flange(recorded @ self.mixing.T + self.zeros)
@@ -154,7 +149,7 @@ class JointGuess:
 
         Of joints with parallel axes it is the more likely one: only a fit of all determines which.
         """
-        return self.best.reading if all(reading.is_zero for reading in self._readings) else None
+        return self.best.reading if all(one.zeros.any() for one in self._readings) else None
 
     @property
     def _readings(self) -> tuple[JointReading, ...]:

@@ -148,10 +148,6 @@ class Change:
         changes, cost = (*reading.changes, self.words), reading.cost + self.cost
         return replace(reading, changes=changes, cost=cost, **fields)
 
-    def goes_with(self, other: "Change") -> bool:
-        """Whether both may be mistaken together."""
-        return self.part != other.part or self.fields.keys().isdisjoint(other.fields)
-
 
 def changes(declared: Hypothesis, is_measured: bool, count: int) -> Iterator[Change]:
     """All mistakes that are tried but rewritten rotations, by the declared reading of `count` rows.

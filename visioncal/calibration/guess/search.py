@@ -195,7 +195,9 @@ def _undone(
     return [
         second.of(declared if first is None else first.of(declared))
         for first, second in pairs
-        if first is None or first.goes_with(second)
+        if first is None
+        or first.part != second.part
+        or first.fields.keys().isdisjoint(second.fields)
     ]
 
 

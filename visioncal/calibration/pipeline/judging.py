@@ -236,7 +236,7 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
             workspace_mm=None if accuracy is None else accuracy.median,
             modelled=model is not None,
             repeatability=REPEATABILITY if model is None else model.repeatability,
-            can_tilt=arm.can_tilt,
+            can_tilt=model is None or model.can_tilt,
             name=f"Robot {robot}" if len(problem.robots) > 1 else "",
         )
         # Of pose pairs without a stated noise, the detection's may be in the flange's.

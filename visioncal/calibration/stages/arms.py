@@ -101,11 +101,6 @@ class RobotArm:
         return self.matched is not None and self.joints_rad is not None
 
     @property
-    def can_tilt(self) -> bool:
-        """Whether the flange turns about more than one direction; True without a model."""
-        return self.matched is None or self.matched.robot.can_tilt
-
-    @property
     def function_gain(self) -> float:
         """Twice the gain in log-likelihood by joint error functions; zero without any."""
         functions = None if self.kinematics is None else self.kinematics.fit.functions

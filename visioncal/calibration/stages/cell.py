@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.priors import priors_of
+from visioncal.calibration.stages.priors import prior_of
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Remedy, or_alone
@@ -150,7 +150,8 @@ def read_cell(seen: Observed) -> Cell:
         number = observation.view.number if observation.view.stop is None else observation.view.stop
         stations.setdefault(observation.station, number)
     tree = Tree(_CELL, branches)
-    priors = priors_of(_prior_tables(session, tree), tree)
+    tables = _prior_tables(session, tree).items()
+    priors = tuple(prior_of(name, table, tree) for name, table in tables)
     poses = _poses(seen, observations)
     cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors, held=held)
     cell = replace(cell, stops=tuple(stations[station] for station in sorted(stations)))

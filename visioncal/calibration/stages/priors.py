@@ -1,6 +1,6 @@
 """Priors on a cell's frames, `[prior.A_from_B]`, and whether the views contradict them."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,16 +84,12 @@ def components(
             yield Component(label, axis, is_used, stated_m, known_m, seen_m, seen_sigma_m)
 
 
-def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
-    """Reads the priors of a cell's frames: `[prior.A_from_B]` is the pose of frame B in frame A.
+def prior_of(name: str, table: PriorTable, tree: Tree) -> FramePrior:
+    """Reads the prior of a cell's frame: `[prior.A_from_B]` is the pose of frame B in frame A.
 
     Raises:
         DataError: A frame is unknown, or a robot moves one of the two relative to the other.
     """
-    return tuple(_prior(name, table, tree) for name, table in tables.items())
-
-
-def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
     first, _, second = name.partition("_from_")
     label = f"session.toml: prior.{name}"
     for frame in (first, second):
