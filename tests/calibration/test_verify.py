@@ -59,7 +59,7 @@ def test_an_unchanged_cell_passes_as_often_as_it_should(place):
     assert all(value.passed and not value.named for value in found)
     # Chi-square of thirty directions; the mean of four is known to 3.9, and the noise's scale to
     # a tenth, which is three more.
-    assert np.mean([value.misfit for value in found]) == pytest.approx(30.0, abs=15.0)
+    assert np.mean([value.unchanged.misfit for value in found]) == pytest.approx(30.0, abs=15.0)
 
 
 def test_a_lens_that_departs_from_its_model_is_seen_with_its_field(place):
@@ -423,7 +423,7 @@ def test_stops_recorded_by_a_plan_of_the_calibrated_arm_are_verified_and_recover
     session = cell_session(stops, "stops", seen="corners")
     planned = replace(session, robot_document=old.arm.robot.document)
     found = [verify(parted(each)[0], old) for each in (session, planned)]
-    assert found[0].misfit == pytest.approx(found[1].misfit, rel=1e-6)
+    assert found[0].unchanged.misfit == pytest.approx(found[1].unchanged.misfit, rel=1e-6)
     new = recover(planned, old, ("joint 3",), found[1])
     assert "3 stops held back from a first estimate agree" in new.verdict.findings[0].words
 
