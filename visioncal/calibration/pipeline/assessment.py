@@ -14,11 +14,11 @@ from visioncal.calibration.pipeline.arm_results import (
     with_errors_beside_step,
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
-from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
 from visioncal.calibration.stages.arm_report import ArmReport
 from visioncal.calibration.stages.cell import Cell, ObservationRow
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clock_offset import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.likely_steps import likely_steps

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from visioncal.calibration.pipeline.cell_fit import CellFit, within
 from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.cell_fit import CellFit, within
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.validate import (
     HeldOutResiduals,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.pipeline.cell_fit import CellFit
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners

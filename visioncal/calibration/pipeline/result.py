@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from visioncal.calibration.pipeline.assessment import seen_rows
-from visioncal.calibration.pipeline.cell_fit import within
 from visioncal.calibration.pipeline.connectivity import connection_advice
 from visioncal.calibration.pipeline.judging import weakest_link
 from visioncal.calibration.pipeline.lens_fields import lens_field_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import robot_key
+from visioncal.calibration.stages.cell_fit import within
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
 from visioncal.calibration.stages.random_effects import of_random_effects

@@ -8,9 +8,9 @@ from typing import TypedDict, TypeVar, Unpack
 
 from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.budget import uncertainty_of
-from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.kinematics import check_level
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.readings import Readings

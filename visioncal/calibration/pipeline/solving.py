@@ -13,10 +13,10 @@ from visioncal.calibration.pipeline.arm_results import (
     with_drifts,
     with_pose_errors,
 )
-from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.starting import Start, find_start, sensors_of
 from visioncal.calibration.stages.arms import RobotArm, arm_effects, check_arms, with_link_errors
 from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.kinematics import check_level_is_possible
@@ -112,7 +112,7 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     if any(arm.drift is not None for arm in cell_fit.arms.values()):
         cell_fit = _fit_with_inliers(cell_fit, observed)
     corners = cell_fit.linearised_corners
-    rows = None if corners is None else cell_fit.frame_model.all_rows(corners)
+    rows = None if corners is None else cell_fit.all_rows(corners)
     if found := random_effects(cell_fit.inlier_fit, cell_fit.arms, corners, rows):
         effects = (*clock_errors, *found)
         cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed)
@@ -134,13 +134,13 @@ def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
     """One solve of the frames by all observations, whose lenses and boards stay as they are."""
     cell_fit = cell_fit.with_arm_poses()
     if observed.scenes and not cell_fit.inlier_fit.problem.is_combined:
-        model, views = cell_fit.frame_model, _views_by_camera(observed, cell_fit.poses)
-        corners = model.camera_parameters(observed.scenes, views).linearised()
-        problem = model.problem(corners)
+        views = _views_by_camera(observed, cell_fit.poses)
+        corners = cell_fit.stated_parameters(observed.scenes, views).linearised()
+        problem = cell_fit.problem(corners)
         start, noise = problem.start(cell_fit.frames), cell_fit.inlier_fit.fit.noise
         state = solve_problem(problem, start, noise)[0]
         fit = Solution(state, estimate_noise(problem, state, noise))
-        return cell_fit.with_joint_fit(model, ConvergedFit(corners, problem, fit))
+        return cell_fit.with_joint_fit(ConvergedFit(corners, problem, fit))
     return replace(cell_fit, inlier_fit=cell_fit.inlier_fit.refitted())
 
 
@@ -263,18 +263,12 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
     nominal = {name: arm.as_reported for name, arm in cell_fit.arms.items()}
     cell_fit = replace(cell_fit, arms=nominal).with_arm_poses()
     if observed.scenes and not cell_fit.inlier_fit.problem.is_combined:
-        model, frames = cell_fit.frame_model, cell_fit.frames
-        views = _views_by_camera(observed, cell_fit.poses)
-        optics = model.camera_parameters(observed.scenes, views)
         if (corners := cell_fit.linearised_corners) is not None:
             # Where other inliers are too far from the last fit, it starts anew.
             with suppress(ConvergenceError):
-                fitted, model = refine_jointly(
-                    model, corners.camera_parameters, frames, is_sized=True
-                )
-                return cell_fit.with_joint_fit(model, fitted)
-        fitted, model = refine_jointly(model, optics, frames)
-        return cell_fit.with_joint_fit(model, fitted)
+                return refine_jointly(cell_fit, corners.camera_parameters, is_sized=True)
+        views = _views_by_camera(observed, cell_fit.poses)
+        return refine_jointly(cell_fit, cell_fit.stated_parameters(observed.scenes, views))
     cell_fit = replace(cell_fit, linearised_corners=None)
     if drifts := tuple(arm_effects(cell_fit.arms)):
         cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, drifts))
@@ -322,11 +316,11 @@ def _converge_arms(cell_fit: CellFit) -> CellFit:
             effects = (*cell_fit.other_effects, *arm_effects(cell_fit.arms))
             cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
         else:
-            model, corners = cell_fit.frame_model, cell_fit.linearised_corners
-            fitted = fit_jointly(corners.camera_parameters, model, cell_fit.frames)
+            optics = cell_fit.linearised_corners.camera_parameters
+            fitted = fit_jointly(optics, cell_fit, cell_fit.frames)
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
-                fitted, _ = with_sizes(model, fitted)
-            cell_fit = cell_fit.with_joint_fit(model, fitted)
+                fitted, _ = with_sizes(cell_fit, fitted)
+            cell_fit = cell_fit.with_joint_fit(fitted)
         problem, state = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.fit.state
         moved = {name: arm.relinearised(problem, state) for name, arm in cell_fit.arms.items()}
         cell_fit = replace(cell_fit, arms={name: arm for name, (arm, _) in moved.items()})

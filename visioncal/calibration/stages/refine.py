@@ -6,13 +6,12 @@ from types import MappingProxyType
 
 import numpy as np
 
-from visioncal.calibration.stages.frame_model import CellFrameModel
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import FloatArray
 from visioncal.estimation.appearance import Appearance, LensBoardParameters, compress
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
@@ -52,12 +51,8 @@ def free_parameters_of_camera(seen: LinearisedCorners) -> LensBoardParameters:
 
 
 def refine_jointly(
-    model: CellFrameModel,
-    optics: CameraParameters,
-    frames: Mapping[str, FloatArray],
-    *,
-    is_sized: bool = False,
-) -> tuple[ConvergedFit, CellFrameModel]:
+    cell_fit: CellFit, optics: CameraParameters, *, is_sized: bool = False
+) -> CellFit:
     """Fits lenses, boards and frames to all corners together, with the sizes of their errors.
 
     A given lens and a printed board have errors of unknown size, a priori zero, in one likelihood
@@ -65,60 +60,59 @@ def refine_jointly(
     of each view, and all is fitted once more with that.
 
     Args:
-        model: Frame part of the fit.
+        cell_fit: The fit from which the frames start.
         optics: Lenses and boards, stated or of a fit with other inliers or effects.
-        frames: Initial poses of unknown frames.
         is_sized: Whether they are of such a fit, whose sizes are the start.
 
     Returns:
-        The fit, and the model with the errors of its arms.
+        The fit, with the errors of its arms.
     """
+    frames, stated = cell_fit.frames, None
     with diverging():
-        stated = None
         if not is_sized:
             # Sizes are estimated from above: near a wrong size, lines of sight restrain another.
             wide = tuple(
                 replace(item, scale=max(item.scale, PRINTED_SCALE)) for item in optics.board_sizes
             )
-            stated = fit_jointly(optics.with_sizes({}, {}, wide), model, frames)
+            stated = fit_jointly(optics.with_sizes({}, {}, wide), cell_fit, frames)
         if stated is None or _is_shrunk(stated):
-            stated = fit_jointly(optics, model, frames)
-        fitted, posture = with_sizes(model, stated)
-        new_model, sized = model.with_errors(fitted), fitted
-        if new_model.has_links:
-            fitted, new_model = _beside_arms(model, new_model, stated)
+            stated = fit_jointly(optics, cell_fit, frames)
+        fitted, posture = with_sizes(cell_fit, stated)
+        after, sized = cell_fit.with_errors(fitted), fitted
+        if after.has_links:
+            fitted, after = _beside_arms(cell_fit, after, stated)
         weighed = fitted.camera_parameters.weighed(fitted.linearised)
         stacks = zip(weighed.problems.values(), optics.problems.values(), strict=True)
         if any(problem.stack is not before.stack for problem, before in stacks):
-            fitted = _follows(new_model, fitted, weighed) or fitted
+            fitted = _follows(after, fitted, weighed) or fitted
         if fitted is not sized:
-            fitted, _ = with_sizes(new_model, fitted, posture)
-        return fitted, new_model
+            fitted, _ = with_sizes(after, fitted, posture)
+        return after.with_joint_fit(fitted)
 
 
 def _beside_arms(
-    model: CellFrameModel, after: CellFrameModel, stated: ConvergedFit
-) -> tuple[ConvergedFit, CellFrameModel]:
+    before: CellFit, after: CellFit, stated: ConvergedFit
+) -> tuple[ConvergedFit, CellFit]:
     """The fit with errors of the arms, which may have passed for those of lenses and boards.
 
     Their sigma is that under the stated lenses and boards, where these show any: a board whose size
     changes with the arm hides a part of it.
     """
-    under_stated = model.with_errors(stated)
+    under_stated = before.with_errors(stated)
     estimating = under_stated if under_stated.has_links else after
     fitted = fit_jointly(stated.camera_parameters, estimating, stated.frames)
     return with_sizes(estimating, fitted)[0], estimating
 
 
 def with_sizes(
-    model: CellFrameModel,
+    cell_fit: CellFit,
     fitted: ConvergedFit,
     posture: Mapping[str, ArmErrors] = MappingProxyType({}),
 ) -> tuple[ConvergedFit, Mapping[str, ArmErrors]]:
     """The fit with estimated sizes of the errors of lenses and boards; itself if that diverges.
 
     Args:
-        model: Frame part of the fit.
+        cell_fit: The frames' side of the fit.
         fitted: The fit.
         posture: Errors of arms without joint angles beside which sizes are estimated; where there
             are none, they are estimated if they matter.
@@ -126,16 +120,16 @@ def with_sizes(
     Returns:
         The fit, and these errors.
     """
-    follows = _follows(model, fitted, _estimated(model, fitted, posture))
-    if follows is None or posture or not model.arms_without_joints:
+    follows = _follows(cell_fit, fitted, _estimated(cell_fit, fitted, posture))
+    if follows is None or posture or not cell_fit.arms_without_joints:
         return follows or fitted, posture
     sized = follows.camera_parameters
     zooms = (problem.lens_sizes.focal for problem in sized.problems.values())
     if not any((*(item.scale for item in sized.board_sizes), *zooms)):
         return follows, posture
     # Errors of arms without joint angles depend on the posture and look like a size, or a zoom.
-    posture = model.pose_errors(follows)
-    again = _follows(model, follows, _estimated(model, follows, posture))
+    posture = cell_fit.pose_errors(follows)
+    again = _follows(cell_fit, follows, _estimated(cell_fit, follows, posture))
     return again or follows, posture
 
 
@@ -169,7 +163,7 @@ def _is_shrunk(fitted: ConvergedFit) -> bool:
 
 
 def _estimated(
-    model: CellFrameModel, fitted: ConvergedFit, posture: Mapping[str, ArmErrors]
+    cell_fit: CellFit, fitted: ConvergedFit, posture: Mapping[str, ArmErrors]
 ) -> CameraParameters:
     """Lenses and boards with the sizes of their errors, near a fit.
 
@@ -178,7 +172,7 @@ def _estimated(
     optics = fitted.linearised.camera_parameters
     seen, noise = replace(fitted.linearised, is_flat=True), fitted.fit.noise
     # Priors may be wrong, which is tested later; without them, frames may be undetermined.
-    problem = model.problem(seen)
+    problem = cell_fit.problem(seen)
     problem = replace(problem, priors=with_loose_positions(problem.priors))
     values = {
         effect.name: fitted.problem.values_of(effect.name, fitted.fit.state)
@@ -197,13 +191,13 @@ def _estimated(
     state = State(fitted.fit.state.edges, np.concatenate(in_order))
     levels, lenses, boards = dict[str, LensLevels](), dict[str, LensSizes](), optics.board_sizes
     for name in optics.problems:
-        rows, uneven = model.rows(seen), UNEVEN_LINKS if model.has_links else 1.0
+        rows, uneven = cell_fit.rows(seen), UNEVEN_LINKS if cell_fit.has_links else 1.0
         # What other cameras tell of the boards is known to each.
         levels[name], lenses[name], boards = estimate_sizes(
             seen, problem, rows, state, noise, name, uneven
         )
     # Errors of an arm look like a scale, too: beside them, boards are sized where that is clear.
-    is_doubtful = bool(model.arms_without_joints) or model.has_links
+    is_doubtful = bool(cell_fit.arms_without_joints) or cell_fit.has_links
     holds = is_doubtful and not _have_other_sizes(fitted)
     return fitted.camera_parameters.with_sizes(levels, lenses, boards, holds_scales=holds)
 

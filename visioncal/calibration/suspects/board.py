@@ -32,8 +32,7 @@ _LEAST_BEND_M = 1e-5
 def _found(run: RunState) -> Iterator[Finding]:
     """Boards of another size by the robot's motion, or of another shape; notes where allowed."""
     cell_fit, covariance = run.cell_fit, run.assessment.covariance
-    fitted, model = cell_fit.joint_fit, cell_fit.frame_model
-    if fitted is None:
+    if (fitted := cell_fit.joint_fit) is None:
         yield from _of_measured_poses(run)
         return
     stated = None
@@ -46,7 +45,7 @@ def _found(run: RunState) -> Iterator[Finding]:
     for board, target in enumerate(scene.targets):
         called = f"board {scene.names[board]}".strip()
         frame = frame_name("target", scene.names[board])
-        measured = measured_scale(model, fitted, frame, board)
+        measured = measured_scale(cell_fit, fitted, frame, board)
         if board not in optics.printed:
             if stated is not None:
                 measured = scale_by_stated_arms(fitted, stated, frame) or measured

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from visioncal.calibration.pipeline.cell_fit import CellFit
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.suspect import EXCHANGED

@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.refine import free_parameters_of_camera
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted

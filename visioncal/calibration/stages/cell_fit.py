@@ -1,0 +1,215 @@
+"""The fit of a cell: inliers, camera parameters and arms; its joint fit with the corners."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from visioncal.calibration.stages.arms import RobotArm, arm_effects, with_link_errors
+from visioncal.calibration.stages.cell import Cell, ObservationRow
+from visioncal.calibration.stages.pnp import ViewPoses
+from visioncal.calibration.stages.validate import chain_rms_px
+from visioncal.core.types import Corners, FloatArray, IntArray
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
+from visioncal.estimation.joint import ConvergedFit
+from visioncal.estimation.outliers import InlierFit
+from visioncal.estimation.pose_errors import find_pose_errors
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.scene import CornerProblem, Scene
+from visioncal.estimation.solve import fit_problem
+
+
+@dataclass(frozen=True, eq=False)
+class CellFit:
+    """The fit of a cell, and the frames' side of its joint fit with corners; see `joint`."""
+
+    cell: Cell  # The cell; its rows are the observations in the fit's order.
+    inlier_fit: InlierFit  # The inliers, their fit, and the frames that moved.
+    # Linearised corners of lenses and boards; None without images.
+    linearised_corners: LinearisedCorners | None
+    poses: tuple[ViewPoses, ...]  # The pose chosen for each row.
+    unconnected: tuple[str, ...]  # Frames that no observation links to the rest.
+    arms: Mapping[str, RobotArm]  # The robots' arms, as far as they were calibrated.
+    level: str  # The requested calibration level of the arms.
+    # Errors of clocks, and those that grow with time, reach or gravity.
+    other_effects: tuple[Effect, ...]
+    solver: str = "joint"  # The solver of the edges.
+
+    @property
+    def inlier_problem(self) -> Problem:
+        """The problem of the inliers."""
+        return self.inlier_fit.part
+
+    @property
+    def noise(self) -> Noise:
+        """Noise levels of robots and sensors, from which another fit starts."""
+        return self.inlier_fit.fit.noise
+
+    @property
+    def has_links(self) -> bool:
+        """Whether errors of an arm's links are free."""
+        return any(arm.has_free_errors for arm in self.arms.values())
+
+    @property
+    def frames(self) -> dict[str, FloatArray]:
+        """Poses (4, 4) of the unknown frames in their parents."""
+        return self.inlier_fit.problem.frames(self.inlier_fit.fit.state)
+
+    def with_arm_poses(self) -> Self:
+        """Replaces the robots' poses by those of their arms."""
+        problem, arms = self.inlier_fit.problem, self.arms.items()
+        poses = {**problem.poses, **{name: arm.poses for name, arm in arms}}
+        inlier_fit = replace(self.inlier_fit, problem=replace(problem, poses=poses))
+        return replace(self, inlier_fit=inlier_fit)
+
+    def with_joint_fit(self, fitted: ConvergedFit) -> Self:
+        """Takes over a joint fit of lenses, boards and frames."""
+        problem = self.full_problem(fitted.linearised)
+        inlier_fit = replace(self.inlier_fit, problem=problem, fit=fitted.fit)
+        return replace(self, inlier_fit=inlier_fit, linearised_corners=fitted.linearised)
+
+    @property
+    def joint_fit(self) -> ConvergedFit | None:
+        """The fit of lenses and boards with the inliers; None without images."""
+        seen = self.linearised_corners
+        if seen is None:
+            return None
+        return ConvergedFit(seen, self.inlier_problem, self.inlier_fit.fit)
+
+    @property
+    def residual_px(self) -> dict[str, float]:
+        """Standard deviation of corner residuals of each camera, per axis [px]."""
+        if self.linearised_corners is None:
+            return {}
+        optics, sigmas_px = self.linearised_corners.camera_parameters, {}
+        for (camera, problem), corners in zip(
+            optics.problems.items(), self.linearised_corners.compressed, strict=True
+        ):
+            unknowns = problem.unknowns(corners)
+            sigmas_px[camera] = problem.stack.shown_px(corners.residuals, unknowns)
+        return sigmas_px
+
+    @property
+    def camera_parameters(self) -> CameraParameters | None:
+        """Estimated lenses and boards; None without images."""
+        return self.camera_parameters_at(self.inlier_fit.fit.state)
+
+    def camera_parameters_at(self, state: State) -> CameraParameters | None:
+        """Lenses and boards at a state; None without images."""
+        if self.linearised_corners is None:
+            return None
+        free = self.linearised_corners.free
+        values = self.inlier_fit.problem.values_of(LENSES, state)[: len(free)]
+        return self.linearised_corners.camera_parameters.with_values(free, values)
+
+    def pixels(
+        self,
+        rows: Sequence[ObservationRow],
+        views: Sequence[ViewPoses],
+        poses: FloatArray,
+        state: State,
+    ) -> FloatArray:
+        """Reprojection errors (m,) [px] of views, given (m, 4, 4) poses of their targets."""
+        optics = self.camera_parameters_at(state)
+        if optics is None:
+            return np.full(len(rows), np.nan)
+        lenses = {problem: optics.camera(problem) for problem in optics.problems}
+        cameras = [lenses.get(row.seer) for row in rows]
+        return chain_rms_px([view.corners for view in views], poses, cameras, optics.points)
+
+    @property
+    def lens_columns(self) -> slice:
+        """The problem's columns of lenses and boards, and of lens errors beyond their models."""
+        return self.inlier_fit.problem.effect_columns.get(LENSES, slice(0, 0))
+
+    @property
+    def field_columns(self) -> IntArray:
+        """The problem's columns of lens errors beyond their models."""
+        columns, corners = self.lens_columns, self.linearised_corners
+        free = 0 if corners is None else len(corners.free)
+        return np.arange(columns.start + free, columns.stop)
+
+    def columns_of(self, indices: IntArray) -> IntArray:
+        """The problem's columns of free values of lenses and boards, given their indices."""
+        free = np.zeros(0) if self.linearised_corners is None else self.linearised_corners.free
+        return np.asarray(self.lens_columns.start + np.searchsorted(free, indices))
+
+    def problem(self, seen: LinearisedCorners) -> Problem:
+        """The problem of the inliers, repeated ones sharing an error."""
+        return replace(self.full_problem(seen), with_repeats=True).subset(self.inlier_fit.used)
+
+    def rows(self, seen: LinearisedCorners) -> IntArray:
+        """(n,) index of the corners' view of each observation of `problem`; -1 for none."""
+        return self.all_rows(seen)[self.inlier_fit.used]
+
+    def all_rows(self, seen: LinearisedCorners) -> IntArray:
+        """(n,) the same of all observations."""
+        places = {view: at for at, view in enumerate(seen.views)}
+        return np.array([places.get(row.view, -1) for row in self.cell.rows], dtype=np.int64)
+
+    def full_problem(self, seen: LinearisedCorners) -> Problem:
+        """The problem of all observations, with the poses by current lenses and boards."""
+        problem, rows = self.inlier_fit.problem, self.all_rows(seen)
+        has_corners, stated = rows >= 0, problem.observations
+        measured, covariance = stated.measured.copy(), stated.covariance.copy()
+        measured[has_corners] = seen.camera_parameters.poses[rows[has_corners]]
+        covariance[has_corners] = seen.covariance[rows[has_corners]]
+        observations = replace(stated, measured=measured, covariance=covariance)
+        effects = [seen.effect(rows), *self.other_effects, *arm_effects(self.arms)]
+        return replace(problem, observations=observations).with_effects(effects)
+
+    def with_errors(self, fitted: ConvergedFit) -> Self:
+        """Tests for errors of the arms that are not free yet."""
+        return replace(self, arms=with_link_errors(self.arms, fitted.problem, fitted.fit))
+
+    @property
+    def arms_without_joints(self) -> dict[str, RobotArm]:
+        """The arms without joint angles."""
+        return {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
+
+    def pose_errors(self, fitted: ConvergedFit) -> dict[str, ArmErrors]:
+        """Errors of the arms without joint angles beside a fit; see `find_pose_errors`."""
+        problem, arms = fitted.problem, self.arms_without_joints
+        for arm in arms.values():
+            problem = arm.without_errors(problem)
+        values, free = problem.start_values.copy(), len(fitted.linearised.free)
+        values[:free] = fitted.fit.state.values[:free]
+        fit = fit_problem(problem, State(fitted.fit.state.edges, values))
+        found = {robot: find_pose_errors(problem, fit.state, fit.noise, robot) for robot in arms}
+        return {robot: errors for robot, errors in found.items() if errors is not None}
+
+    def stated_parameters(
+        self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]
+    ) -> CameraParameters:
+        """The corners of scenes and views (by camera frame), with stated lenses and boards."""
+        shares, problems, poses = self._shares, {}, {}
+        for frame, scene in scenes.items():
+            corners: dict[int, Corners] = {
+                view.view: view.corners for view in views[frame] if view.corners is not None
+            }
+            problem = CornerProblem.of(scene, corners, shares)
+            problems[frame] = replace(problem, holds_scales=bool(self.arms_without_joints))
+            with_corners = [view for view in views[frame] if view.view in corners]
+            poses[frame] = np.array([view.cam_from_target[0] for view in with_corners])
+        return CameraParameters.of(problems, poses)
+
+    @property
+    def _shares(self) -> dict[int, float]:
+        """Weight of each view for lenses and boards; views of one stop share one weight."""
+        observations, tree = self.inlier_fit.problem.observations, self.inlier_fit.problem.tree
+        pairs = list(zip(observations.observers, observations.observed, strict=True))
+        has_robot = {pair: any(step.robot for step in tree.path(*pair)) for pair in set(pairs)}
+        rows = zip(self.cell.rows, pairs, observations.stops.tolist(), strict=True)
+        repeated = {row.view: (pair, stop if has_robot[pair] else None) for row, pair, stop in rows}
+        # Errors of a lens, a print or a detector in one of them are the same in all.
+        counts = Counter(repeated.values())
+        return {view: 1.0 / counts[key] for view, key in repeated.items()}
+
+
+def within(indices: IntArray, part: slice) -> IntArray:
+    """Those of ascending indices that lie in a slice."""
+    return np.asarray(indices[(indices >= part.start) & (indices < part.stop)])
