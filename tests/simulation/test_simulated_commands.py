@@ -206,7 +206,7 @@ from_stop = 4
 def test_a_description_with_a_mistake_is_refused_by_its_field(old, new, words, tmp_path):
     assert old in OWN + PUSHED + SWEPT
     (tmp_path / "own.toml").write_text((OWN + PUSHED + SWEPT).replace(old, new))
-    raised(DataError, words, simulate, read_cell(str(tmp_path / "own.toml")))
+    raised(DataError, words, lambda: simulate(read_cell(str(tmp_path / "own.toml"))))
 
 
 def test_a_sweep_of_a_cell_with_a_rolling_shutter_has_corners(place):
