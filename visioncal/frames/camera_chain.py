@@ -244,7 +244,7 @@ class CameraPose:
     # (6, 6) its right perturbation by the flange's; zero for a fixed camera.
     flange_jacobian: FloatArray
     flange_noise: FloatArray  # (6, 6) covariance of the flange's noise.
-    arm_basis: FloatArray  # (6, a) see `Eye.arm_basis`.
+    arm_basis: FloatArray  # (6, a) see `CalibratedCamera.arm_basis`.
 
     def point(self, point_cam: FloatArray) -> FloatArray:
         """(3,) position in the base of a point in the camera's frame [m]."""
