@@ -67,7 +67,7 @@ from visioncal.live.planning.messages import plan_warnings, plan_words
 from visioncal.present.torques import torque_table
 from visioncal.present.words import said
 from visioncal.robot import load_robot
-from visioncal.robot.collision import Body, capsule
+from visioncal.robot.collision import capsule
 from visioncal.robot.inertia import Inertias, symmetric_matrices
 from visioncal.session import STREAMS, Session, check_stream, save_stream
 
@@ -75,8 +75,7 @@ from visioncal.session import STREAMS, Session, check_stream, save_stream
 def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
     """Plans an exciting motion and sweeps, writes them into a folder, and reports them."""
     arm = load_robot(options.robot)
-    boxes = boxes_of(options)
-    bodies = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
+    bodies = [box.body for box in boxes_of(options)]
     if options.tool is not None:
         length, radius = (1e-3 * number for number in options.tool)
         if min(length, radius) <= 0.0:

@@ -65,6 +65,11 @@ class Box:
                 culprits=[f"box {self.name}"],
             )
 
+    @property
+    def body(self) -> Body:
+        """It as a body that is fixed to the base."""
+        return Body(self.name, 0, "box", self.size_m, self.base_from_box)
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -278,7 +283,7 @@ def collision_model(cell: PlanCell) -> Collisions:
         capsule("holder", hand, flange[:3, 3], middle, 0.02, unsure_m=unsure_m),
         carried,
         standing,
-        *(Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in cell.boxes),
+        *(box.body for box in cell.boxes),
     ]
     return Collisions(cell.robot, bodies, cell.limits.clearance_m, cell.limits.floor_m)
 

@@ -5,7 +5,6 @@ import numpy as np
 from visioncal.dynamics.plan_files import MotionPlan
 from visioncal.live.planning.messages import plan_words, summary_of
 from visioncal.live.planning.plan import Plan, PlannedStop
-from visioncal.present.recording.arm import Obstacle
 from visioncal.present.recording.preview import MotionPreview, Preview, PreviewStop
 
 
@@ -35,7 +34,7 @@ def preview_of(plan: Plan, name: str) -> Preview:
         name,
         cell.robot,
         tuple(PreviewStop(stop.view, stop.q, stop.via, _note(stop)) for stop in plan.stops),
-        tuple(Obstacle(box.name, box.base_from_box, box.size_m) for box in cell.boxes),
+        tuple(box.body for box in cell.boxes),
         cell.limits.floor_m,
         "\n".join(lines),
     )
@@ -63,7 +62,7 @@ def motion_preview(plan: MotionPlan) -> MotionPreview:
     if plan.sweeps is not None:
         motions["sweeps"] = plan.sweeps.sampled(5.0)
     boxes = [
-        Obstacle(body.name, body.link_from_body, body.size_m)
+        body
         for body in allowed.bodies
         if body.link == 0 and body.shape == "box" and not body.of_arm
     ]

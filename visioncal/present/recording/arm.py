@@ -1,7 +1,6 @@
 """Drawing of a robot arm, a capsule per link and a ball per joint, and of obstacles."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import rerun as rr
 from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import Row, send_rows
+from visioncal.robot.collision import Body
 
 _LINKS: dict[str, Any] = {"colors": colours.LINK, "fill_mode": "solid"}
 _JOINTS: dict[str, Any] = {"colors": colours.JOINT, "fill_mode": "solid"}
@@ -68,17 +68,8 @@ def _shapes(link_frames: FloatArray) -> tuple[dict[str, Any], dict[str, Any]]:
     return capsules, {"centers": origins[:, 1:-1].reshape(-1, 3), "half_sizes": half_sizes}
 
 
-@dataclass(frozen=True, eq=False)
-class Obstacle:
-    """A box: pose of its centre in the base (4, 4) and its side lengths (3,) [m]."""
-
-    name: str
-    base_from_box: FloatArray
-    size_m: FloatArray
-
-
 def log_obstacles(
-    stream: rr.RecordingStream, obstacles: Sequence[Obstacle], floor_m: float | None, size_m: float
+    stream: rr.RecordingStream, obstacles: Sequence[Body], floor_m: float | None, size_m: float
 ) -> None:
     """Draws the boxes, and the floor of a cell of `size_m` at a height in the base, if any [m]."""
     frame = rr.CoordinateFrame(paths.BASE_FRAME)
@@ -100,6 +91,6 @@ def log_obstacles(
             fill_mode="solid",
         )
         name = f"box_{index + 1}"
-        pose = placed(box.base_from_box, paths.BASE_FRAME, name)
+        pose = placed(box.link_from_body, paths.BASE_FRAME, name)
         entity = f"{paths.OBSTACLES}/{name}"
         stream.log(entity, pose, rr.CoordinateFrame(name), shape, static=True)

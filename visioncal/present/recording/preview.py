@@ -15,11 +15,12 @@ from visioncal.core.types import FloatArray
 from visioncal.dynamics.model import JointMotion
 from visioncal.present.cell_poses import states_of
 from visioncal.present.recording import colours, paths
-from visioncal.present.recording.arm import Obstacle, log_obstacles
+from visioncal.present.recording.arm import log_obstacles
 from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.recorder import Recorder, send_rows
 from visioncal.present.recording.scene import Scene, Seen
 from visioncal.robot import Robot
+from visioncal.robot.collision import Body
 from visioncal.vision.camera import project
 from visioncal.vision.targets import closed_outline, corner_positions
 
@@ -44,7 +45,7 @@ class Preview(Seen):
     name: str  # Name of the recording.
     robot: Robot  # The arm.
     stops: Sequence[PreviewStop]  # Stops in driving order.
-    obstacles: Sequence[Obstacle]  # Obstacles in the cell.
+    obstacles: Sequence[Body]  # Obstacles in the cell.
     floor_m: float | None  # Height of the floor in the base [m]; None without a floor.
     note: str  # Text of the plan in Markdown.
 
@@ -155,7 +156,7 @@ class MotionPreview:
     name: str  # Name of the recording.
     robot: Robot  # The arm.
     motions: Mapping[str, JointMotion]  # By name, one after the other on the timeline.
-    obstacles: Sequence[Obstacle]  # Obstacles in the cell.
+    obstacles: Sequence[Body]  # Obstacles in the cell.
     floor_m: float | None  # Height of the floor in the base [m]; None without a floor.
     note: str  # Text of the plan in Markdown.
 
