@@ -223,7 +223,9 @@ def _size_facts(board: BoardResult, target: Target) -> tuple[Fact, ...]:
         return (stated, Fact("squares, found", "as stated", "nothing speaks against it"))
     posterior_mm = 1e3 * target.square_m * board.sigma.get("scale", target.square_sigma_m)
     decimals = decimals_for(posterior_mm)
-    x_mm, y_mm = (f"{1e3 * square:.{decimals}f}" for square in board.squares_m(target))
+    scale, half = 1.0 + board.shape["scale"], 0.5 * board.shape["aspect"]
+    sides_m = target.square_m * (scale - half), target.square_m * (scale + half)
+    x_mm, y_mm = (f"{1e3 * side:.{decimals}f}" for side in sides_m)
     note = f"{PLUS_MINUS} {significant(posterior_mm)}"
     if "scale" in adjusted:
         note += ", between what is stated and what the robot's motion measures"

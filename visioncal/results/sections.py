@@ -86,11 +86,6 @@ class BoardResult(Section):
         """Whether its bend was estimated; else it is taken as flat."""
         return any(name.startswith(_BEND) for name in self.estimated)
 
-    def squares_m(self, target: Target) -> tuple[float, float]:
-        """Sides of its squares along the target's x and y [m]."""
-        scale, half = 1.0 + self.shape["scale"], 0.5 * self.shape["aspect"]
-        return target.square_m * (scale - half), target.square_m * (scale + half)
-
     def corners(self, target: Target) -> FloatArray:
         """(c, 3) corner positions in the target's frame, whose z points into the board [m]."""
         flat = corner_positions(target)

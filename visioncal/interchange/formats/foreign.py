@@ -25,10 +25,10 @@ class PoseImportOptions:
     inverse: bool | None = None  # Whether the inverse of the pose is written.
 
     @property
-    def is_scalar_first(self) -> bool:
-        """Whether the stated form has quaternions with the scalar first."""
-        maker = POSE_FORMS.get(self.form or "")
-        return (self.form if maker is None else maker.rotation) == "quaternion-wxyz"
+    def rotation(self) -> str:
+        """Form of the rotations in the stated form; empty where none is stated."""
+        form = self.form or ""
+        return POSE_FORMS[form].rotation if form in POSE_FORMS else form
 
     def over(self, source: Self) -> Self:
         """These options, and those of the source where they leave the choice to it."""
@@ -39,12 +39,9 @@ class PoseImportOptions:
         """The declared reading with the user's options in its place; raises DataError."""
         reading = declared
         if self.form is not None:
-            maker = POSE_FORMS.get(self.form)
-            rotation = self.form if maker is None else maker.rotation
-            known_name("form of poses", rotation, [*POSE_FORMS, *ROTATION_FORMS])
-            reading = replace(
-                reading, rotation=rotation, unit=maker.unit if maker else reading.unit
-            )
+            known_name("form of poses", self.rotation, [*POSE_FORMS, *ROTATION_FORMS])
+            unit = POSE_FORMS[self.form].unit if self.form in POSE_FORMS else reading.unit
+            reading = replace(reading, rotation=self.rotation, unit=unit)
         if self.unit is not None:
             known_name("unit of length", self.unit, UNITS_M)
             reading = replace(reading, unit=self.unit)

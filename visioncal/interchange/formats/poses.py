@@ -219,7 +219,7 @@ def poses_from(
                 culprits=["--robot-form"],
             )
         requested = replace(requested, form=fields.form)
-    if not requested.names and len(names) == 7 and requested.is_scalar_first:
+    if not requested.names and len(names) == 7 and requested.rotation == "quaternion-wxyz":
         # --form refers to the columns in their order in the file, and these were found by their
         # names.
         order = {name: at for at, name in enumerate(fields.numbers)}

@@ -1,5 +1,6 @@
 """Views of a board: sampling, the camera's field of view, uncertain guesses and occlusion."""
 
+from collections.abc import Iterable
 from copy import copy
 
 import numpy as np
@@ -9,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.live.planning.cell import PlanCell, board_size_m
-from visioncal.robot.collision import arm_bodies
+from visioncal.robot.collision import Body, arm_bodies
 from visioncal.vision.camera import normalise, project_with_jacobian
 from visioncal.vision.targets import extent_m, outline
 
@@ -220,23 +221,22 @@ class Occlusion:
 
     def behind_boxes(self, base_from_flange: FloatArray) -> Mask:
         """Whether a box hides part of the print (k,) at flange poses (k, 4, 4)."""
-        starts, ends = self._sight_lines(base_from_flange)
-        hidden = np.zeros(len(base_from_flange), dtype=bool)
-        for box in self.cell.boxes:
-            hidden |= _box_blocks(starts, ends, box.base_from_box[None], box.size_m)
-        return hidden
+        return self._behind([box.body for box in self.cell.boxes], base_from_flange[:, None])
 
     def behind_arm(self, q: FloatArray) -> Mask:
         """Whether the arm hides part of the print (k,) at joints (k, n) [rad]."""
-        frames = self.cell.robot.link_frames(q)
+        return self._behind(self.parts, self.cell.robot.link_frames(q))
+
+    def _behind(self, bodies: Iterable[Body], frames: FloatArray) -> Mask:
+        """Whether one of some bodies hides part of the print (k,) at frames of the links."""
         starts, ends = self._sight_lines(frames[:, -1])
-        hidden = np.zeros(len(q), dtype=bool)
-        for part in self.parts:
-            body = part.link_from_body[None]
-            if part.link:
-                body = frames[:, part.link - 1] @ body
-            blocks = _box_blocks if part.shape == "box" else _capsule_blocks
-            hidden |= blocks(starts, ends, body, part.size_m)
+        hidden = np.zeros(len(frames), dtype=bool)
+        for body in bodies:
+            place = body.link_from_body[None]
+            if body.link:
+                place = frames[:, body.link - 1] @ place
+            blocks = _box_blocks if body.shape == "box" else _capsule_blocks
+            hidden |= blocks(starts, ends, place, body.size_m)
         return hidden
 
     def _sight_lines(self, base_from_flange: FloatArray) -> tuple[FloatArray, FloatArray]:
