@@ -24,8 +24,6 @@ from visioncal.dynamics.reading import (
 _TORQUE_BAND, _LEAST_HZ, _MOST_HZ, _WIDEST = 10.0, 4.0, 10.0, 3.0
 # Samples whose regressors are held in memory at a time.
 _SAMPLES_AT_ONCE = 20_000
-# Half the length of the low-pass, over its rate and cut-off.
-_SPAN = 1.81
 # Polynomials of fourth order pass a sixth of their own bandwidth to a few parts in ten thousand.
 _ORDER, WIDER = 4, 6.0
 
@@ -45,7 +43,7 @@ class LowPass:
     def of(cls, band_hz: float, rate_hz: float) -> Self:
         """Designs the filter for a cut-off and a sampling rate [Hz]."""
         step = max(int(rate_hz / (2.0 * band_hz)), 1)
-        half = step * int(np.ceil(_SPAN * rate_hz / band_hz / step))
+        half = step * int(np.ceil(1.81 * rate_hz / band_hz / step))
         at = np.arange(-half, half + 1)
         # Kaiser's design (1974): with this length, 60 dB of attenuation from 1.5 times the cut-off.
         taps = np.sinc(2.0 * band_hz / rate_hz * at) * np.kaiser(len(at), 5.65)

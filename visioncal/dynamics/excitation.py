@@ -31,8 +31,6 @@ SHORTEST_S, LONGEST_S = 10.0, 30.0
 FEWEST, MOST = 3, 10
 # Sharpness of the smoothed condition and penalty weight of the limits, round by round.
 _ROUNDS = ((1.0, 10.0), (4.0, 80.0), (15.0, 640.0))
-# Sampling of the check for collisions.
-_CLEAR_HZ = 10.0
 # Sampling of the condition numbers, which do not change with more.
 _FIGURES_HZ = 100.0
 
@@ -318,7 +316,7 @@ class _ExcitationSearch:
             motion = self._modest(self._posture())
             # A descent that begins inside a body may never come out of it.
             for _ in range(8):
-                q = motion.sampled(_CLEAR_HZ).q
+                q = motion.sampled(10.0).q
                 if (self._allowed.collisions.first_contact(q) < 0).all():
                     break
                 motion = motion.shrunk(0.5)

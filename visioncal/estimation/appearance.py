@@ -47,9 +47,6 @@ BOARD_NAMES = (
 # Exponents of the polynomial's terms.
 _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
-# Rigs with more points are taken as exact: each point adds three unknowns common to all views.
-MOST_LOOSE = 100
-
 
 def board_basis(positions: FloatArray) -> FloatArray:
     """Derivatives of the corner positions with respect to the board's shape.
@@ -102,7 +99,8 @@ def shape_slices(targets: Sequence[Target], first: int = 0) -> tuple[slice, ...]
 def stated_board_sigma(target: Target) -> FloatArray:
     """(s,) stated standard deviations of the target's shape; zero where nothing is stated."""
     if target.is_rig:
-        sigmas = target.point_sigmas_m if len(target.point_sigmas_m) <= MOST_LOOSE else ()
+        # Larger rigs are taken as exact: each point adds three unknowns common to all views.
+        sigmas = target.point_sigmas_m if len(target.point_sigmas_m) <= 100 else ()
         return np.repeat(sigmas, 3).astype(float)
     shape = np.zeros(len(BOARD_NAMES))
     shape[SCALE] = target.square_sigma_m / target.square_m

@@ -33,8 +33,6 @@ TWIST_UNITS: FloatArray = np.repeat([1.0, LEVER_M], 3)
 SIGNIFICANT, _LIKELY = map(float, chi2_limit([FALSE_ALARM, 0.05], 1))
 # Smaller sizes count as zero [rad].
 _NOTHING = 1e-6
-# Position by which the errors change in proportion [m]: typical reach of an arm.
-_REACH_M = 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +108,8 @@ def pose_basis(base_from_flange: FloatArray) -> FloatArray:
     """
     of_base = adjoint(invert(base_from_flange)) * TWIST_UNITS
     of_flange = np.broadcast_to(np.eye(6) * TWIST_UNITS, of_base.shape)
-    position, axis = base_from_flange[:, :3, 3] / _REACH_M, base_from_flange[:, :3, 2]
+    # Over the typical reach of an arm [m].
+    position, axis = base_from_flange[:, :3, 3] / 0.6, base_from_flange[:, :3, 2]
     varying = [
         of_base * factor[:, None, None] for factor in np.concatenate([position, axis], axis=1).T
     ]

@@ -41,12 +41,10 @@ from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelih
 # Lengths tried [rad], longest first, and the highest harmonic in inverse lengths: three thousandths
 # of the variance lie beyond. Shorter ones are not tried after this many that are less likely.
 _LENGTHS_RAD, _CARRIED, _WORSE = (0.5, 0.25, 0.12, 0.06, 0.03), 3.0, 2
-# Combinations of harmonics that move all stops by less per unit are dropped [rad, m].
-_LEAST_MOTION = 5e-3
 # Harmonics of order 2 of each joint.
 _SECOND = "second"
-# Typical sizes of errors [rad], with a log-normal prior of a factor of e, and the torque of a
-# compliance's [N m].
+# Typical sizes of errors [rad], with a log-normal prior of a factor of e; that of a compliance is
+# for 10 N m.
 _TYPICAL = {
     "links": 7e-4,
     "offsets": 7e-4,
@@ -58,7 +56,6 @@ _TYPICAL = {
     _SECOND: 1e-4,
     HARMONICS: 2e-4,
 }
-_TORQUE_NM = 10.0
 # Least twice gain by functions with all other sizes held: those that are just significant have half
 # of that or more. Least gain in log-likelihood of a step.
 _LEAST_GAIN, _LITTLE = 5.0, 1e-2
@@ -166,7 +163,8 @@ class _Waves:
         higher = harmonics[:, :, :, 1 : len(sizes)] * sizes[1:, None]
         columns = higher.reshape(6 * len(higher), -1)
         values, vectors = np.linalg.eigh(columns.T @ columns)
-        kept = vectors[:, values > _LEAST_MOTION**2]
+        # Combinations that move all stops by less per unit are dropped [rad, m].
+        kept = vectors[:, values > 5e-3**2]
         expanded = np.zeros((harmonics.shape[2], len(sizes), 2, kept.shape[1]))
         expanded[:, 1:] = kept.reshape(*higher.shape[2:], -1) * sizes[1:, None, None]
         return cls((columns @ kept).reshape(len(higher), 6, -1), expanded, sizes, length_rad)
@@ -197,7 +195,7 @@ class _Blocks:
         """That of the robots' levels, with the q errors of the arm as the last unknowns."""
         if not self.bases:
             return self.nominal
-        factor = {COMPLIANCE: self.torque_nm / _TORQUE_NM}
+        factor = {COMPLIANCE: self.torque_nm / 10.0}
         typical = np.log([_TYPICAL[name] * factor.get(name, 1.0) for name in self.bases])
         basis = np.concatenate(list(self.bases.values()), axis=2)
         return self.nominal.beside(self.robot, basis, self.shares, typical)

@@ -41,7 +41,6 @@ from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.trajectory import Trajectory
 
-_CONVERGED_S = 1e-7
 # Frames beyond this multiple of the typical residual are outliers.
 _OUTLYING = 4.0
 # Length of a stretch of time within which errors may be correlated [s]; fewest stretches for a
@@ -328,7 +327,7 @@ def _iterated(
         steps_s = np.clip(solution.state.values, -WINDOW_S, WINDOW_S)
         start, offset_s = solution.state, offset_s + float(steps_s[0])
         readout_s += float(steps_s[1:].sum())
-        if np.abs(steps_s).max() < _CONVERGED_S:
+        if np.abs(steps_s).max() < 1e-7:
             break
     fit = replace(solution, state=State(solution.state.edges, problem.start_values))
     sigmas_s, freedom = _sigmas_s(problem, fit, covered.frames.stamps_s, pulls)

@@ -36,9 +36,6 @@ _FULL_WEIGHT = float(np.cos(np.radians(82.5)) ** 2)
 # robot's noise of up to 0.5 mrad, and useful motion begins at 10 mrad. Less than the second is
 # rounding [rad^2].
 _SMALLEST_TURN_RAD, _ROUNDING = 2e-3, 1e-14
-# Least squared norm of q in the unit dual quaternion (q, q'): with less, X would be a kilometre
-# long, and the motion does not determine q'.
-_SMALLEST_PART = 1e-6
 # The identity and the half turns about x, y, z.
 _FRAMES = np.array([np.diag(d) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])], float)
 
@@ -197,7 +194,8 @@ def daniilidis(robot: FloatArray, camera: FloatArray) -> FloatArray:
     square, mixed = real @ real.T, dual @ real.T
     squares = np.block([[square + dual @ dual.T, mixed], [mixed.T, square]])
     quaternion = _study_point(np.linalg.eigh(squares)[1][:, :2])[:4]
-    if quaternion @ quaternion < _SMALLEST_PART:
+    # With a smaller q, X would be a kilometre long, and the motion does not determine q'.
+    if quaternion @ quaternion < 1e-6:
         quaternion = np.linalg.eigh(squares[:4, :4])[1][:, 0]
     return _rotation(quaternion)
 

@@ -18,9 +18,6 @@ from visioncal.estimation.points import (
 )
 from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
 
-# Odds over any other group at which a single group is called the outlier.
-_ODDS = 100.0
-
 
 @dataclass(frozen=True, eq=False)
 class GroupInliers:
@@ -141,7 +138,7 @@ def _doubtful(problem: PointProblem, fit: GroupFit) -> Mask:
     """Groups among which the outliers cannot be identified."""
     # Each excluded group is compared with each inlier: under the mean-shift model with unknown
     # noise, the odds of one or the other being wrong are those of the squared residuals left
-    # without it (Cook and Weisberg 1982, section 2.2.2).
+    # without it (Cook and Weisberg 1982, section 2.2.2). Odds of a hundred decide.
     doubtful = np.zeros(len(fit.used), dtype=bool)
     for excluded in np.flatnonzero(~fit.used):
         used = fit.used.copy()
@@ -151,7 +148,7 @@ def _doubtful(problem: PointProblem, fit: GroupFit) -> Mask:
         left, total = np.full(len(used), np.inf), _misfit(inside, refit.sigma)
         left[used] = total - distances(refit).squares[used]
         least = max(left[excluded], np.finfo(float).eps * total)
-        rivals = fit.used & (left < least * _ODDS ** (2.0 / max(fit.freedom, 1)))
+        rivals = fit.used & (left < least * 100.0 ** (2.0 / max(fit.freedom, 1)))
         if rivals.any():
             doubtful |= rivals
             doubtful[excluded] = True

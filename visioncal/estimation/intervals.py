@@ -23,8 +23,6 @@ _ENDS, _STEPS = (-4.6, 2.2), 25
 _NOTHING, _LEAST_MIDDLE_M = 1e-7, 5e-5
 # Gain in log-likelihood of the other levels after which an interval's end moves by less than 1 %.
 _CONVERGED = 1e-3
-# Degrees of freedom of a level not significantly above zero: those of a handful of stops.
-_LEAST_FREEDOM = 8.0
 
 
 def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
@@ -102,4 +100,5 @@ def freedom_of(intervals: Iterable[Sequence[float]]) -> float:
     freedoms = [
         2.0 * (SURPRISE_95 / np.log(high / low)) ** 2 for low, high in intervals if 0.0 < low < high
     ]
-    return max(float(sum(freedoms)), _LEAST_FREEDOM)
+    # Levels not significantly above zero have those of a handful of stops.
+    return max(float(sum(freedoms)), 8.0)

@@ -21,11 +21,6 @@ from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian
 # Grid points per axis of the image over which the intrinsics' part is removed, and the relative
 # singular value below which a combination of intrinsics is undetermined there.
 _IMAGE_GRID, _DETERMINED = 20, 1e-8
-# Least error of each mode of a lens that has errors [px].
-_LEAST_ERROR_PX = 1e-3
-# Combinations that move all poses together by less than this share of a pose's variance are
-# neglected.
-_MOVED = 1e-2
 
 
 @dataclass(frozen=True)
@@ -51,7 +46,8 @@ class LensSizes:
     def variances(self, count: int) -> FloatArray:
         """(k,) variances of the modes [px^2]; zeros for a lens without errors."""
         sizes = np.repeat([self.focal, self.centre, self.shape], [2, 2, count - 4])
-        return np.maximum(sizes, _LEAST_ERROR_PX) ** 2 if sizes.any() else sizes
+        # A lens that has errors has some of each mode.
+        return np.maximum(sizes, 1e-3) ** 2 if sizes.any() else sizes
 
 
 def lens_modes(camera: Camera) -> FloatArray:
@@ -200,7 +196,8 @@ class Coefficients:
         inverse_root = np.linalg.inv(root).T
         pose_changes = by_coefficients @ inverse_root
         values, vectors = np.linalg.eigh(gram(pose_changes, poses @ pose_changes))
-        visible = values > _MOVED
+        # Others move all poses together by less than a hundredth of a pose's variance.
+        visible = values > 1e-2
         return cls(
             -solved[:, between.shape[1]],
             -solved[:, : between.shape[1]],

@@ -48,8 +48,6 @@ _LENGTHS, _GAIN, _LITTLE_GAIN = (0.2, 0.12, 0.07), 0.5, 1e-2
 # The corner noise lies between the residuals with lens, board and field all free and those with
 # lens and board alone, times these factors.
 _NOISE_RANGE = (0.7, 3.0)
-# Residuals above this with lens, board and field all free are wrong corners, not noise [px].
-_WRONG_PX = 10.0
 # Lower bounds, at which sizes count as zero, upper bounds and starts: of the field (in units of the
 # corner noise, but for the upper bound [px]), breathing and jitter (autofocus repeats to some
 # 0.1 %), errors of a given lens [px], of a board's scale, plane (shares of its size) and bend [m],
@@ -194,7 +192,8 @@ def estimate_sizes(
     length = _LENGTHS[0] if before is None else before.length
     likelihood = _assembled(linearised, length, count)
     left_px, noise_px = likelihood.noise_px
-    if left_px > _WRONG_PX:
+    # With lens, board and field all free such residuals are wrong corners, not noise [px].
+    if left_px > 10.0:
         return LensLevels(), mine.lens_sizes, mine.board_sizes
     starts = likelihood.bounds[:, 2].copy()
     if before is not None:

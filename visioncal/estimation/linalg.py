@@ -11,8 +11,6 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 
 _Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 
-# Squared Cholesky pivots of a unit-diagonal matrix below which the factor is mostly rounding.
-_LEAST_PIVOT_SQ = 1e-11
 # Share of a variance, or of an information, below which what is left is rounding.
 ROUNDING = 1e-6
 # Share of the largest eigenvalue below which a direction is undetermined.
@@ -47,7 +45,8 @@ def covariance_root(information: FloatArray) -> FloatArray:
     """Factors `covariance_from(information)` as (n, n) `root @ root^T`, even if singular."""
     scale = _scale(information)
     factor, failed = lapack.dpotrf(information * np.outer(scale, scale), lower=1)
-    if not failed and np.diag(factor).min(initial=1.0) ** 2 > _LEAST_PIVOT_SQ:
+    # With smaller pivots of a unit-diagonal matrix the factor is mostly rounding.
+    if not failed and np.diag(factor).min(initial=1.0) ** 2 > 1e-11:
         inverse, _ = lapack.dtrtri(factor, lower=1)
         return np.asarray(scale[:, None] * np.tril(inverse).T)
     values, vectors, scale = _floored(information)

@@ -39,15 +39,10 @@ _HARDLY, _VARIANCES = 0.1, 3.0
 # The actual gain is rarely more than this multiple of the second-order prediction, for steps up to
 # this length: at three times the initial level it is three times the prediction.
 _SURELY, _SHORT_STEP = 3.0, 0.5
-# Least share of the predicted change of the gradient along a step that corrects the curvature.
-_LEAST_CHANGE = 0.05
 # Square root of the likelihood-ratio limit of a 95 % interval of one unknown.
 SURPRISE_95 = float(np.sqrt(chi2_limit(0.05, 1)))
 # First and largest half width and tolerance of its search, in logarithms of the sigma.
 _FIRST_WIDTH, _WIDEST, _EXACT = 0.125, 4.0, 0.02
-
-# Spacing of the grid over the logarithm of a random effect's size.
-_SIZE_STEP = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +284,7 @@ class MixedModel:
         kept = values > NULL_SHARE * np.trace(information + absorbed.T @ absorbed)
         values, vectors = values[kept], vectors[:, kept]
         squares = (gram(moved, residuals[among]) @ vectors) ** 2
-        sizes = np.exp(np.arange(np.log(LEAST_SIGMA), np.log(MOST_SIGMA), _SIZE_STEP))[:, None]
+        sizes = np.exp(np.arange(np.log(LEAST_SIGMA), np.log(MOST_SIGMA), 0.2))[:, None]
         added = 1.0 + sizes**2 * values
         change = 0.5 * np.sum(np.log(added) - sizes**2 * squares / added, axis=1)
         best = int(np.argmin(change))
@@ -369,7 +364,8 @@ def _corrected(
     step, change, second = step[moved], change[moved], (curvature + correction)[inner]
     along = second @ step
     corrected = correction.copy()
-    if step @ change > _LEAST_CHANGE * (step @ along):
+    # The gradient has to change by a share of what is predicted at least.
+    if step @ change > 0.05 * (step @ along):
         corrected[inner] += np.outer(change, change) / (step @ change)
         corrected[inner] -= np.outer(along, along) / (step @ along)
     return corrected

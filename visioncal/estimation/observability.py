@@ -24,10 +24,6 @@ SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
 # Typical noise of robots and corners, per axis. Larger noise is no fault of the motion but of
 # exchanged rows, another convention or wrong images; the verdict judges it.
 TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(float(np.deg2rad(0.05)), 1e-4), 0.2
-# Least component along an axis for a direction to be called by it.
-_NEARLY_AXIS = 0.95
-# Most stops of a robot that are paired.
-_PAIRED = 300
 # A direction with a larger predicted sigma is not determined at all [m or rad].
 _OPEN = 0.2
 # Cause and advice where unknowns common to all views are not determined.
@@ -95,10 +91,10 @@ class Turning:
     def of(cls, robot: FloatArray) -> "Turning":
         """The rotations between all pairs of (m, 4, 4) poses, m of two or more.
 
-        Of many poses a subset is paired, which includes those that rotate least and most.
+        Of more than 300 poses as many are paired, which include those that rotate least and most.
         """
         ranked = robot[np.argsort(rotation_angle(invert(robot[0]) @ robot))]
-        chosen = np.linspace(0, len(robot) - 1, min(len(robot), _PAIRED)).round().astype(np.int64)
+        chosen = np.linspace(0, len(robot) - 1, min(len(robot), 300)).round().astype(np.int64)
         i, j = np.triu_indices(len(chosen), 1)
         relative = invert(ranked[chosen[j]]) @ ranked[chosen[i]]
         return cls.by(np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec()))
@@ -343,7 +339,7 @@ def edge_directions(
 def axis_words(direction: FloatArray) -> str:
     """Names a direction (3,): `x`, or `direction (0.71, 0.71, 0.00)`."""
     axis = int(np.argmax(np.abs(direction)))
-    if abs(direction[axis]) > _NEARLY_AXIS:
+    if abs(direction[axis]) > 0.95:
         return "xyz"[axis]
     signed = direction * np.sign(direction[axis])
     return "direction ({:.2f}, {:.2f}, {:.2f})".format(*signed)

@@ -49,8 +49,6 @@ _GROSS = 20.0
 _MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
 # Least share of inliers; with fewer, the outliers cannot be identified.
 _LEAST_SHARE = 0.5
-# Share of the limit from which an observation is tested again, with noise estimated without it.
-_SUSPECT_SHARE = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +267,8 @@ def _widened(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solutio
 
 
 def _refined(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:
-    return settled(_ObservationSearch(problem), used, fit, FEWEST_COMPARED, _SUSPECT_SHARE)
+    # From this share of the limit on, observations are tested with noise estimated without them.
+    return settled(_ObservationSearch(problem), used, fit, FEWEST_COMPARED, 0.4)
 
 
 def _converged(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> InlierFit:

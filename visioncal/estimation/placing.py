@@ -19,8 +19,6 @@ TOUCH_NOISE_M = 1e-4
 # Fewest degrees of freedom that estimate the noise: a single residual is within a tenth of its
 # sigma in one frame of twelve. Features that were touched twice leave six.
 _ENOUGH = 6
-# Touches nearer to the origin than this share of the farthest one's distance may be on either side.
-_BEHIND = 0.1
 
 
 def counted_noise_m(fit: GroupFit, expected_m: float) -> float:
@@ -56,8 +54,8 @@ def check_sides(
     """
     for kind, coordinate in along.items():
         rows = used & (np.array(kinds) == kind)
-        # Near to the origin noise may put them on either side.
-        limit = _BEHIND * np.abs(coordinate[rows]).max(initial=0.0)
+        # Near to the origin, by the farthest one's distance, noise may put them on either side.
+        limit = 0.1 * np.abs(coordinate[rows]).max(initial=0.0)
         behind, before = (
             [names[row] for row in np.flatnonzero(rows & (side * coordinate > limit)).tolist()]
             for side in (-1.0, 1.0)

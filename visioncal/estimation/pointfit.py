@@ -42,8 +42,6 @@ _STATED = {
     "x": (False, True, True),
     "xy": (False, False, True),
 }
-# Points within so many sigmas of a plane lie in it.
-_FLAT_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +229,8 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
         "Measure points that are farther apart and not nearly on one line, or measure them better.",
         f" The part is {scale.value:.4g} times as large as drawn." if scale.differs else "",
     )
-    return DrawingFit(agreement, scale, float(extents[2]) < _FLAT_SIGMAS * level_m)
+    # Points within five sigmas of a plane lie in it.
+    return DrawingFit(agreement, scale, float(extents[2]) < 5.0 * level_m)
 
 
 def _fit_inliers(pairs: PointPairs, expected_noise_m: float | None) -> tuple[GroupInliers, Scale]:

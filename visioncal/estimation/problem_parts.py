@@ -11,8 +11,6 @@ from visioncal.core.transforms import exp, inverse_right_jacobian, log
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.mixed import PriorInformation
 
-# Variances of undetermined directions of a pose are larger [rad^2].
-_UNDETERMINED_VARIANCE = 0.05
 # Name of the only robot of a cell.
 ROBOT = "robot"
 # Where an observation's covariance is a guess, its errors are up to this many times larger: with
@@ -41,7 +39,8 @@ class Observations:
     @cached_property
     def directions(self) -> IntArray:
         """(n,) number of directions that each determines: six at most."""
-        count = np.sum(np.linalg.eigvalsh(self.covariance) < _UNDETERMINED_VARIANCE, axis=1)
+        # Variances of undetermined directions are larger [rad^2].
+        count = np.sum(np.linalg.eigvalsh(self.covariance) < 0.05, axis=1)
         return np.asarray(np.where(self.has_rotation, count, 3))
 
     def take(self, rows: IntArray) -> "Observations":

@@ -35,10 +35,6 @@ def ratio_prior(robots: Iterable[int], count: int, first: int = 0) -> SizePrior:
 
 # Lower bound of the initial noise levels of robots [rad and m]: the search starts from above.
 START_SIGMA = 5e-4
-# Lower bound of the initial levels of a repeated search: from zero, levels cannot grow.
-_ABOVE_NOTHING = 2e-5
-# Noise at the start beside random effects, as a share of the residuals.
-_LITTLE_NOISE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +93,8 @@ class RobotLikelihood:
         """Estimates the robots' levels (r, 2); see `estimate_noise`."""
         if from_above:
             return self.white[0]
-        return self._levels(np.maximum(self.before, _ABOVE_NOTHING))[0]
+        # From zero, levels cannot grow.
+        return self._levels(np.maximum(self.before, 2e-5))[0]
 
     @cached_property
     def white(self) -> tuple[FloatArray, float]:
@@ -114,7 +111,7 @@ class RobotLikelihood:
             moved: (m, 6 w, p) Jacobian of a robot's units by the effects of each group.
             least: (g,) least sizes.
         """
-        levels = np.maximum(_LITTLE_NOISE * self.rms, LEAST_SIGMA)
+        levels = np.maximum(0.1 * self.rms, LEAST_SIGMA)
         motion = [np.sqrt(np.sum(np.mean(columns[:, :6] ** 2, axis=0))) for columns in moved]
         sizes = np.maximum(least, np.linalg.norm(self.rms) / np.maximum(motion, LEAST_SIGMA))
         return np.append(np.tile(levels, len(self.before)), sizes)

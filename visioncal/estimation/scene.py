@@ -21,8 +21,6 @@ from visioncal.vision.targets import first_corners, numbered_positions
 
 # Frame of a single camera.
 ONLY_CAMERA = "cam"
-# Least residuals per unknown of lens and board.
-_SPARE = 10
 # Share of the information of values that is added where they have none.
 _RIDGE = 1e-12
 # Prior sigmas of intrinsics that are given to be refined: focal length and centre as shares of the
@@ -186,9 +184,9 @@ class CornerProblem:
 
     @property
     def has_spare_corners(self) -> bool:
-        """Whether there are enough residuals to estimate lens and board."""
+        """Whether there are ten residuals per unknown, enough to estimate lens and board."""
         residuals = 2 * len(self.stack.px) - 6 * len(self.stack.views)
-        return residuals >= _SPARE * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
+        return residuals >= 10 * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
 
     def unknowns(self, compressed: Compressed) -> int:
         """Number of unknowns, poses among them, that the corners have determined, not a prior."""

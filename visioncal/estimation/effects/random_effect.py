@@ -27,8 +27,6 @@ from visioncal.estimation.robot_likelihood import robot_likelihood
 _RARE = 0.01
 # Typical size of an arm's errors by its posture [rad].
 _ARM = 3e-4
-# The search for a size starts at this multiple of its typical one.
-_ABOVE = 3.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,8 @@ def find_random_effects(
     )
     levels = np.maximum(fit.noise.robots.ravel(), LEAST_SIGMA)
     low = np.full(first + len(effects), np.log(LEAST_SIGMA))
-    logs = np.log(np.concatenate([levels, _ABOVE * np.array(typical)]))
+    # The search starts above the typical sizes.
+    logs = np.log(np.concatenate([levels, 3.0 * np.array(typical)]))
     found = model.maximised(logs, low, np.log(MOST_SIGMA))
 
     def gain(index: int) -> float:

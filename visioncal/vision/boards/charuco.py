@@ -38,14 +38,11 @@ from visioncal.vision.boards.template import Print
 # A homography has eight unknowns and a marker gives eight equations: three are a check.
 _LAYOUT_MARKERS = 3
 
-# Thresholding window of a quick search: of 7 to 31, it detected most markers at squares of 20 to 70
-# px.
-_QUICK_PX = 7
 
 _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
 # Steps between markers up to this length, and this close to whole squares, are counted [squares].
 _NEAR, _OFF = 2.5, 0.3
-_SHARES, _SHARE_STEPS = (0.25, 0.98), 3
+_SHARES = (0.25, 0.98)
 # A marker's corners around its centre [sides].
 _AROUND = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 
@@ -167,9 +164,9 @@ class Charuco(Board):
         parameters.checkMarkers = False
         marker_parameters = cv2.aruco.DetectorParameters()
         if quick:
-            marker_parameters.adaptiveThreshWinSizeMin = (
-                marker_parameters.adaptiveThreshWinSizeMax
-            ) = _QUICK_PX
+            # Of 7 to 31 px, it detected most markers at squares of 20 to 70 px.
+            marker_parameters.adaptiveThreshWinSizeMin = 7
+            marker_parameters.adaptiveThreshWinSizeMax = 7
         detector = cv2.aruco.CharucoDetector(board, parameters, marker_parameters)
         px, ids, marker_px, marker_ids = detector.detectBoard(image)
         if not marker_px:
@@ -300,7 +297,7 @@ def _charuco_of(
     squares = _places(ids, columns, legacy=legacy)
     rows = int(squares[:, 1].max()) + 1
     quads = np.array([marker.px for marker in markers])
-    for _ in range(_SHARE_STEPS):
+    for _ in range(3):
         places = (squares + 0.5)[:, None] + share * _AROUND
         fit = cv2.findHomography(places.reshape(-1, 2), quads.reshape(-1, 2))[0]
         px_from_board = np.asarray(fit, dtype=float)
