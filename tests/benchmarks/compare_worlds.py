@@ -193,18 +193,9 @@ def foreign(name: str):
             return {"errors": {"mm": 1e3 * rms(np.array(away)), "deg": np.rad2deg(turned)},
                     "nees": nees, "beyond": bool(chi2.sf(2.0 * nees, 2) < UNLIKELY)}  # fmt: skip
 
-        return Made(folder / "session", judge, FOREIGN_CAUSES.get(name, ""))
+        return Made(folder / "session", judge, world.causes)
 
     return write
-
-
-# First causes that are right, where a cell of `elsewhere` has a fault that is no source of noise.
-FOREIGN_CAUSES = {
-    "camera bumped 1 mm": "moved|step|slip|drift",
-    "drift 0.5 mm": "drift|moved|base_creeps",
-    "lens grows by 0.15 %, 30 views": "lens_grows",
-    "base tilts by 1.5 mrad/m, 30 views": "base_tilts",
-}
 
 
 def network(cause: str = "", gauge_m: float = 0.0, **options):

@@ -49,6 +49,7 @@ class World:
     lift: Callable[[np.ndarray], np.ndarray] | None = None
     off_px: float = 0.0  # Standard deviation of what given fx, fy, cx, cy are off by [px].
     is_said: bool = False  # Whether the session says so.
+    causes: str = ""  # First ones that are right, where a fault is no source of noise: a pattern.
     noise: Callable[[tuple[int, int], np.random.Generator], np.ndarray] = field(
         default=lambda shape, rng: rng.normal(size=shape)
     )
@@ -273,8 +274,10 @@ WORLDS = {
     "field 0.2 px": World(shift=lens_field(0.2)),
     "field 0.1 px, 80 views": World(shift=lens_field(0.1), views=80),
     "field 0.2 px, 200 views": World(shift=lens_field(0.2), views=200),
-    "lens grows by 0.15 %, 30 views": World(focus=growing(0.0015), views=30),
-    "base tilts by 1.5 mrad/m, 30 views": World(robot=tilting(1.5e-3), views=30),
+    "lens grows by 0.15 %, 30 views": World(focus=growing(0.0015), views=30, causes="lens_grows"),
+    "base tilts by 1.5 mrad/m, 30 views": World(
+        robot=tilting(1.5e-3), views=30, causes="base_tilts"
+    ),
     "thin prism": World(shift=thin_prism(0.002)),
     "breathing 0.1 %": World(focus=breathing(0.001)),
     "breathing 0.3 %": World(focus=breathing(0.003)),
@@ -284,12 +287,14 @@ WORLDS = {
     "board 0.2 % too large": World(board=stretched(1.002, 1.002)),
     "board 0.1 % longer one way": World(board=stretched(1.0005, 0.9995)),
     "board sheared by 1.5 mrad": World(board=sheared(1.5e-3)),
-    "drift 0.5 mm": World(lift=lambda share: 5e-4 * share),
+    "drift 0.5 mm": World(lift=lambda share: 5e-4 * share, causes="drift|moved|base_creeps"),
     "given lens off by 0.5 px": World(off_px=0.5),
     "given lens off by 2 px": World(off_px=2.0),
     "given lens off by 0.5 px, said": World(off_px=0.5, is_said=True),
     "given lens off by 2 px, said": World(off_px=2.0, is_said=True),
-    "camera bumped 1 mm": World(lift=lambda share: 1e-3 * ((share > 0) - 0.5)),
+    "camera bumped 1 mm": World(
+        lift=lambda share: 1e-3 * ((share > 0) - 0.5), causes="moved|step|slip|drift"
+    ),
     "arm off by 0.05 mm": World(robot=arm_off_by(5e-5)),
     "arm off by 0.1 mm": World(robot=arm_off_by(1e-4)),
     "arm off by 0.3 mm": World(robot=arm_off_by(3e-4)),

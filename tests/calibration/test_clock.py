@@ -320,10 +320,10 @@ def test_at_rest_the_clocks_do_not_matter():
 SCREW = np.array([0.05, 0.1, 0.2, 0.01, 0.02, 0.005])
 
 
-def going(way=lambda times_s: np.outer(times_s, SCREW)) -> Session:
+def going(way=lambda times_s: np.outer(times_s, SCREW), hz=30) -> Session:
     """A flange that goes a way: evenly about one axis, which no offset changes, or another one."""
     rng, times_s = np.random.default_rng(5), np.arange(0, 20, 0.02)
-    frames_s = np.arange(3, 17, 1 / 30)
+    frames_s = np.arange(3, 17, 1 / hz)
     x, z = exp(rng.normal(size=(2, 6)))
     noise = exp(1e-4 * rng.normal(size=(len(frames_s), 6)))
     seen = invert(exp(way(frames_s)) @ x) @ z @ noise
@@ -333,7 +333,7 @@ def going(way=lambda times_s: np.outer(times_s, SCREW)) -> Session:
 def test_motion_that_repeats_itself_is_refused_unless_the_offset_is_stated():
     """Every two seconds."""
     turns, sizes = np.pi * np.array([1, 2, 1, 2, 1, 2]), np.array([0.4, 0.5, 0.3, 0.1, 0.1, 0.1])
-    again = going(lambda times_s: np.sin(np.outer(times_s, turns) + np.arange(6)) * sizes)
+    again = going(lambda s: np.sin(np.outer(s, turns) + np.arange(6)) * sizes, hz=10)
     words = "the motion repeats itself: offsets of .* ms explain it alike"
     raised(DegenerateError, words, clocked_of, again)
     # A period off, which is for whoever stated it, to 1 ms, to know.

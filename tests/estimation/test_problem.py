@@ -8,14 +8,13 @@ import pytest
 from scipy.linalg import block_diag
 from support.cells import calibrated
 from support.edges import inliers_of
-from support.problems import ROBOT_SIGMAS, away, observed, pose, true_state, world
+from support.problems import ROBOT_SIGMAS, away, observed, pose, swung, true_state, world
 from support.slopes import jacobian
 
 from visioncal.calibration.stages.init_frames import init_network
 from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.transforms import adjoint, exp, invert, log
-from visioncal.core.types import FloatArray
 from visioncal.estimation import joint
 from visioncal.estimation.budget import Sources, covariance_by_source
 from visioncal.estimation.chain import chain
@@ -55,8 +54,6 @@ SOURCES = Sources(
 NETWORK_NOISE = Noise(np.array([ROBOT_SIGMAS["a"], ROBOT_SIGMAS["b"]]), np.zeros(0))
 NOISE = Noise.of_robot(1e-4, 1e-4)
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-RATES = np.array([0.31, 0.47, 0.73, 0.21, 0.37, 0.53])
-SIZES = np.array([0.4, 0.5, 0.7, 0.1, 0.1, 0.1])
 
 
 def problem_of(seed, stops=20, seen=0.7, **more):
@@ -441,11 +438,6 @@ def test_linear_algebra_says_what_it_sees(monkeypatch):
     np.testing.assert_allclose(covariance_from(information), np.linalg.inv(information), rtol=1e-8)
     with pytest.raises(np.linalg.LinAlgError):
         covariance_from(np.full((2, 6, 6), np.nan))
-
-
-def swung(times_s: FloatArray) -> FloatArray:
-    """A flange that swings about all axes, at up to 3 rad/s: (n, 4, 4)."""
-    return exp(np.sin(2 * np.pi * RATES * times_s[:, None] + np.arange(6)) * SIZES)
 
 
 def sampled(hz: float, keep=lambda times_s: times_s >= 0.0) -> Trajectory:

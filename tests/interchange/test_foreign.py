@@ -24,6 +24,7 @@ from support.foreign_samples import (
     streams,
     vectors,
 )
+from support.problems import swung
 from support.refusals import raised
 from support.samples import made_up
 
@@ -219,13 +220,6 @@ def test_streams_of_different_motions_are_refused(tmp_path):
 
 FLANGE_FROM_CAM_BACK = exp(np.array([0.1, -0.2, 1.5, 0.05, 0.01, 0.08]))
 TARGET = exp(np.array([0.3, 0.1, 0.2, 0.5, 0.1, 0.9]))
-
-
-def swung(times_s):
-    """A camera that swings about all axes, never twice alike within a minute: (n, 4, 4)."""
-    rates = np.array([0.31, 0.47, 0.73, 0.21, 0.37, 0.53])
-    sizes = np.array([0.4, 0.5, 0.7, 0.1, 0.1, 0.1])
-    return exp(np.sin(2 * np.pi * rates * times_s[:, None] + np.arange(6)) * sizes)
 
 
 LENSES = {

@@ -123,6 +123,13 @@ def observed(world, rng, changed=None, noise=1.0):
     return Problem(world.tree(), reported, observations)
 
 
+def swung(times_s):
+    """A flange that swings about all axes at up to 3 rad/s, never twice alike: (n, 4, 4)."""
+    rates = np.array([0.31, 0.47, 0.73, 0.21, 0.37, 0.53])
+    sizes = np.array([0.4, 0.5, 0.7, 0.1, 0.1, 0.1])
+    return exp(np.sin(2 * np.pi * rates * times_s[:, None] + np.arange(6)) * sizes)
+
+
 def true_state(world, tree):
     return State(np.array([world.truth[index] for index in tree.unknown]), np.zeros(0))
 
