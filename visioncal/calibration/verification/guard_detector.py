@@ -148,9 +148,8 @@ class Detector:
 
 
 # Fields of a detector with a row for each candidate.
-_CANDIDATE = (
-    *("born", "follows", "information", "gradient", "raw_information", "raw_gradient", "excess"),
-)
+_BOUNDED, _RAW = ("information", "gradient"), ("raw_information", "raw_gradient", "excess")
+_CANDIDATE = ("born", "follows", *_BOUNDED, *_RAW)
 
 
 def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
