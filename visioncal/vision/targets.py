@@ -61,6 +61,12 @@ def load_target(name_or_path: str | Path, folder: str | Path | None = None) -> T
     return read_target(str(name_or_path), None if folder is None else Path(folder))[0]
 
 
+def target_name(document: Mapping[str, Any]) -> str | None:
+    """Name of the shipped target with this content; None where there is none."""
+    shipped = ((name, read_target(name, None)[1]) for name in target_names())
+    return next((name for name, content in shipped if content == document), None)
+
+
 def read_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
     """Loads a target as `load_target` does.
 

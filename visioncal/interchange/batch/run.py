@@ -307,23 +307,20 @@ def batch(
     buffer = io.BytesIO()
     parquet.write_table(table, buffer)
     write_atomically(results.table, buffer.getvalue())
-    write_atomically(results.page, _page(results.rows))
-    return results
-
-
-def _page(rows: Sequence[Row]) -> str:
-    """The page of a batch: that of a history of one day."""
     from visioncal.present.report.fleet import FleetRow, fleet_page
 
+    # The page is that of a history of one day.
     shown = [
         FleetRow(row.name, failure=f"{row.failure} {row.next_step}")
         if row.entry is None
         else FleetRow(
             row.name, (row.entry,), link=f"{row.name}/{REPORT if row.has_report else CALIBRATION}"
         )
-        for row in rows
+        for row in results.rows
     ]
-    return fleet_page(shown, "Batch", f"{len(rows)} sessions", TABLE)
+    page = fleet_page(shown, "Batch", f"{len(rows)} sessions", TABLE)
+    write_atomically(results.page, page)
+    return results
 
 
 def _rows(jobs: Sequence[Job], workers: int | None, scheduler: str | None) -> Iterator[Row]:

@@ -15,22 +15,15 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Mount
-from visioncal.interchange.formats.foreign import (
-    ForeignRecording,
-    ImportOptions,
-    rows_of,
-)
-from visioncal.interchange.formats.intrinsics import (
-    read_intrinsics,
-    read_target_description,
-    target_name,
-)
+from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions, rows_of
+from visioncal.interchange.formats.intrinsics import read_intrinsics, read_target_description
 from visioncal.robot import Robot
 from visioncal.robot.files import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session import ImageStore, Session, Stream
 from visioncal.session import columns as session_columns
 from visioncal.session.images import ListedImages
 from visioncal.vision.boards.imaging import image_size, looks_like_image
+from visioncal.vision.targets import target_name
 
 
 class FileImages(ListedImages[Path]):

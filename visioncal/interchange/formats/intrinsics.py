@@ -63,12 +63,6 @@ def target_named(words: str, name: str = "") -> Target:
     return target_from_document(read_target_description(words), name or words)
 
 
-def target_name(document: Mapping[str, Any]) -> str | None:
-    """Name of the shipped target with this content; None where there is none."""
-    shipped = ((name, read_target(name, None)[1]) for name in target_names())
-    return next((name for name, content in shipped if content == document), None)
-
-
 _MATRIX_KEYS = (
     *("camera_matrix", "cameraMatrix", "camera_intrinsics", "intrinsic_matrix", "IntrinsicMatrix"),
     *("K", "k", "mtx", "M1", "intrinsic"),

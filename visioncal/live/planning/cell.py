@@ -1,7 +1,7 @@
 """A cell to plan for: guesses of what is unknown, limits of the stops, and obstacles."""
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
@@ -19,10 +19,9 @@ from visioncal.robot.collision import Body, Collisions, arm_bodies, camera_body,
 from visioncal.vision.targets import (
     corner_positions,
     extent_m,
-    load_target,
     target_document,
     target_from_document,
-    target_names,
+    target_name,
 )
 
 # Greatest angle between the line of sight and a board's normal [rad].
@@ -35,16 +34,13 @@ _PLATE_M, _RIM_M = 0.01, 0.02
 
 Pose: TypeAlias = Annotated[FloatArray, Array((4, 4))]
 # Forms in plan.json. A board that comes with visioncal gets its name.
-_TARGET = WrittenForm(target_document, lambda content, _: _named(content))
+_TARGET = WrittenForm(
+    target_document,
+    lambda content, _: target_from_document(content, target_name(content) or "board"),
+)
 _NOISE = WrittenForm(
     lambda noise: noise.robots[0].tolist(), lambda sigmas, _: Noise.of_robot(*sigmas)
 )
-
-
-def _named(content: dict[str, Any]) -> Target:
-    target = target_from_document(content, "board")
-    shipped = (load_target(name) for name in target_names())
-    return next((one for one in shipped if target_document(one) == content), target)
 
 
 @dataclass(frozen=True, eq=False)

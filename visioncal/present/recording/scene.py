@@ -93,12 +93,25 @@ class Scene(CellPoses):
                 line = rr.LineStrips3D(
                     [[np.zeros(3), self.frames.matrices[child][:3, 3]]],
                     colors=colours.JOINT,
-                    radii=self._radius(2 * _LINE),
+                    radii=2 * _LINE * self.size_m,
                 )
                 entity = f"{paths.entity_of(flange)}/{flange}_from_{child}"
                 stream.log(entity, rr.CoordinateFrame(flange), line, static=True)
         for frame, camera in self.cameras.items():
-            self._log_image_plane(stream, camera, frame)
+            image = paths.image_frame(frame)
+            matrix = matrix_3x3(camera)
+            # Rerun's origin is the image's corner, not the first pixel's centre.
+            matrix[:2, 2] += 0.5
+            plane = rr.Pinhole(
+                image_from_camera=matrix,
+                resolution=camera.resolution,
+                camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=_FRUSTUM * self.size_m,
+                parent_frame=frame,
+                child_frame=image,
+            )
+            entity = f"{paths.entity_of(frame)}/image"
+            stream.log(entity, rr.CoordinateFrame(image), plane, static=True)
         for frame, target in self.boards.items():
             entity = f"{paths.entity_of(frame)}/sheet"
             stream.log(entity, rr.CoordinateFrame(frame), board.sheet(target), static=True)
@@ -119,7 +132,7 @@ class Scene(CellPoses):
                 points = rr.Points3D(
                     [pose[:3, 3] for pose in poses.values()],
                     colors=colour,
-                    radii=self._radius(_POINT),
+                    radii=_POINT * self.size_m,
                     labels=list(map(str, poses)) if labelled else None,
                     show_labels=labelled or None,
                 )
@@ -143,7 +156,7 @@ class Scene(CellPoses):
                 [np.array([np.zeros(3), state.pose[:3, 3]])] if state and links is None else []
                 for state, links in zip(states, arms, strict=True)
             ]
-            style = rr.LineStrips3D.from_fields(colors=colours.JOINT, radii=self._radius(2 * _LINE))
+            style = rr.LineStrips3D.from_fields(colors=colours.JOINT, radii=2 * _LINE * self.size_m)
             stream.log(f"{entity}/reach", style, static=True)
             _send_strips(stream, f"{entity}/reach", rows.values(), lines, timeline)
 
@@ -189,33 +202,13 @@ class Scene(CellPoses):
         if not strips:
             return
         frame, entity = rr.CoordinateFrame(paths.CELL_FRAME), paths.SEEN_TARGET
-        style = rr.LineStrips3D.from_fields(radii=self._radius(_LINE))
+        style = rr.LineStrips3D.from_fields(radii=_LINE * self.size_m)
         stream.log(entity, frame, style, static=True)
         unused = [seen[row].view in self.rejected for row in strips]
         colour = [colours.REJECTED if is_unused else colours.DETECTED for is_unused in unused]
         _send_strips(
             stream, entity, strips, [*strips.values()], more=rr.LineStrips3D.columns(colors=colour)
         )
-
-    def _radius(self, share: float) -> float:
-        return share * self.size_m
-
-    def _log_image_plane(self, stream: rr.RecordingStream, camera: Camera, frame: str) -> None:
-        """Places the image in a camera's frame."""
-        image = paths.image_frame(frame)
-        matrix = matrix_3x3(camera)
-        # Rerun's origin is the image's corner, not the first pixel's centre.
-        matrix[:2, 2] += 0.5
-        plane = rr.Pinhole(
-            image_from_camera=matrix,
-            resolution=camera.resolution,
-            camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=_FRUSTUM * self.size_m,
-            parent_frame=frame,
-            child_frame=image,
-        )
-        entity = f"{paths.entity_of(frame)}/image"
-        stream.log(entity, rr.CoordinateFrame(image), plane, static=True)
 
 
 def _log_poses(
