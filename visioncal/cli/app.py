@@ -15,9 +15,6 @@ from visioncal.cli.lazy import LazyGroup
 from visioncal.core.errors import DataError, VerdictError, VisioncalError
 from visioncal.core.version import __version__
 
-# As shells report a program ended by SIGPIPE.
-_EXIT_BROKEN_PIPE = 128 + 13
-
 
 def _group(name: str, words: str, records: str, *listed: str) -> typer.Typer:
     """A command with commands of its own, in the order of a typical workflow."""
@@ -137,7 +134,8 @@ def _refuse(error: VisioncalError) -> None:
 
 def _end(error: OSError) -> None:
     if isinstance(error, BrokenPipeError):
-        raise SystemExit(_EXIT_BROKEN_PIPE) from error
+        # As shells report a program ended by SIGPIPE.
+        raise SystemExit(128 + 13) from error
     # Importing a console takes longer than `--version` itself.
     from visioncal.cli.console import EXIT_NO_RESULT, report_error
 

@@ -25,8 +25,6 @@ from visioncal.results import select_matching
 from visioncal.session import Session
 from visioncal.vision.boards.imaging import read_image
 
-# A program that is killed loses fewer looks than these of what it has learned.
-_KEPT_EVERY = 50
 _KEYS = tuple(each.name for each in fields(Look))
 
 
@@ -45,7 +43,8 @@ def guard_command(options: GuardOptions) -> None:
             typer.echo(json.dumps(answer, allow_nan=False))
             sys.stdout.flush()
             is_refused = is_refused or "error" in answer
-            if count % _KEPT_EVERY == 0 or guard.holds != holds:
+            # A program that is killed loses fewer than 50 looks of what it has learned.
+            if count % 50 == 0 or guard.holds != holds:
                 holds = guard.holds
                 _keep(guard, options.state)
     finally:

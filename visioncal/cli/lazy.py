@@ -16,8 +16,6 @@ from typer.main import get_command, get_group
 
 from visioncal.core.errors import DataError
 
-# As shells report a program ended by SIGINT.
-_EXIT_CTRL_C = 128 + 2
 # Source of a parameter that was typed.
 _TYPED = "COMMANDLINE"
 # Attributes of options that are not typer's.
@@ -70,7 +68,8 @@ class PlainCommand(TyperCommand):
             return super().invoke(ctx)
         except KeyboardInterrupt:
             typer.echo("stopped by Ctrl-C", err=True)
-            raise typer.Exit(_EXIT_CTRL_C) from None
+            # As shells report a program ended by SIGINT.
+            raise typer.Exit(128 + 2) from None
 
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - typer's own types
         """Writes the options by panel."""

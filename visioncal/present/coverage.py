@@ -12,8 +12,6 @@ from visioncal.results.evidence import ViewEvidence
 
 # Columns and rows of the image's grid, to show where no corner lies.
 _CELLS = (8, 5)
-# The axes of smaller rotations are mostly noise.
-_MIN_ROTATION_RAD = np.deg2rad(1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +80,8 @@ def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
     points: dict[int, FloatArray] = {}
     for view, rotvec in zip(list(poses)[1:], rotvecs, strict=True):
         angle_rad = float(np.linalg.norm(rotvec))
-        if angle_rad > _MIN_ROTATION_RAD:
+        # The axes of smaller rotations are mostly noise.
+        if angle_rad > np.deg2rad(1.0):
             axis = rotvec / (angle_rad if rotvec[2] > 0 else -angle_rad)
             points[view] = _disc(axis[None])
     return _disc_chart("rotation_axes", points, (30, 60, 90)) if points else None

@@ -29,10 +29,6 @@ _STEPS_A_YEAR, _DRIFTS = 0.5, 0.2
 # Four entries at least distinguish a drift from a step; changes are looked for as long as they are
 # more probable than not.
 _DRIFT_ENTRIES, _LIKELY, _MOST_CHANGES = 4, 0.5, 6
-# Entries of a transform that are looked at, the latest ones: the time grows with their square.
-_MOST_ENTRIES = 200
-# Relative sigma of a sigma, which has about 20 degrees of freedom.
-_SIGMA_OF_SIGMA = 0.16
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +85,8 @@ def courses(entries: Sequence[Entry]) -> tuple[Course, ...]:
         left_out = entry.edges if entry.status == "bad" else entry.boards
         for name in entry.edges.keys() - {*left_out}:
             by_name.setdefault(name, []).append(entry)
-    return tuple(_course(name, by_name[name][-_MOST_ENTRIES:]) for name in sorted(by_name))
+    # The latest entries alone: the time grows with the square of their number.
+    return tuple(_course(name, by_name[name][-200:]) for name in sorted(by_name))
 
 
 def _course(name: str, entries: Sequence[Entry]) -> Course:
@@ -103,7 +100,8 @@ def _course(name: str, entries: Sequence[Entry]) -> Course:
         days = np.array([(entry.time - entries[0].time) / timedelta(days=1) for entry in entries])
         changes = find_changes(days, twists, covariances, _UNITS[part])
         log_sigmas = np.log([max(edge.sigma_mm, 1e-6) for edge in edges])[:, None]
-        noise = np.full((len(edges), 1, 1), _SIGMA_OF_SIGMA**2)
+        # Relative sigma of a sigma, which has about 20 degrees of freedom.
+        noise = np.full((len(edges), 1, 1), 0.16**2)
         sigma_changes = find_changes(days, log_sigmas, noise, np.ones(1))
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     steps = tuple(change for change in changes if change.at)

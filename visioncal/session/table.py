@@ -17,7 +17,7 @@ from visioncal.session import columns as cols
 from visioncal.session.images import image_path
 
 # Largest number of rows: two days of a stop every ten seconds.
-_MOST_VIEWS = 20_000
+MOST_VIEWS = 20_000
 # Columns that observe without an image.
 _OBSERVED = ("cft_x_m", "meas_x_m")
 _CENTRE, _FORCE = cols.LOAD[1:4], cols.LOAD[4:]
@@ -131,9 +131,9 @@ def parse_csv(text: str, label: str) -> TextTable:
         DataError: It is empty, has no rows or too many, or its quotes do not close.
     """
     table = parse_table(text, label)
-    if len(table.rows) > _MOST_VIEWS:
+    if len(table.rows) > MOST_VIEWS:
         raise DataError(
-            f"{label} has more than {_MOST_VIEWS:,} rows.",
+            f"{label} has more than {MOST_VIEWS:,} rows.",
             culprits=[label],
             next_step="A row is one observation at a stop. Samples of a running motion belong into "
             "streams/NAME.csv; write the stops alone here.",

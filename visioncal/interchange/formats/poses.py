@@ -136,10 +136,6 @@ CAMERA_KEYS: tuple[tuple[str, ...], ...] = (
 )
 JOINT_KEYS: tuple[str, ...] = ("joint_pose", "joints", "joint_angles", "joint_positions", "q")
 
-# Largest angle: a turn with rounding; joints may make several turns.
-_MOST_RAD = 2 * np.pi + 0.01
-_MOST_TURNS_RAD = 10 * 2 * np.pi
-
 _JOINT_NAME = re.compile(
     r"(?:.*\.)?(joint|axis|j|a|q)[ _]?([1-9])((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*"
     r"(?:deg|rad|[°º])[a-z]*\W*)?)",
@@ -297,7 +293,8 @@ def joints_from(
     ends = [name.rsplit(".", 1)[-1].lower() for name in names]
     largest = np.abs(joints).max(initial=0.0)
     is_named = degrees or all(any(unit in end for unit in _DEGREES) for end in ends)
-    is_large = not is_named and bool(largest > _MOST_TURNS_RAD)
+    # Joints may make several turns.
+    is_large = not is_named and bool(largest > 10 * 2 * np.pi)
     fault = "a joint angle is missing or infinite" if bad.any() else ""
     if is_large and any("rad" in end for end in ends):
         fault = f"joint angles up to {largest:.0f} are no radians: say --joint-unit deg"
@@ -322,7 +319,7 @@ def check_radians(
         return
     largest = np.abs(np.where(there[:, None], poses.rotations, 0.0)).max(axis=1)
     row = int(largest.argmax())
-    if is_degrees or largest[row] > _MOST_RAD:
+    if is_degrees or largest[row] > 2 * np.pi + 0.01:
         size = "in degrees" if is_degrees else "too large for radians"
         raise DataError(
             f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "

@@ -20,6 +20,7 @@ from visioncal.core.errors import DataError, DriverError
 from visioncal.core.types import FloatArray
 from visioncal.live.drivers.manual import form_name
 from visioncal.live.drivers.protocols import Answer, ArmState, Stopwatch
+from visioncal.session.table import MOST_VIEWS
 
 # The programs for robots, beside which the protocol is described.
 CLIENTS = Path(__file__).parents[1] / "clients"
@@ -29,13 +30,9 @@ PATIENCE_S = 900.0
 _DEAD_S = 4
 # A client that said nothing for so long gives way to another [s].
 _MUTE_S = 5.0
-# How long a robot may take to read `done` and to close the link [s].
-_LINGER_S = 3.0
 _SLICE_S = 0.05
 # Longest line in, and longest answer out [bytes].
 _MAX_LINE, _MAX_ANSWER = 500, 200
-# Largest number of a stop: the columns of a session have no more views.
-_MAX_STOP = 20_000
 _ENDS = re.compile(rb"[\r\n]")
 # What a client may add to a line without meaning: blanks, and the zeros of a character array.
 _FILL = b" \t\r\n\0"
@@ -229,10 +226,10 @@ class SocketArm:
         """Reads a stop; raises DataError."""
         number, *parts = (part.strip() for part in line.split("|"))
         is_number = number.isascii() and number.isdecimal() and len(number) < 6
-        if len(parts) not in (1, 2) or not (is_number and 1 <= int(number) <= _MAX_STOP):
+        if len(parts) not in (1, 2) or not (is_number and 1 <= int(number) <= MOST_VIEWS):
             raise DataError(
                 f"{line[:20]!r} is no stop.",
-                next_step=f"Needed is: number (1 to {_MAX_STOP}) | pose, or number | pose | "
+                next_step=f"Needed is: number (1 to {MOST_VIEWS}) | pose, or number | pose | "
                 "joints deg.",
             )
         if self._form is None and len(forms := possible_forms(parts[0])) > 1:
@@ -311,7 +308,8 @@ class SocketArm:
     def _linger(self, *, is_answered: bool) -> None:
         """Answers `done` to whatever comes, until an answered program has closed its link."""
         lingering = Stopwatch()
-        while lingering.read() < _LINGER_S and not (is_answered and self._link is None):
+        # How long a robot may take to read it and to close the link [s].
+        while lingering.read() < 3.0 and not (is_answered and self._link is None):
             if self._next_line() is not None and self._link is not None:
                 with self._dropped_if_lost():
                     self._link.send(b"done")

@@ -11,9 +11,6 @@ from visioncal.core.types import Camera, Image
 from visioncal.live.drivers import stream
 from visioncal.live.drivers.protocols import DeviceSetup
 
-# Of rates that a resolution has, the nearest is taken: a resting arm needs no more [Hz].
-_RATE_HZ = 15
-
 
 class RealsenseCamera(stream.StreamingCamera):
     """Camera device of a RealSense's colour stream, by its serial number.
@@ -51,7 +48,8 @@ def _colour(
         for profile in sensor.get_stream_profiles():
             if (profile.stream_type(), profile.format()) == (rs.stream.color, rs.format.bgr8):
                 video = profile.as_video_stream_profile()
-                ranked = abs(video.fps() - _RATE_HZ), sensor, video
+                # A resting arm needs no more than 15 Hz: the nearest rate is taken.
+                ranked = abs(video.fps() - 15), sensor, video
                 profiles.setdefault((video.width(), video.height()), []).append(ranked)
     size = resolution or max(profiles, default=(0, 0))
     if size not in profiles:

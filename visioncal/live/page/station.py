@@ -30,9 +30,6 @@ from visioncal.live.page.outcome import Light, Outcome, ask_command
 from visioncal.live.page.suggestion import NextPose, near, next_view
 from visioncal.live.planning.cell import PlanCell, flange_at
 
-# From this number of views on a calibration is tried after each.
-_FIRST_TRIAL = 5
-
 
 class TypedPoses:
     """Arm without a connection, whose poses are typed on a page."""
@@ -343,7 +340,7 @@ class Station:
         count = len(self._capture.journal.views)
         if self._task.count and count >= self._task.count:
             self._ask(is_trial=False)
-        elif count >= _FIRST_TRIAL and not self._task.stops:
+        elif count >= 5 and not self._task.stops:
             self._ask(is_trial=True)
         self._advise()
 

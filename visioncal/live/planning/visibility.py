@@ -19,8 +19,6 @@ from visioncal.vision.targets import extent_m, outline
 _NEAREST, _FARTHEST = 0.75, 1.6
 # Factor by which draws extend the range of distances found useful.
 _WIDER = 1.05
-# Greatest distance relative to that at which the board fills the image.
-_NEVER_BEYOND = 6.0
 # Draws of the uncertain cell, the numbers of them after which hopeless poses are dropped, and the
 # corners and points per side of the print.
 _GUESSES, _CHECKED, _CORNERS, _SIDE_POINTS = 100, (5, 15, 40, 100), 4, 2
@@ -105,7 +103,7 @@ class BoardViews:
         # the camera's rotation, and by half its own size times the error of its own rotation.
         cell, radius = self._cell, 0.5 * board_size_m(self._cell.target)
         full = radius / half
-        near, far = _NEAREST * full, _NEVER_BEYOND * full
+        near, far = _NEAREST * full, 6.0 * full
         for d in np.linspace(full, far, 60):
             turned = cell.sigma_rad * np.hypot(d, radius)
             # Errors of 2.2 standard deviations.

@@ -17,8 +17,6 @@ from visioncal.results.years import Change, Course, courses
 # Days after which a cell should have been checked again; weeks of notice of a need that will be
 # missed; days for which a step, or a sigma that grew, is a reason to look; and by how much it grew.
 _UNCHECKED_DAYS, _NOTICE_WEEKS, _RECENT_DAYS, _GREW = 90, 26, 365, 1.5
-# Cells whose years are drawn, the worst: each takes a third of a second.
-_DRAWN = 40
 _STATES = ("good", "check", "bad", "no result")
 _CHECKS = ("calibrated", "verified", "touched")
 
@@ -170,7 +168,8 @@ def fleet_page(rows: Sequence[FleetRow], kind: str, name: str, table: str = "") 
         rows=sorted(rows, key=lambda row: (row.matters[0].rank, row.name)),
         states=[(state, states[state]) for state in _STATES],
         table=table,
-        drawn=_DRAWN,
+        # Cells whose years are drawn, the worst: each takes a third of a second.
+        drawn=40,
         figure=lambda value: "" if value is None else significant(value),
     )
 
