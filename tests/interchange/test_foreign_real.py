@@ -126,7 +126,7 @@ def test_pose_pairs_give_what_opencv_gets_of_them(
     x_mm, rms_mm, rms_deg = by_opencv(Session.load(tmp_path / "session"))
     np.testing.assert_allclose(x_mm, park_mm, atol=0.05)
     assert (rms_mm, rms_deg) == pytest.approx(scatter, abs=0.005)
-    if count == 31:  # Of the other set some are left out.
+    if count > 12:  # Which pairs of so few are solved for, and by what weights, matters.
         assert result.solvers["park"].rms_mm == pytest.approx(rms_mm, abs=0.1)
     assert result.rms.mm <= rms_mm
 
