@@ -194,7 +194,10 @@ def find_steps(
         many = freedom / (kinds if candidate.kind == FRAME else 1)
         chance = FALSE_ALARM / tried[candidate.kind]
         limit = count * float(f_limit(chance, count, max(0.5 * many, 6.0)))
-        shown = np.where(_as_f_test(squares, many, count) < limit, 0.0, squares)
+        # An F test: the noise of a score includes the tested change, which bounds the score.
+        remaining = np.maximum(many - squares, (1.0 - _MOST_EXPLAINED) * many)
+        tested = squares * max(many - count, 1.0) / remaining
+        shown = np.where(tested < limit, 0.0, squares)
         if shown.max(initial=0.0) > 0.0:
             best = int(np.argmax(shown))
             share = min(float(shown[best]) / freedom, _MOST_EXPLAINED)
@@ -207,15 +210,6 @@ def find_steps(
             gain = -freedom * float(np.log1p(-share))
             steps.append(Step(candidate, stop, value, covariances[best], gain, spread))
     return sorted(steps, key=lambda step: -step.gain)
-
-
-def _as_f_test(squares: FloatArray, freedom: float, count: int) -> FloatArray:
-    """Score statistics (k,) of `count` values as those of an F test, times their number.
-
-    The noise of the score includes the tested change, which bounds the score.
-    """
-    remaining = np.maximum(freedom - squares, (1.0 - _MOST_EXPLAINED) * freedom)
-    return np.asarray(squares * max(freedom - count, 1.0) / remaining)
 
 
 def _residual_freedom(problem: Problem, fit: Solution) -> float:

@@ -26,7 +26,7 @@ from visioncal.vision.boards.kind import (
 )
 from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit, read_markers
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
-from visioncal.vision.boards.template import Print
+from visioncal.vision.boards.template import SQUARE, Print
 
 # Kalibr's pages have tags with borders of two modules, and usually gaps of this share of a side.
 _MOST_BORDER, _USUAL_SPACING = 2, 0.3
@@ -265,8 +265,7 @@ def _tag_corners(target: Target, numbers: IntArray) -> FloatArray:
     """(t, 4, 2) corners of tags [sides]; numbers outside the grid continue its rows."""
     rows, columns = np.divmod(numbers, target.columns)
     first = np.stack([columns, target.rows - 1 - rows], axis=1) * (1.0 + target.spacing)
-    square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    return np.asarray(first[:, None] + square)
+    return np.asarray(first[:, None] + SQUARE)
 
 
 def _refined_tags(image: Image, px: FloatArray, spacing: float) -> FloatArray:

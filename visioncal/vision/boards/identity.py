@@ -8,6 +8,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA, aruco_dictionary
+from visioncal.vision.boards.template import SQUARE
 
 # Dictionaries by family, smallest first. Each contains the markers of the previous ones under the
 # same ids, so that the largest decodes all.
@@ -107,7 +108,7 @@ def _likeness(image: Image, px: FloatArray, family: str, number: int) -> float:
     ideal = cv2.aruco.generateImageMarker(aruco_dictionary(FAMILIES[family][-1]), number, side)
     ideal = np.pad(ideal, ring, constant_values=255)
     # Pixel centres are at integers; the marker's edge is half a pixel before the first one.
-    frame = ring - 0.5 + side * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    frame = ring - 0.5 + side * SQUARE
     flat_from_image = cv2.getPerspectiveTransform(px.astype(np.float32), frame.astype(np.float32))
     seen = cv2.warpPerspective(
         image, flat_from_image, ideal.shape[::-1], borderMode=cv2.BORDER_REPLICATE

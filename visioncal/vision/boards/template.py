@@ -62,7 +62,7 @@ _LEAST_PX = 3.0
 MIN_CORNERS = 4
 # Margin around the outermost corners [px].
 _RIM_PX = 32
-_SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 # Half-width of the excluded area at a tag's corner itself [edge widths].
 _SLANT = 1.5
 # Nodes per axis of the polynomial that interpolates a map over a window. With cubics, a fisheye's
@@ -298,7 +298,7 @@ def refine_tags(
     Returns:
         The corners, four per tag.
     """
-    board = _SQUARE[None] if board is None else board
+    board = SQUARE[None] if board is None else board
     inward = np.tile([[1.0, 1], [-1, 1], [-1, -1], [1, -1]], (len(board), 1))
     sides = np.stack([board[:, 1] - board[:, 0], board[:, 3] - board[:, 0]], axis=1)
     unit = float(np.mean(np.linalg.norm(sides, axis=2)))

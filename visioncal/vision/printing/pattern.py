@@ -7,11 +7,11 @@ import numpy as np
 from visioncal.core.types import FloatArray, Target
 from visioncal.vision.boards import kind_of
 from visioncal.vision.boards.kind import Cells
+from visioncal.vision.boards.template import SQUARE
 
 # A polygon whose sides deviate from the circle by less than 0.05 % of the radius.
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
 _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
-_SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def dark_cells(target: Target) -> tuple[Cells, ...]:
@@ -42,7 +42,7 @@ def draw_pattern(target: Target) -> Pattern:
     (left, top), (right, bottom) = (array.tolist() for array in kind.extent_m(target))
     grids = dark_cells(target)
     loops = [
-        grid.corner_m + grid.cell_m * (_SQUARE + place[::-1]) @ grid.turn.T
+        grid.corner_m + grid.cell_m * (SQUARE + place[::-1]) @ grid.turn.T
         for grid in grids
         for place in np.argwhere(grid.dark)
     ]
