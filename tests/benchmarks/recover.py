@@ -118,7 +118,18 @@ def main():
                 f"{named} ({alone}) of {cells} | {passed} of {cells} | {facts[:, 0].max():.1f} |"
             )
             print(lines[-1], flush=True)
-    write_section("Recovering after a knock", "tests/benchmarks/recover.py", "\n".join(lines))
+    text = (
+        f"{cells} cells each, calibrated with 40 views. {PICKS} picks at random points of the "
+        "workspace, in rms [mm]: of what the camera sees, and on a moved base of places taught "
+        'before; "worst cell" is the largest ratio of a cell. Encoders slip by 0.2 to 1 deg, the '
+        "base moves by 10 mm and 1 deg, the new flange is off by 30 mm and 10 deg. A third of the "
+        'stops is held back for the proof. "Named" counts checks that name the cause, "(alone)" '
+        "those that name it alone: the first and the last joint never are. Minutes are the longest "
+        "of a cell, by the motions that `record` predicts and the computation. With an exact arm "
+        "only noise is left, by which few stops fall behind 40 views.\n\n"
+    )
+    text += "\n".join(lines)
+    write_section("Recovering after a knock", "tests/benchmarks/recover.py", text)
 
 
 if __name__ == "__main__":
