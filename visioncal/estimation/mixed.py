@@ -364,8 +364,8 @@ def _corrected(
     step, change, second = step[moved], change[moved], (curvature + correction)[inner]
     along = second @ step
     corrected = correction.copy()
-    # The gradient has to change by a share of what is predicted at least.
-    if step @ change > 0.05 * (step @ along):
+    # The gradient has to change by a share of what is predicted at least; of exact data nothing is.
+    if step @ change > 0.05 * (step @ along) > 0.0:
         corrected[inner] += np.outer(change, change) / (step @ change)
         corrected[inner] -= np.outer(along, along) / (step @ along)
     return corrected
