@@ -94,7 +94,7 @@ def test_false_alarms_are_as_rare_as_stated():
 @pytest.mark.parametrize("tail", [0.6, 1.2])
 def test_the_limit_follows_the_tail_of_the_statistic(tail):
     rng, count = np.random.default_rng(3), 40_000
-    state = Detector.of(np.eye(12), 1e-5, np.zeros(0))
+    state = Detector.of(np.eye(12), 1e-5, np.zeros(0), 0.0)
     # At first as in theory.
     assert limit(state, 700.0) == pytest.approx(700.0)
     values = 5.0 * rng.random(count) ** (-1.0 / tail)
@@ -145,6 +145,14 @@ def test_a_change_is_named_with_its_size_and_time(mount):
         again_ = Guard(place.calibration).restore(json.loads(json.dumps(guard.document)))
         (look,) = looks(place, rng, 1, change, learned + 40)
         assert again_.update(look) == guard.update(look)
+        # What is acknowledged is as it should be, and another change is found as soon.
+        guard.acknowledge()
+        assert all(guard.update(look).holds for look in looks(place, rng, 60, change, learned + 41))
+        other = replace(
+            change, **{"board" if name == "camera" else "camera": knock(rng, 0.6, 0.06)}
+        )
+        found = [guard.update(look) for look in looks(place, rng, 12, other, learned + 101)]
+        assert found[-1].causes[0].cause == ("board" if name == "camera" else "camera")
 
 
 def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
@@ -158,6 +166,7 @@ def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
         ({"time_s": 1.0}, "earlier than the last, at 18000 s"),
         ({"joints_rad": None}, "no joints_rad"),
         ({"joints_rad": np.zeros(3)}, "6 are needed"),
+        ({"joints_rad": np.rad2deg(look.joints_rad)}, "in degrees by its size"),
         ({"corners": bad}, "its 3 corners do not determine"),
         ({"corners": strange}, "corners do not determine"),
         ({"target": "other"}, "its target is 'other'"),

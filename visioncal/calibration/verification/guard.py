@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,6 +13,7 @@ from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.change_hypotheses import BOARD, CAMERA, JOINT, MOTION_UNITS
 from visioncal.calibration.verification.guard_detector import (
+    WIDEST_M,
     ChangeKind,
     Detector,
     LookRows,
@@ -176,7 +178,8 @@ class Guard:
         self._noise = prior.noise(from_corners=self._free is not None)
         # An arm that is off by a millimetre has zeros that are off by a milliradian.
         zeros = np.full(len(joints), self._noise.robots[0, 1])
-        self._state = Detector.of(own, 1e-3 * slow_mm, zeros)
+        self._begun = partial(Detector.of, own, 1e-3 * slow_mm, zeros)
+        self._state = self._begun(0.0)
 
     @property
     def holds(self) -> bool:
@@ -255,8 +258,9 @@ class Guard:
         }
 
     def acknowledge(self) -> None:
-        """Ends an alarm: what is now is taken as it should be, and the guard goes on."""
-        self._state, self._is_changed = self._state.without_candidates(), False
+        """Ends an alarm: what is now is taken as it should be, and learned by the next looks."""
+        begun = self._begun(WIDEST_M * self._units)
+        self._state, self._is_changed = begun.begun(self._state), False
 
     def rows(self, look: Look) -> LookRows:
         """The rows of a look: its residual, covariance and Jacobians; see `update`."""
@@ -286,6 +290,13 @@ class Guard:
             if joints.shape != (1, count) or not np.isfinite(joints).all():
                 raise DataError(
                     f"{label}: joints_rad is {look.joints_rad.tolist()}; {count} are needed.",
+                    culprits=["joints_rad"],
+                )
+            # Beyond two turns there are few joints, and their degrees are there at once.
+            if (np.abs(joints) > 4.0 * np.pi)[:, ~self._arm.robot.chain.prismatic].any():
+                raise DataError(
+                    f"{label}: joints_rad is {look.joints_rad.tolist()}, in degrees by its size; "
+                    "radians are needed.",
                     culprits=["joints_rad"],
                 )
             offsets = self._arm.columns("offsets", joints)[0]

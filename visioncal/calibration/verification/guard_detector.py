@@ -2,12 +2,12 @@
 
 A look's residual is `r = A x + b + H change + noise`. The state x has what is no fault: the
 calibration's own errors (constant, of its covariance), motions of the frames over hours (an
-Ornstein-Uhlenbeck process), and the joints' zeros; b is the arm's error at a posture, where it
-stands again and again. A Kalman filter predicts the next look; its innovations are white while
-nothing changes. A change at look k adds `(H - A F_k) change` to the later ones; F_k, by which the
-filter follows it, has a recursion (Willsky and Jones 1976). The last looks, and older ones at
-growing distances, are candidates (the window of Lai 1995, 1998): an update costs the same after any
-history, and its state is small.
+Ornstein-Uhlenbeck process), changes that were acknowledged, and the joints' zeros; b is the arm's
+error at a posture, where it stands again and again. A Kalman filter predicts the next look; its
+innovations are white while nothing changes. A change at look k adds `(H - A F_k) change` to the
+later ones; F_k, by which the filter follows it, has a recursion (Willsky and Jones 1976). The last
+looks, and older ones at growing distances, are candidates (the window of Lai 1995, 1998): an update
+costs the same after any history, and its state is small.
 
 The statistic is that of Shiryaev and Roberts (Pollak 1987): the sum, over candidates, of the
 likelihood ratio of a change there to none, averaged over causes and sizes as in `verify`. If
@@ -40,8 +40,8 @@ _CANDIDATES, _OLDEST = 14, 1000
 _SHIFTS = np.array([0.1, 0.6, 4.0])
 # Squared shift of all looks together below which a change is not shown.
 _SHOWN = 1e-3
-# Prior size of the change in its estimate [m]: hardly any.
-_WIDEST_M = 0.1
+# Prior size of a change in its estimate, and of one that is acknowledged [m]: hardly any.
+WIDEST_M = 0.1
 # Share of the arm's error that is new, at first.
 _FRESH = 0.4
 # Squared length of an innovation that noise exceeds in one look of a hundred: the largest that
@@ -93,7 +93,8 @@ class Detector:
 
     time_s: FloatArray  # () time of the last look [s].
     looks: FloatArray  # () number of looks.
-    mean: FloatArray  # (p,) state: frames, their slow motions, joints' zeros.
+    # (p,) state: frames, their slow motions, what is taken as moved of them, joints' zeros.
+    mean: FloatArray
     covariance: FloatArray  # (p, p).
     shape: FloatArray  # (6, 6) covariance of the noise in units of the stated.
     fresh: FloatArray  # () share of the arm's error that is new at a known posture, in variance.
@@ -118,18 +119,25 @@ class Detector:
     passed: FloatArray = field(default_factory=lambda: np.array([np.zeros(2), 1.0 / _LEVELS]))
 
     @classmethod
-    def of(cls, edges: FloatArray, slow_m: float, joints_rad: FloatArray) -> "Detector":
+    def of(
+        cls, edges: FloatArray, slow_m: float, joints_rad: FloatArray, changed: FloatArray | float
+    ) -> "Detector":
         """Starts the test.
 
         Args:
             edges: (e, e) covariance of the calibrated frames.
             slow_m: Standard deviation of a frame's slow motions [m].
             joints_rad: (n,) standard deviations of the joints' zeros; empty without joint angles.
+            changed: (d,) standard deviations of a change of frames and joints that is taken as it
+                should be; 0 for none.
         """
         count, changes = len(edges), len(edges) + len(joints_rad)
-        size = count + changes
+        size = 2 * count + changes
         slow = np.tile(np.repeat([slow_m / LEVER_M, slow_m], 3), count // 6)
-        covariance = np.diag(np.concatenate([np.zeros(count), slow, joints_rad]) ** 2)
+        moved = np.broadcast_to(changed, changes)
+        joints = np.hypot(joints_rad, moved[count:])
+        sigmas = np.concatenate([np.zeros(count), slow, moved[:count], joints])
+        covariance = np.diag(sigmas**2)
         covariance[:count, :count] = edges
         shapes = ((_PLACES, 12), _PLACES, (_PLACES, 6), (_PLACES, 6, 6), (changes, changes))
         candidates = ((4,), (size, changes), *((changes, changes), (changes,)) * 2, ())
@@ -141,10 +149,10 @@ class Detector:
             *(np.zeros((0, *shape)) for shape in candidates),
         )
 
-    def without_candidates(self) -> "Detector":
-        """What the test has learned, with no change supposed so far."""
-        none = {name: getattr(self, name)[:0] for name in _CANDIDATE}
-        return replace(self, **none)
+    def begun(self, learned: "Detector") -> "Detector":
+        """This one with what another has learned of noise, slow motions and false alarms."""
+        names = ("time_s", "looks", "shape", "fresh", "slow", "forecast", "usual", "passed")
+        return replace(self, **{name: getattr(learned, name) for name in names})
 
 
 # Fields of a detector with a row for each candidate.
@@ -173,7 +181,8 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
         held = getattr(state, name)
         grown[name] = np.concatenate([held, np.zeros((int(is_learning), *held.shape[1:]))])
     follows = motion[:, None] * grown["follows"]
-    design = np.concatenate([rows.by_edges, rows.by_motion, rows.by_joints], axis=1)
+    change = np.concatenate([rows.by_motion, rows.by_joints], axis=1)
+    design = np.concatenate([rows.by_edges, rows.by_motion, change], axis=1)
     at, places = _place(state, rows)
     own, root = places["offsets_covariance"][at], np.linalg.cholesky(rows.covariance)
     seen, part = design @ covariance, root @ state.shape @ root.T
@@ -185,7 +194,6 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
     clipped = share * white
     # Gains on whitened innovations.
     gain, own_gain = (whiten @ seen).T, (whiten @ own).T
-    change = np.concatenate([rows.by_motion, rows.by_joints], axis=1)
     signature = whiten @ (change - design @ follows)
     turned = np.swapaxes(signature, 1, 2)
     products, accepted = turned @ signature, np.ones(len(follows))
@@ -251,7 +259,7 @@ def _explained(
     white: FloatArray, signature: FloatArray, information: FloatArray, gradient: FloatArray
 ) -> FloatArray:
     """(c,) 1 where a candidate's estimate of the change explains a far innovation, else 0."""
-    covariance = np.linalg.inv(information + np.eye(information.shape[1]) / _WIDEST_M**2)
+    covariance = np.linalg.inv(information + np.eye(information.shape[1]) / WIDEST_M**2)
     away = white - (signature @ (covariance @ gradient[:, :, None]))[:, :, 0]
     total = np.eye(6) + signature @ covariance @ np.swapaxes(signature, 1, 2)
     squares = np.sum(away * np.linalg.solve(total, away[:, :, None])[:, :, 0], axis=1)
@@ -336,6 +344,6 @@ def estimate(
     """A change at a candidate, (q,), and its covariance (q, q)."""
     columns = np.array(kind.columns)
     information = state.raw_information[candidate][np.ix_(columns, columns)]
-    prior = np.diag((_WIDEST_M * units[columns]) ** -2.0)
+    prior = np.diag((WIDEST_M * units[columns]) ** -2.0)
     covariance = np.linalg.inv(information + prior)
     return covariance @ state.raw_gradient[candidate, columns], covariance
