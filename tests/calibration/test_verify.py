@@ -24,6 +24,7 @@ from visioncal.calibration.verification.prediction import predict_detected, pred
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.results import Calibration
+from visioncal.results.history import History
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.simulation import (
@@ -476,7 +477,11 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     asked = ("--targets", stops / "views.csv", "--to", "ur")
     visioncal(*command, *asked).refused("--cause camera\n", "--cause mount\n")
     assert not (act / "result").exists()
-    done = visioncal(*command, *asked, "--cause", "camera", "--payload-kg", 3).good()
+    history = ("--history", tmp_path / "history.db")
+    done = visioncal(*command, *asked, "--cause", "camera", "--payload-kg", 3, *history).good()
+    # It is of the cell of the calibration from before, not one of its own.
+    (entry,) = History(history[1]).entries()
+    assert (entry.session, entry.cell) == ("moved", Calibration.load(out).session_name)
     assert "--payload-kg 3 changes nothing" in " ".join(done.err.split())
     assert "the camera moved by 3 mm" in done.out
     assert "minutes: plan" in done.out

@@ -26,7 +26,13 @@ from visioncal.results.history import (
 )
 
 
-def enter(options: ActOptions, near: Path, entries: Iterable[Entry], out: Path | str = "") -> None:
+def enter(
+    options: ActOptions,
+    near: Path,
+    entries: Iterable[Entry],
+    out: Path | str = "",
+    after: Calibration | None = None,
+) -> None:
     """Enters acts whose files are written; where that fails, it costs no more than a warning.
 
     Args:
@@ -34,12 +40,13 @@ def enter(options: ActOptions, near: Path, entries: Iterable[Entry], out: Path |
         near: The session or file that was read, by which the site is found.
         entries: The entries, whose cell and paths are filled in.
         out: The output, from which they can be added later; empty for none.
+        after: The calibration that a recovery goes on from, whose cell they are of.
     """
     history = History(options.history) if options.history else History.of_site(near)
     if history is None:
         return
     try:
-        history.append(*_placed(history, options.cell, entries, out, near))
+        history.append(*_placed(history, options.cell, entries, out, near, after))
     except DataError as error:
         later = shlex.join(["visioncal", "history", str(history.path), "--add", str(out)])
         how = f"Then enter it: {later}" if out else "Then run the command once more."
@@ -52,14 +59,17 @@ def _placed(
     entries: Iterable[Entry],
     out: Path | str,
     source: Path | None = None,
+    after: Calibration | None = None,
 ) -> Iterator[Entry]:
     """Entries with their paths and their cell: the one that was named, or that is known already."""
     place, origin = str(out and Path(out).absolute()), str(source.absolute()) if source else ""
     for entry in entries:
-        session, known = entry.against or entry.sha256, tuple[Entry, ...]()
+        session, name, known = entry.against or entry.sha256, entry.cell, tuple[Entry, ...]()
+        if after is not None:
+            session, name = after.session_sha256, after.session_name
         if session and not cell and history.path.exists():
             known = history.entries(sha256=session)
-        named = cell or (known[0].cell if known else entry.cell)
+        named = cell or (known[0].cell if known else name)
         yield replace(entry, cell=named, source=entry.source or origin, out=entry.out or place)
 
 

@@ -112,7 +112,7 @@ def recover_command(options: RecoverOptions) -> None:
         new = recover(session, old, causes, check)
         progress("write", 0, 1)
         written = write_outputs(result, session, Run(new, ()))
-    enter(options, path, entries_of(new), result)
+    enter(options, path, entries_of(new), result, old)
     print_verdict(new.verdict, str(result))
     print_conditions(new)
     # A zero of the controller is set by a proven angle alone, and where nothing else changed.
