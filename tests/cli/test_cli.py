@@ -38,6 +38,7 @@ from visioncal.core.types import Mount
 from visioncal.dynamics.excitation import ExcitationRequest
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.results import Calibration
+from visioncal.results.history import History
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, cell_names, read_truth, simulate, write_session
 from visioncal.simulation.dynamics import exercise_session, real_dynamics, record, slow_sweep
@@ -348,13 +349,18 @@ HAS_FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is n
     ids=["full stdout", "full stderr", "no reader", "closed"],
 )
 def test_broken_streams_take_no_result_away(pairs, tmp_path, out, err, options, ends, said):
+    folder, history = tmp_path / "out", tmp_path / "history.db"
+    options = [*options, "--history", history]
     with out() as stdout, err() as stderr:
-        assert status(stdout, stderr, "calibrate", pairs, "-o", tmp_path, *options) == ends
+        assert status(stdout, stderr, "calibrate", pairs, "-o", folder, *options) == ends
         if said is not None:
             told = stderr.getvalue()
             assert said in told
             assert bool(said) == bool(told)
-    assert sorted(path.name for path in tmp_path.iterdir()) == FILES
+    assert sorted(path.name for path in folder.iterdir()) == FILES
+    with out() as stdout, err() as stderr:
+        status(stdout, stderr, "verify", pairs, "--against", folder, *options)
+    assert [entry.kind for entry in History(history).entries()] == ["calibrated", "verified"]
 
 
 @HAS_FULL

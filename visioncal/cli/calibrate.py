@@ -44,11 +44,11 @@ def calibrate_command(options: CalibrateOptions) -> None:
         written = write_outputs(
             options.out, loaded, result, without=options.left_out, images=options.images
         )
+    enter(options, session, entries_of(result.calibration), options.out)
     if options.as_json:
         typer.echo(result.calibration.text)
     else:
         print_summary(result.calibration, verbose=options.verbose)
     if left is not None:
         say(left.words)
-    enter(options, session, entries_of(result.calibration), options.out)
     report_written(written, quiet=options.as_json, status=exit_status(result.calibration.verdict))

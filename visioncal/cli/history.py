@@ -33,7 +33,9 @@ def enter(
     out: Path | str = "",
     after: Calibration | None = None,
 ) -> None:
-    """Enters acts whose files are written; where that fails, it costs no more than a warning.
+    """Enters acts whose files are written, before their results are printed, as a reader may leave.
+
+    Where it fails, that costs no more than a warning.
 
     Args:
         options: Which history and which cell are meant.

@@ -75,11 +75,11 @@ def touch_test_command(options: TouchTestOptions) -> None:
     test = evaluate_gaps(points, numbers_in(options.gaps_mm, "--gaps-mm"), touching)
     extended = replace(result, touch_test=test)
     written = rewrite_result(calibration if calibration.is_dir() else calibration.parent, extended)
+    enter(options, options.session, entries_of(extended), calibration)
     if options.as_json:
         print_json({"points": targets, "touch_test": to_document(extended)["touch_test"]})
     else:
         answer(touch_test_finding(test).reason)
-    enter(options, options.session, entries_of(extended), calibration)
     report_written(written, quiet=options.as_json, status=0 if test.passed else EXIT_BAD)
 
 

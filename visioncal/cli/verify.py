@@ -54,6 +54,7 @@ def verify_command(options: VerifyOptions) -> None:
         if options.output is None
         else write_check(options.output, check, triggers, verdict, document)
     )
+    enter(options, options.session, [entry_of_check(content)], options.output or "")
     if options.as_json:
         typer.echo(document, nl=False)
     else:
@@ -70,5 +71,4 @@ def verify_command(options: VerifyOptions) -> None:
             words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)
             if words:
                 answer(words, begin, style)
-    enter(options, options.session, [entry_of_check(content)], options.output or "")
     report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)
