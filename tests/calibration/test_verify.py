@@ -464,9 +464,15 @@ def cell(tmp_path_factory):
 def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     act, out, stops = tmp_path / "act", cell / "out", tmp_path / "act/stops"
     command = ("recover", act, "--against", out)
+    unknown = visioncal(*command, "--cause", "joint 9")
+    unknown.refused("here is camera, board, joint 1, joint 2,", "joint 6, base and mount")
+    assert not act.exists()
     begun = visioncal(*command)
     assert begun.status == 2
     assert f"visioncal record --arm manual --target BOARD --camera uvc:0 -o {stops}" in begun.err
+    assert f"Drive to those of {act / 'plan/stops.csv'}, and record them" in begun.err
+    # A step of the act is no error.
+    assert "error" not in begun.err
     # The recording was cut off after nine stops, and is whole later.
     stops.mkdir()
     (stops / "session.toml").write_text((cell / "moved/session.toml").read_text())

@@ -161,19 +161,9 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
         DataError: One of them is not possible here.
     """
     old, prior, fit = check.calibration, check.prior, check.prior.fit
-    in_hand = old.mount == "eye-in-hand"
-    sides = {BASE: BOARD if in_hand else CAMERA, MOUNT: CAMERA if in_hand else BOARD}
     possible = {at.name: at.cause for at in check.compared if at.cause.kind in _RECOVERABLE}
-    names = {sides.get(name, name) for name in causes}
+    names = parts_changed(old, causes, possible)
     joints = [name for name in names if name.startswith(JOINT)]
-    if len(names) < len(causes) or not names <= possible.keys() or len(joints) > 1:
-        raise DataError(
-            f"--cause {listed(causes)}: what can be recovered here is "
-            f"{listed([*possible, BASE, MOUNT])}, each motion once and one joint.",
-            culprits=["--cause"],
-            next_step="A joint needs joint angles and the robot's model; of several boards each "
-            "has its own name.",
-        )
     # Those of edges first.
     chosen = sorted((possible[name] for name in names), key=lambda cause: cause.kind == JOINT)
     moved = [0 if at.kind == CAMERA else 1 + at.at for at in chosen if at.kind != JOINT]
@@ -244,6 +234,30 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
         own = replace(found, values=values[part], covariance=found.covariance[part, part])
         words.append(change_words(check, PossibleChange(cause, 1.0, own)))
     return replace(new, frames=frames), "; ".join(words)
+
+
+def parts_changed(old: Calibration, causes: Sequence[str], shown: Iterable[str] = ()) -> set[str]:
+    """What changed by `causes`, of what is shown by stops, or else of all that a calibration has.
+
+    Raises:
+        DataError: One of them is not possible here.
+    """
+    fit, robot, in_hand = old.joint_fit, old.calibrated_robot, old.mount == "eye-in-hand"
+    boards = [f"{BOARD} {name}".strip() for name in (fit and fit.boards) or ("",)]
+    joints = [f"{JOINT} {at + 1}" for at in range(robot.joint_count if robot else 0)]
+    possible = [*shown] or [CAMERA, *boards, *joints]
+    sides = {BASE: BOARD if in_hand else CAMERA, MOUNT: CAMERA if in_hand else BOARD}
+    names = {sides.get(name, name) for name in causes}
+    is_several = sum(name.startswith(JOINT) for name in names) > 1
+    if len(names) < len(causes) or not names <= {*possible} or is_several:
+        raise DataError(
+            f"--cause {listed(causes)}: what can be recovered here is "
+            f"{listed([*possible, BASE, MOUNT])}, each motion once and one joint.",
+            culprits=["--cause"],
+            next_step="A joint needs joint angles and the robot's model; of several boards each "
+            "has its own name.",
+        )
+    return names
 
 
 def _columns(edges: Sequence[int]) -> IntArray:

@@ -6,6 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import typer
 
 from visioncal.calibration.run import run
 from visioncal.cli.console import (
@@ -22,7 +23,6 @@ from visioncal.cli.recover import recover_command
 from visioncal.cli.result_options import RecoverOptions
 from visioncal.cli.session_options import DemoOptions
 from visioncal.cli.summary import print_summary, truth_rows
-from visioncal.core.errors import DataError
 from visioncal.core.extras import client_library
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.threads import signals_as_interrupts
@@ -159,7 +159,7 @@ def _rehearse(options: DemoOptions, result: Path) -> None:
     answer(f"the encoder of joint {_SLIPPED + 1} slips by {_SLIP_DEG:g} deg")
     asked = RecoverOptions(folder=folder, against=result)
     # Ends where the stops are to be recorded.
-    with suppress(DataError):
+    with suppress(typer.Exit):
         recover_command(asked)
     slip_rad = np.zeros(len(arm_named("ur5e").offset))
     slip_rad[_SLIPPED] = np.deg2rad(_SLIP_DEG)

@@ -12,11 +12,13 @@ from typing import Any, NoReturn
 import numpy as np
 import typer
 
+from visioncal.calibration import recovery
 from visioncal.calibration.recovery import causes_found, moved_along, parted, recover
 from visioncal.calibration.run import Run
 from visioncal.calibration.verification import Check, verdict_of, verify
 from visioncal.cli.console import (
     EXIT_BAD,
+    EXIT_NO_RESULT,
     answer,
     exit_status,
     report_written,
@@ -34,9 +36,8 @@ from visioncal.cli.session_options import PlanOptions
 from visioncal.cli.summary import print_conditions, print_steps, print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_json
-from visioncal.core.number_format import counted
 from visioncal.core.verdict import Verdict
-from visioncal.interchange.outputs import write_outputs
+from visioncal.interchange.outputs import STOPS, write_outputs
 from visioncal.interchange.result_files import content_of, load_result
 from visioncal.results import Calibration, select_matching
 from visioncal.results.history import entries_of
@@ -62,7 +63,10 @@ def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
             culprits=[str(folder), "--against"],
             next_step="Name that one, or another folder.",
         )
-    return {"schema": 1, "against": against, "minutes": {}} | known
+    stated = options.cause or known.get("stated", [])
+    if old.cell is None:
+        recovery.parts_changed(old, stated)
+    return {"schema": 1, "against": against, "minutes": {}} | known | {"stated": stated}
 
 
 @contextmanager
@@ -85,9 +89,9 @@ def recover_command(options: RecoverOptions) -> None:
     loaded, result = load_result(options.against), options.folder / "result"
     path = options.stops or options.folder / "stops"
     facts = _opened(options, loaded)
-    session, old = select_matching(_recorded(options, facts, path), loaded, options.choice)
-    stated = facts["stated"] = options.cause or facts.get("stated", [])
+    stated = facts["stated"]
     causes = tuple(stated)
+    session, old = select_matching(_recorded(options, facts, path), loaded, options.choice)
     with (
         _step(options, facts, "result"),
         shown_progress(quiet=False) as progress,
@@ -176,17 +180,19 @@ def _recorded(options: RecoverOptions, facts: dict[str, Any], path: Path) -> Ses
                 facts["record"] = plan_command(asked, path)
             except DataError as error:
                 warn(f"no stops are planned: {error.message}")
-    reason = f"{counted(options.count, 'stop')} are next."
-    how = (
-        "Keep clear: an arm whose joint slipped stands elsewhere than it reads. Record them, and "
-        "type the same command again:"
-    )
+    taken, places = 0 if session is None else len(session.views), planned / STOPS
     record = facts.get("record", f"visioncal record --page -o {shlex.quote(str(path))}")
-    if session is not None:
-        reason = f"{len(session.views)} of {options.count} stops are in {path}."
-        how = "Record the others, and type the same command again; or go on with fewer by --count."
-        record += " --resume"
-    raise DataError(reason, culprits=[str(path)], next_step=f"{how}\n  {record}")
+    how = (
+        "Keep clear: an arm whose joint slipped stands elsewhere than it reads. "
+        f"{f'Drive to those of {places}, and record' if places.is_file() else 'Record'} "
+        + ("the others (or go on with fewer by --count)" if taken else "them")
+        + f"; then type the same command again:\n  {record}{' --resume' if taken else ''}"
+    )
+    reason = f"{taken} of {options.count} stops are in {path}."
+    if options.stops is not None:
+        raise DataError(reason, culprits=[str(path)], next_step=how)
+    say(f"{reason}\n{how}")
+    raise typer.Exit(EXIT_NO_RESULT)
 
 
 def _ask_cause(check: Check, verdict: Verdict) -> NoReturn:

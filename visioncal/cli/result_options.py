@@ -201,7 +201,7 @@ class RecoverOptions(LoadOptions, PartOptions, ActOptions):
     FOLDER holds the whole act: started again, it goes on where it was ended. It drives nothing:
     where stops are to be recorded, it says how. A third of them is held back, and proves the
     result. Exit status 0: recovered and proven, or nothing has changed; 3: the cause is not known,
-    or the proof fails; 2: it cannot go on yet, for the reason given.
+    or the proof fails; 2: stops are next, or it cannot go on.
     """
 
     folder: Path = argument(
