@@ -63,10 +63,11 @@ def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
             culprits=[str(folder), "--against"],
             next_step="Name that one, or another folder.",
         )
-    stated = options.cause or known.get("stated", [])
+    facts: dict[str, Any] = {"schema": 1, "against": against, "minutes": {}, "stated": []} | known
+    facts["stated"] = options.cause or facts["stated"]
     if old.cell is None:
-        recovery.parts_changed(old, stated)
-    return {"schema": 1, "against": against, "minutes": {}} | known | {"stated": stated}
+        recovery.parts_changed(old, facts["stated"])
+    return facts
 
 
 @contextmanager
