@@ -23,6 +23,7 @@ from support.site import CREEP_M, NOW, SIGMA_M, acts
 from visioncal.cli.console import EXIT_BAD
 from visioncal.core.choices import SITE_FILE
 from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp
 from visioncal.results import history as module
 from visioncal.results import years
 from visioncal.results.edge import Edge
@@ -318,6 +319,22 @@ def test_what_is_planted_is_found_and_nothing_else():
     # Two entries are enough for a step, and too few for a drift.
     assert step.at == 1
     assert step.vector[3] == pytest.approx(1e-3)
+
+
+def test_a_course_is_in_the_axes_of_the_table():
+    """Those of the parent: the child's are turned by 90 deg about z, and by 0.1 rad later."""
+    covariance, turn = np.diag([1.0, 4.0, 9.0, 1.0, 4.0, 9.0]) * 1e-8, np.array([0.0, 0.1, 0.0])
+    quarter = exp(np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0]))
+    later = exp(np.append(turn, np.zeros(3))) @ quarter
+    later[:3, 3] = [0.3, 0.02, 0.0]
+    named = [{"flange_from_cam": Edge(at, covariance)} for at in (quarter, later)]
+    (course,) = courses([entry(at, edges=edges) for at, edges in enumerate(named)])
+    columns = [one.columns for one in course.entries]
+    moved = [
+        columns[1][name] - columns[0][name] for name in map("flange_from_cam {}_m".format, "xyz")
+    ]
+    assert course.offsets[1] == pytest.approx([*turn, *moved])
+    assert course.sigmas[0] == pytest.approx([2e-4, 1e-4, 3e-4] * 2)
 
 
 def test_the_time_of_a_miss_is_within_its_interval():

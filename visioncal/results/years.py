@@ -47,9 +47,9 @@ class Course:
 
     name: str  # Name of the transform.
     entries: tuple[Entry, ...]  # Those that have it, in the order of time.
-    # (n, 6) where it was, as (rotation [rad], translation [m]) from the first entry; without
-    # rotation (n, 3).
-    twists: FloatArray
+    # (n, 6) where it was, as (rotation vector [rad], translation [m]) from the first entry, in the
+    # axes of the parent frame; without rotation (n, 3).
+    offsets: FloatArray
     sigmas: FloatArray  # (n, 6) or (n, 3) standard deviations of these.
     steps: tuple[Change, ...]  # Steps in the order of time.
     drift: Change | None  # The drift; None where there is probably none.
@@ -93,12 +93,16 @@ def _course(name: str, entries: Sequence[Entry]) -> Course:
     edges = [entry.edges[name] for entry in entries]
     part = slice(0 if all(edge.oriented for edge in edges) else 3, 6)
     matrices = np.array([edge.matrix for edge in edges])
-    twists = log(invert(matrices[:1]) @ matrices)[:, part]
-    covariances = np.array([edge.covariance[part, part] for edge in edges])
+    rotations = log(matrices @ invert(matrices[:1]))[:, :3]
+    offsets = np.hstack([rotations, matrices[:, :3, 3] - matrices[0, :3, 3]])[:, part]
+    # Those of edges are in the axes of the child.
+    turned = np.array([np.kron(np.eye(2), matrix[:3, :3]) for matrix in matrices])
+    own = np.array([edge.covariance for edge in edges])
+    covariances = (turned @ own @ turned.swapaxes(1, 2))[:, part, part]
     changes = sigma_changes = tuple[Change, ...]()
     if len(entries) > 1:
         days = np.array([(entry.time - entries[0].time) / timedelta(days=1) for entry in entries])
-        changes = find_changes(days, twists, covariances, _UNITS[part])
+        changes = find_changes(days, offsets, covariances, _UNITS[part])
         log_sigmas = np.log([max(edge.sigma_mm, 1e-6) for edge in edges])[:, None]
         # Relative sigma of a sigma, which has about 20 degrees of freedom.
         noise = np.full((len(edges), 1, 1), 0.16**2)
@@ -106,7 +110,7 @@ def _course(name: str, entries: Sequence[Entry]) -> Course:
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     steps = tuple(change for change in changes if change.at)
     drift = next((change for change in changes if not change.at), None)
-    return Course(name, tuple(entries), twists, sigmas, steps, drift, sigma_changes)
+    return Course(name, tuple(entries), offsets, sigmas, steps, drift, sigma_changes)
 
 
 def find_changes(

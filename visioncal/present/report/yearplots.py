@@ -34,7 +34,7 @@ _AXES = {"x": ACCENT, "y": GOOD, "z": CHECK}
 
 @drawn
 def years(name: str, courses: Sequence[Course], acts: Sequence[Entry]) -> tuple[Figure, str]:
-    """Each transform's course since its first entry: position, and rotation where it has one.
+    """Each transform's course since its first entry, in its parent: position, and any rotation.
 
     Args:
         name: Name of the cell.
@@ -55,11 +55,11 @@ def years(name: str, courses: Sequence[Course], acts: Sequence[Entry]) -> tuple[
         for axes, first, scale, unit in zip(
             row, (-3, -6), (1e3, np.rad2deg(1.0)), ("mm", "deg"), strict=True
         ):
-            if -first > course.twists.shape[1]:
+            if -first > course.offsets.shape[1]:
                 axes.set_axis_off()
                 continue
             part = slice(first, first + 3 or None)
-            values, sigmas = scale * course.twists[:, part], scale * course.sigmas[:, part]
+            values, sigmas = scale * course.offsets[:, part], scale * course.sigmas[:, part]
             for at, colour in enumerate(_AXES.values()):
                 value, band = values[:, at], sigmas[:, at]
                 axes.fill_between(times, value - band, value + band, color=colour, alpha=0.18,
