@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from visioncal.calibration.pipeline.checkup import to_document as checkup_docume
 from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.verdict import NOTE
 from visioncal.interchange.formats import load_for_rereading
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session
@@ -100,8 +102,16 @@ def test_a_pose_whose_forms_contradict_each_other_is_refused_and_a_rounded_one_i
 
 def test_joints_stand_in_for_poses(session_copy, result):
     rewritten(session_copy, lambda _, row: {k: v for k, v in row.items() if k not in POSE})
+    # A board's file that sessions share is beside them, and no reason for doubt.
+    name = BOARDS["charuco"].name
+    shutil.copy(Path(__file__).parents[2] / "targets" / f"{name}.toml", session_copy.parent)
+    edit(session_copy, lambda text: text.replace(f'"{name}"', f'"../{name}.toml"'))
+    found = visioncal.calibrate(session_copy)
     # The model's poses and the reported ones agree to rounding.
-    assert away_mm(visioncal.calibrate(session_copy), result) < 1e-6
+    assert away_mm(found, result) < 1e-6
+    (shared,) = (one for one in found.verdict.findings if "outside of the session" in one.words)
+    assert (shared.kind, shared.do) == (NOTE, None)
+    assert found.verdict.status == result.verdict.status
 
 
 def test_a_view_held_out_by_the_session_is_in_no_fit(session_copy):

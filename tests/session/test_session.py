@@ -132,7 +132,7 @@ def test_a_saved_session_needs_no_other_file(folder, tmp_path):
     edit(folder, "session.toml", '"board.toml"', '"../shared board.toml"')
     edit(folder, "session.toml", '"ur10e"', '"../arm.toml"')
     session = Session.load(folder)
-    assert [warning.partition(" = ")[0] for warning in session.warnings] == [
+    assert [note.partition(" = ")[0] for note in session.notes] == [
         "session.toml: target",
         "session.toml: model",
     ]

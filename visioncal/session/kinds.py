@@ -160,8 +160,8 @@ def is_file(name: object) -> bool:
     return isinstance(name, str) and name.lower().endswith(ROBOT_SUFFIXES)
 
 
-def outside_warnings(declaration: Declaration, folder: Path | None) -> Iterator[str]:
-    """Warnings that name the files outside of the folder that were read."""
+def outside_notes(declaration: Declaration, folder: Path | None) -> Iterator[str]:
+    """Notes that name the files outside of the folder that were read."""
     if folder is None:
         return
     named = [(path, "target") for path in _declared_targets(declaration).values()]

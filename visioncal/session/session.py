@@ -38,7 +38,7 @@ from visioncal.session.kinds import (
     check_images_can_be_used,
     check_kinds_named,
     is_camera_observation,
-    outside_warnings,
+    outside_notes,
     read_robots,
     read_targets,
     target_warnings,
@@ -88,6 +88,7 @@ class Session:
     streams: Mapping[str, Stream] = field(default_factory=dict)
     # Corners by another detector; None where there are none.
     corner_table: CornerTable | None = None
+    notes: tuple[str, ...] = ()  # Remarks that are no reason for doubt.
 
     @classmethod
     @typed
@@ -548,7 +549,7 @@ def _build(
     if declaration.is_network:
         warnings += stop_warnings(declaration, views)
     robot_document, problems = read_robots(declaration, folder, robot_document)
-    warnings += [*problems, *outside_warnings(declaration, folder)]
+    warnings += problems
     session = Session(
         document,
         columns,
@@ -560,6 +561,7 @@ def _build(
         robot_document,
         several,
         corner_table=corners,
+        notes=tuple(outside_notes(declaration, folder)),
     )
     if corners is not None:
         seen = (view for view in views if view.has_corners)

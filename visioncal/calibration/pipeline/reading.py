@@ -50,7 +50,7 @@ def read_cell_inputs(run: RunState) -> RunState:
         )
     lost = [found for found in (missing_images(session), empty_rows(session)) if found is not None]
     run = run.noting((), (*lost, *_suspicious(session), *_not_used(run)))
-    run = replace(run, notes=(*run.notes, *session.declaration.corrected))
+    run = replace(run, notes=(*run.notes, *session.declaration.corrected, *session.notes))
     if len(run.held_back) == len(session.views):
         raise all_held_back(run)
     # Views with only a time get their poses once the camera's are known.
