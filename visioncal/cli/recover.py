@@ -105,7 +105,7 @@ def recover_command(options: RecoverOptions) -> None:
                 warn(words)
             verdict = verdict_of(check).with_paths(path, options.against, _again())
             if check.passed and not stated:
-                answer(f"nothing has changed: {options.against} holds, by {verdict.top[0]}")
+                answer(f"nothing has changed: {options.against} holds. {verdict.top[0]}")
                 raise typer.Exit
             causes = causes or causes_found(check)
             if check.explained and not causes:
