@@ -225,6 +225,9 @@ def test_commands_enter_what_they_did(site, tmp_path):
     shown = visioncal("history", file, "--show", verified.id[:6]).good().out
     assert f"against: {calibrated.sha256}" in shown
     visioncal("history", file, "--show", "xyz").refused("0 entries")
+    visioncal("history", file, "--cell", "nobody").refused(
+        "no cell named 'nobody'; the names are line 4"
+    )
     whole = json.loads(visioncal("history", file, "--json").good().out)
     assert [one["id"] for one in whole] == [calibrated.id, verified.id]
     visioncal("history", file, "-o", tmp_path / "table.csv").good()

@@ -13,6 +13,7 @@ from visioncal.core.choices import SITE_FILE
 from visioncal.core.codec import write
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
+from visioncal.core.number_format import known_name
 from visioncal.interchange.outputs import CALIBRATION, VERIFY
 from visioncal.interchange.result_files import content_of, load_result_or_frames
 from visioncal.results import Calibration
@@ -90,6 +91,9 @@ def history_command(options: HistoryOptions) -> None:
         new = history.append(*found)
         say(f"{new} added, {len(found) - new} were there already")
         return
+    if options.cell is not None:
+        known = sorted({entry.cell for entry in history.entries()})
+        known_name("cell", options.cell, known, "--cell")
     entries = history.entries(options.cell, options.kind, begin=options.show or "")
     if options.out is not None:
         _write(options.out, entries, history.path, force=options.force)
