@@ -211,15 +211,33 @@ def test_of_the_command_line(tmp_path, monkeypatch):
 
     status, said = sent(*seen(20, 0))
     assert (status, said[-1]["look"], said[-1]["holds"]) == (0, 20, True)
-    status, said = sent("{", "", '{"time_s": 1}', '{"when": 2}', "[]", "[" * 9999, *seen(1, 20))
+    wrong = {
+        "{": "no JSON",
+        '{"time_s": 1}': "cam_from_target or",
+        '{"when": 2}': "'when'",
+        '{"acknowledge": false}': "or acknowledge alone, true",
+        "null": "line 6: the look is null; a JSON object",
+        "[" * 9999: "nested deeper",
+        '{"time_s": null}': "no time_s",
+        '{"time_s": [1]}': "time_s is [1]; it has to be a number of seconds",
+        '{"time_s": 1, "corners": 3}': "corners is 3; it has to be a list of [number, x, y]",
+        '{"time_s": 1, "joints_rad": ["a"]}': 'joints_rad is ["a"]; it has to be a list',
+        '{"time_s": 1, "base_from_flange": {}}': "base_from_flange is {}; it has to be a 4 x 4",
+    }
+    status, said = sent("", *wrong, *seen(1, 20))
     assert (status, said[-1]["look"]) == (2, 21)
-    wrong = ("no JSON", "cam_from_target or", "'when'", "is list", "nested deeper")
-    for answer, words in zip(said, wrong, strict=False):
-        assert words in answer["error"]["message"]
+    for answer, words in zip(said[:-1], wrong.values(), strict=True):
+        error = answer["error"]
+        assert words in error["message"]
+        assert not error["next"] or error["next"] not in error["message"]
     status, said = sent(*seen(30, 21, Change(camera=knock(rng, 2.0, 0.2))))
     assert (status, said[-1]["holds"], said[-1]["causes"][0]["cause"]) == (3, False, "camera")
     status, said = sent('{"acknowledge": true}')
     assert (status, said) == (0, [{"acknowledged": True}])
+    for damaged in ("", "{", "[]", "{}"):
+        (tmp_path / "state.json").write_text(damaged)
+        refused = visioncal("guard", *against).refused("Delete it, if it is the guard's")
+        assert "Correct" not in refused.err
 
 
 TURNS_DEG = np.array([[0.02, 0.01, 0.0], [-0.1, 0.3, 0.4], [0.05, -0.06, -0.2]])

@@ -2,8 +2,8 @@
 
 import json
 import sys
-from collections.abc import Iterator
-from dataclasses import fields
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,11 @@ from visioncal.core.documents.jsons import parse_json, parse_stored
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text, write_atomically
 from visioncal.core.transforms import compose
-from visioncal.core.types import Corners
+from visioncal.core.types import Corners, FloatArray
 from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
 from visioncal.session import Session
 from visioncal.vision.boards.imaging import read_image
-
-_KEYS = tuple(each.name for each in fields(Look))
 
 
 def guard_command(options: GuardOptions) -> None:
@@ -36,7 +34,11 @@ def guard_command(options: GuardOptions) -> None:
     calibration = load_result(options.against).chosen(options.choice)
     guard = Guard(calibration, false_alarm_looks=options.false_alarm_looks, slow_mm=options.slow_mm)
     if options.state is not None and options.state.exists():
-        guard.restore(parse_stored(read_text(options.state), str(options.state)))
+        try:
+            guard.restore(parse_stored(read_text(options.state), str(options.state)))
+        except DataError as error:
+            step = "Delete it, if it is the guard's, which then learns anew; else name another."
+            raise DataError(error.message, culprits=[str(options.state)], next_step=step) from error
     holds, is_refused = guard.holds, False
     try:
         for count, answer in enumerate(_answers(guard), 1):
@@ -88,50 +90,62 @@ def _answers(guard: Guard) -> Iterator[dict[str, Any]]:
         try:
             document = parse_json(line, "the look")
             if not isinstance(document, dict):
-                kind = type(document).__name__
-                raise DataError(f"the look is {kind}; a JSON object is needed.")
+                raise DataError(f"the look is {line.strip()[:60]}; a JSON object is needed.")
             if document == {"acknowledge": True}:
                 guard.acknowledge()
                 yield {"acknowledged": True}
             else:
                 yield guard.update(_look(document)).document
         except VisioncalError as error:
-            yield {"error": {"message": f"line {number}: {error}", "next": error.next_step}}
+            yield {"error": {"message": f"line {number}: {error.message}", "next": error.next_step}}
 
 
 def _look(document: dict[str, Any]) -> Look:
-    """A look of a line's JSON object.
+    """A look of a line's JSON object, in which null is as good as absent.
 
     Raises:
         DataError: It has other keys or values.
     """
     if unknown := [key for key in document if key not in _KEYS]:
         raise DataError(
-            f"the look has {unknown[0]!r}; the keys are {', '.join(_KEYS)}.", culprits=unknown
+            f"the look has {unknown[0]!r}; the keys are {', '.join(_KEYS)}; or acknowledge alone, "
+            "true.",
+            culprits=unknown,
         )
-    key, corners = "time_s", document.get("corners")
-    try:
-        content: dict[str, Any] = {"time_s": float(document["time_s"])}
-        for key in ("base_from_flange", "cam_from_target"):
-            if key in document:
-                numbers = np.array(document[key], dtype=float)
-                if numbers.shape == (7,):
-                    numbers = compose(Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3])
-                content[key] = numbers
-        if "joints_rad" in document:
-            key = "joints_rad"
-            content[key] = np.array(document[key], dtype=float)
-        if corners is not None:
-            key, table = "corners", np.array(sorted(corners), dtype=float).reshape(-1, 3)
-            ids = table[:, 0].astype(np.int64)
-            content[key] = Corners(0, ids, table[:, 1:], 0.0)
-        return Look(target=str(document.get("target", "")), **content)
-    except KeyError:
-        raise DataError("the look has no time_s.", culprits=["time_s"]) from None
-    except (TypeError, ValueError) as error:
-        raise DataError(
-            f"the look's {key} cannot be read: {error}.",
-            culprits=[key],
-            next_step="Poses are 4 x 4 matrices or x, y, z, qx, qy, qz, qw, in metres; corners are "
-            "[number, x, y] in pixels, joints in radians, times in seconds.",
-        ) from None
+    given = {key: value for key, value in document.items() if value is not None}
+    if "time_s" not in given:
+        raise DataError("the look has no time_s, in seconds.", culprits=["time_s"])
+    content: dict[str, Any] = {}
+    for key, value in given.items():
+        read, needed = _KEYS[key]
+        try:
+            content[key] = read(value)
+        except (TypeError, ValueError):
+            words = f"the look's {key} is {json.dumps(value)[:60]}; it has to be {needed}."
+            raise DataError(words, culprits=[key]) from None
+    return Look(**content)
+
+
+def _pose(value: Any) -> FloatArray:  # noqa: ANN401 - of JSON
+    numbers = _numbers(value)
+    if numbers.shape == (7,):
+        return compose(Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3])
+    return numbers
+
+
+def _corners(value: Any) -> Corners:  # noqa: ANN401 - of JSON
+    table = _numbers(sorted(value)).reshape(-1, 3)
+    return Corners(0, table[:, 0].astype(np.int64), table[:, 1:], 0.0)
+
+
+_numbers = partial(np.asarray, dtype=float)
+_A_POSE = (_pose, "a 4 x 4 matrix or x, y, z, qx, qy, qz, qw, in metres")
+# By key what reads its value, and what that has to be.
+_KEYS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "time_s": (float, "a number of seconds"),
+    "base_from_flange": _A_POSE,
+    "cam_from_target": _A_POSE,
+    "corners": (_corners, "a list of [number, x, y] in pixels"),
+    "joints_rad": (_numbers, "a list of radians"),
+    "target": (str, "a name"),
+}
