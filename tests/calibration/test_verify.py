@@ -474,6 +474,7 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     assert f"Drive to those of {act / 'plan/stops.csv'}, and record them" in begun.err
     # A step of the act is no error.
     assert "error" not in begun.err
+    assert "BOARD stands for the target's name" in begun.err
     # The recording was cut off after nine stops, and is whole later.
     stops.mkdir()
     (stops / "session.toml").write_text((cell / "moved/session.toml").read_text())

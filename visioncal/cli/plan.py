@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.cli.console import answer, print_json, report_written, warn
+from visioncal.cli.console import answer, print_json, report_written, say, warn
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import (
@@ -142,6 +142,8 @@ def _plan_to_verify(
                 warn(f"the way between calibrated stops is not planned: {error.message}")
     if plan is None:
         record = f"--arm manual --target {words.target or 'BOARD'}"
+        if not words.target:
+            say("In the command, BOARD stands for the target's name, or the path of its .toml.")
         document: dict[str, Any] = {"views": spread.views, "poses": spread.poses.tolist()}
         written = write_stops(options.out, spread.table())
     else:
