@@ -471,7 +471,7 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     begun = visioncal(*command)
     assert begun.status == 2
     assert f"visioncal record --arm manual --target BOARD --camera uvc:0 -o {stops}" in begun.err
-    assert f"Drive to those of {act / 'plan/stops.csv'}, and record them" in begun.err
+    assert f"Drive to those of {act / 'plan/stops.csv'} that are missing, record them" in begun.err
     # A step of the act is no error.
     assert "error" not in begun.err
     assert "BOARD stands for the target's name" in begun.err
@@ -492,6 +492,8 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     assert (entry.session, entry.cell) == ("moved", Calibration.load(out).session_name)
     assert "--payload-kg 3 changes nothing" in " ".join(done.err.split())
     assert "the camera moved by 3 mm" in done.out
+    assert "whether the mount moved instead" in done.out
+    assert "say --cause mount." in done.out
     assert "minutes: plan" in done.out
     assert "5 stops held back from a first estimate agree" in done.out
     result = Calibration.load(act / "result")
@@ -502,6 +504,11 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     assert len((act / "targets.csv").read_text().splitlines()) == len(rows)
     assert visioncal("verify", cell / "moved", "--against", act / "result").status == 0
     visioncal("recover", act, "--against", act / "result").refused("of another calibration")
+    # The mount is said to have moved: as far as the camera, which did not turn.
+    along = visioncal(*command, "--cause", "mount").good()
+    assert re.search(r"the mount moved by (2\.9|3(\.[01])?)\d* mm", along.out)
+    assert "the camera moved" not in along.out
+    assert "moved instead" not in along.out
     # Taught targets are not overwritten by what becomes of them.
     taught = (act / "targets.csv").read_text()
     over = visioncal(*command, "--targets", act / "targets.csv", "--cause", "camera")

@@ -27,8 +27,8 @@ from visioncal.calibration.verification.check import Check, PossibleChange, veri
 from visioncal.calibration.verification.messages import change_words
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits, RecoveryLimits
-from visioncal.core.number_format import counted, listed
-from visioncal.core.transforms import adjoint, exp, invert, log
+from visioncal.core.number_format import counted, listed, mm_and_deg
+from visioncal.core.transforms import adjoint, exp, invert, log, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, remarks
 from visioncal.estimation.armmodel import ArmModel
@@ -50,6 +50,7 @@ from visioncal.session import Session
 # What may have happened, as a user says it: the base moved on its foundation, or the flange's mount
 # was exchanged, with all that stands on that side of the arm.
 BASE, MOUNT = "base", "mount"
+_SIDES = {"eye-in-hand": {CAMERA: MOUNT, BOARD: BASE}, "eye-to-hand": {CAMERA: BASE, BOARD: MOUNT}}
 _LIMITS = RecoveryLimits()
 _RECOVERABLE = (CAMERA, BOARD, JOINT)
 _OFFSETS, _CONVERGED, _MOST_STEPS = "offsets", 1e-9, 10
@@ -139,7 +140,12 @@ def recover(
     # Praise and advice were of the old stops; doubts remain.
     doubts = () if new.verdict.status == "good" else new.verdict.findings
     doubts = tuple(replace(doubt, do=None) for doubt in doubts)
-    findings = (found, *doubts, *remarks(warnings, NOTE))
+    rivals = [
+        f"Stops cannot tell whether the {side} moved instead, which targets, tools and fixtures of "
+        f"that side have to follow: if it did, say --cause {side}."
+        for side in sorted({*along(old, causes)} - {*causes})
+    ]
+    findings = (found, *remarks(rivals, NOTE), *doubts, *remarks(warnings, NOTE))
     verdict = Verdict(new.verdict.status if passed else "bad", findings)
     return replace(new, session_sha256=digest, verdict=verdict)
 
@@ -232,8 +238,16 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
     for at, cause in enumerate(chosen):
         part = slice(6 * at, 6 * at + len(cause.units))
         own = replace(found, values=values[part], covariance=found.covariance[part, part])
-        words.append(change_words(check, PossibleChange(cause, 1.0, own)))
+        (side,) = along(old, [cause.name])
+        by = pose_difference(np.eye(4), flange_moved if side == MOUNT else base_moved)
+        alone = change_words(check, PossibleChange(cause, 1.0, own))
+        words.append(alone if cause.name in causes else f"the {side} moved by {mm_and_deg(*by)}")
     return replace(new, frames=frames), "; ".join(words)
+
+
+def along(old: Calibration, causes: Iterable[str]) -> tuple[str, ...]:
+    """The causes if not a camera or board alone moved, but the base or mount with all on it."""
+    return tuple(_SIDES[old.mount].get(at.partition(" ")[0], at) for at in causes)
 
 
 def parts_changed(old: Calibration, causes: Sequence[str], shown: Iterable[str] = ()) -> set[str]:
@@ -242,14 +256,13 @@ def parts_changed(old: Calibration, causes: Sequence[str], shown: Iterable[str] 
     Raises:
         DataError: One of them is not possible here.
     """
-    fit, robot, in_hand = old.joint_fit, old.calibrated_robot, old.mount == "eye-in-hand"
+    fit, robot = old.joint_fit, old.calibrated_robot
     boards = [f"{BOARD} {name}".strip() for name in (fit and fit.boards) or ("",)]
     joints = [f"{JOINT} {at + 1}" for at in range(robot.joint_count if robot else 0)]
     possible = [*shown] or [CAMERA, *boards, *joints]
-    sides = {BASE: BOARD if in_hand else CAMERA, MOUNT: CAMERA if in_hand else BOARD}
-    names = {sides.get(name, name) for name in causes}
-    is_several = sum(name.startswith(JOINT) for name in names) > 1
-    if len(names) < len(causes) or not names <= {*possible} or is_several:
+    parts = {side: part for part, side in _SIDES[old.mount].items()}
+    names = {parts.get(name, name) for name in causes}
+    if len(names) < len(causes) or not names <= {*possible} or len(names & {*joints}) > 1:
         raise DataError(
             f"--cause {listed(causes)}: what can be recovered here is "
             f"{listed([*possible, BASE, MOUNT])}, each motion once and one joint.",
@@ -381,9 +394,8 @@ def moved_along(
     Returns:
         That of poses in the base, on the left; and that of poses of the flange, on the right.
     """
-    sides = (MOUNT, BASE) if old.mount == "eye-in-hand" else (BASE, MOUNT)
     moved = {BASE: np.eye(4), MOUNT: np.eye(4)}
-    for side, name in zip(sides, edge_names(old.mount), strict=True):
+    for side, name in zip(_SIDES[old.mount].values(), edge_names(old.mount), strict=True):
         if side in causes:
             before, after = old.edges[name].matrix, new.edges[name].matrix
             # The flange goes where its tool is where it was.

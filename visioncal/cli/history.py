@@ -28,28 +28,22 @@ from visioncal.results.history import (
 
 
 def enter(
-    options: ActOptions,
-    near: Path,
-    entries: Iterable[Entry],
-    out: Path | str = "",
-    after: Calibration | None = None,
+    options: ActOptions, near: Path, entries: Iterable[Entry], out: Path | str = "", of: str = ""
 ) -> None:
-    """Enters acts whose files are written, before their results are printed, as a reader may leave.
-
-    Where it fails, that costs no more than a warning.
+    """Enters acts before their results are printed; where it fails, that costs a warning at most.
 
     Args:
         options: Which history and which cell are meant.
         near: The session or file that was read, by which the site is found.
         entries: The entries, whose cell and paths are filled in.
         out: The output, from which they can be added later; empty for none.
-        after: The calibration that a recovery goes on from, whose cell they are of.
+        of: Digest of the calibrated session whose cell they are of; else each entry says so.
     """
     history = History(options.history) if options.history else History.of_site(near)
     if history is None:
         return
     try:
-        history.append(*_placed(history, options.cell, entries, out, near, after))
+        history.append(*_placed(history, options.cell, entries, out, near, of))
     except DataError as error:
         later = shlex.join(["visioncal", "history", str(history.path), "--add", str(out)])
         how = f"Then enter it: {later}" if out else "Then run the command once more."
@@ -62,17 +56,15 @@ def _placed(
     entries: Iterable[Entry],
     out: Path | str,
     source: Path | None = None,
-    after: Calibration | None = None,
+    of: str = "",
 ) -> Iterator[Entry]:
     """Entries with their paths and their cell: the one that was named, or that is known already."""
     place, origin = str(out and Path(out).absolute()), str(source.absolute()) if source else ""
     for entry in entries:
-        session, name, known = entry.against or entry.sha256, entry.cell, tuple[Entry, ...]()
-        if after is not None:
-            session, name = after.session_sha256, after.session_name
+        session, known = of or entry.against or entry.sha256, tuple[Entry, ...]()
         if session and not cell and history.path.exists():
             known = history.entries(sha256=session)
-        named = cell or (known[0].cell if known else name)
+        named = cell or (known[0].cell if known else entry.cell)
         yield replace(entry, cell=named, source=entry.source or origin, out=entry.out or place)
 
 

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn
@@ -90,8 +91,7 @@ def recover_command(options: RecoverOptions) -> None:
     loaded, result = load_result(options.against), options.folder / "result"
     path = options.stops or options.folder / "stops"
     facts = _opened(options, loaded)
-    stated = facts["stated"]
-    causes = tuple(stated)
+    stated = causes = tuple(facts["stated"])
     session, old = select_matching(_recorded(options, facts, path), loaded, options.choice)
     with (
         _step(options, facts, "result"),
@@ -117,7 +117,8 @@ def recover_command(options: RecoverOptions) -> None:
         new = recover(session, old, causes, check)
         progress("write", 0, 1)
         written = write_outputs(result, session, Run(new, ()))
-    enter(options, path, entries_of(new), result, old)
+    entries = (replace(entry, cell=old.session_name) for entry in entries_of(new))
+    enter(options, path, entries, result, old.session_sha256)
     print_verdict(new.verdict, str(result))
     print_conditions(new)
     # A zero of the controller is set by a proven angle alone, and where nothing else changed.
@@ -183,16 +184,15 @@ def _recorded(options: RecoverOptions, facts: dict[str, Any], path: Path) -> Ses
                 warn(f"no stops are planned: {error.message}")
     taken, places = 0 if session is None else len(session.views), planned / STOPS
     record = facts.get("record", f"visioncal record --page -o {shlex.quote(str(path))}")
-    how = (
-        "Keep clear: an arm whose joint slipped stands elsewhere than it reads. "
-        f"{f'Drive to those of {places}, and record' if places.is_file() else 'Record'} "
-        + ("the others (or go on with fewer by --count)" if taken else "them")
-        + f"; then type the same command again:\n  {record}{' --resume' if taken else ''}"
-    )
     reason = f"{taken} of {options.count} stops are in {path}."
+    how = (
+        "Keep clear: an arm whose joint slipped stands elsewhere than it reads. Drive to those"
+        f"{f' of {places}' if places.is_file() else ''} that are missing, record them, and type "
+        f"the same command again (with fewer: --count):\n  {record}{' --resume' if taken else ''}"
+    )
     if options.stops is not None:
         raise DataError(reason, culprits=[str(path)], next_step=how)
-    say(f"{reason}\n{how}")
+    say(f"{reason} {how}")
     raise typer.Exit(EXIT_NO_RESULT)
 
 
@@ -211,12 +211,8 @@ def _ask_cause(check: Check, verdict: Verdict) -> NoReturn:
 
 def _ask_side(options: RecoverOptions, old: Calibration, causes: Sequence[str]) -> None:
     """Asks whether all else moved along with a camera or board, where targets or tools may."""
-    on_flange = "camera" if old.mount == "eye-in-hand" else "board"
-    along = [
-        at if at.startswith("joint") else "mount" if at.startswith(on_flange) else "base"
-        for at in causes
-    ]
-    if [*causes] != along and (options.targets or old.frames):
+    along = recovery.along(old, causes)
+    if (*causes,) != along and (options.targets or old.frames):
         raise DataError(
             f"{' and '.join(causes)} moved: alone, or with the robot's base or the tool's mount, "
             "so that targets, tools and fixtures of that side have to follow?",
