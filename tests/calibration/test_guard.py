@@ -94,7 +94,7 @@ def test_false_alarms_are_as_rare_as_stated():
 @pytest.mark.parametrize("tail", [0.6, 1.2])
 def test_the_limit_follows_the_tail_of_the_statistic(tail):
     rng, count = np.random.default_rng(3), 40_000
-    state = Detector.of(np.eye(12), 1e-5, np.zeros(0), 0.0)
+    state = Detector.of(np.eye(12), 1e-5, np.zeros(0))
     # At first as in theory.
     assert limit(state, 700.0) == pytest.approx(700.0)
     values = 5.0 * rng.random(count) ** (-1.0 / tail)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,10 +12,10 @@ from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.change_hypotheses import BOARD, CAMERA, JOINT, MOTION_UNITS
 from visioncal.calibration.verification.guard_detector import (
-    WIDEST_M,
     ChangeKind,
     Detector,
     LookRows,
+    accepted,
     counted,
     estimate,
     limit,
@@ -178,8 +177,7 @@ class Guard:
         self._noise = prior.noise(from_corners=self._free is not None)
         # An arm that is off by a millimetre has zeros that are off by a milliradian.
         zeros = np.full(len(joints), self._noise.robots[0, 1])
-        self._begun = partial(Detector.of, own, 1e-3 * slow_mm, zeros)
-        self._state = self._begun(0.0)
+        self._state = Detector.of(own, 1e-3 * slow_mm, zeros)
 
     @property
     def holds(self) -> bool:
@@ -206,9 +204,7 @@ class Guard:
                 next_step="Send looks in the order of their times, by one clock.",
             )
         state = step(self._state, rows, is_learning=not self._is_changed)
-        # (c,) by candidates; beyond any limit, and no overflow.
-        scores = np.minimum(weighed(state, self._kinds, self._units), 300.0)
-        statistic = np.exp(scores).sum(axis=0)
+        statistic = self._statistic(state)
         evidence = float(statistic.sum()) / limit(state, self._looks)
         if not self._is_changed:
             state = counted(state, statistic)
@@ -222,15 +218,26 @@ class Guard:
             **found,
         )
 
-    def _found(self) -> dict[str, Any]:
-        """Causes and the time of the change."""
-        kinds, born = (*self._kinds, self._other), self._state.born
+    def _statistic(self, state: Detector) -> FloatArray:
+        """(c,) by candidates, whose sum is that of the test."""
+        # Beyond any limit, and no overflow.
+        scores = np.minimum(weighed(state, self._kinds, self._units), 300.0)
+        return np.asarray(np.exp(scores).sum(axis=0))
+
+    def _judged(self) -> tuple[tuple[ChangeKind, ...], FloatArray, int, FloatArray]:
+        """Kinds of a change, their probabilities at the likeliest candidate, it, and (c,) all."""
+        kinds = (*self._kinds, self._other)
         scores = weighed(self._state, kinds, self._units, is_raw=True)
         by_time = np.exp(scores - scores.max()).sum(axis=0)
         candidate = int(by_time.argmax())
         # What changed is judged at the likeliest time.
-        shares, causes = np.exp(scores[:, candidate] - scores[:, candidate].max()), []
-        shares /= shares.sum()
+        shares = np.exp(scores[:, candidate] - scores[:, candidate].max())
+        return kinds, shares / shares.sum(), candidate, by_time
+
+    def _found(self) -> dict[str, Any]:
+        """Causes and the time of the change."""
+        (kinds, shares, candidate, by_time), causes = self._judged(), []
+        born = self._state.born
         for at in np.argsort(-shares).tolist():
             kind = kinds[at]
             size: dict[str, float] = {}
@@ -258,16 +265,21 @@ class Guard:
         }
 
     def acknowledge(self) -> None:
-        """Ends an alarm: what is now is taken as it should be, and learned by the next looks."""
-        begun = self._begun(WIDEST_M * self._units)
-        self._state, self._is_changed = begun.begun(self._state), False
+        """Ends an alarm: the change that was found is as it should be, and the guard goes on."""
+        state = self._state
+        if self._is_changed:
+            kinds, shares, candidate, _ = self._judged()
+            # False alarms just pass the limit, and what is true leaves it far behind.
+            shares /= 1.0 + 100.0 * limit(state, self._looks) / self._statistic(state).sum()
+            state = accepted(state, kinds, shares, candidate, self._units)
+        self._state, self._is_changed = state, False
 
     def rows(self, look: Look) -> LookRows:
         """The rows of a look: its residual, covariance and Jacobians; see `update`."""
         prior = self.prior
         label, targets = f"look at {look.time_s:g} s", tuple(prior.targets)
         if look.target not in (*targets, "") or (not look.target and len(prior.boards) > 1):
-            known = ", ".join(targets)
+            known = ", ".join(targets) or "without a name"
             raise DataError(
                 f"{label}: its target is {look.target!r}, and those calibrated with are {known}.",
                 culprits=["target"],

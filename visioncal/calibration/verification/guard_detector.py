@@ -41,7 +41,7 @@ _SHIFTS = np.array([0.1, 0.6, 4.0])
 # Squared shift of all looks together below which a change is not shown.
 _SHOWN = 1e-3
 # Prior size of a change in its estimate, and of one that is acknowledged [m]: hardly any.
-WIDEST_M = 0.1
+_WIDEST_M = 0.1
 # Share of the arm's error that is new, at first.
 _FRESH = 0.4
 # Squared length of an innovation that noise exceeds in one look of a hundred: the largest that
@@ -119,25 +119,19 @@ class Detector:
     passed: FloatArray = field(default_factory=lambda: np.array([np.zeros(2), 1.0 / _LEVELS]))
 
     @classmethod
-    def of(
-        cls, edges: FloatArray, slow_m: float, joints_rad: FloatArray, changed: FloatArray | float
-    ) -> "Detector":
+    def of(cls, edges: FloatArray, slow_m: float, joints_rad: FloatArray) -> "Detector":
         """Starts the test.
 
         Args:
             edges: (e, e) covariance of the calibrated frames.
             slow_m: Standard deviation of a frame's slow motions [m].
             joints_rad: (n,) standard deviations of the joints' zeros; empty without joint angles.
-            changed: (d,) standard deviations of a change of frames and joints that is taken as it
-                should be; 0 for none.
         """
         count, changes = len(edges), len(edges) + len(joints_rad)
         size = 2 * count + changes
         slow = np.tile(np.repeat([slow_m / LEVER_M, slow_m], 3), count // 6)
-        moved = np.broadcast_to(changed, changes)
-        joints = np.hypot(joints_rad, moved[count:])
-        sigmas = np.concatenate([np.zeros(count), slow, moved[:count], joints])
-        covariance = np.diag(sigmas**2)
+        none = np.zeros(count)
+        covariance = np.diag(np.concatenate([none, slow, none, joints_rad]) ** 2)
         covariance[:count, :count] = edges
         shapes = ((_PLACES, 12), _PLACES, (_PLACES, 6), (_PLACES, 6, 6), (changes, changes))
         candidates = ((4,), (size, changes), *((changes, changes), (changes,)) * 2, ())
@@ -149,10 +143,10 @@ class Detector:
             *(np.zeros((0, *shape)) for shape in candidates),
         )
 
-    def begun(self, learned: "Detector") -> "Detector":
-        """This one with what another has learned of noise, slow motions and false alarms."""
-        names = ("time_s", "looks", "shape", "fresh", "slow", "forecast", "usual", "passed")
-        return replace(self, **{name: getattr(learned, name) for name in names})
+    def without_candidates(self) -> "Detector":
+        """What the test has learned, with no change supposed so far."""
+        none = {name: getattr(self, name)[:0] for name in _CANDIDATE}
+        return replace(self, **none)
 
 
 # Fields of a detector with a row for each candidate.
@@ -259,7 +253,7 @@ def _explained(
     white: FloatArray, signature: FloatArray, information: FloatArray, gradient: FloatArray
 ) -> FloatArray:
     """(c,) 1 where a candidate's estimate of the change explains a far innovation, else 0."""
-    covariance = np.linalg.inv(information + np.eye(information.shape[1]) / WIDEST_M**2)
+    covariance = np.linalg.inv(information + np.eye(information.shape[1]) / _WIDEST_M**2)
     away = white - (signature @ (covariance @ gradient[:, :, None]))[:, :, 0]
     total = np.eye(6) + signature @ covariance @ np.swapaxes(signature, 1, 2)
     squares = np.sum(away * np.linalg.solve(total, away[:, :, None])[:, :, 0], axis=1)
@@ -344,6 +338,33 @@ def estimate(
     """A change at a candidate, (q,), and its covariance (q, q)."""
     columns = np.array(kind.columns)
     information = state.raw_information[candidate][np.ix_(columns, columns)]
-    prior = np.diag((WIDEST_M * units[columns]) ** -2.0)
+    prior = np.diag((_WIDEST_M * units[columns]) ** -2.0)
     covariance = np.linalg.inv(information + prior)
     return covariance @ state.raw_gradient[candidate, columns], covariance
+
+
+def accepted(
+    state: Detector,
+    kinds: Sequence[ChangeKind],
+    shares: FloatArray,
+    candidate: int,
+    units: FloatArray,
+) -> Detector:
+    """The state by which a change at a candidate, of kinds with these probabilities, is no change.
+
+    The mixture of the kinds' estimates, and of no change where the probabilities leave some, has
+    one mean and covariance; what the filter took of a change into the state is taken back.
+    """
+    size = len(units)
+    mean, moment = np.zeros(size), np.zeros((size, size))
+    for kind, share in zip(kinds, shares, strict=True):
+        change, covariance = estimate(state, kind, candidate, units)
+        columns = np.array(kind.columns)
+        mean[columns] += share * change
+        moment[np.ix_(columns, columns)] += share * (covariance + np.outer(change, change))
+    by_change = -state.follows[candidate]
+    by_change[-size:] += np.eye(size)
+    more = by_change @ (moment - np.outer(mean, mean)) @ by_change.T
+    return replace(
+        state, mean=state.mean + by_change @ mean, covariance=state.covariance + more
+    ).without_candidates()
