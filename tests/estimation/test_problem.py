@@ -172,10 +172,12 @@ def test_a_held_value_stays_and_counts_with_what_is_known_of_it():
     moved, _ = solve_problem(held, State(state.edges, np.zeros(1)), NETWORK_NOISE)
     without, _ = solve_problem(problem, state, NETWORK_NOISE)
     assert moved.values[0] == 0.0
-    np.testing.assert_array_equal(moved.edges, without.edges)
+    # A column more changes the order in which a processor's kernels sum, and so the last bits.
+    np.testing.assert_allclose(moved.edges, without.edges, rtol=0.0, atol=1e-14)
     free = problem.with_effects([replace(effect, held=np.zeros(1, dtype=bool))])
     there = Solution(moved, NETWORK_NOISE)
-    np.testing.assert_array_equal(covariance_of(held, there), covariance_of(free, there))
+    apart = covariance_of(held, there) / covariance_of(free, there) - 1.0
+    assert np.abs(apart).max() < 1e-9
     alone = covariance_of(problem, Solution(without, NETWORK_NOISE))
     assert np.trace(covariance_of(held, there)[:-1, :-1]) > 1.5 * np.trace(alone)
 

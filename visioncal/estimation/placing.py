@@ -145,7 +145,8 @@ def refuse_poor(
         return
     if wild is not None and fit.sigma > SIGMA_LIMIT_M:
         raise wild
-    first = beyond[0]
+    # The rounding of an undetermined direction leaks into the others.
+    first = max(beyond, key=lambda direction: direction.sigma / direction.limit)
     words, next_step = cause(first)
     raise DegenerateError(
         f"{label}: {first.words} {first.fault('')}: {words}.",

@@ -177,13 +177,14 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
     agreement = find_inlier_groups(problem, expected_noise_m)
     fit = agreement.fit
     local = problem.local(fit.state)
+    reaches = local[touches.rows("x"), 0].max(), local[touches.rows("xy"), 1].max()
+    reach_mm = 1e3 * np.maximum(reaches, 0.0).round(9)
     _refuse_poor(
         touches,
         fit,
         np.zeros(3),
-        f"the x axis was touched up to {1e3 * local[touches.rows('x'), 0].max():.3g} mm from the "
-        f"origin and the plane up to {1e3 * local[touches.rows('xy'), 1].max():.3g} mm from the x "
-        f"axis, at a noise of {figure(1e3 * fit.sigma)} mm",
+        f"the x axis was touched up to {figure(reach_mm[0])} mm from the origin and the plane up to "
+        f"{figure(reach_mm[1])} mm from the x axis, at a noise of {figure(1e3 * fit.sigma)} mm",
         "Touch the x axis farther from the origin and the plane farther from the x axis, or say "
         "how well the points are touched.",
     )
