@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.refusals import raised
 
+from visioncal.core import extras
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import Stopwatch
 from visioncal.live.drivers.ur import UrArm
@@ -128,6 +129,9 @@ def test_polyscope_x_is_watched_without_a_dashboard_and_not_driven():
 def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "rtde_receive", None)
     with pytest.raises(DriverError, match=r"rtde_receive cannot be imported.*pip install 'ur-rtde"):
+        UrArm("127.0.0.1")
+    monkeypatch.setitem(extras._NEWEST_PYTHON, "ur", (3, 10))
+    with pytest.raises(DriverError, match=r"no release for this Python, 3\.\d+: .*Python 3\.10"):
         UrArm("127.0.0.1")
 
 

@@ -1,5 +1,6 @@
 """Import of optional libraries, with the command that installs a missing one."""
 
+import sys
 from importlib import import_module
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -21,6 +22,8 @@ _PACKAGES = {
     "ros": "rosbags>=0.11,<0.12",
     "lerobot": "pyarrow>=18",
 }
+# The newest Python for which a package has wheels, where it is not the newest of all.
+_NEWEST_PYTHON = {"ur": (3, 12)}
 
 
 def client_library(module: str, extra: str) -> ModuleType:
@@ -28,8 +31,14 @@ def client_library(module: str, extra: str) -> ModuleType:
     try:
         return import_module(module)
     except ImportError as error:
+        package, newest = _PACKAGES[extra], _NEWEST_PYTHON.get(extra, sys.version_info[:2])
+        next_step = f"Install it: pip install '{package}'"
+        if sys.version_info[:2] > newest:
+            next_step = (
+                f"{package} has no release for this Python, {sys.version_info[0]}."
+                f"{sys.version_info[1]}: make a virtual environment with Python "
+                f"{newest[0]}.{newest[1]}."
+            )
         raise DriverError(
-            f"{module} cannot be imported: {error}.",
-            culprits=[module],
-            next_step=f"Install it: pip install '{_PACKAGES[extra]}'",
+            f"{module} cannot be imported: {error}.", culprits=[module], next_step=next_step
         ) from error
