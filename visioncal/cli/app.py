@@ -87,6 +87,8 @@ def main() -> None:
     # Commands compute on one BLAS thread. Loaded by both numpy and scipy, BLAS would start one a
     # core, which takes as long as a small calibration's solve.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Whatever a command starts imports nothing from the folder in which it was typed.
+    os.environ["PYTHONSAFEPATH"] = "1"
     # A thousand modules create many permanent objects: garbage collection at Python's default rate
     # takes a twentieth of a small calibration's time, and finds nothing.
     gc.set_threshold(20_000, 100)

@@ -4,6 +4,7 @@ The first thread that needs a setting makes it and the last one undoes it; if ea
 value it found, it could restore another thread's.
 """
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -61,6 +62,29 @@ class SharedSetting:
                 self._within -= 1
                 if self._within == 0:
                     self._made.close()
+
+
+@contextmanager
+def _no_current_folder() -> Iterator[None]:
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop("PYTHONSAFEPATH")
+        if before is not None:
+            os.environ["PYTHONSAFEPATH"] = before
+
+
+_SAFE_PATH = SharedSetting(_no_current_folder)
+
+
+def safe_path() -> AbstractContextManager[None]:
+    """Python processes that start within import no module from the current folder.
+
+    A session's folder may come from anywhere, and `multiprocessing` would import from there.
+    """
+    return _SAFE_PATH.held()
 
 
 def one_blas_thread() -> AbstractContextManager[None]:

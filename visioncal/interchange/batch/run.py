@@ -29,7 +29,7 @@ from visioncal.core.codec import read, write
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.extras import client_library
 from visioncal.core.files import named_errors, natural, read_text, write_atomically
-from visioncal.core.threads import one_blas_thread
+from visioncal.core.threads import one_blas_thread, safe_path
 from visioncal.core.types import Progress
 from visioncal.core.verdict import need_options
 from visioncal.core.version import __version__
@@ -420,11 +420,12 @@ def _pool(count: int) -> Iterator[Executor]:
         )
     else:
         context = multiprocessing.get_context("spawn")
-    executor = ProcessPoolExecutor(count, context, initializer=_end_with_parent)
-    try:
-        yield executor
-    finally:
-        executor.shutdown(cancel_futures=True)
+    with safe_path():
+        executor = ProcessPoolExecutor(count, context, initializer=_end_with_parent)
+        try:
+            yield executor
+        finally:
+            executor.shutdown(cancel_futures=True)
 
 
 def _end_with_parent() -> None:

@@ -43,7 +43,7 @@ def ask_command(words: Sequence[str], folder: Path | None, views: int) -> Outcom
     with tempfile.TemporaryDirectory() as passing:
         if folder is None:
             folder, words = Path(passing) / "trial", (*words, "--no-report", "--no-recording")
-        command = [sys.executable, "-m", "visioncal", *words, "-o", str(folder), "--json"]
+        command = [sys.executable, "-P", "-m", "visioncal", *words, "-o", str(folder), "--json"]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
     try:
         document = json.loads(ended.stdout)

@@ -31,6 +31,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.core.errors import DriverError
+from visioncal.core.threads import safe_path
 from visioncal.core.types import FloatArray
 from visioncal.live.drivers import ur_net
 from visioncal.simulation.arms import ArmOptions, DhArm, arm_named, forward
@@ -562,7 +563,8 @@ def spawn(options: ControllerOptions | None = None) -> SimulatedController:
     here, there = context.Pipe()
     arguments = (options or ControllerOptions(), host, there)
     process = context.Process(target=_serve, args=arguments, daemon=True)
-    process.start()
+    with safe_path():
+        process.start()
     # This end alone must hold the pipe open, so that the end of either process is noticed.
     there.close()
     controller = SimulatedController(host, process, here)

@@ -58,7 +58,10 @@ def drawn(
 
     @wraps(draw)
     def inline(*args: _Given.args, **kwargs: _Given.kwargs) -> Markup:
-        with _LOCK, mpl.rc_context(_STYLE):
+        # A matplotlibrc in the current folder may name programs, such as LaTeX, and change figures.
+        with _LOCK, mpl.rc_context():
+            mpl.rcdefaults()
+            mpl.rcParams.update(_STYLE)
             done = draw(*args, **kwargs)
             return Markup("") if done is None else _svg(*done)
 

@@ -108,7 +108,7 @@ def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     quiet = {key: name for key, name in os.environ.items() if key != "FORCE_RERUN_ANALYTICS"}
     proxies = dict.fromkeys(("HTTPS_PROXY", "https_proxy", "ALL_PROXY", "all_proxy"), _NOWHERE)
     process = subprocess.Popen(
-        [sys.executable, "-m", "rerun_cli", *arguments],
+        [sys.executable, "-P", "-m", "rerun_cli", *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

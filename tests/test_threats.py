@@ -1,0 +1,153 @@
+"""Attacks by what a person may have downloaded; .github/SECURITY.md has a row for each."""
+
+import ast
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+import pytest
+from matplotlib.figure import Figure
+from support.commands import every_command
+from support.fuzz.mutants import PACKAGED, READINGS, sound
+
+from visioncal.present.report.plotting import drawn
+
+PACKAGE = Path(__file__).parents[1] / "visioncal"
+PAGE = Path(__file__).parents[1] / ".github" / "SECURITY.md"
+# Modules that Python, its worker processes and the libraries of the house import.
+PLANTED = (
+    "json", "numpy", "multiprocessing", "typing", "random", "logging", "cv2", "rerun_cli",
+    "pathlib", "scipy", "pickle", "visioncal", "sitecustomize", "usercustomize", "concurrent", "matplotlib",
+)  # fmt: skip
+TRAP = "import os\nopen(os.environ['VISIONCAL_CAUGHT'], 'a').write(__name__ + '\\n')\n"
+# Commands that read no file: what each is called with, in a folder with planted modules.
+NOT_READING = {
+    "batch": "SESSION -o out --workers 2",
+    "demo": "--help",
+    "simulate": "cell --no-images",
+    "record": "--help",
+    "dynamics record": "--help",
+}
+QUICK = ("pairs", "pairs_out", "frames.json", *PACKAGED)
+
+
+def calls():
+    """Words for each command; those of sound inputs that take long to make ask for help."""
+    for name, _ in every_command():
+        reading = next((words for words in READINGS if words.startswith(f"{name} ")), "")
+        inputs = re.findall(r"[\[{]([\w.]+)", reading)
+        if name in NOT_READING:
+            yield name, NOT_READING[name]
+        elif all(each in QUICK for each in inputs):
+            yield name, reading.removeprefix(f"{name} ")
+        else:
+            yield name, "--help"
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    for name in {"pairs", "pairs_out", "frames.json"} | PACKAGED.keys():
+        sound(folder, name)
+    return folder
+
+
+@pytest.fixture
+def trap(tmp_path, monkeypatch):
+    """A current folder with planted modules; what they were imported as is in the returned file."""
+    caught, folder = tmp_path / "caught", tmp_path / "downloaded"
+    folder.mkdir()
+    for name in PLANTED:
+        (folder / f"{name}.py").write_text(TRAP, "utf-8")
+    caught.touch()
+    monkeypatch.setenv("VISIONCAL_CAUGHT", str(caught))
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    monkeypatch.chdir(folder)
+    return caught
+
+
+@pytest.fixture(scope="session")
+def program(tmp_path_factory):
+    """The installed command, as pip writes it."""
+    path = tmp_path_factory.mktemp("bin") / "visioncal"
+    path.write_text("import sys\nfrom visioncal.cli import main\nsys.exit(main())\n", "utf-8")
+    return [sys.executable, str(path)]
+
+
+def test_each_row_of_the_threat_model_has_its_test():
+    rows = re.findall(r"^\| (?!what |---)(.*) \|$", PAGE.read_text("utf-8"), re.MULTILINE)
+    assert len(rows) > 5
+    for row in rows:
+        tests = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", row.rpartition("|")[2])
+        assert tests, row
+        for file, test in tests:
+            assert f"def {test}(" in (PAGE.parents[1] / file).read_text("utf-8"), test
+
+
+def test_the_trap_is_sprung_by_what_imports_from_the_current_folder(trap):
+    subprocess.run([sys.executable, "-c", "import json"], check=True)
+    assert "json" in trap.read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [*calls()], ids=lambda word: word.replace(" ", "_")[:20]
+)
+def test_no_command_runs_code_of_the_current_folder(name, words, trap, program, inputs):
+    shutil.copytree(inputs / "pairs", "session")
+    words = re.sub(r"[\[{]([\w./]+)[\]}]", lambda found: str(inputs / found[1]), words)
+    words = words.replace("SESSION", "session").replace("OUT", "out").replace("NEW", "new")
+    done = subprocess.run(
+        [*program, *name.split(), *shlex.split(words)], capture_output=True, text=True, check=False,
+        stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    assert done.returncode in (0, 2, 3), done.stderr
+    assert trap.read_text("utf-8") == ""
+
+
+def test_processes_of_the_page_and_of_the_simulated_cell_run_none_either(trap, tmp_path):
+    # From a script elsewhere, so that the current folder is not on the path of this process.
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from visioncal.live.page.outcome import ask_command\n"
+        "from visioncal.live.simulated.controller import spawn\n"
+        "if __name__ == '__main__':\n"
+        "    print(ask_command(['calibrate', 'nothing'], None, 0).title)\n"
+        "    spawn().close()\n",
+        "utf-8",
+    )
+    subprocess.run([sys.executable, str(script)], check=True)
+    assert trap.read_text("utf-8") == ""
+
+
+def test_every_process_of_python_starts_with_a_safe_path():
+    starts = 0
+    for path in PACKAGE.rglob("*.py"):
+        text = path.read_text("utf-8")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.List) and ast.unparse(node).startswith("[sys.executable"):
+                assert ast.unparse(node).startswith("[sys.executable, '-P', "), path
+                starts += 1
+        if re.search(r"get_context\(|ProcessPoolExecutor\(", text):
+            assert "with safe_path():" in text, path
+            starts += 1
+    assert starts >= 4
+
+
+def test_settings_of_matplotlib_in_the_current_folder_change_no_figure():
+    # As `matplotlibrc` of the current folder sets them when matplotlib is imported.
+    hostile = {"text.usetex": True, "text.latex.preamble": r"\input{/etc/passwd}", "font.size": 40}
+
+    @drawn
+    def figure():
+        figure = Figure()
+        figure.add_subplot().set_title("a title")
+        return figure, "a figure"
+
+    plain = figure()
+    with mpl.rc_context(hostile):
+        assert figure() == plain
+        assert mpl.rcParams["text.usetex"]
