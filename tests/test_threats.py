@@ -21,7 +21,8 @@ PAGE = Path(__file__).parents[1] / ".github" / "SECURITY.md"
 # Modules that Python, its worker processes and the libraries of the house import.
 PLANTED = (
     "json", "numpy", "multiprocessing", "typing", "random", "logging", "cv2", "rerun_cli",
-    "pathlib", "scipy", "pickle", "visioncal", "sitecustomize", "usercustomize", "concurrent", "matplotlib",
+    "pathlib", "scipy", "pickle", "visioncal", "sitecustomize", "usercustomize",
+    "concurrent", "matplotlib",
 )  # fmt: skip
 TRAP = "import os\nopen(os.environ['VISIONCAL_CAUGHT'], 'a').write(__name__ + '\\n')\n"
 # Commands that read no file: what each is called with, in a folder with planted modules.

@@ -183,8 +183,8 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
         touches,
         fit,
         np.zeros(3),
-        f"the x axis was touched up to {figure(reach_mm[0])} mm from the origin and the plane up to "
-        f"{figure(reach_mm[1])} mm from the x axis, at a noise of {figure(1e3 * fit.sigma)} mm",
+        f"the x axis was touched up to {figure(reach_mm[0])} mm from the origin and the plane up "
+        f"to {figure(reach_mm[1])} mm from the x axis, at a noise of {figure(1e3 * fit.sigma)} mm",
         "Touch the x axis farther from the origin and the plane farther from the x axis, or say "
         "how well the points are touched.",
     )
