@@ -4,17 +4,22 @@ import ast
 import re
 import shlex
 import shutil
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import matplotlib as mpl
 import pytest
 from matplotlib.figure import Figure
-from support.commands import every_command
+from support.commands import every_command, visioncal
 from support.fuzz.mutants import PACKAGED, READINGS, sound
 
+from visioncal.core.choices import SITE_FILE
 from visioncal.present.report.plotting import drawn
+from visioncal.results import history
+from visioncal.results.history import History
 
 PACKAGE = Path(__file__).parents[1] / "visioncal"
 PAGE = Path(__file__).parents[1] / ".github" / "SECURITY.md"
@@ -152,3 +157,54 @@ def test_settings_of_matplotlib_in_the_current_folder_change_no_figure():
     with mpl.rc_context(hostile):
         assert figure() == plain
         assert mpl.rcParams["text.usetex"]
+
+
+VIEW = (
+    "CREATE VIEW entry AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
+    "SELECT i AS id, i AS at, 'x' AS cell, 'calibrated' AS kind, i AS sha256, '{}' AS document "
+    "FROM n"
+)
+TRIGGER = "CREATE TRIGGER more AFTER INSERT ON entry BEGIN DELETE FROM entry; END"
+
+
+def planted_history(path, hostile):
+    History(path).append()
+    with closing(sqlite3.connect(path)) as file:
+        if hostile is VIEW:
+            file.execute("DROP TABLE entry")
+        file.execute(hostile)
+        file.commit()
+    return path
+
+
+@pytest.mark.parametrize("hostile", [VIEW, TRIGGER, "CREATE TABLE more (x)"])
+def test_a_history_with_code_in_it_is_refused_before_it_is_read(hostile, tmp_path, inputs):
+    path = planted_history(tmp_path / SITE_FILE, hostile)
+    visioncal("history", path).refused("other tables, views or triggers")
+    out = tmp_path / "out"
+    done = visioncal("calibrate", inputs / "pairs", "-o", out, "--history", path, "--no-report")
+    assert "This is not in the history" in done.err
+    assert (out / "calibration.json").is_file()
+
+
+def test_a_history_that_came_with_a_session_is_not_adopted(tmp_path, inputs):
+    session = tmp_path / "site" / "session"
+    shutil.copytree(inputs / "pairs", session)
+    (session / "deeper").mkdir()
+    for folder in (session, session / "deeper"):
+        planted_history(folder / SITE_FILE, VIEW)
+    assert History.of_site(session) is History.of_site(session / "deeper") is None
+    History(session.parent / SITE_FILE).append()
+    assert History.of_site(session) == History(session.parent / SITE_FILE)
+
+
+def test_reading_a_history_has_an_end(tmp_path, monkeypatch):
+    History(tmp_path / SITE_FILE).append()
+    with closing(sqlite3.connect(tmp_path / SITE_FILE)) as file:
+        file.execute(
+            "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 200000) "
+            "INSERT INTO entry SELECT i, i, 'x', 'calibrated', i, '{}' FROM n"
+        )
+        file.commit()
+    monkeypatch.setattr(history, "_MOST_ROUNDS", 1)
+    visioncal("history", tmp_path / SITE_FILE).refused("takes without end to read")

@@ -26,6 +26,8 @@ from visioncal.results.frame import Frame
 from visioncal.results.result import Calibration
 from visioncal.session.frames import frames_of_kind
 
+# Millions of SQLite's instructions that an act may take.
+_MOST_ROUNDS = 1000
 # Seconds that an entry waits for others that are being written.
 _PATIENCE_S = 20.0
 # "vcal", by which our files are known among SQLite's.
@@ -226,9 +228,14 @@ class History:
 
     @classmethod
     def of_site(cls, near: Path) -> Self | None:
-        """The history of the site to which a path belongs: the nearest in its folder or above."""
+        """The history of the site to which a path belongs: the nearest in its folder or above.
+
+        One within a session's folder came with the session, and is nobody's site.
+        """
         folders = (near.absolute(), *near.absolute().parents)
-        found = (folder / SITE_FILE for folder in folders if (folder / SITE_FILE).is_file())
+        sessions = [at for at, folder in enumerate(folders) if (folder / "session.toml").is_file()]
+        above = folders[max(sessions, default=-1) + 1 :]
+        found = (folder / SITE_FILE for folder in above if (folder / SITE_FILE).is_file())
         return next(map(cls, found), None)
 
     def append(self, *entries: Entry) -> int:
@@ -340,6 +347,12 @@ class History:
         if version > len(_FORMS):
             why = f"is of form {version}, and this version of visioncal knows {len(_FORMS)}"
             raise self._refusal(why, "Use the newer version that wrote it.")
+        # A view in the place of the table, or another's trigger, would run when it is read.
+        query = "SELECT sql FROM sqlite_master WHERE sql IS NOT NULL ORDER BY rowid"
+        made = [text for (text,) in file.execute(query)]
+        if made != [statement for form in _FORMS[:version] for statement in form]:
+            why = "has other tables, views or triggers than a history"
+            raise self._refusal(why, "Name a history's file, and do not open this one elsewhere.")
         return version
 
     def _refusal(self, why: str, do: str) -> DataError:
@@ -350,6 +363,10 @@ def _connection(address: str) -> sqlite3.Connection:
     file = sqlite3.connect(address, uri=True, timeout=_PATIENCE_S, isolation_level=None)
     try:
         file.execute("PRAGMA synchronous = FULL")
+        file.execute("PRAGMA trusted_schema = OFF")
+        # A damaged index may go round; a million entries take a hundredth of this.
+        rounds = iter(range(_MOST_ROUNDS))
+        file.set_progress_handler(lambda: next(rounds, None) is None, 1_000_000)
         # The file is opened by the first statement that reads.
         file.execute("PRAGMA user_version").fetchone()
     except (sqlite3.Error, UnicodeError):
@@ -372,6 +389,7 @@ _FAULTS = {
         "cannot be opened: you may not read it, or not write into its folder",
         "Ask for the right to, or copy it to where you may.",
     ),
+    sqlite3.SQLITE_INTERRUPT: ("takes without end to read", "Take an earlier copy of it."),
     sqlite3.SQLITE_FULL: ("cannot be written: the disk is full", "Make room on that disk."),
     sqlite3.SQLITE_IOERR: (
         "cannot be read or written: the disk is full, or fails",
