@@ -129,6 +129,59 @@ def test_a_data_set_of_lerobot_calibrates(version, source, rendered, tmp_path):
     assert pose_difference(transform.as_matrix(), meant.as_matrix())[0] < 0.5
 
 
+HUGE = "{chunk_index:>9000000000}{episode_chunk:>9000000000}"
+HOSTILE = [
+    None, [], "text", {}, {"features": None}, {"features": []}, {"features": {KEY: []}},
+    {"features": {KEY: None}}, {"fps": 0}, {"fps": -1.0}, {"fps": "fast"}, {"fps": 1e300},
+    {"fps": [30]}, {"chunks_size": 0}, {"chunks_size": "many"}, {"chunks_size": 1.5},
+    {"robot_type": ["ur10e"]}, {"robot_type": 3}, {"video_path": 7}, {"video_path": HUGE},
+    {"video_path": "{episode_chunk.__class__}"}, {"video_path": "{nothing}"}, {"video_path": "{"},
+    {"video_path": "../{video_key}.mp4"}, {"video_path": "/etc/passwd"}, {"video_path": ""},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_a_hostile_description_of_a_data_set_is_refused(version, source, rendered, tmp_path):
+    path = write_dataset(tmp_path / "set", source, rendered, version, "ur10e")
+    file = path / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    for hostile in HOSTILE:
+        changed = info | hostile if isinstance(hostile, dict) and hostile else hostile
+        file.write_text(json.dumps(changed))
+        with pytest.raises(DataError) as caught:
+            convert(path, tmp_path / "out", requested=BOARD)
+        assert caught.value.culprits
+        assert len(caught.value.message) < 500
+    # What says how much there is is no reason to look for as much.
+    file.write_text(json.dumps(info | {"total_episodes": 10**12}))
+    assert convert(path, tmp_path / "out", requested=BOARD).views
+
+
+@pytest.mark.parametrize(
+    ("name", "cells"),
+    [
+        ("observation.state", [[1.0], [1.0, 2.0]]),
+        ("observation.state", [[], []]),
+        ("observation.state", [[1.0, None], [1.0, 2.0]]),
+        ("observation.state", ["a", "b"]),
+        ("timestamp", [None, 1.0]),
+        ("episode_index", [2**62, 5]),
+        ("frame_index", ["x", "y"]),
+    ],
+)
+def test_rows_of_a_data_set_that_are_no_numbers_are_refused(
+    name, cells, source, rendered, tmp_path
+):
+    path = write_dataset(tmp_path / "set", source, rendered, "v3.0", "ur10e")
+    (file,) = (path / "data").rglob("*.parquet")
+    columns = pq.read_table(file).to_pydict()
+    count = len(columns["timestamp"])
+    pq.write_table(pa.table(columns | {name: (cells * count)[:count]}), file)
+    with pytest.raises(DataError) as caught:
+        convert(path, tmp_path / "out", requested=BOARD)
+    assert caught.value.culprits
+
+
 def test_image_files_of_a_data_set_are_read_inside_its_folder(source, rendered, tmp_path):
     path = write_dataset(tmp_path / "set", source, rendered, "v2.1", "ur10e")
     info = json.loads((path / "meta" / "info.json").read_text())

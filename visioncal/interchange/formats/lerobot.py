@@ -4,13 +4,16 @@ Every frame has the joint angles of its moment. Where the arm stood, one frame a
 view; of a motion without stops, frames evenly. Videos are read when the session is stored.
 """
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
 
+from visioncal.core.codec import read, reading
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.documents.jsons import parse_json
 from visioncal.core.documents.values import mapping
@@ -34,6 +37,8 @@ _STATE, _IMAGES = "observation.state", "observation.image"
 _ARMS = {"so100": "so101", "so-100": "so101", "franka": "panda"}
 # Names of what is on the flange, and of cameras there.
 _GRIPPERS, _WRISTS = ("gripper", "finger", "hand"), ("wrist", "hand", "gripper", "eef")
+# Frames a second of no camera.
+_MOST_FPS = 1e5
 # A stop: joints stay within the first for the time before and after [rad, s]; those of another
 # stop differ by more than the second.
 _STILL_RAD, _STILL_S, _MOVED_RAD = float(np.deg2rad(0.6)), 0.3, float(np.deg2rad(3.0))
@@ -74,18 +79,70 @@ def _parquet(path: Path, columns: list[str], rows: IntArray | None = None) -> di
         columns_read: dict[str, list[Any]] = table.to_pydict()
     # Errors of pyarrow are among these.
     except (OSError, ValueError, LookupError, RuntimeError, TypeError) as error:
-        raise DataError(
-            f"{path} cannot be read as parquet: {error}.",
-            culprits=[str(path)],
-            next_step="Download the data set again, with its large files.",
-        ) from error
+        raise _refusal(f"{path} cannot be read as parquet: {error}", str(path)) from error
     return columns_read
+
+
+def _refusal(words: str, culprit: str) -> DataError:
+    return DataError(
+        f"{words}.",
+        culprits=[culprit],
+        next_step="Download the data set again, with its large files.",
+    )
+
+
+@dataclass(frozen=True)
+class _Info:
+    """The fields of meta/info.json that are read."""
+
+    features: Mapping[str, Mapping[str, Any]]
+    fps: float = 30.0  # Frames a second.
+    robot_type: str = ""
+    video_path: str = ""  # Place of a video, with `{names}` of what is known of it.
+    chunks_size: int = 1000  # Episodes a chunk.
+
+    @classmethod
+    def of(cls, source: Path) -> Self:
+        """Reads it; raises DataError."""
+        where = "meta/info.json"
+        with reading(str(_info(source)), "that of a data set of LeRobot", "Download it again."):
+            document = mapping(parse_json(read_text(_info(source)), where), where)
+            stated = {name: value for name, value in document.items() if value is not None}
+            info = read(cls, stated, where)
+        if not 0.0 < info.fps < _MOST_FPS or info.chunks_size < 1:
+            words = f"{info.fps:g} frames a second and {info.chunks_size} episodes a chunk"
+            raise _refusal(f"{where} has {words}; both must be at least 1", where)
+        return info
+
+    def video(self, known: Mapping[str, object]) -> str:
+        """The place of a video by what is known of it; raises DataError."""
+
+        def value(found: re.Match[str]) -> str:
+            known_value = known.get(found[1])
+            if known_value is None:
+                raise _refusal(f"meta/info.json: video_path asks for {found[0]}", "video_path")
+            return str(known_value).rjust(int(found[2] or 0), "0")
+
+        return re.sub(r"\{([^{}:]*)(?::0?([0-9]?)d?)?\}", value, self.video_path)
+
+
+def _numbers(cells: Sequence[object], name: str) -> FloatArray:
+    """The finite numbers of a column, (n,) or (n, k); raises DataError."""
+    try:
+        numbers = np.array(cells, dtype=float)
+    except (ValueError, TypeError) as error:
+        raise _refusal(
+            f"{name} has rows that are no numbers, or no lists of one length", name
+        ) from error
+    if not np.isfinite(numbers).all():
+        raise _refusal(f"{name} has rows without a number", name)
+    return numbers
 
 
 def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads a data set; of several cameras the one that `--image-key` names."""
-    info = mapping(parse_json(read_text(_info(source)), "meta/info.json"), "meta/info.json")
-    features = mapping(info.get("features"), "meta/info.json: features")
+    info = _Info.of(source)
+    features = info.features
     cameras = [name for name in features if name.startswith(_IMAGES)]
     key = requested.image or next(iter(cameras), "")
     if key not in cameras:
@@ -95,7 +152,7 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
             next_step=did_you_mean(key, cameras) or "Name one with --image-key.",
         )
     state = (*requested.joints, _STATE)[0]
-    is_video = mapping(features[key], key).get("dtype") == "video"
+    is_video = features[key].get("dtype") == "video"
     columns = [state, "timestamp", "frame_index", "episode_index"]
     files = sorted((source / "data").glob("chunk-*/*.parquet"))
     rows: dict[str, list[Any]] = {name: [] for name in columns}
@@ -110,10 +167,12 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
             culprits=[state],
             next_step="Download the whole data set, with its large files.",
         )
-    joints, notes = _joints(np.array(rows[state], dtype=float), features, state, requested)
-    episodes, stamps_s = (np.array(rows[name], dtype=float) for name in columns[3:0:-2])
-    fps = float(info.get("fps", 30.0))
-    reach, count = max(round(_STILL_S * fps), 1), len(joints)
+    angles = _numbers(rows[state], state)
+    if angles.ndim != 2 or not angles.size:
+        raise _refusal(f"{state} has rows that are no lists of joint angles", state)
+    joints, notes = _joints(angles, features, state, requested)
+    episodes, frames, stamps_s = (_numbers(rows[name], name).ravel() for name in columns[:0:-1])
+    reach, count = max(round(_STILL_S * info.fps), 1), len(joints)
     at = np.arange(count)
     sides = [np.clip(at + side, 0, count - 1) for side in (-reach, reach)]
     is_still = np.all(
@@ -131,10 +190,10 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     paths = tuple(Path(f"images/{at:06d}.png") for at in chosen.tolist())
     places: dict[str, tuple[Path, int] | bytes] = {}
     if is_video:
-        starts = _starts(source, info, key, fps)
+        starts = _starts(source, info, key, np.unique(episodes).astype(int).tolist())
         for path, at in zip(paths, chosen.tolist(), strict=True):
             file, first = starts[int(episodes[at])]
-            places[path.as_posix()] = file, first + int(rows["frame_index"][at])
+            places[path.as_posix()] = file, first + int(frames[at])
     else:
         # Of the chosen rows only: all images may take more memory than there is.
         parts = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
@@ -144,10 +203,8 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
             for cell in (_parquet(file, [key], part - first)[key] if len(part) else [])
         ]
         for path, cell in zip(paths, cells, strict=True):
-            places[path.as_posix()] = cell.get("bytes") or read_bytes(
-                path_inside(source, str(cell.get("path"))), MOST_IMAGE_BYTES
-            )
-    kind = str(info.get("robot_type")).lower()
+            places[path.as_posix()] = _image_in(source, mapping(cell, f"a cell of {key}"))
+    kind = info.robot_type.lower()
     arms = {name: name for name in robot_names()} | _ARMS
     arm = next((arms[word] for word in sorted(arms, key=len, reverse=True) if word in kind), None)
     mount: Mount = "eye-in-hand" if any(at in key for at in _WRISTS) else "eye-to-hand"
@@ -175,14 +232,22 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     )
 
 
+def _image_in(source: Path, cell: Mapping[str, Any]) -> bytes:
+    """The image that a cell holds, or names."""
+    data = cell.get("bytes")
+    if data and isinstance(data, bytes):
+        return data
+    return read_bytes(path_inside(source, str(cell.get("path"))), MOST_IMAGE_BYTES)
+
+
 def _joints(
     state: FloatArray, features: Mapping[str, Any], key: str, requested: ImportOptions
 ) -> tuple[FloatArray, list[str]]:
     """(n, j) joint angles [rad], without the gripper, and notes on what was assumed."""
-    names = mapping(features.get(key), key).get("names") or []
+    names = features.get(key, {}).get("names")
     if isinstance(names, Mapping):
-        names = next(iter(names.values()), [])
-    if len(names) == state.shape[1]:
+        names = next(iter(names.values()), None)
+    if isinstance(names, list) and len(names) == state.shape[1]:
         arm = [at for at, name in enumerate(names) if not any(x in str(name) for x in _GRIPPERS)]
         state = state[:, arm]
     is_deg = requested.joints_deg or bool(np.abs(state).max() > 2.0 * np.pi + 0.1)
@@ -197,24 +262,28 @@ def _joints(
 
 
 def _starts(
-    source: Path, info: Mapping[str, Any], key: str, fps: float
+    source: Path, info: _Info, key: str, episodes: Sequence[int]
 ) -> dict[int, tuple[Path, int]]:
     """The video of each episode, and the episode's first frame in it."""
-    form = str(info.get("video_path"))
     tables = sorted((source / "meta" / "episodes").glob("chunk-*/*.parquet"))
     starts: dict[int, tuple[Path, int]] = {}
     for table in tables:
         prefix = f"videos/{key}/"
         names = [f"{prefix}{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
         columns = _parquet(table, ["episode_index", *names])
-        for episode, chunk, file, from_s in zip(*columns.values(), strict=True):
-            named = form.format(video_key=key, chunk_index=chunk, file_index=file)
-            starts[episode] = path_inside(source, named), round(from_s * fps)
+        numbers = [_numbers(cells, name).ravel().tolist() for name, cells in columns.items()]
+        for episode, chunk, file, from_s in zip(*numbers, strict=True):
+            known = {"video_key": key, "chunk_index": int(chunk), "file_index": int(file)}
+            starts[int(episode)] = path_inside(source, info.video(known)), round(from_s * info.fps)
+    lost = [episode for episode in episodes if tables and episode not in starts]
+    if lost:
+        words = f"meta/episodes names no video of the episodes {some_of([*map(str, lost)])}"
+        raise _refusal(f"{words}, which have rows in {source}/data", "meta/episodes")
     if not tables:
-        for episode in range(int(info.get("total_episodes", 1))):
-            chunk = episode // int(info.get("chunks_size", 1000))
-            named = form.format(video_key=key, episode_chunk=chunk, episode_index=episode)
-            starts[episode] = path_inside(source, named), 0
+        for episode in episodes:
+            chunk = episode // info.chunks_size
+            known = {"video_key": key, "episode_chunk": chunk, "episode_index": episode}
+            starts[episode] = path_inside(source, info.video(known)), 0
     return starts
 
 
