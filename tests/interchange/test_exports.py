@@ -1,13 +1,16 @@
 """Exports: what others read is the transform that was calibrated, or the tool, or the fixture."""
 
 import re
+import shlex
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import RigidTransform, Rotation
 from support import placed, readers
 from support.beyond import with_field
 from support.commands import visioncal
@@ -97,6 +100,91 @@ def test_the_inverse_carries_the_covariance_along():
     # 20,000 samples know a standard deviation to half a percent, and two digits are stated.
     assert abs(stated_mm / sampled_mm - 1) < 0.05
     assert abs(edge.sigma_mm / sampled_mm - 1) > 0.1
+
+
+# The optical frame of a RealSense in its camera_link: 15 mm to the left, and z forward (REP 103).
+BODY = RigidTransform.from_components([0.0, 0.015, 0.0], Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]))
+
+
+def stated(body_from_cam):
+    return (*body_from_cam.translation, *body_from_cam.rotation.as_quat(canonical=True))
+
+
+def of_the_body(body_from_cam, **changes):
+    return Selection(child="camera_link", child_from_cam=stated(body_from_cam), **changes)
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_frame_beside_the_optical_one_stands_where_the_camera_has_it(name, mount):
+    for rotation in Rotation.random(4, rng=RNG):
+        body = RigidTransform.from_components(RNG.uniform(-0.1, 0.1, 3), rotation)
+        camera = RigidTransform.from_components(RNG.uniform(-1, 1, 3), Rotation.random(rng=RNG))
+        wanted = camera * body.inv()
+        found = calibration(camera.as_matrix(), mount)
+        # As for the optical frame itself.
+        assert off(name, export(found, name, of_the_body(body)), wanted.as_matrix()) < 1e-9
+        if name in ANY_EDGE:
+            back = Selection(parent="camera_link", child_from_cam=stated(body), inverse=True)
+            assert off(name, export(found, name, back), wanted.inv().as_matrix()) < 1e-9
+
+
+def test_the_covariance_goes_to_the_frame_beside_the_optical_one():
+    # Two metres beside the camera its rotation error is mostly one of place.
+    edge = SAMPLE.edges["flange_from_cam"]
+    body = RigidTransform.from_components([2.0, -1.0, 0.5], Rotation.random(rng=RNG))
+    away = body.inv().as_matrix()
+    noise = RNG.multivariate_normal(np.zeros(6), edge.covariance, 20_000)
+    moved = log(invert(edge.matrix @ away) @ edge.matrix @ exp(noise) @ away)
+    text = export(SAMPLE, "text", of_the_body(body))
+    sampled_mm = 1e3 * np.sqrt(np.trace(np.cov(moved[:, 3:].T)))
+    stated_mm = float(text.partition("sigma ")[2].split()[0])
+    # As of the inverse.
+    assert abs(stated_mm / sampled_mm - 1) < 0.05
+    assert edge.sigma_mm < 0.5 * sampled_mm
+
+
+def test_a_body_is_no_camera_and_keeps_the_lens_of_one():
+    for name in ("ros", "mujoco", "text"):
+        text = export(SAMPLE, name, of_the_body(BODY))
+        assert "goes with the lens" in text
+        assert "stands in it at (0, 0.015, 0, -0.5, 0.5, -0.5, 0.5)" in text
+        assert "camera_link: the camera's optical frame" not in text
+    site = ET.fromstring(export(SAMPLE, "mujoco", of_the_body(BODY))).findall(".//site")[1]
+    assert site.get("name") == "camera_link"
+    # A lens's name is no frame's.
+    assert export(SAMPLE, "camera-info", Selection(child="camera_link"))
+
+
+BODIES = ("camera_link", "arm/wrist_camera_link", "link", "camera_depth_frame", "rs_Color_frame")
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_the_optical_pose_is_not_written_under_the_name_of_a_body(name):
+    for body in BODIES:
+        raised(DataError, f"{body}.*optical", export, SAMPLE, name, Selection(child=body))
+    back = Selection("flange_from_cam", inverse=True, parent="camera_link")
+    if name in ANY_EDGE:
+        raised(DataError, "camera_link.*optical", export, SAMPLE, name, back)
+        assert export(SAMPLE, name, Selection("base_from_target", child="board_link"))
+    for optical in ("camera_color_optical_frame", "camera", "linked", "link_cam"):
+        assert export(SAMPLE, name, Selection(child=optical))
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        (Selection(child_from_cam=stated(BODY)), "under the name ''.*--child camera_link"),
+        (Selection("base_from_target", child="a", child_from_cam=stated(BODY)), "for target under"),
+        (Selection(child="a", child_from_cam=(0, 15, 0, 0, 0, 0, 1)), "0, 15, 0.*at most 3 m"),
+        (Selection(child="a", child_from_cam=(0, 0, np.nan, 0, 0, 0, 1)), "nan.*metres"),
+        (Selection(child="a", child_from_cam=(0, 0, 0, 0, 0, np.nan, 1)), "nan.*metres"),
+        (Selection(child="a", child_from_cam=(0, 0, 0, 0, 0, 1)), "x,y,z,qx,qy,qz,qw"),
+        (Selection(child="a", child_from_cam=(0, 0, 0, 0, 0, 0, 2)), "not a quaternion"),
+    ],
+)
+def test_where_the_optical_frame_is_must_be_a_pose_of_a_named_frame(chosen, words):
+    raised(DataError, words, export, SAMPLE, "ros", chosen)
 
 
 def test_frames_stand_where_their_readers_look():
@@ -451,6 +539,39 @@ def test_the_command_prints_the_document_or_writes_it_once(tmp_path):
     assert out.read_text(encoding="utf-8") == written
     assert exporting(folder, "--to", "text", "-o", out, "--force").status == 0
     assert np.array_equal(readers.plain(out.read_text()), SAMPLE.edges["flange_from_cam"].matrix)
+
+
+def test_the_command_for_a_body_is_printed_and_runs(tmp_path):
+    SAMPLE.save(tmp_path / "calibration.json")
+    camera = RigidTransform.from_matrix(SAMPLE.edges["flange_from_cam"].matrix)
+    done = exporting(tmp_path, "--to", "ros", "--child", "camera_link").refused("optical frame")
+    assert done.out == ""
+    typed = shlex.split(done.err.rpartition("Run: ")[2])
+    text = exporting(*typed[2:]).good().out
+    turned = RigidTransform.from_rotation(BODY.rotation)
+    assert yaml.safe_load(text)["child_frame_id"] == "camera_link"
+    assert off("ros", text, (camera * turned.inv()).as_matrix()) < 1e-9
+
+
+CASE = Path(__file__).parents[3] / "shared/data/field/cases/camera-link-export/case.md"
+
+
+@pytest.mark.skipif(not CASE.is_file(), reason="the case is not beside this checkout")
+def test_the_case_of_public_threads(tmp_path):
+    SAMPLE.save(tmp_path / "calibration.json")
+    told = CASE.read_text(encoding="utf-8")
+    xyz, rpy = (
+        list(map(float, re.search(rf"{word} \(([^)]*)\)", told)[1].split(",")))
+        for word in ("xyz", "rpy")
+    )
+    # As a URDF has them: about fixed x, y, z.
+    body = RigidTransform.from_components(xyz, Rotation.from_euler("xyz", rpy, degrees=True))
+    words = ",".join(map(repr, map(float, stated(body))))
+    chosen = ("--child", "camera_link", "--child-from-cam", words)
+    camera = RigidTransform.from_matrix(SAMPLE.edges["flange_from_cam"].matrix)
+    for name in ("ros", "ros-launch", "urdf", "easy-handeye", "easy-handeye2"):
+        text = exporting(tmp_path, "--to", name, *chosen).good().out
+        assert off(name, text, (camera * body.inv()).as_matrix()) < 1e-9
 
 
 @pytest.mark.parametrize("name", ["", "session.toml"])

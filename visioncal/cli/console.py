@@ -184,5 +184,5 @@ def with_run_paths(session: Path, out: Path | str = "") -> Iterator[None]:
         raise type(error)(
             error.message,
             culprits=error.culprits,
-            next_step=with_paths(error.next_step, session, out),
+            next_step=with_paths(error.next_step, session, out, ["visioncal", *sys.argv[1:]]),
         ) from error

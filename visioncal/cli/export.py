@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from visioncal.cli.console import check_usable, say
+from visioncal.cli.console import check_usable, say, with_run_paths
 from visioncal.cli.result_options import ExportOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
@@ -26,7 +26,8 @@ def export_command(options: ExportOptions) -> None:
         load = Load(options.mass_kg, options.cog_mm)
     given = {**vars(options), "load": load}
     selection = Selection(**{field.name: given[field.name] for field in fields(Selection)})
-    written = document(load_exportable(options.source), options.to, selection)
+    with with_run_paths(options.source, options.source):
+        written = document(load_exportable(options.source), options.to, selection)
     bad = check_usable(written.verdict, "what is exported", force=options.force)
     for warning in (*bad, *written.warnings):
         say(warning, "warning: ", "bold red")

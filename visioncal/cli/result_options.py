@@ -252,6 +252,10 @@ class ExportOptions(PartOptions):
     inverse: bool = flag("Write the inverse of it.")
     parent: str | None = option("Exported name of the frame in which the pose is given.")
     child: str | None = option("Exported name of the frame whose pose it is.")
+    child_from_cam: tuple[float, ...] | None = numbers_option(
+        "Pose of the camera's optical frame in --child, where that is another, as camera_link [m].",
+        form=POSE,
+    )
     number: int | None = option("Number of the controller's tool or base.")
     mass_kg: float | None = option("The tool's mass, for ABB's tooldata (kg).")
     cog_mm: tuple[float, float, float] | None = option(

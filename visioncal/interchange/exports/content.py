@@ -14,6 +14,7 @@ from visioncal.core.types import FloatArray, Mount
 from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 from visioncal.results.conditions import Condition
+from visioncal.session.frames import frames_of_kind
 
 Source: TypeAlias = Calibration | FrameFile
 
@@ -107,6 +108,11 @@ def ends_of(name: str) -> tuple[str, str]:
     return parent, child
 
 
+def is_camera(frame: str) -> bool:
+    """Whether a frame, by our name, is a camera's optical frame."""
+    return bool(frames_of_kind((frame,), "camera"))
+
+
 def is_kind(name: str, kind: FrameKind) -> bool:
     """Whether a transform is a tool's pose on a flange, or a fixture's in a base."""
     # The parent by our names: flange, flange_2, ...
@@ -186,8 +192,13 @@ _OF_LENS = "it goes with the lens of that calibration, and with no other"
 # base.
 Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
 # Fields of a selection that select a part of a cell, and those of any transform.
-_PARTS, OF_TRANSFORMS = ("camera", "robot", "target"), ("edge", "inverse", "parent", "child")
-_OPTIONS = {"load": "--mass-kg and --cog-mm", "calibration_hash": "--hash"}
+_PARTS = ("camera", "robot", "target")
+OF_TRANSFORMS = ("edge", "inverse", "parent", "child", "child_from_cam")
+_OPTIONS = {
+    "load": "--mass-kg and --cog-mm",
+    "calibration_hash": "--hash",
+    "child_from_cam": "--child-from-cam",
+}
 _T = TypeVar("_T")
 
 
@@ -210,6 +221,9 @@ class Selection:
     parent: str | None = None  # Exported name of the frame in which the pose is given.
     # Exported name of the frame whose pose it is; the camera, in a format of lenses.
     child: str | None = None
+    # Pose [m] of the camera's optical frame in a frame called `child`, which is then exported in
+    # its place: x, y, z, qx, qy, qz, qw.
+    child_from_cam: tuple[float, ...] | None = None
     number: int | None = None  # Number of the controller's tool or base.
     load: Load | None = None
     convention: str | None = None
@@ -230,6 +244,8 @@ class Content(Placement):
     frames: tuple[str, str]  # Our own names of parent and child.
     mount: Mount | None
     lens: CameraResult | None  # The camera, where there is one.
+    # Where a camera's child is not the optical frame, that frame's pose in it, in words.
+    optical: str = ""
     number: int | None = None  # Of the controller's tool or base.
     load: Load | None = None
 
@@ -259,11 +275,12 @@ class Content(Placement):
         else:
             of = self.rotation_of if "_" in self.rotation_of else f"the {self.rotation_of}"
             sigma += f"; rotation taken from {of}, not measured"
-        is_of_lens = self.lens is not None and any(frame.startswith("cam") for frame in self.frames)
+        is_of_lens = self.lens is not None and (any(map(is_camera, self.frames)) or self.optical)
         return [
             self.origin,
             f"verdict {self.verdict.status}; {sigma}",
             f"{self.name}, the pose of {self.child} in {self.parent}: p_parent = R p_child + t",
+            *([self.optical] if self.optical else []),
             *([_OF_LENS] if is_of_lens else []),
             *(f"only where: {condition.words}" for condition in self.conditions),
         ]

@@ -1,14 +1,18 @@
 """All export formats, and the selection of content for them."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.core.arguments import typed
+from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import known_name
 from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray
+from visioncal.core.verdict import AGAIN
 from visioncal.dynamics import Identified
 from visioncal.dynamics.identified import judge
 from visioncal.frames.naming import PARENTS
@@ -21,6 +25,7 @@ from visioncal.interchange.exports.content import (
     Placements,
     Selection,
     Source,
+    is_camera,
     is_kind,
     placements,
     worst_of,
@@ -43,6 +48,9 @@ _EVERYTHING = Selection()
 _ALL = "all"
 # Such a name needs no quotes in YAML, XML, Python or a shell, and is no command option.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*", re.ASCII)
+# Names of bodies, and of the frames beside optical ones in the drivers of depth cameras: their x is
+# forward (REP 103).
+_BODY = re.compile(r"(?:.*[_/])?(?:link|(?:color|depth|infra[12]?)_frame)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -89,8 +97,8 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     if selection.edge == _ALL:
         available = placements(source, selection.camera)
         _check_takes(form, selection)
-        is_of_one = selection.inverse or selection.parent is not None or selection.child is not None
-        if form.write_all is None or is_of_one or available.cell is None:
+        one = (getattr(selection, field) for field in OF_TRANSFORMS if field != "edge")
+        if form.write_all is None or any(one) or available.cell is None:
             forms = [one.name for one in EXPORT_FORMATS if getattr(one, "write_all", None)]
             raise DataError(
                 f"--edge all: all transforms are of a whole cell, written as {', '.join(forms)}, "
@@ -161,7 +169,7 @@ def _camera_fault(form: ExportFormat, selection: Selection, available: Placement
         return ""
     if not (of_lens and cell is not None) and available.mount in (None, "instrument"):
         return f"holds the camera, and {available.words} has none"
-    if of_lens and (selection.inverse or edge or selection.parent):
+    if of_lens and (selection.inverse or edge or selection.parent or selection.child_from_cam):
         return "holds the lens and no transform; --child names the camera"
     if of_lens and cell is not None and available.lens is None:
         return f"holds one camera; this cell has {', '.join(available.lenses) or 'none'}"
@@ -174,14 +182,24 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
     placement, frames = available.find(name)
     rotation_of = placement.rotation_of or frames[0]
     # The poses of tools, fixtures and targets depend on no convention of a lens.
-    of_camera = any(frame.startswith("cam") for frame in frames)
-    edge, lens = placement.edge, available.lens
+    of_camera = any(map(is_camera, frames))
+    edge, lens, optical = placement.edge, available.lens, ""
+    given = (selection.parent, selection.child)
+    named = given[::-1] if selection.inverse else given
+    if selection.child_from_cam is not None:
+        child = named[1] or ""
+        child_from_cam = _child_from_cam(selection.child_from_cam, child, frames[1])
+        # T exp(x) C^-1 = T C^-1 exp(adjoint(C) x).
+        edge = _carried(edge, edge.matrix @ invert(child_from_cam), adjoint(child_from_cam))
+        stated = ", ".join(f"{value:g}" for value in selection.child_from_cam)
+        optical = f"{child} is another frame than the optical one, which stands in it at ({stated})"
+        name, frames = f"{name} * cam_from_{child}", (frames[0], "")
+    if form.holds != "lens":
+        _check_optical(frames, named)
     if selection.inverse:
         # (T exp(x))^-1 = T^-1 exp(-adjoint(T) x): the lever arm turns rotation into translation.
-        turned = adjoint(edge.matrix)
-        edge = Edge(invert(edge.matrix), np.asarray(turned @ edge.covariance @ turned.T))
+        edge = _carried(edge, invert(edge.matrix), adjoint(edge.matrix))
         name, frames = f"inverse of {name}", (frames[1], frames[0])
-    given = (selection.parent, selection.child)
     parent, child = (
         form.frames.get(frame, frame) if stated is None else stated
         for frame, stated in zip(frames, given, strict=True)
@@ -215,9 +233,51 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         frames=frames,
         mount=available.mount,
         lens=lens,
+        optical=optical,
         number=selection.number,
         load=selection.load,
     )
+
+
+def _carried(edge: Edge, matrix: FloatArray, jacobian: FloatArray) -> Edge:
+    """Another transform, with the covariance that the edge's has by the (6, 6) Jacobian."""
+    return Edge(matrix, np.asarray(jacobian @ edge.covariance @ jacobian.T))
+
+
+def _child_from_cam(numbers: Sequence[float], child: str, frame: str) -> FloatArray:
+    """(4, 4) pose of a camera's optical frame in the frame that is exported; raises DataError."""
+    places, pose = ("--child-from-cam",), np.array([numbers], dtype=float)
+    # No part of a camera is farther away [m].
+    if not (child and is_camera(frame)) or pose.shape != (1, 7) or not np.abs(pose).max() <= 3.0:
+        raise DataError(
+            f"--child-from-cam is ({', '.join(f'{value:g}' for value in numbers)}), for {frame} "
+            f"under the name {child!r}; where a camera's optical frame is in a frame with a name "
+            "is needed, in metres, at most 3 m away.",
+            culprits=places,
+            next_step="Give x,y,z,qx,qy,qz,qw and a name, as --child camera_link, of a camera.",
+        )
+    numbers_of = PoseNumbers(pose[:, :3], pose[:, 3:], Reading(), places)
+    return np.asarray(numbers_of.poses()[0])
+
+
+def _check_optical(frames: Sequence[str], named: Sequence[str | None]) -> None:
+    """Refuses names of cameras' bodies for their optical frames; raises DataError."""
+    of_child = (
+        "Say where that one is in {name}, as ros2 run tf2_ros tf2_echo {name} "
+        "camera_color_optical_frame prints it: its offset in metres for the zeros below (all of "
+        "0,0,0,0,0,0,1 where the name is that of the optical frame after all). Run: "
+        f"{AGAIN} --child-from-cam 0,0,0,-0.5,0.5,-0.5,0.5"
+    )
+    steps = ("Give it the name of an optical frame.", of_child)
+    for frame, name, step in zip(frames, named, steps, strict=True):
+        if name and is_camera(frame) and _BODY.fullmatch(name):
+            raise DataError(
+                f"{name!r} is by its name the frame of a camera's body, x forward, and what was "
+                f"calibrated is its optical frame, z forward and x right: under that name it would "
+                "be wrong by a turn of 90 degrees or more.",
+                culprits=[name],
+                next_step=step.format(name=name),
+            )
 
 
 def _check_takes(form: ExportFormat, selection: Selection) -> None:
