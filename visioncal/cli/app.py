@@ -5,14 +5,15 @@ import gc
 import os
 import sys
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from errno import ENAMETOOLONG
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, TextIO, cast
 
 import typer
 
 from visioncal.cli.lazy import LazyGroup
-from visioncal.core.errors import DataError, VerdictError, VisioncalError
+from visioncal.core.errors import DataError, VerdictError, VisioncalError, check_names
 from visioncal.core.version import __version__
 
 
@@ -97,6 +98,8 @@ def main() -> None:
     messages, results = _guarded(sys.stderr, lambda _: None), _guarded(sys.stdout, _end)
     with redirect_stderr(messages), redirect_stdout(results), _WithoutPandas():
         try:
+            with suppress(FileNotFoundError):
+                check_names(*sys.argv, str(Path.cwd()))
             app()
         except VisioncalError as error:
             _refuse(error)

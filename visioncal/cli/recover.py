@@ -66,6 +66,13 @@ def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
         )
     facts: dict[str, Any] = {"schema": 1, "against": against, "minutes": {}, "stated": []} | known
     facts["stated"] = options.cause or facts["stated"]
+    if old.cell is None and old.mount == "instrument":
+        raise DataError(
+            f"{options.against} was measured by an instrument, and recover works by what a camera "
+            "sees.",
+            culprits=["--against"],
+            next_step="Calibrate anew: visioncal calibrate SESSION -o OUT",
+        )
     if old.cell is None:
         recovery.parts_changed(old, facts["stated"])
     return facts

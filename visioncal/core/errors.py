@@ -65,3 +65,20 @@ class VerdictError(VisioncalError):
 
 class DriverError(VisioncalError):
     """A device is absent or fails: check the cable or install the extra that is named."""
+
+
+def check_names(*names: str) -> None:
+    """Refuses names of files that are no text: results and pages in UTF-8 could not hold them.
+
+    Raises:
+        DataError: A name holds bytes of another encoding.
+    """
+    for name in names:
+        try:
+            name.encode()
+        except UnicodeEncodeError as error:
+            raise DataError(
+                f"{name!r} holds bytes that are no UTF-8.",
+                culprits=[ascii(name)],
+                next_step="Rename the file or folder; an archive of another system has such names.",
+            ) from error

@@ -120,6 +120,10 @@ UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 MAX_VALUES = 1_000_000
 # Matrices in lists in tables need six.
 MAX_DEPTH = 40
+_DEEP_KEY = re.compile(
+    r"""(?<![\w-])(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+    rf"""(?:[ \t]*+\.[ \t]*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')){{{MAX_DEPTH + 1}}}"""
+)
 
 
 @contextmanager
@@ -229,6 +233,9 @@ def read_toml(path: Path, label: str) -> dict[str, Any]:
 
 def parse_toml(text: str, label: str) -> dict[str, Any]:
     """Parses TOML; `label` names its origin in errors; raises DataError."""
+    # The parser takes the square of their number for the parts of a dotted key.
+    if _DEEP_KEY.search(text):
+        raise too_deep(label)
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

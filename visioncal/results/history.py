@@ -114,7 +114,7 @@ def table_of(entries: Iterable[Entry]) -> str:
     """Entries as CSV, a row an entry; see `Entry.columns`."""
     rows = [entry.columns for entry in entries]
     names = dict.fromkeys(name for row in rows for name in row)
-    return csv_text([names, *([row.get(name, "") for name in names] for row in rows)])
+    return csv_text([names, *([row.get(name, "") for name in names] for row in rows)], inert=True)
 
 
 def entries_of(calibration: Calibration) -> Iterator[Entry]:

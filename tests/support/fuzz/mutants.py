@@ -140,7 +140,7 @@ READINGS = tuple(
         f"plan ur5e {_PLAN} --target charuco_9x6_30mm --camera {{lens.yaml|board_out}} -o OUT",
         "target make {board.toml} -o OUT",
         "target check {board/images/000.png}",
-        "dynamics plan {arm.toml} -o OUT --seconds 0 --duration 10 --acceleration-deg 400",
+        "dynamics plan {arm.toml} -o OUT --seconds 1 --duration 10 --acceleration-deg 400",
         "dynamics identify {motions} -o OUT",
         "dynamics validate {motions} --against [dynamics_out]",
         "dynamics validate [motions] --against {dynamics_out}",

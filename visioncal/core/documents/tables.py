@@ -25,6 +25,8 @@ _EMPTY = "; ,\t\r\n"
 _COMMENTS = ("#", "%", "//")
 # A row printed as a list, possibly with a name: `pose: [1.0, 2.0]`, `array([1, 2]),`.
 _LISTED = re.compile(r"[^\[\](){}]*+[\[({]++([^\[\](){}]*+)[\])}]++\s*+[,;]?\s*+")
+# A text that begins so is a formula to spreadsheets.
+_FORMULAS = ("=", "+", "-", "@", "\t", "\r")
 
 
 @dataclass(frozen=True)
@@ -90,12 +92,18 @@ def _split(
         ) from error
 
 
-def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Formats rows as CSV with the line ends of UNIX."""
+def csv_text(rows: Iterable[Iterable[object]], *, inert: bool = False) -> str:
+    """Formats rows as CSV with the line ends of UNIX.
+
+    A text that begins like a formula is evaluated by spreadsheets; `inert` puts an apostrophe
+    before it, for tables that leave for other programs.
+    """
 
     def quoted(cell: object) -> str:
-        # csv.writer does not quote a lone carriage return.
         text = str(cell)
+        if inert and text.startswith(_FORMULAS) and not is_number(text):
+            text = f"'{text}"
+        # csv.writer does not quote a lone carriage return.
         return '"' + text.replace('"', '""') + '"' if {*text} & {*',"\r\n'} else text
 
     return "".join(",".join(map(quoted, row)) + "\n" for row in rows)

@@ -26,7 +26,7 @@ from typing import Literal
 
 from visioncal.core.arguments import typed
 from visioncal.core.codec import read, write
-from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.errors import DataError, VisioncalError, check_names
 from visioncal.core.extras import client_library
 from visioncal.core.files import named_errors, natural, read_text, write_atomically
 from visioncal.core.threads import one_blas_thread, safe_path
@@ -97,6 +97,7 @@ def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list
         The jobs, named by their paths below the folder that all sessions share.
     """
     by_argument = {str(session): [*_sessions_of(str(session))] for session in sessions}
+    check_names(*(str(path) for found in by_argument.values() for path in found))
     empty = [name for name, found in by_argument.items() if not found]
     paths = sorted(
         {path.absolute() for found in by_argument.values() for path in found},

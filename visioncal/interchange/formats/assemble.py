@@ -1,5 +1,6 @@
 """Builds a session from a foreign recording."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, count
@@ -232,7 +233,9 @@ def _image_paths(images: Sequence[Path | None], name: str, notes: list[str]) -> 
     for at, file in enumerate(images):
         if file is None or file in paths:
             continue
-        names = chain([file.name], (f"{number}_{file.name}" for number in count(at)))
+        # Archives of other systems leave names in their own encoding.
+        own = os.fsencode(file.name).decode("utf-8" if file.name.isprintable() else "latin-1")
+        names = chain([own], (f"{number}_{own}" for number in count(at)))
         # Some file systems do not distinguish upper and lower case.
         paths[file] = next(name for name in names if name.casefold() not in taken)
         taken.add(paths[file].casefold())

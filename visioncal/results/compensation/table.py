@@ -129,7 +129,7 @@ def table_to_send(targets: Targets, columns: Mapping[str, FloatArray], rows: Int
         cells = dict(zip(own, targets.table.rows[row], strict=True))
         cells |= {name: written(name, float(numbers[row])) for name, numbers in columns.items()}
         lines.append([cells[name] for name in names])
-    return csv_text(lines)
+    return csv_text(lines, inert=True)
 
 
 def written(name: str, value: float) -> str:
