@@ -270,3 +270,10 @@ def test_no_table_for_other_programs_carries_formulas(tmp_path, inputs):
     assert csv_text([["@SUM(1)", "-1.5e-3", "+1", "-x", "ok"]], inert=True) == (
         "'@SUM(1),-1.5e-3,+1,'-x,ok\n"
     )
+
+
+def test_what_a_tracker_measured_cannot_be_recovered_by_a_camera(tmp_path):
+    visioncal("simulate", tmp_path / "s", "--instrument", "points").good()
+    visioncal("calibrate", tmp_path / "s", "-o", tmp_path / "out", "--no-report").good()
+    done = visioncal("recover", tmp_path / "act", "--against", tmp_path / "out")
+    done.refused("was measured by an instrument", "visioncal calibrate")

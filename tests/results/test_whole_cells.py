@@ -430,3 +430,19 @@ def test_two_whole_cells_are_compared_by_all_frames_or_by_a_pair(folder, tmp_pat
     pair = told("diff", folder / "out", tmp_path, *of("left", "b"))
     assert pair["transforms"]["base_from_cam"]["is_change"]
     assert not compare(whole, moved, camera="hand").is_change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda document: document["transforms"].pop("cell_from_base_b"), "is missing"),
+        (lambda document: document["tree"].update(base_b="nowhere"), "lead to the cell"),
+        (lambda document: document["tree"].update(base_b="base_b"), "lead to the cell"),
+        (lambda document: document["tree"].pop("base_b"), "lead to the cell"),
+    ],
+)
+def test_a_tree_that_does_not_hold_together_is_refused(change, words, found):
+    document = json.loads(json.dumps(to_document(found)))
+    change(document)
+    with pytest.raises(DataError, match=words):
+        Calibration.from_json(json.dumps(document), "calibration.json")

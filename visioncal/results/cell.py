@@ -58,6 +58,14 @@ class CellResult:
     joint_fit: CellJointFit | None = None
     uncertainty: CellUncertainty | None = None  # Uncertainty of the cell.
 
+    def __post_init__(self) -> None:
+        for name in self.tree:
+            above, parent = {name}, self.tree[name]
+            while parent != CELL:
+                if parent in above or parent not in self.tree:
+                    raise ValueError(f"tree.{name} does not lead to the cell")
+                above, parent = above | {parent}, self.tree[parent]
+
     @property
     def flanges(self) -> dict[str, str]:
         """Robot of each flange, by the flange's frame."""

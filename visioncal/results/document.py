@@ -100,6 +100,12 @@ class CellForm:
     # Unknown sections, kept as they are.
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        known = {*self.cell.flanges, self.cell.reference}
+        for frame, parent in self.cell.tree.items():
+            if frame not in known and f"{parent}_from_{frame}" not in self.edges:
+                raise ValueError(f"transforms.{parent}_from_{frame} is missing")
+
 
 # Fields of the forms that a calibration, or its cell, has under the same names.
 _CONVERTED = "schema visioncal session joint_covariance"

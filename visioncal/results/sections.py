@@ -166,6 +166,11 @@ class CellUncertainty(Section):
     # 95 % intervals of the noise levels, by robot and by name.
     noise_95: Mapping[str, Intervals] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        for name, budget in self.budget_mm.items():
+            if "total" not in budget:
+                raise ValueError(f"budget_mm.{name} has no total")
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedArm:
