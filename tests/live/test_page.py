@@ -1,84 +1,24 @@
 """The page in headless Chromium: a calibration by typed poses alone, and checks of it."""
 
-import os
 import re
 import socket
-import subprocess
-import sys
-import time
-import urllib.error
-import urllib.request
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import played
 from support.browser import CHROMIUM
 from support.commands import visioncal as command
+from support.page import free_port, opened, served
 
 import visioncal
 from visioncal import Calibration, Session
 from visioncal.vision.boards.imaging import read_image
 
 pytest.importorskip("nicegui")
-sync_api = pytest.importorskip("playwright.sync_api")
+pytest.importorskip("playwright.sync_api")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser")
-# Longer than anything takes that comes at all [ms].
-PATIENT_MS = 30_000
 POSE = "Pose of the flange"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with sync_api.sync_playwright() as play:
-        flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-        opened = play.chromium.launch(executable_path=CHROMIUM, args=flags)
-        yield opened
-        opened.close()
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
-@contextmanager
-def served(*words: object):
-    """The page of a command: its address, and its process."""
-    url = f"127.0.0.1:{free_port()}"
-    words = [sys.executable, played.__file__, *map(str, words), "--page", "--address", url]
-    # NiceGUI would take the process for a test of itself.
-    own = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
-    process = subprocess.Popen(
-        words, env=own, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    try:
-        for _ in range(300):
-            assert process.poll() is None, process.stdout.read()
-            try:
-                urllib.request.urlopen(f"http://{url}/live.jpg").close()
-                break
-            except OSError:
-                time.sleep(0.1)
-        yield f"http://{url}", process
-    finally:
-        process.kill()
-        said = process.communicate()[0]
-        assert "Traceback" not in said, said
-
-
-@contextmanager
-def opened(browser, url: str):
-    """A page with a short patience, whose own errors fail the test."""
-    page = browser.new_page(viewport={"width": 1300, "height": 1000})
-    page.set_default_timeout(PATIENT_MS)
-    page.on("pageerror", lambda error: pytest.fail(str(error)))
-    page.goto(url)
-    yield page
-    # One that stays asks for its process, and draws its pictures, for ever.
-    page.close()
 
 
 def kuka(pose, *, comma: bool = False) -> str:
@@ -226,13 +166,3 @@ def test_a_check_passes_and_fails_and_is_remembered(cell, browser):
                     lines = page.get_by_text(re.compile(r"^\d{4}-\d\d-\d\d-cell-result"))
                     history = lines.all_inner_texts()
     assert ["agree" in line for line in history] == [False, True]
-
-
-def test_other_sites_are_refused(cell):
-    with served("record", "-o", cell / "alone") as (url, _):
-        for headers in ({"Origin": "http://elsewhere.example"}, {"Host": "elsewhere.example"}):
-            asked = urllib.request.Request(f"{url}/live.jpg", headers=headers)
-            with pytest.raises(urllib.error.HTTPError, match="403"):
-                urllib.request.urlopen(asked)
-        own = urllib.request.Request(f"{url}/live.jpg", headers={"Origin": url})
-        assert urllib.request.urlopen(own).status == 200

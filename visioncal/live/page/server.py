@@ -4,49 +4,25 @@ Every browser has a page of its own of the one station, redrawn from its snapsho
 nothing.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from urllib.parse import urlsplit
 
 import numpy as np
 from fastapi import Response
 from nicegui import app, ui
-from starlette.types import ASGIApp, Receive, Scope, Send
 
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.documents.pendants import PendantPose, pendant_words, read_pose
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
 from visioncal.live.drivers.manual import pose_words
+from visioncal.live.page.access import Admission
 from visioncal.live.page.outcome import Outcome
 from visioncal.live.page.station import PageText, Snapshot, Station
 
 _COLOURS = {"green": "#2e9e2e", "yellow": "#e0a800", "red": "#c62828", "grey": "#777777"}
 _PICTURE, _REPORT = "/live.jpg", "/report"
-
-
-class _SameOrigin:
-    """Refuses requests of other sites' pages, which a browser on this machine may have open.
-
-    A page's own requests name its address as their host, and as their origin where they name one.
-    """
-
-    def __init__(self, asgi: ASGIApp, hosts: Sequence[str]) -> None:
-        self._asgi, self._hosts = asgi, hosts
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = {key.lower(): value.decode("latin-1") for key, value in scope.get("headers", ())}
-        host = headers.get(b"host", "")
-        is_known = not self._hosts or urlsplit(f"//{host}").hostname in self._hosts
-        origin = headers.get(b"origin")
-        is_own = origin is None or urlsplit(origin).netloc == host
-        if scope["type"] == "lifespan" or (is_known and is_own):
-            await self._asgi(scope, receive, send)
-        elif scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008})
-        else:
-            await Response("Not from here.", 403)(scope, receive, send)
 
 
 def serve(station: Station, text: PageText, host: str, port: int, *, opens: bool) -> None:
@@ -61,7 +37,7 @@ def serve(station: Station, text: PageText, host: str, port: int, *, opens: bool
     """
     loopback = ("127.0.0.1", "localhost", "::1")
     # By another address a page may have any name.
-    app.add_middleware(_SameOrigin, hosts=loopback if host in loopback else ())
+    app.add_middleware(Admission, hosts=loopback if host in loopback else ())
 
     def live_picture() -> Response:
         headers = {"Cache-Control": "no-store"}
@@ -92,17 +68,17 @@ class _Page:
         setup = station.snapshot.setup
         with ui.row().classes("w-full items-center gap-4"):
             ui.label(text.title).classes("text-2xl")
-            self._light = ui.html("", sanitize=False)
+            self._light = ui.label().classes("text-white text-xl px-4 py-1").props("role=status")
             self._status = ui.label("").props("aria-live=polite")
         self._problem = ui.label("").classes("text-red-700 text-lg").props("role=alert")
         self._note = ui.label("").classes("text-sm")
         with ui.card().classes("w-full") as self._setup:
             for name, (label, choices) in text.fields.items():
-                self._inputs[name] = (
-                    ui.input(label, value=getattr(setup, name), autocomplete=[*choices])
-                    .props(f'clearable hint="{", ".join(choices)}"')
-                    .classes("w-full")
-                )
+                value = getattr(setup, name)
+                field = ui.input(label, value=value, autocomplete=[*choices]).classes("w-full")
+                # Names of folders are data: `props()` would parse them, and run what they say.
+                field.props("clearable").props["hint"] = ", ".join(choices)
+                self._inputs[name] = field
             ui.button("Start", on_click=self._begin)
         self._outcome = ui.card().classes("w-full gap-1")
         with ui.row().classes("w-full gap-4 items-start") as self._live:
@@ -122,7 +98,7 @@ class _Page:
             with ui.row().classes("items-center"):
                 self._still = ui.label("").classes("text-xl font-bold")
                 self._sees = ui.label("")
-            self._coverage = ui.html("", sanitize=False)
+            self._coverage = ui.html()
             self._advice = ui.label("").classes("text-sm")
         with ui.column().classes("flex-1").style("min-width: min(100%, 360px)"):
             self._next = ui.label("").classes("text-lg")
@@ -146,13 +122,14 @@ class _Page:
                 self._understood = ui.label("").props("aria-live=polite")
             with ui.row().classes("gap-1"):
                 self._take_button = ui.button("Take view (Enter)", on_click=self._take)
-                for words, request, look in (
-                    ("Undo last", station.undo, "flat"),
-                    ("Another pose", station.skip, "flat"),
-                    (self._text.finish, station.finish, ""),
-                    ("Close", station.end, "flat"),
+                for words, request in (
+                    ("Undo last", station.undo),
+                    ("Another pose", station.skip),
+                    (self._text.finish, station.finish),
+                    ("Close", station.end),
                 ):
-                    ui.button(words, on_click=partial(self._ask, request)).props(look)
+                    button = ui.button(words, on_click=partial(self._ask, request))
+                    button.props["flat"] = request != station.finish
             self._missed = ui.label("").classes("text-red-700").props("role=alert")
             self._views = ui.column().classes("gap-0 text-sm")
 
@@ -232,11 +209,8 @@ class _Page:
         shown: Outcome | None = now.outcome or now.trial
         light, words = ("grey", "no result yet") if shown is None else (shown.light, shown.title)
         so_far = " so far" if now.outcome is None and shown is not None else ""
-        self._light.content = (
-            f'<span role="status" style="background:{_COLOURS[light]};color:white;'
-            f'border-radius:1em;padding:0.4em 1em;font-size:1.2em;white-space:nowrap">{words}'
-            f"{so_far}</span>"
-        )
+        self._light.text = f"{words}{so_far}"
+        self._light.style(f"background:{_COLOURS[light]};border-radius:1em;white-space:nowrap")
         self._outcome.clear()
         self._outcome.visible = shown is not None
         if shown is not None:
@@ -254,5 +228,5 @@ class _Page:
         with self._history:
             for light, date, line in self._text.history():
                 with ui.row().classes("items-center no-wrap"):
-                    ui.html(f'<span style="color:{_COLOURS[light]}">&#9679;</span>', sanitize=False)
+                    ui.label("\N{BLACK CIRCLE}").style(f"color:{_COLOURS[light]}")
                     ui.label(f"{date}: {line}")
