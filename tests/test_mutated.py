@@ -7,8 +7,8 @@ from support.fuzz.mutants import READINGS, missing_commands, walk
 
 # Inputs that are made within a second, and commands that end soon on them.
 QUICK = re.compile(
-    r"(convert|diff|export|fixture|tcp|show|verify) .*"
-    r"\{(pairs|pairs_out|pairs.rrd|pairs/\w+.csv|frames.json|arm.toml|foreign/\w+)\}"
+    r"(convert|diff|export|fixture|guard|tcp|show|verify) .*"
+    r"\{(pairs|pairs_out|pairs.rrd|pairs/\w+.csv|pairs.jsonl|guard.json|frames.json|arm.toml|foreign/\w+)\}"
 )
 READ = [
     words for words in READINGS if QUICK.match(words) and not re.search(r"\[[b-o]\w+_out", words)

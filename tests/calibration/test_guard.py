@@ -13,6 +13,7 @@ from support.commands import visioncal
 from support.later import FITTED, Change, again, knock, usual
 from support.refusals import raised
 from support.scenes import CAMERA, Scene, disturbed, turned
+from support.wrong_arms import target_in_camera
 
 from visioncal import Guard, Look
 from visioncal.calibration.verification.guard_detector import Detector, counted, limit
@@ -86,6 +87,8 @@ def test_false_alarms_are_as_rare_as_stated():
         if not guard.take(white(shown[at % 12], rng, HOUR_S * at, factor)).holds:
             alarms += 1
             guard.acknowledge()
+        # Rounding of the widest entry, of (0.4 rad)^2: an indefinite one ends in no answer.
+        assert np.linalg.eigvalsh(guard.document["state"]["covariance"])[0] > -1e-15
     # 30 in the mean; beyond four sigma of Poisson's distribution above. While noise is learned
     # there are fewer.
     assert 3 <= alarms <= 30 + 4 * np.sqrt(30)
@@ -155,19 +158,96 @@ def test_a_change_is_named_with_its_size_and_time(mount):
         assert found[-1].causes[0].cause == ("board" if name == "camera" else "camera")
 
 
+# Of a camera: distance and angle of a change, and what names it; nothing where it is noise.
+SIZES = ((0.1, 0.01, ""), (1.0, 0.1, "camera"), (10.0, 1.0, "camera"), (100.0, 10.0, "camera"),
+         (300.0, 25.0, "camera"), (600.0, 5.0, None), (0.0, 60.0, "none of these"),
+         (10.0, 90.0, "none of these"), (0.0, 120.0, "none of these"),
+         (0.0, 180.0, "none of these"), (1500.0, 0.0, "none of these"),
+         (8000.0, 179.0, "none of these"))  # fmt: skip
+
+
+def posed(place, rng, count, change=None, start=0):
+    """Looks by the target's pose, which may be anywhere: out of the image, behind the camera."""
+    cell, change = place.cell, change or Change()
+    x, z = cell.transforms.values()
+    for at in range(start, start + count):
+        fresh = again(cell, rng, change, 1)
+        flange = fresh.robot.true_base_from_flange
+        moved = x @ exp(change.camera), z @ exp(change.board)
+        seen = target_in_camera(cell.options.mount, *moved, flange)[0]
+        yield Look(
+            time_s=HOUR_S * at,
+            base_from_flange=fresh.robot.base_from_flange[0],
+            cam_from_target=seen @ exp(2e-5 * rng.standard_normal(6)),
+            joints_rad=fresh.robot.joints[0],
+        )
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_changes_of_any_size_are_answered_and_beyond_the_model_something_else(mount):
+    place, rng = usual(mount), np.random.default_rng(5)
+    guard, kept = Guard(place.calibration), None
+    for look in posed(place, rng, 60):
+        assert guard.update(look).holds
+    kept = json.loads(json.dumps(guard.document, allow_nan=False))
+    for mm, deg, name in SIZES:
+        for what in ("camera", "board", "joints_rad"):
+            if what == "joints_rad" and not deg:
+                continue
+            twist = np.eye(6)[2] * np.deg2rad(deg) if what == "joints_rad" else knock(rng, mm, deg)
+            changed = guard.restore(kept), Change(**{what: twist})
+            found = [guard.update(look) for look in posed(place, rng, 9, changed[1], 60)]
+            case = f"{what}, {mm} mm and {deg} deg"
+            # What a PLC reads has no NaN, nor has what is kept.
+            for document in (*(answer.document for answer in found), guard.document):
+                json.dumps(document, allow_nan=False)
+            if not name:
+                continue
+            # One wrong look is no alarm; two or three are.
+            assert found[0].holds, case
+            assert not found[-1].holds, case
+            first = found[-1].causes[0]
+            assert first.probability > 0.9, case
+            expected = {"camera": {"board": "board", "joints_rad": "joint 3"}.get(what, "camera")}
+            assert first.cause == expected.get(name, name) or name is None, case
+            if name == "none of these":
+                assert not found[1].holds, case
+                assert first.mm is first.deg is None
+                # As the calibration knows nothing of it, nothing is learned from it.
+                guard.acknowledge()
+                assert all(guard.update(look).holds for look in posed(place, rng, 5, start=70))
+
+
+def test_one_look_beyond_the_model_changes_nothing():
+    place, rng = usual("eye-in-hand"), np.random.default_rng(6)
+    guard = Guard(place.calibration)
+    for at, look in enumerate(posed(place, rng, 40)):
+        deg, before = 170.0 * (at % 10 == 9), guard.document["state"]
+        seen = look.cam_from_target @ exp(np.eye(6)[at % 3] * np.deg2rad(deg))
+        assert guard.update(replace(look, cam_from_target=seen)).holds
+        if deg:
+            after = guard.document["state"]
+            for name in ("shape", "fresh", "slow", "offsets", "stood", "usual"):
+                assert after[name] == before[name]
+
+
 def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
     place = usual("eye-in-hand")
     guard, cell = Guard(place.calibration), place.cell
     (look,) = looks(place, np.random.default_rng(2), 1, start=5)
     guard.update(look)
     before, bad = guard.document, look.corners.take(np.arange(3))
-    strange = replace(look.corners, ids=look.corners.ids + 900)
+    strange, px = replace(look.corners, ids=look.corners.ids + 900), look.corners.px.copy()
+    # Its square is no number.
+    px[2, 0] = 1e200
+    afar = replace(look.corners, px=px)
     for changed, words in (
         ({"time_s": 1.0}, "earlier than the last, at 18000 s"),
         ({"joints_rad": None}, "no joints_rad"),
         ({"joints_rad": np.zeros(3)}, "6 are needed"),
         ({"joints_rad": np.rad2deg(look.joints_rad)}, "in degrees by its size"),
         ({"corners": bad}, "its 3 corners do not determine"),
+        ({"corners": afar}, r"at \(1e\+200, .*\) px lies far outside the calibrated"),
         ({"corners": strange}, "corners do not determine"),
         ({"target": "other"}, "its target is 'other'"),
     ):
@@ -180,12 +260,19 @@ def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
         ({"corners": None}, "one of both"),
         ({"corners": None, "cam_from_target": far}, "millimetres"),
         ({"base_from_flange": np.eye(3)}, "its shape is"),
-        ({"time_s": np.nan}, "its time is nan"),
+        ({"time_s": np.nan}, "its time_s is nan; seconds"),
+        # Nanoseconds: after them all looks in seconds would be too early.
+        ({"time_s": 1.8e18}, "its time_s is 1.8e"),
     ):
         raised(DataError, words, lambda c=changed: replace(look, **c))
     assert guard.document == before
-    for damaged in ({**before, "calibration": "x"}, {"calibration": before["calibration"]}):
-        raised(DataError, "cannot be used", guard.restore, damaged)
+    wide, state = np.array(before["state"]["covariance"]), before["state"]
+    damaged = [{**before, "calibration": "x"}, {"calibration": before["calibration"]}]
+    # With these the next look's covariance is none, or its evidence no number.
+    damaged += [{**before, "state": {**state, "covariance": (-wide).tolist()}}]
+    damaged += [{**before, "state": {**state, "mean": state["mean"][:-1]}}]
+    for document in damaged:
+        raised(DataError, "cannot be used", guard.restore, document)
     for wrong in ({"false_alarm_looks": 1.0}, {"slow_mm": -1.0}):
         raised(DataError, "are needed", Guard, place.calibration, **wrong)
     without = replace(place.calibration, joint_fit=None)
@@ -198,7 +285,9 @@ def test_of_the_command_line(tmp_path, monkeypatch):
     against = ("--against", tmp_path, "--state", tmp_path / "state.json")
 
     def sent(*lines):
-        monkeypatch.setattr(sys, "stdin", io.StringIO("".join(f"{line}\n" for line in lines)))
+        # A lone surrogate is a byte that is no text.
+        typed = "".join(f"{line}\n" for line in lines).encode(errors="surrogateescape")
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(typed), encoding="ascii"))
         done = visioncal("guard", *against)
         return done.status, [json.loads(line) for line in done.out.splitlines()]
 
@@ -213,14 +302,17 @@ def test_of_the_command_line(tmp_path, monkeypatch):
     assert (status, said[-1]["look"], said[-1]["holds"]) == (0, 20, True)
     wrong = {
         "{": "no JSON",
+        '{"time_s": 1, "target": "\udcff"': "no JSON",
         '{"time_s": 1}': "cam_from_target or",
         '{"when": 2}': "'when'",
         '{"acknowledge": false}': "or acknowledge alone, true",
-        "null": "line 6: the look is null; a JSON object",
+        "null": "line 7: the look is null; a JSON object",
         "[" * 9999: "nested deeper",
         '{"time_s": null}': "no time_s",
         '{"time_s": [1]}': "time_s is [1]; it has to be a number of seconds",
         '{"time_s": 1, "corners": 3}': "corners is 3; it has to be a list of [number, x, y]",
+        '{"time_s": 1, "corners": [[1, 2, 3], [1, 4, 5]]}': "each whole number once",
+        '{"time_s": 1, "corners": [[0.5, 2, 3]]}': "each whole number once",
         '{"time_s": 1, "joints_rad": ["a"]}': 'joints_rad is ["a"]; it has to be a list',
         '{"time_s": 1, "base_from_flange": {}}': "base_from_flange is {}; it has to be a 4 x 4",
     }

@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT
 from visioncal.cli.result_options import GuardOptions
 from visioncal.core.documents.jsons import parse_json, parse_stored
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.files import read_text, write_atomically
+from visioncal.core.files import MOST_BYTES, read_text, write_atomically
 from visioncal.core.transforms import compose
 from visioncal.core.types import Corners, FloatArray
 from visioncal.interchange.result_files import load_result
@@ -84,7 +85,11 @@ def _keep(guard: Guard, path: Path | None) -> None:
 
 def _answers(guard: Guard) -> Iterator[dict[str, Any]]:
     """Answers the lines of stdin; one that cannot be used changes nothing."""
-    for number, line in enumerate(sys.stdin, 1):
+    if isinstance(sys.stdin, TextIOWrapper):
+        sys.stdin.reconfigure(encoding="utf-8", errors="replace")
+    # A line that never ends comes in pieces, none of which is a look.
+    lines = iter(partial(sys.stdin.readline, MOST_BYTES), "")
+    for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
         try:
@@ -135,6 +140,8 @@ def _pose(value: Any) -> FloatArray:  # noqa: ANN401 - of JSON
 
 def _corners(value: Any) -> Corners:  # noqa: ANN401 - of JSON
     table = _numbers(sorted(value)).reshape(-1, 3)
+    if not (np.diff(table[:, 0]) >= 1.0).all() or (table[:, 0] % 1.0 != 0.0).any():
+        raise ValueError
     return Corners(0, table[:, 0].astype(np.int64), table[:, 1:], 0.0)
 
 
@@ -145,7 +152,7 @@ _KEYS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "time_s": (float, "a number of seconds"),
     "base_from_flange": _A_POSE,
     "cam_from_target": _A_POSE,
-    "corners": (_corners, "a list of [number, x, y] in pixels"),
+    "corners": (_corners, "a list of [number, x, y] in pixels, each whole number once"),
     "joints_rad": (_numbers, "a list of radians"),
     "target": (str, "a name"),
 }

@@ -19,6 +19,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import repeat
@@ -28,6 +29,7 @@ from unittest.mock import patch
 
 from support import foreign_samples
 from support.commands import Done, every_command, visioncal
+from support.fuzz.looks import write_looks
 from support.fuzz.mutators import mutate
 
 from visioncal.cli import console
@@ -65,6 +67,7 @@ MADE = {
     "arm.json": "export [arm_out] --to robot-json -o IT",
     "arm.urdf": "export [arm_out] --to robot-urdf -o IT",
     "lens.yaml": "export [board_out] --to camera-info -o IT",
+    "guard.json": "guard --against [pairs_out] --state IT < [pairs.jsonl]",
 }  # fmt: skip
 PACKAGED = {
     "arm.toml": "visioncal/robot/models/ur10e.toml", "board.toml": "targets/charuco_9x6_30mm.toml"
@@ -76,7 +79,7 @@ _KUKA = "--robot-key X,Y,Z,A,B,C --robot-form kuka --camera-key " \
     "cam_x,cam_y,cam_z,cam_qx,cam_qy,cam_qz,cam_qw"  # fmt: skip
 _STOOD = "--pose 0.5,0.1,0.4,0,1,0,0"
 # How each command is called: {name} is the input that is broken, one of several; [name] another
-# sound one, OUT an earlier result's folder, NEW a path where nothing is.
+# sound one, OUT an earlier result's folder, NEW a path where nothing is; < what is typed into it.
 READINGS = tuple(
     f"{before}{{{name}}}{after}"
     for before, names, after in (re.split("[{}]", words) for words in (
@@ -90,6 +93,9 @@ READINGS = tuple(
         "verify [pairs] --against {pairs_out} -o NEW",
         "verify {board} --against [board_out]",
         "guard --against {board_out|arm_out}",
+        "guard --against [pairs_out] < {pairs.jsonl}",
+        "guard --against [arm_out] < {arm.jsonl}",
+        "guard --against [pairs_out] --state {guard.json} < [pairs.jsonl]",
         "recover NEW --against {pairs_out} --stops [pairs] --count 9",
         "recover NEW --against [pairs_out] --stops {pairs} --count 9",
         "history {site.db} -o NEW.html",
@@ -171,11 +177,14 @@ def sound(folder: Path, name: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     if name in MADE:
         words = shlex.split(_NAMED.sub(lambda found: str(sound(folder, found[1])), MADE[name]))
-        done = visioncal(*(path if word == "IT" else word for word in words))
+        with _typed(words):
+            done = visioncal(*(path if word == "IT" else word for word in words))
         if done.status not in (0, 3):
             raise RuntimeError(f"{name}: {done.err}")
     elif name in PACKAGED:
         shutil.copyfile(Path(__file__).parents[3] / PACKAGED[name], path)
+    elif name.endswith(".jsonl"):
+        write_looks(path, sound(folder, path.stem))
     elif name.startswith("foreign/"):
         makers = foreign_samples.RECORDINGS | foreign_samples.MORE_RECORDINGS
         makers[name.removeprefix("foreign/")](path)
@@ -220,7 +229,8 @@ def run_mutant(number: int, seed: int, readings: Sequence[str], inputs: Path) ->
         if (most := resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) > MOST_KB:
             faults.append(f"{most} kB of memory")
         changed = [name for name in {*before, *after} if before.get(name) != after.get(name)]
-        if done.status == 2:
+        # Of the guard, whose status is that of its lines, the others count.
+        if done.status == 2 and not words.startswith("guard "):
             faults += [f"status 2 changed {name}" for name in changed]
         for written in changed:
             if written.endswith(".json") and written in after:
@@ -246,7 +256,21 @@ def digests(folder: Path) -> dict[str, str]:
     return found
 
 
-def _called(words: Sequence[str]) -> tuple[Done, list[str]]:
+@contextmanager
+def _typed(words: list[str]) -> Iterator[None]:
+    """Types the file after < into the command, and takes both from its words."""
+    data = b""
+    if "<" in words:
+        at = words.index("<")
+        path = Path(words[at + 1])
+        # Anything but a file a shell would not type, or without end.
+        data = path.read_bytes() if path.is_file() and not path.is_symlink() else b""
+        del words[at:]
+    with patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(data))):
+        yield
+
+
+def _called(words: list[str]) -> tuple[Done, list[str]]:
     """Calls the application as its entry point does: how it ended, and its faults."""
     errors: list[VisioncalError] = []
     report = console.report_error
@@ -257,13 +281,15 @@ def _called(words: Sequence[str]) -> tuple[Done, list[str]]:
 
     try:
         with (
-            patch.object(sys, "stdin", io.StringIO()),
+            _typed(words),
             patch.object(console, "report_error", reported),
             patch.object(viewer, "review_native", lambda *_: None),
         ):
             done = visioncal(*words)
     except BaseException:  # noqa: BLE001 - what escapes is what is looked for
         return Done(1, "", ""), [f"traceback: {traceback.format_exc(limit=-6)}"]
+    if words[0] == "guard" and not errors:
+        return done, [*_unanswered(done)]
     if done.status == 2:
         return done, [*_unclear(errors, done, as_json="--json" in words)]
     return done, [f"said {done.err[-600:]}"] * (done.status == 1 or "Warning:" in done.err)
@@ -281,6 +307,19 @@ def _unclear(errors: Sequence[VisioncalError], done: Done, *, as_json: bool) -> 
         yield f"no culprit: {error}"
     if as_json != bool(done.out) or (as_json and json.loads(done.out).keys() != {"error"}):
         yield f"a refusal printed {done.out[:100]!r}"
+
+
+def _unanswered(done: Done) -> Iterator[str]:
+    """What is wrong with the guard's answers to lines."""
+    answers = [json.loads(line, parse_constant=float.fromhex) for line in done.out.splitlines()]
+    holds = [answer["holds"] for answer in answers if "holds" in answer]
+    wrong = any("error" in answer for answer in answers)
+    if done.err:
+        yield f"said {done.err[-600:]}"
+    if False in holds and any(holds[holds.index(False) :]):
+        yield "an alarm that was not acknowledged ended"
+    if done.status != (3 if holds and not holds[-1] else 2 if wrong else 0):
+        yield f"status {done.status}, and the last of {len(answers)} answers is {answers[-1:]}"
 
 
 def walk(

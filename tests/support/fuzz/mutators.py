@@ -15,6 +15,7 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
+from support.fuzz.looks import moved_looks
 
 Chance: TypeAlias = random.Random
 Bytes: TypeAlias = Callable[[bytes, Chance], bytes]
@@ -156,6 +157,20 @@ def _broken(value: object, chance: Chance) -> object:
     return changed
 
 
+def json_line(data: bytes, chance: Chance) -> bytes:
+    """One of a file's documents, a line each."""
+    lines = data.splitlines() or [b""]
+    at = chance.randrange(len(lines))
+    return b"\n".join([*lines[:at], json_value(lines[at], chance), *lines[at + 1 :], b""])
+
+
+def looks_moved(data: bytes, chance: Chance) -> bytes:
+    """Looks of a cell in which something has moved, which are as valid."""
+    looks = [json.loads(line) for line in data.splitlines()]
+    moved = moved_looks(looks, np.random.default_rng(chance.randrange(2**32)))
+    return b"".join(json.dumps(look).encode() + b"\n" for look in moved)
+
+
 # --- Pictures and arrays.
 
 
@@ -183,6 +198,7 @@ KINDS: dict[str, tuple[tuple[Bytes, ...], tuple[Bytes, ...]]] = {
     ".csv": ((columns_changed, columns_changed, *TEXT[:3]), (*ANY, *TEXT)),
     ".toml": (TEXT[:2], (*ANY, *TEXT)),
     ".json": ((json_value, json_value, number_changed), (*ANY, *TEXT)),
+    ".jsonl": ((looks_moved, looks_moved, json_line), (*ANY, *TEXT)),
     ".png": ((other_picture,), ANY),
     ".rrd": (ANY, ANY),
     ".npz": (ANY, ANY),

@@ -34,13 +34,8 @@ def usable_corners(
     Raises:
         DataError: Most views have corners outside the image, or contradict the target's numbering.
     """
-    size = np.array(resolution, dtype=float)
     corners = {view.number: session.corners[view.number] for view in views}
-    least, most = -_OUTSIDE * size, (1 + _OUTSIDE) * size
-    outside = {
-        view: np.asarray(((at.px < least) | (at.px > most)).any(axis=1))
-        for view, at in corners.items()
-    }
+    outside = {view: far_outside(at.px, resolution) for view, at in corners.items()}
     lost = [f"view {view}" for view, mask in outside.items() if mask.any()]
     if 2 * len(lost) > len(views):
         px = np.concatenate([at.px for at in corners.values()])
@@ -64,6 +59,12 @@ def usable_corners(
                 view, "its corners in corners.csv do not lie as the target's drawing numbers them"
             )
     return usable
+
+
+def far_outside(px: FloatArray, resolution: tuple[int, int]) -> Mask:
+    """(n,) whether each of (n, 2) pixels is none of an image of (width, height), nor near it."""
+    shares = px / np.array(resolution, dtype=float)
+    return np.asarray(~((shares >= -_OUTSIDE) & (shares <= 1.0 + _OUTSIDE)).all(axis=1))
 
 
 def _usable(

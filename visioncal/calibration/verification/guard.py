@@ -7,11 +7,13 @@ from typing import Any, Self
 
 import numpy as np
 
+from visioncal.calibration.stages.corner_numbers import far_outside
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.change_hypotheses import BOARD, CAMERA, JOINT, MOTION_UNITS
 from visioncal.calibration.verification.guard_detector import (
+    CANDIDATE,
     ChangeKind,
     Detector,
     LookRows,
@@ -72,8 +74,10 @@ class Look:
                 culprits=["cam_from_target", "corners"],
                 next_step="Send looks that show the target alone.",
             )
-        if not np.isfinite(self.time_s):
-            raise DataError(f"look: its time is {self.time_s}.", culprits=["time_s"])
+        # After one in other units every look in seconds would be too early.
+        if not abs(self.time_s) < 1e11:
+            words = f"look: its time_s is {self.time_s:g}; seconds of under 3000 years are needed."
+            raise DataError(words, culprits=["time_s"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +177,7 @@ class Guard:
             self._kinds.append(ChangeKind(name, columns, share / len(self._boards)))
         for at in range(len(joints)):
             self._kinds.append(ChangeKind(f"{JOINT} {at + 1}", (edges + at,), share / len(joints)))
+        self._kinds.append(ChangeKind(NONE, (), share))
         self._other = ChangeKind(NONE, tuple(range(edges + len(joints))), share)
         self._noise = prior.noise(from_corners=self._free is not None)
         # An arm that is off by a millimetre has zeros that are off by a milliradian.
@@ -237,6 +242,8 @@ class Guard:
     def _found(self) -> dict[str, Any]:
         """Causes and the time of the change."""
         (kinds, shares, candidate, by_time), causes = self._judged(), []
+        # Of none, within what looks' rows say and beyond it.
+        kinds, shares = (*kinds[:-2], kinds[-1]), np.append(shares[:-2], shares[-2:].sum())
         born = self._state.born
         for at in np.argsort(-shares).tolist():
             kind = kinds[at]
@@ -377,9 +384,18 @@ class Guard:
             robot, (x, *z) = robot_part(flange[None], calibration.mount)[0], self.prior.state.edges
             start = invert(robot @ x) @ z[self.prior.boards.index(board)]
             seen = look.corners or Corners(0, np.arange(0), np.zeros((0, 2)), 0.0)
+            size = lens.camera.resolution
+            if (outside := far_outside(seen.px, size)).any():
+                u_px, v_px = seen.px[outside][0].tolist()
+                raise DataError(
+                    f"{label}: its corner at ({u_px:g}, {v_px:g}) px lies far outside the "
+                    f"calibrated camera's image of {size[0]} x {size[1]} px.",
+                    culprits=["corners"],
+                    next_step="Send pixels of its whole raw image.",
+                )
             px = lens.in_model(seen.px, float(start[2, 3]))
             seen = replace(seen, view=0, ids=seen.ids + first)
-        is_known = np.all((seen.ids >= first) & (seen.ids < end)) and np.isfinite(px).all()
+        is_known = np.all((seen.ids >= first) & (seen.ids < end))
         if not is_known or not determines_pose(free.positions[seen.ids]):
             raise DataError(
                 f"{label}: its {len(seen.ids)} corners do not determine the target's pose: that "
@@ -395,7 +411,8 @@ class Guard:
         """All that a restart needs beside the calibration; for JSON."""
         state = {name: values.tolist() for name, values in vars(self._state).items()}
         created = self.prior.calibration.created
-        return {"calibration": created, "is_changed": self._is_changed, "state": state}
+        kept = {"calibration": created, "is_changed": self._is_changed, "state": state}
+        return {**kept, "sha256": self._state.digest()}
 
     def restore(self, document: Mapping[str, Any]) -> Self:
         """Goes on from an earlier `document` of the same calibration's guard.
@@ -408,9 +425,12 @@ class Guard:
             if document["calibration"] != self.prior.calibration.created:
                 fault = "it is of another calibration"
             for name, now in vars(self._state).items():
-                shape = (-1, *now.shape[1:]) if now.ndim else ()
-                values[name] = np.array(document["state"][name], dtype=float).reshape(shape)
+                kept = np.array(document["state"][name], dtype=float)
+                count = (len(document["state"]["born"]),) if name in CANDIDATE else now.shape[:1]
+                values[name] = kept.reshape((*count, *now.shape[1:]))
             state, is_changed = Detector(**values), bool(document["is_changed"])
+            if not fault and document["sha256"] != state.digest():
+                fault = "its numbers are not those that were kept"
         except (LookupError, TypeError, ValueError) as error:
             fault = fault or repr(error)
         if fault:

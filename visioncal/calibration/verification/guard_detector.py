@@ -17,6 +17,9 @@ new at a known posture, and the size of slow motions are learned; these by the i
 correlation with the motion that was predicted, which is none if it is as large as supposed (Mehra
 1970). The influence of an innovation is bounded (Huber 1964), however wrong a look is.
 
+Looks that are off by more than linear rows can say are counted alone: after a change of that size
+nearly every look is so, and otherwise one of 200.
+
 What no model has, a machine that is off at weekends, gives the statistic a heavier tail. It is a
 power of the limit (in simulated cells with exponents of 0.6 to 1.3), as of the maxima of many
 sequences (Hill 1975): how often two small limits are passed is counted, and the limit of the stated
@@ -25,6 +28,7 @@ rate extrapolated from them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from hashlib import sha256
 
 import numpy as np
 
@@ -49,6 +53,9 @@ _FRESH = 0.4
 _FAR = float(chi2_limit(0.01, 6))
 # That of noise as unlikely as a wrong look: one of 200, over lengths of centimetres.
 _WRONG = 60.0
+# Rotation [rad] and distance [m] of a residual beyond which its rows say nothing, and the log
+# likelihood ratio of such a look, and inverse of any other, after a change of that size to none.
+_BEYOND, _LOG_BEYOND = np.array([0.5, 1.0]), float(np.log(200.0))
 # Looks by which the noise is known at first, after which it is forgotten, and its proportions.
 _STATED, _MEMORY, _SOON = 200.0, 3000.0, 1000.0
 # Small limits of the statistic; the looks by which it is known at first that each is passed as
@@ -83,7 +90,7 @@ class ChangeKind:
     """A cause that the test compares."""
 
     name: str  # `camera`, `board NAME`, `joint 3`, or `none of these`.
-    columns: tuple[int, ...]  # Which of the changes of frames and joints it has.
+    columns: tuple[int, ...]  # Which of the changes of frames and joints it has; none beyond rows.
     prior: float  # Prior probability.
 
 
@@ -115,6 +122,10 @@ class Detector:
     raw_gradient: FloatArray  # (c, d).
     # (c,) by how much these exceed, in log likelihood ratio, those of a look that may be wrong.
     excess: FloatArray
+    # (c,) looks that are off beyond their rows, less the others; and with those that are far off
+    # and that the change does not explain.
+    beyond: FloatArray
+    raw_beyond: FloatArray
     # (2, 2) by small limits: the looks when each was last passed, and how often in a look it is.
     passed: FloatArray = field(default_factory=lambda: np.array([np.zeros(2), 1.0 / _LEVELS]))
 
@@ -134,7 +145,7 @@ class Detector:
         covariance = np.diag(np.concatenate([none, slow, none, joints_rad]) ** 2)
         covariance[:count, :count] = edges
         shapes = ((_PLACES, 12), _PLACES, (_PLACES, 6), (_PLACES, 6, 6), (changes, changes))
-        candidates = ((4,), (size, changes), *((changes, changes), (changes,)) * 2, ())
+        candidates = ((4,), (size, changes), *((changes, changes), (changes,)) * 2, (), (), ())
         return cls(
             *(np.zeros(()), np.zeros(()), np.zeros(size), covariance, np.eye(6)),
             *(np.array(_FRESH), slow**2),
@@ -145,13 +156,17 @@ class Detector:
 
     def without_candidates(self) -> "Detector":
         """What the test has learned, with no change supposed so far."""
-        none = {name: getattr(self, name)[:0] for name in _CANDIDATE}
+        none = {name: getattr(self, name)[:0] for name in CANDIDATE}
         return replace(self, **none)
+
+    def digest(self) -> str:
+        """The sha256 of its numbers."""
+        return sha256(b"".join(values.tobytes() for values in vars(self).values())).hexdigest()
 
 
 # Fields of a detector with a row for each candidate.
-_BOUNDED, _RAW = ("information", "gradient"), ("raw_information", "raw_gradient", "excess")
-_CANDIDATE = ("born", "follows", *_BOUNDED, *_RAW)
+_SUMS = ("information", "gradient", "raw_information", "raw_gradient", "excess")
+CANDIDATE = ("born", "follows", *_SUMS, "beyond", "raw_beyond")
 
 
 def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
@@ -171,17 +186,27 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
     covariance[motions, motions] += (1.0 - motion[edges] ** 2) * np.diag(state.slow)
     first = np.array([[count, before_s, rows.time_s, 1.0]])
     grown = {"born": np.concatenate([state.born, first[: int(is_learning)]])}
-    for name in _CANDIDATE[1:]:
+    for name in CANDIDATE[1:]:
         held = getattr(state, name)
         grown[name] = np.concatenate([held, np.zeros((int(is_learning), *held.shape[1:]))])
+    if len(grown["born"]) > _CANDIDATES:
+        _thin(grown, count)
     follows = motion[:, None] * grown["follows"]
+    is_beyond = bool((np.linalg.norm(rows.residual.reshape(2, 3), axis=1) > _BEYOND).any())
+    for name in ("beyond", "raw_beyond"):
+        grown[name] += 1.0 if is_beyond else -1.0
+    now = {"time_s": np.array(rows.time_s), "looks": np.array(count + 1.0)}
+    if is_beyond:
+        grown["follows"] = follows
+        return replace(state, **now, mean=mean, covariance=covariance, **grown)
     change = np.concatenate([rows.by_motion, rows.by_joints], axis=1)
     design = np.concatenate([rows.by_edges, rows.by_motion, change], axis=1)
     at, places = _place(state, rows)
     own, root = places["offsets_covariance"][at], np.linalg.cholesky(rows.covariance)
     seen, part = design @ covariance, root @ state.shape @ root.T
     noise = part + state.fresh * rows.by_arm
-    whiten = np.linalg.inv(np.linalg.cholesky(seen @ design.T + own + noise))
+    by_look = own + noise
+    whiten = np.linalg.inv(np.linalg.cholesky(seen @ design.T + by_look))
     white = whiten @ (rows.residual - design @ mean - places["offsets"][at])
     squared = float(white @ white)
     share = min(1.0, float(np.sqrt(_FAR / max(squared, 1e-12))))
@@ -199,10 +224,14 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
     grown["raw_information"] += accepted[:, None, None] * products
     grown["raw_gradient"] += accepted[:, None] * (turned @ white)
     grown["excess"] += accepted * 0.5 * max(squared - _WRONG, 0.0)
+    grown["raw_beyond"] += 2.0 * (1.0 - accepted) * (squared > _WRONG)
     # What innovations still have of the slow motions that were predicted, by frames: none if these
     # are as large as supposed.
     forecast = (whiten @ (rows.by_motion * mean[motions])).reshape(6, -1, 6).sum(axis=2)
-    mean, covariance = mean + gain @ clipped, covariance - gain @ gain.T
+    mean = mean + gain @ clipped
+    # In the form of Joseph: by plain differences it is indefinite after wide changes were accepted.
+    kept, filled = np.eye(len(mean)) - gain @ whiten @ design, gain @ whiten
+    covariance = kept @ covariance @ kept.T + filled @ by_look @ filled.T
     # The arm's error at a posture is learned beside the state, and its small share in what the
     # filter takes of a change is left out: it costs a little delay and no false alarm.
     places["offsets"][at] += own_gain @ clipped
@@ -228,11 +257,7 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
             "slow": np.maximum(state.slow * np.exp(soon * np.repeat(larger, 6)), _LEAST_M**2),
             "usual": state.usual + (products[-1] - state.usual) / min(count + 1.0, 5e3),
         }
-        if len(grown["born"]) > _CANDIDATES:
-            _thin(grown, count)
-    time_s, looks = np.array(rows.time_s), np.array(count + 1.0)
-    filtered = {"time_s": time_s, "looks": looks, "mean": mean, "covariance": covariance}
-    return replace(state, **filtered, **grown, **places, **learned)
+    return replace(state, **now, mean=mean, covariance=covariance, **grown, **places, **learned)
 
 
 def _place(state: Detector, rows: LookRows) -> tuple[int, dict[str, FloatArray]]:
@@ -267,7 +292,7 @@ def _thin(grown: dict[str, FloatArray], looks: float) -> None:
     if ages[0] <= _OLDEST:
         at = 1 + int(np.argmin((ages[:-2] - ages[2:]) / ages[1:-1]))
         born[at + 1, 1], born[at + 1, 3] = born[at, 1], born[at + 1, 3] + born[at, 3]
-    for name in _CANDIDATE:
+    for name in CANDIDATE:
         grown[name] = np.delete(grown[name], at, axis=0)
 
 
@@ -279,14 +304,18 @@ def weighed(
     Weights are prior probabilities, and the numbers of looks that candidates stand for; the sum of
     the ratios is the statistic. Innovations of bounded influence say whether something changed;
     `is_raw` ones, as they are, what it was and when. `units` (d,) are the sizes of each change for
-    one of a metre.
+    one of a metre. A kind without columns is a change beyond what rows can say.
     """
     scores = np.zeros((len(kinds), len(state.born)))
     every, slopes = state.information, state.gradient
     if is_raw:
         every, slopes = state.raw_information, state.raw_gradient
     for at, kind in enumerate(kinds):
-        columns = np.array(kind.columns)
+        columns = np.array(kind.columns, dtype=np.int64)
+        if not kind.columns:
+            looks = state.raw_beyond if is_raw else state.beyond
+            scores[at] = _LOG_BEYOND * looks + np.log(kind.prior)
+            continue
         usual = float(np.diagonal(state.usual)[columns] @ units[columns] ** 2)
         sizes_m = np.array(SIZES_M) if is_raw else np.sqrt(_SHIFTS / max(usual, 1e-12))
         sizes = sizes_m[:, None] * units[columns]
@@ -295,8 +324,8 @@ def weighed(
         # Of what looks do not show there is no evidence yet: of another board, of joints.
         is_shown = np.diagonal(information, axis1=1, axis2=2) @ sizes[-1] ** 2 > _SHOWN
         mean = np.logaddexp.reduce(ratios, axis=0) - np.log(len(sizes_m))
-        scores[at] = np.where(is_shown, mean, -np.inf) + np.log(kind.prior)
-    return scores + np.log(state.born[:, 3]) - is_raw * state.excess
+        scores[at] = np.where(is_shown, mean, -np.inf) + np.log(kind.prior) - is_raw * state.excess
+    return scores + np.log(state.born[:, 3])
 
 
 def log_ratios(information: FloatArray, gradient: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -336,7 +365,7 @@ def estimate(
     state: Detector, kind: ChangeKind, candidate: int, units: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """A change at a candidate, (q,), and its covariance (q, q)."""
-    columns = np.array(kind.columns)
+    columns = np.array(kind.columns, dtype=np.int64)
     information = state.raw_information[candidate][np.ix_(columns, columns)]
     prior = np.diag((_WIDEST_M * units[columns]) ** -2.0)
     covariance = np.linalg.inv(information + prior)
@@ -359,7 +388,7 @@ def accepted(
     mean, moment = np.zeros(size), np.zeros((size, size))
     for kind, share in zip(kinds, shares, strict=True):
         change, covariance = estimate(state, kind, candidate, units)
-        columns = np.array(kind.columns)
+        columns = np.array(kind.columns, dtype=np.int64)
         mean[columns] += share * change
         moment[np.ix_(columns, columns)] += share * (covariance + np.outer(change, change))
     by_change = -state.follows[candidate]
