@@ -12,6 +12,7 @@ from support.boards import charuco, circles
 from support.cells import exact
 from support.commands import visioncal as command
 from support.edited import rewritten
+from support.following import follow
 from support.fuzz.broken_sessions import BROKEN, Mistake, broken_session, edit, sound_session
 from support.refusals import raised
 from support.rendered import Shot, photograph
@@ -334,8 +335,10 @@ def test_squares_in_the_place_of_inner_corners_are_named(tmp_path):
     (found,) = visioncal.doctor(folder).findings
     assert found.kind == "other_board"
     assert "checkerboard of 9 x 6" in found.words
-    caught = raised(DataError, "checkerboard of 9 x 6", visioncal.calibrate, folder)
-    assert "In the target's .toml, write columns = 9 and rows = 6" in caught.next_step
+    followed = follow("calibrate", folder, "-o", tmp_path / "out")
+    assert "Write columns = 9 and rows = 6 in the board's .toml" in followed.runs[0].refused().said
+    # What remains is that these are few views.
+    assert "4 of 4 views used" in followed.last.said
 
 
 def test_rotations_of_another_form_are_loaded_in_doubt(tmp_path):

@@ -1,7 +1,6 @@
 """Poses, joints and rows that are misread: named, and sound ones left alone; `convert --guess`."""
 
 import json
-import shlex
 import tracemalloc
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -11,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.advice import printed_commands
 from support.cells import known_of, pairs_session
 from support.commands import visioncal as typed
 from support.edited import rewritten
+from support.following import follow, printed_commands
 from support.fuzz.mistakes import HALF_TURNS, MISTAKES, Poses, numbers, sound
 from support.refusals import raised
 
@@ -279,15 +278,12 @@ def test_what_is_advised_runs_as_it_is_printed_and_mends_it(tmp_path, monkeypatc
     planted = plant("the other mount", cell_poses())
     told, seen = planted.robot.poses(), planted.camera.poses()
     pairs_session(planted.mount, told, seen).save(Path("my cell"))
-    done = typed("calibrate", "my cell", "-o", "out")
-    assert done.status == 3, done.err
-    first = done.said.split("What to do next:")[1].splitlines()[2].strip()
-    assert first == (
+    followed = follow("calibrate", "my cell", "-o", "out")
+    assert [run.status for run in followed.runs] == [3, 0]
+    assert printed_commands(followed.runs[0].said)[0] == (
         "visioncal convert 'my cell' 'my cell-fixed' --guess --yes"
         " && visioncal calibrate 'my cell-fixed' -o out"
     )
-    for command in first.split(" && "):
-        typed(*shlex.split(command)[1:]).good()
     assert Calibration.load(Path("out/calibration.json")).verdict.status == "good"
 
 

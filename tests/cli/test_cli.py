@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from contextlib import nullcontext, redirect_stderr, redirect_stdout
+from contextlib import chdir, nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -16,9 +16,9 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from support.advice import failures, printed_commands
 from support.commands import every_command, turned_poses, visioncal, write_poses
 from support.edited import rewritten
+from support.following import follow, printed_commands
 from support.fuzz.broken_sessions import BROKEN, broken_session
 from support.marks import slow
 from support.samples import made_up
@@ -451,12 +451,10 @@ def place(tmp_path, monkeypatch):
 )
 def test_of_broken_sessions(place, name):
     broken_session(place / "session", BROKEN[name])
-    said = [
-        visioncal(*pair) for pair in (("doctor", "session"), ("calibrate", "session", "-o", "out"))
-    ]
-    assert {done.status for done in said} <= {0, 2, 3}
-    # What both print is run once.
-    assert list(failures("".join(done.said for done in said))) == []
+    for words in (("doctor", "session"), ("calibrate", "session", "-o", "out")):
+        shutil.copytree(place / "session", place / words[0] / "session")
+        with chdir(place / words[0]):
+            follow(*words)
 
 
 WRONG_PLACES = {
@@ -495,10 +493,8 @@ def test_of_what_is_given_in_the_wrong_place(place, name):
         assert visioncal("simulate", "tracker", "--instrument", "point").status == 0
     if "tracked" in words:
         assert visioncal("calibrate", "tracker", "-o", "tracked").status == 0
-    done = visioncal(*words).refused()
-    assert said in done.said
-    assert advised in done.said
-    assert list(failures(done.said)) == []
+    first, *_ = follow(*words).runs
+    first.refused(said, advised)
 
 
 @pytest.mark.slow
@@ -512,9 +508,8 @@ def test_of_verify(place):
     ):
         replace(whole, views=whole.views[15:last]).save(place / name)
         rewritten(place / name, change)
-        done = visioncal("verify", name, "--against", "out")
-        assert printed_commands(done.said), name
-        assert list(failures(done.said)) == []
+        first, *_ = follow("verify", name, "--against", "out").runs
+        assert printed_commands(first.said), name
 
 
 def test_of_a_tool(place):
@@ -528,9 +523,9 @@ def test_of_a_tool(place):
         ("tcp", "inverse.csv", "-o", "frames.json"),
         ("tcp", "touches.csv", "-o", "frames.json", "--force", "--touch-noise-mm", "0.01"),
     ):
-        done = visioncal(*words).good()
-        assert printed_commands(done.said), done.said
-        assert list(failures(done.said)) == []
+        followed = follow(*words)
+        assert all(run.good() for run in followed.runs)
+        assert followed.done
 
 
 def test_of_a_fixture(place):
@@ -547,13 +542,11 @@ def test_of_a_fixture(place):
         (*asked, "--name", "tray", "--touch-noise-mm", "0.005"),
         (*asked, "--name", "bin", "--touch-noise-mm=0.005"),
     ):
-        done = visioncal(*words).good()
-        (again,) = printed_commands(done.said)
+        # That of a value as one word is that of two.
+        first = visioncal(*words).good() if "bin" in words else follow(*words).runs[0].good()
+        (again,) = printed_commands(first.said)
         # The advice's value stands behind what was typed, and counts.
         assert ("--touch-noise-mm" in again) == ("--touch-noise" in words[-1] + words[-2])
-        # That of a value as one word is that of two.
-        if "bin" not in words:
-            assert list(failures(done.said)) == []
 
 
 @pytest.mark.slow
@@ -568,6 +561,5 @@ def test_of_dynamics(place, monkeypatch):
     built = real_dynamics("ur5e", rng)
     streams = {"sweeps": record(built, slow_sweep(6, rng, seconds=30.0), rng)}
     exercise_session("ur5e", streams).save(place / "session")
-    done = visioncal("dynamics", "identify", "session", "-o", "out").good()
-    assert "visioncal dynamics plan ur5e -o motions" in printed_commands(done.said)
-    assert list(failures(done.said)) == []
+    first, *_ = follow("dynamics", "identify", "session", "-o", "out").runs
+    assert "visioncal dynamics plan ur5e -o motions" in printed_commands(first.good().said)

@@ -196,7 +196,11 @@ def test_an_image_of_another_size_is_named_with_the_sizes(charuco):
     session = session_of(
         {"a.png": encoded(images[0]), "b.png": encoded(small)}, cell.options.target
     )
-    raised(DataError, r"view 1: b\.png is 640 x 400 px.*1280 x 800", detect, session)
+    # Neither is usual, and the larger is kept: `resolution` in session.toml would not change that.
+    found = detect(session)
+    assert found.resolution == (1280, 800)
+    assert [rejection.view for rejection in found.rejections] == [1]
+    assert "640 x 400 px, and the camera's images are 1280 x 800" in found.rejections[0].reason
 
 
 def claiming(width, height):

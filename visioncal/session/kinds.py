@@ -149,7 +149,7 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
 
 def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None) -> Iterator[str]:
     """Warnings of misspelt keys in the targets' descriptions, in the form of `read_targets`."""
-    for name, path in (paths := _declared_targets(declaration)).items():
+    for name, path in (paths := declared_targets(declaration)).items():
         described = document if len(paths) == 1 else (document or {}).get(name)
         for words in misspelt_keys(described or {}):
             yield f"{path}: {words}"
@@ -164,7 +164,7 @@ def outside_notes(declaration: Declaration, folder: Path | None) -> Iterator[str
     """Notes that name the files outside of the folder that were read."""
     if folder is None:
         return
-    named = [(path, "target") for path in _declared_targets(declaration).values()]
+    named = [(path, "target") for path in declared_targets(declaration).values()]
     robots = declaration.named("robot").values()
     named += [(getattr(table, "model", None) or "", "model") for table in robots]
     for path, key in dict.fromkeys(named):
@@ -215,7 +215,7 @@ def read_targets(
     Relative paths are below the folder or, where None, the working directory; `document` has the
     contents in the same form, if they are read already. Raises DataError.
     """
-    paths = _declared_targets(declaration)
+    paths = declared_targets(declaration)
     is_only = len(paths) == 1
     given = dict.fromkeys(paths, document) if is_only and document is not None else document
     targets: dict[str, Target] = {}
@@ -236,7 +236,7 @@ def read_targets(
     return (targets, contents) if paths else ({}, document)
 
 
-def _declared_targets(declaration: Declaration) -> dict[str, str]:
+def declared_targets(declaration: Declaration) -> dict[str, str]:
     """Built-in names or paths of the targets, by their names in rows."""
     if declaration.target is not None:
         return {"": declaration.target}

@@ -145,7 +145,7 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
     if views:
         yield Finding(
             "wrong_views",
-            f"Views {some_of([*map(str, views)])} disagree with the others: a pose or an image is "
+            f"View {some_of([*map(str, views)])}: the others disagree. A pose or an image is "
             "wrong, or something moved.",
             Remedy(
                 "Look at images and poses: repeat these views, or in views.csv, delete the rows of "

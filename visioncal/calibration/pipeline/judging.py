@@ -85,7 +85,7 @@ def _use(run: RunState) -> Remedy:
         words, command = "Take the frames to another program", "export OUT --to ros --edge all"
     elif form is not None:
         words, command = "Take the transform to the robot", f"export OUT --to {form.name}"
-    elif run.mount == "instrument":
+    elif run.mount == "instrument" or not run.session.boards:
         words, command = "Take the transform to another program", "export OUT --to text"
     again = "visioncal verify compares later stops with it."
     return Remedy(f"{words}, and keep the result: {again}", f"visioncal {command}")

@@ -4,6 +4,7 @@ Corners that another detector found (corners.csv) are used as they are.
 """
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -61,9 +62,9 @@ def detect(
         The corners and the rejected views.
 
     Raises:
-        DataError: No view shows the target, half of the images or more have another size than the
-            camera, the size of the images is unknown, or the printed board has another layout than
-            the declared one.
+        DataError: No view shows the target, more images have some other size than the camera's,
+            the size of the images is unknown, or the printed board has another layout than the
+            declared one.
     """
     if not session.boards:
         raise DataError("session: images need a target.", next_step="Name one in session.toml.")
@@ -99,7 +100,8 @@ def detect(
 def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Searched]) -> Size:
     """The stated (width, height) of one camera's images [px], else the most common one."""
     names = {name_of(session.declaration, "camera", view) for view in views}
-    of_cameras = {session.cameras[name].size for name in names & session.cameras.keys()} - {None}
+    tables = [session.cameras[name] for name in names & session.cameras.keys()]
+    of_cameras = {table.size for table in tables} - {None}
     stated = of_cameras.pop() if len(of_cameras) == 1 else None
     sizes = {view: searched.size for view, searched in found.items() if searched.size is not None}
     if stated is not None and not sizes:
@@ -113,23 +115,26 @@ def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Sea
             culprits=[*reasons, "session.toml: camera.resolution"],
             next_step="Add resolution = [width, height] to [camera]: the size of the images.",
         )
-    usual = max(set(sizes.values()), key=[*sizes.values()].count)
-    size = stated or usual
+    counts = Counter(sizes.values())
+    usual = max(counts, key=lambda size: (counts[size], size == stated, size))
+    if stated is None or stated == usual:
+        return usual
     images = {view.number: view.image for view in views}
     culprits = [
         f"view {view}: {images[view]} is {width} x {height} px"
         for view, (width, height) in sizes.items()
-        if (width, height) != size
+        if (width, height) != stated
     ]
-    if 2 * len(culprits) < len(sizes):
-        return size
-    whose = "session.toml has" if stated else "most others are of"
+    lens = (
+        ""
+        if all(table.matrix is None for table in tables)
+        else (", and delete matrix and distortion: they are of other images")
+    )
     raise DataError(
-        f"{len(culprits)} of {len(sizes)} images are of another size: {culprits[0]}, and {whose} "
-        f"{size[0]} x {size[1]} px.",
+        f"{len(culprits)} of {len(sizes)} images are of another size: {culprits[0]}, and "
+        f"session.toml has {stated[0]} x {stated[1]} px.",
         culprits=culprits,
-        next_step=f"In session.toml, write resolution = [{usual[0]}, {usual[1]}], and delete "
-        "matrix and distortion: they are of other images.",
+        next_step=f"In session.toml, write resolution = [{usual[0]}, {usual[1]}]{lens}.",
     )
 
 
@@ -137,8 +142,9 @@ def _of_size(view: View, searched: Searched, size: Size) -> Searched:
     """What was found in an image; a rejection for one of another size than the camera's."""
     if searched.size in (None, size):
         return searched
-    words = "{} is {} x {} px, and the camera's images are {} x {}"
-    words = words.format(view.image, *searched.size, *size)
+    turned = ", turned by a quarter" if searched.size == size[::-1] else ""
+    words = "its image is {} x {} px, and the camera's images are {} x {}"
+    words = f"{words.format(*searched.size, *size)}{turned}"
     return Searched(Rejection(view.number, words), None)
 
 

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Sequence
+from pathlib import PurePath
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError
@@ -10,13 +11,18 @@ from visioncal.core.number_format import some_of
 from visioncal.core.types import Image, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
-from visioncal.session.kinds import is_camera_observation, is_instrument_reading
+from visioncal.session.images import IMAGE_ENDINGS, FolderImages
+from visioncal.session.kinds import (
+    declared_targets,
+    is_camera_observation,
+    is_instrument_reading,
+)
 from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.boards import kind_of
 from visioncal.vision.boards.identify import describe, identify
 from visioncal.vision.boards.identity import Identity
 from visioncal.vision.boards.imaging import decode_image
-from visioncal.vision.targets import board_words
+from visioncal.vision.targets import board_words, target_names
 
 # Images that are searched for any board.
 _LOOKED_AT = 3
@@ -34,16 +40,32 @@ def missing_images(session: Session) -> Finding | None:
         return None
     images = some_of([view.image for view in missing])
     views = tuple(view.number for view in missing)
+    listed = ", ".join(map(str, views))
+    do = f"Copy them there; or in views.csv, delete the rows of view {listed}."
+    if len(missing) == len(searched):
+        do = "Copy them there; or in views.csv, correct their folder and names."
+        if other := _namesake(session, missing[0]):
+            do = f"In views.csv, write {other} for {missing[0].image}, and the others alike."
     return Finding(
         "missing_images",
         f"{len(missing)} of {len(searched)} images are missing: {images}.",
-        Remedy(
-            "Copy them there; or in views.csv, correct their folder and names, or delete the rows "
-            f"of view {', '.join(map(str, views))}."
-        ),
+        Remedy(do),
         views,
         until_mm=0.0,
     )
+
+
+def _namesake(session: Session, view: View) -> str:
+    """Path of the only image named as a missing one, in another folder or format, if any."""
+    if not isinstance(session.images, FolderImages):
+        return ""
+    folder, stem = session.images.folder, PurePath(view.image).stem.lower()
+    found = {
+        file.relative_to(folder).as_posix()
+        for file in (*folder.glob("*"), *folder.glob("*/*"))
+        if file.stem.lower() == stem and file.suffix.lower() in IMAGE_ENDINGS
+    } - {view.text.get("depth")}
+    return found.pop() if len(found) == 1 else ""
 
 
 def empty_rows(session: Session) -> Finding | None:
@@ -84,6 +106,25 @@ def unseen_cause(observed: Observed) -> Finding | None:
     return _other_board(observed.session, unseen)
 
 
+def board_correction(session: Session | None, board: str, figures: str) -> tuple[str, str]:
+    """How figures such as `square_m = 0.03` are written into the description of a board.
+
+    Returns:
+        A part of a sentence, and the command that it takes: one for a board that ships with
+        visioncal, of which a session's folder has no file.
+    """
+    shipped = ""
+    if session is not None and isinstance(session.images, FolderImages):
+        shipped = declared_targets(session.declaration).get(board, "")
+    if shipped not in target_names():
+        return f"write {figures} in the board's .toml", ""
+    return (
+        f'write target = "{shipped}.toml" in session.toml, and {figures} in that file, which the '
+        "command makes",
+        f"visioncal target make {shipped} -o SESSION",
+    )
+
+
 def _other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
     """Identifies the board in images without the declared target; None where none is seen."""
     declared = session.target
@@ -105,8 +146,9 @@ def _other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
     if is_same and declared.dictionary in dictionaries:
         return None
     counts = f"columns = {board.columns} and rows = {board.rows}"
-    step = Remedy(f"In the target's .toml, write {counts}, or name another target.")
-    if board.dictionary and board.kind == declared.kind:
+    words, command = board_correction(session, "", counts)
+    step = Remedy(f"{words[0].upper()}{words[1:]}, or name another target.", command)
+    if board.dictionary:
         side, mm = kind_of(board).side, f"{1e3 * declared.square_m:g}"
         step = Remedy(
             f"Measure the {side}, and where it is not {mm} mm as declared, change the figure in "

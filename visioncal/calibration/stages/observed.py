@@ -1,6 +1,5 @@
 """The observations of a session, by one camera and one robot or by many."""
 
-import shlex
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +18,6 @@ from visioncal.results import HELD_BACK, CameraResult
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.document import CameraTable
-from visioncal.session.images import FolderImages
 from visioncal.vision.boards.identify import DESCRIBE_IT
 
 if TYPE_CHECKING:
@@ -198,13 +196,11 @@ def nothing_seen(observed: Observed) -> DataError:
             f"session {observed.session.name!r}: there are neither images nor measured poses.",
             next_step="Give the views images, rows in corners.csv, or cft_ or meas_ columns.",
         )
-    image = next((view.image for view in observed.session.views if view.image), "")
-    has_files = image and isinstance(observed.session.images, FolderImages)
-    command = f" Run: visioncal target check SESSION/{shlex.quote(image)}" if has_files else ""
+    image = next((view.image for view in observed.session.views if view.image), "an image")
     why = "".join(f" ({reason})" for reason in observed.lost_views[:1])
     return DataError(
         f"session {observed.session.name!r}: no view shows the target, or enough of it{why}.",
         culprits=observed.lost_views,
-        next_step="Look at an image: is the whole board in it, sharp, near enough and not "
-        f"mirrored, and is it the one that the session declares?{command} {DESCRIBE_IT}",
+        next_step=f"Look at {image}: is the whole board in it, sharp, near enough and not "
+        f"mirrored, and is it the one that the session declares? {DESCRIBE_IT}",
     )

@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.distance_scale import distance_scale
+from visioncal.calibration.stages.image_checks import board_correction
 from visioncal.calibration.suspects.lens import has_changed
 from visioncal.calibration.suspects.suspect import Suspect
 from visioncal.core.number_format import figure
@@ -20,6 +21,7 @@ from visioncal.estimation.joint import (
     measured_scale,
     scale_by_stated_arms,
 )
+from visioncal.session import Session
 from visioncal.session.frames import frame_name
 from visioncal.vision.boards import kind_of
 
@@ -58,7 +60,8 @@ def _found(run: RunState) -> Iterator[Finding]:
             (at,) = fitted.columns_of(np.array([place]))
             sigma = float(covariance[at, at] ** 0.5)
             written = replace(measured, scale=float(optics.values[place]), sigma=sigma)
-            yield scale_finding(called, target, measured, written)
+            own = (run.session, scene.names[board])
+            yield scale_finding(called, target, measured, written, own)
         yield from _shape_findings(fitted, board, called)
 
 
@@ -78,12 +81,16 @@ def _of_measured_poses(run: RunState) -> Iterator[Finding]:
 
 
 def scale_finding(
-    called: str, target: Target, measured: MeasuredScale, written: MeasuredScale
+    called: str,
+    target: Target,
+    measured: MeasuredScale,
+    written: MeasuredScale,
+    own: tuple[Session | None, str] = (None, ""),
 ) -> Finding:
     """Finding on a board or rig of another size; a note where its stated sigma allows it.
 
     `measured` is the scale by the robot's motion, `written` that of the result, with its total
-    sigma.
+    sigma; `own` is the session that declares it, and its name there.
     """
     share = f"{figure(100 * measured.stated_sigma)} %"
     size = (
@@ -100,6 +107,7 @@ def scale_finding(
             "Measure the distance of two points that are far apart. If the robot is right, "
             f"multiply the table's x_m, y_m and z_m by {1 + written.scale:.5g}; else check the arm."
         )
+        command = ""
     else:
         kind, side = kind_of(target), 1e3 * target.square_m
         found = side * (1 + written.scale)
@@ -108,13 +116,14 @@ def scale_finding(
             f"{share}). The result takes the robot's scale; if the board is right, the arm's model "
             "is off by as much."
         )
+        write, command = board_correction(*own, f"{kind.size_key} = {1e-3 * found:.4g}")
         do = (
-            f"Measure the board over its whole width. If the robot is right, write {kind.size_key} "
-            f"= {1e-3 * found:.4g} in the board's .toml; else check the arm."
+            f"Measure the board over its whole width. If the robot is right, {write}; else check "
+            "the arm."
         )
     total = measured.sigma**2 + measured.stated_sigma**2
     square = measured.scale**2 / total
-    return Finding("board_size", words, Remedy(do, CALIBRATE), mahalanobis_sq=square)
+    return Finding("board_size", words, Remedy(do, command or CALIBRATE), mahalanobis_sq=square)
 
 
 def _shape_findings(fitted: ConvergedFit, board: int, called: str) -> Iterator[Finding]:

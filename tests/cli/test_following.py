@@ -1,0 +1,150 @@
+"""Advice that is followed to its end: it runs, mends, and does not come again."""
+
+import tomllib
+from pathlib import Path
+
+import cv2
+import pytest
+import tomli_w
+from PIL import Image
+from support.commands import Done
+from support.following import follow
+from support.fuzz.broken_sessions import BROKEN, edit, sound_session
+from support.marks import slow
+
+from visioncal.simulation import CellOptions, cell_session, simulate
+
+SIZE = "In session.toml, write resolution = [640, 480]."
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder that the commands are typed in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def told(*messages, status=2):
+    """A program that says one message a run, and the last one from then on."""
+    left = list(messages)
+
+    def run(*_words):
+        said = left.pop(0) if len(left) > 1 else left[0]
+        return Done(status if said else 0, "", f"error: it is wrong.\n{said}\n")
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("messages", "why"),
+    [
+        ((SIZE, "Look.", SIZE), None),
+        ((SIZE, SIZE), "comes again"),
+        (('In session.toml, write name = "cell".',), "so already"),
+        (("In session.toml, delete matrix.",), "so already"),
+        (("In the board's .toml, write columns = 8.",), "no file of the user's"),
+        (("In views.csv, delete the rows of view 0, 1.",), "all rows"),
+        (("visioncal nonsense",), "2 error: it is wrong"),
+        (("visioncal calibrate SESSION -o out",), "a placeholder"),
+        (tuple(f"In session.toml, write at = {at}." for at in range(1, 12)), "does not end"),
+    ],
+)
+def test_what_cannot_be_followed_is_noticed(place, messages, why):
+    cell = place / "cell"
+    cell.mkdir()
+    (cell / "session.toml").write_text('name = "cell"\ntarget = "charuco_9x6_30mm"\n')
+    (cell / "views.csv").write_text("view\n0\n1\n")
+    if why is None:
+        followed = follow("calibrate", "cell", run=told(*messages))
+        assert len(followed.done) == 1
+        assert "[camera]\nresolution = [" in (cell / "session.toml").read_text()
+    else:
+        with pytest.raises(AssertionError, match=why):
+            follow("calibrate", "cell", run=told(*messages))
+
+
+def resized(folder: Path, every: int, size: tuple[int, int]) -> None:
+    """One image of so many is of another size, as after a change of the camera's mode."""
+    for path in sorted((folder / "images").iterdir())[::every]:
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), size))
+
+
+def of_three_sizes(folder: Path) -> None:
+    resized(folder, 2, (640, 400))
+    resized(folder, 4, (960, 600))
+
+
+def turned_for_viewers(folder: Path, every: int) -> None:
+    """Pictures of a telephone, which turns some of them and says so in their EXIF data."""
+    tag = Image.Exif()
+    tag[0x0112] = 6
+    for at, path in enumerate(sorted((folder / "images").iterdir())):
+        image = Image.open(path)
+        image = image.rotate(90, expand=True) if at % every == 0 else image
+        image.save(path.with_suffix(".jpg"), quality=97, **{"exif": tag} if at % every == 0 else {})
+        path.unlink()
+    edit(folder, lambda text: text.replace(".png", ".jpg"), "views.csv")
+
+
+def without_a_lens(folder: Path) -> None:
+    document = tomllib.loads((folder / "session.toml").read_text("utf-8"))
+    del document["camera"]["matrix"], document["camera"]["distortion"]
+    (folder / "session.toml").write_text(tomli_w.dumps(document), "utf-8")
+
+
+PLANTED = {
+    "half of another size": lambda it: resized(it, 2, (640, 400)),
+    "three sizes": of_three_sizes,
+    "half of another size, no lens": lambda it: (without_a_lens(it), resized(it, 2, (640, 400))),
+    "all turned": lambda it: turned_for_viewers(it, 1),
+    "half turned": lambda it: turned_for_viewers(it, 2),
+    "all of another size, no lens": lambda it: (without_a_lens(it), resized(it, 1, (640, 400))),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [name if name == "half of another size" else slow(name) for name in PLANTED]
+)
+def test_pictures_of_several_sizes_are_no_circle(place, name):
+    cell = sound_session(place / "cell")
+    edit(cell, lambda text: "".join(text.splitlines(keepends=True)[:15]), "views.csv")
+    PLANTED[name](cell)
+    # Doctor leaves lost views to a person, and the verdict counts them.
+    assert follow("doctor", "cell").last.status == (0 if "all" in name else 3)
+    assert follow("calibrate", "cell", "-o", "out").last.status == 0
+
+
+def test_a_board_of_markers_where_another_kind_is_declared_is_followed_to_a_result(place):
+    sound = sound_session(place / "cell")
+    (sound / "board.toml").write_text(
+        'kind = "marker"\nid = 3\nsize_m = 0.1\ndictionary = "DICT_6X6_250"\n'
+    )
+    edit(sound, lambda text: text.replace('"charuco_9x6_30mm"', '"board.toml"'))
+    followed = follow("calibrate", "cell", "-o", "out")
+    # The size is a person's to measure: it was not.
+    assert "ChArUco board of 9 x 6 squares" in followed.runs[0].refused().said
+    assert "seen.toml" in (sound / "session.toml").read_text("utf-8")
+
+
+def test_a_board_that_visioncal_ships_is_corrected_in_a_file_of_the_user_s(place):
+    options = CellOptions(views=20, seed=3, board_scale=1.01, pixel_sigma_px=0.05)
+    cell_session(simulate(options), "cell", seen="corners").save(place / "cell")
+    assert 'target = "charuco_9x6_30mm"' in (place / "cell/session.toml").read_text("utf-8")
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert "1 % larger than stated" in followed.runs[0].said
+    assert followed.last.good().said.startswith("good")
+    assert "square_m = 0.0303" in (place / "cell/charuco_9x6_30mm.toml").read_text("utf-8")
+
+
+@pytest.mark.parametrize("mistake", ["images named .jpg", "images in another folder"])
+def test_images_that_are_elsewhere_are_found(place, mistake):
+    BROKEN[mistake].plant(sound_session(place / "cell"))
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert [run.status for run in followed.runs] == [2, 0]
+
+
+def test_a_board_that_nobody_finds_is_looked_for_by_a_person(place):
+    BROKEN["mirrored images"].plant(sound_session(place / "cell"))
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert followed.done == ()
+    assert "not mirrored" in followed.last.refused().said
