@@ -14,11 +14,13 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
+import cv2
 import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from support.commands import every_command, visioncal, write_poses
+from support.fuzz.looks import write_looks
 from support.fuzz.mutants import PACKAGED, READINGS, sound
 
 from visioncal.core.choices import SITE_FILE
@@ -277,3 +279,53 @@ def test_what_a_tracker_measured_cannot_be_recovered_by_a_camera(tmp_path):
     visioncal("calibrate", tmp_path / "s", "-o", tmp_path / "out", "--no-report").good()
     done = visioncal("recover", tmp_path / "act", "--against", tmp_path / "out")
     done.refused("was measured by an instrument", "visioncal calibrate")
+
+
+def called(program, words, said, **more):
+    """Runs a command as a process of its own, with bytes on its stdin; None closes it."""
+    close = {"preexec_fn": lambda: os.close(0)} if said is None else {"input": said}
+    return subprocess.run([*program, *map(str, words)], capture_output=True, check=False, **close,
+                          **more)  # fmt: skip
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="stdin is closed as on POSIX")
+def test_what_comes_on_stdin_is_refused_by_the_line(program, inputs, tmp_path):
+    words = ["guard", "--against", inputs / "pairs_out"]
+    write_looks(tmp_path / "looks", inputs / "pairs")
+    sound_look = (tmp_path / "looks").read_bytes().split(b"\n")[0]
+    # A guard goes on after a line that is no text.
+    done = called(program, words, b'\xff\xfe\n{"time_s": "\xe4"}\n' + sound_look + b"\n")
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    assert ["error" in answer for answer in answers] == [True, True, False]
+    assert (done.returncode, done.stderr) == (2, b"")
+    assert called(program, words, None).returncode == 0
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    cv2.imwrite(str(pictures / "0.png"), np.zeros((48, 64), np.uint8))
+    words = ["record", "-o", tmp_path / "new", "--arm", "manual", "--target", "charuco_9x6_30mm",
+             "--camera", f"folder:{pictures}", "--json"]  # fmt: skip
+    # A line without an end takes no memory; of the guard, it comes in pieces.
+    for said, reason in ((b"X 1 \xff\n", "no pose"), (b"1" * 5_000_000, "stdin has a line of")):
+        document = json.loads(called(program, words, said).stdout)
+        assert reason in document["error"]["message"]
+        shutil.rmtree(tmp_path / "new")
+    assert called(program, ["--version"], None).returncode == 0
+
+
+def test_letters_that_a_terminal_does_not_have_are_written_as_their_numbers(
+    program, inputs, tmp_path
+):
+    session = tmp_path / "Zelle ü \N{CAMERA}"
+    shutil.copytree(inputs / "pairs", session)
+    text = (session / "session.toml").read_text("utf-8")
+    name = text.replace('name = "', 'name = "Zelle ü \N{CAMERA} ')
+    (session / "session.toml").write_text(name, "utf-8")
+    calls = (
+        ["calibrate", session, "-o", tmp_path / "out", "--no-report"],
+        ["verify", session, "--against", tmp_path / "out"],
+        ["doctor", session],
+    )
+    for words in calls:
+        done = called(program, words, b"", env={**os.environ, "PYTHONIOENCODING": "ascii"})
+        assert done.returncode == 0, done.stderr
+        assert rb"Zelle \xfc \U0001f4f7" in done.stdout + done.stderr

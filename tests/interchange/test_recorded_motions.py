@@ -19,6 +19,7 @@ from visioncal.calibration.stages.motion import motion_of
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import pose_difference
 from visioncal.interchange.formats import ImportOptions, PoseImportOptions, convert
+from visioncal.interchange.formats.lerobot import FrameImages
 from visioncal.session import Session
 
 BOARD = ImportOptions(target="charuco_9x6_30mm")
@@ -211,3 +212,14 @@ def test_what_is_damaged_is_refused(source, rendered, tmp_path):
     path = write_dataset(tmp_path / "set", source, rendered, "v3.0", "ur10e")
     next((path / "data").rglob("*.parquet")).write_text("version https://git-lfs.github.com")
     raised(DataError, "cannot be read as parquet", convert, path, tmp_path / "out", requested=BOARD)
+
+
+def test_a_video_that_is_not_the_same_when_read_twice_leaves_nothing(
+    source, rendered, tmp_path, monkeypatch
+):
+    path = write_dataset(tmp_path / "set", source, rendered, "v2.1", "ur10e_follower")
+    read, load = iter(range(10_000)), FrameImages.load
+    # As damaged ones, whose decoder shows what its memory held.
+    monkeypatch.setattr(FrameImages, "load", lambda *at: load(*at) + b"%d" % next(read))
+    raised(DataError, "read twice", convert, path, tmp_path / "out", requested=BOARD)
+    assert not (tmp_path / "out").exists()

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from errno import ENAMETOOLONG
+from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TextIO, cast
 
@@ -95,6 +96,11 @@ def main() -> None:
     gc.set_threshold(20_000, 100)
     # The collection at exit would take as long again.
     atexit.register(gc.freeze)
+    sys.stdin = sys.stdin or StringIO()
+    for stream in (sys.stdin, sys.stdout, sys.stderr):
+        # Letters that a terminal does not have, and bytes that are no text.
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     messages, results = _guarded(sys.stderr, lambda _: None), _guarded(sys.stdout, _end)
     with redirect_stderr(messages), redirect_stdout(results), _WithoutPandas():
         try:

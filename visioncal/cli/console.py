@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from visioncal.core.errors import DataError, VerdictError, VisioncalError
+from visioncal.core.files import MOST_TOML_BYTES
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
@@ -81,9 +82,16 @@ def asked(question: str) -> str:
 
     Raises:
         EOFError: The input has ended.
+        DataError: The line does not end.
     """
     console().print(question, markup=False, end="")
-    line = sys.stdin.readline()
+    line = sys.stdin.readline(MOST_TOML_BYTES)
+    if len(line) == MOST_TOML_BYTES:
+        raise DataError(
+            f"stdin has a line of {len(line)} letters or more.",
+            culprits=["stdin"],
+            next_step="Type one answer or pose a line, each ended by Enter.",
+        )
     if not line:
         raise EOFError
     return line.rstrip("\r\n")

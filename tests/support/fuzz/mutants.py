@@ -17,24 +17,37 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from itertools import repeat
 from multiprocessing import get_context
 from pathlib import Path
 from unittest.mock import patch
 
-from support import foreign_samples
+from support import bags, foreign_samples, lerobot
 from support.commands import Done, every_command, visioncal
+from support.fuzz import spoken
 from support.fuzz.looks import write_looks
 from support.fuzz.mutators import mutate
 
 from visioncal.cli import console
 from visioncal.core.errors import VisioncalError
 from visioncal.present import viewer
+from visioncal.session import Session
+
+
+def _bag(path: Path, folder: Path, form: str) -> None:
+    options = bags.BagOptions(form, is_compressed=True, frames_s=0.8)
+    bags.write_bag(path, Session.load(folder), folder, options)
+
+
+def _data_set(path: Path, folder: Path, version: str) -> None:
+    lerobot.write_dataset(path, Session.load(folder), folder, version, "ur10e_follower")
+
 
 # What one mutant may take [s], and the most memory of its process [kB], libraries included.
 LONGEST_S, MOST_KB = 300, 2 * 1024**2
@@ -69,6 +82,18 @@ MADE = {
     "lens.yaml": "export [board_out] --to camera-info -o IT",
     "guard.json": "guard --against [pairs_out] --state IT < [pairs.jsonl]",
 }  # fmt: skip
+# Sound inputs that are written from a session: which, and by what.
+WRITTEN: dict[str, tuple[str, Callable[[Path, Path], object]]] = {
+    **{f"{name}.jsonl": (name, write_looks) for name in ("pairs", "arm")},
+    "typed.txt": ("board", spoken.write_typed),
+    "stops.txt": ("board", spoken.write_stops),
+    "requests.http": ("board", spoken.write_requests),
+    "checks": ("board", spoken.write_checks),
+    **{f"bags/{name}": ("board", partial(_bag, form=form))
+       for name, form in (("ros1.bag", "ros1"), ("mcap", "mcap"), ("sqlite3", "sqlite3"))},
+    **{f"lerobot/{version}": ("board", partial(_data_set, version=version))
+       for version in ("v2.1", "v3.0")},
+}  # fmt: skip
 PACKAGED = {
     "arm.toml": "visioncal/robot/models/ur10e.toml", "board.toml": "targets/charuco_9x6_30mm.toml"
 }  # fmt: skip
@@ -77,9 +102,12 @@ _HAND = "NEW --mount eye-in-hand"
 _SHOTS = f"{_HAND} --target {foreign_samples.CHARUCO} --robot-key x,y,z,qw,qx,qy,qz"
 _KUKA = "--robot-key X,Y,Z,A,B,C --robot-form kuka --camera-key " \
     "cam_x,cam_y,cam_z,cam_qx,cam_qy,cam_qz,cam_qw"  # fmt: skip
+_LIVE = "--camera folder:[board]/images --target charuco_9x6_30mm --views 3"
+_PAGE = "--page --address 127.0.0.1:PORT"
 _STOOD = "--pose 0.5,0.1,0.4,0,1,0,0"
 # How each command is called: {name} is the input that is broken, one of several; [name] another
-# sound one, OUT an earlier result's folder, NEW a path where nothing is; < what is typed into it.
+# sound one, OUT an earlier result's folder, NEW a path where nothing is. What stands behind < is
+# said to it: on its stdin, or at PORT, a free one, as a robot's program or a browser.
 READINGS = tuple(
     f"{before}{{{name}}}{after}"
     for before, names, after in (re.split("[{}]", words) for words in (
@@ -95,7 +123,14 @@ READINGS = tuple(
         "guard --against {board_out|arm_out}",
         "guard --against [pairs_out] < {pairs.jsonl}",
         "guard --against [arm_out] < {arm.jsonl}",
+        "guard --against {pairs_out} < [pairs.jsonl]",
         "guard --against [pairs_out] --state {guard.json} < [pairs.jsonl]",
+        f"record -o NEW --arm manual {_LIVE} < {{typed.txt}}",
+        f"record -o NEW --arm socket:PORT {_LIVE} < {{stops.txt}}",
+        f"record -o NEW {_PAGE} < {{requests.http}}",
+        f"record -o {{board}} {_PAGE} --arm manual {_LIVE} < [requests.http]",
+        f"verify {{checks}} --against [pairs_out] {_PAGE} < [requests.http]",
+        f"verify [checks] --against {{pairs_out}} {_PAGE} < [requests.http]",
         "recover NEW --against {pairs_out} --stops [pairs] --count 9",
         "recover NEW --against [pairs_out] --stops {pairs} --count 9",
         "history {site.db} -o NEW.html",
@@ -118,6 +153,8 @@ READINGS = tuple(
         f"convert [foreign/images_and_table] {_SHOTS} --intrinsics {{lens.yaml}}",
         f"convert [foreign/zivid] {_HAND} --target {{board.toml}}",
         f"convert [foreign/easy_handeye]/cell.samples {_HAND} --robot-model {{arm.toml}}",
+        "convert {bags/ros1.bag|bags/mcap|bags/sqlite3} NEW --target charuco_9x6_30mm",
+        "convert {lerobot/v2.1|lerobot/v3.0} NEW --target charuco_9x6_30mm",
         "export {pairs_out} --to ros -o OUT/pose.yaml",
         "export {network_out} --to ros --edge all -o OUT/poses.yaml",
         "export {board_out} --to camera-info",
@@ -156,7 +193,7 @@ READINGS = tuple(
     for name in names.split("|")
 )  # fmt: skip
 # What reads no file of the user's, or in processes of its own, or once a device has answered.
-READS_NOTHING = {"batch", "demo", "simulate", "record", "dynamics record"}
+READS_NOTHING = {"batch", "demo", "simulate", "dynamics record"}
 # What a sound input may be exchanged with.
 _OTHERS = ("pairs", "pairs_out", "arm.toml", "pairs/touches.csv", "foreign/visp")
 _NAMED, _BROKEN = re.compile(r"\[([a-z][\w./]+)\]"), re.compile(r"\{(.+?)\}")
@@ -177,14 +214,16 @@ def sound(folder: Path, name: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     if name in MADE:
         words = shlex.split(_NAMED.sub(lambda found: str(sound(folder, found[1])), MADE[name]))
-        with _typed(words):
+        with _typed(_said(words)):
             done = visioncal(*(path if word == "IT" else word for word in words))
         if done.status not in (0, 3):
             raise RuntimeError(f"{name}: {done.err}")
+    elif name in WRITTEN:
+        source, written = WRITTEN[name]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        written(path, sound(folder, source))
     elif name in PACKAGED:
         shutil.copyfile(Path(__file__).parents[3] / PACKAGED[name], path)
-    elif name.endswith(".jsonl"):
-        write_looks(path, sound(folder, path.stem))
     elif name.startswith("foreign/"):
         makers = foreign_samples.RECORDINGS | foreign_samples.MORE_RECORDINGS
         makers[name.removeprefix("foreign/")](path)
@@ -229,8 +268,9 @@ def run_mutant(number: int, seed: int, readings: Sequence[str], inputs: Path) ->
         if (most := resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) > MOST_KB:
             faults.append(f"{most} kB of memory")
         changed = [name for name in {*before, *after} if before.get(name) != after.get(name)]
-        # Of the guard, whose status is that of its lines, the others count.
-        if done.status == 2 and not words.startswith("guard "):
+        # Of the guard, whose status is that of its lines, the others count; what a recording has
+        # taken stays.
+        if done.status == 2 and words.split()[0] not in ("guard", "record"):
             faults += [f"status 2 changed {name}" for name in changed]
         for written in changed:
             if written.endswith(".json") and written in after:
@@ -256,18 +296,19 @@ def digests(folder: Path) -> dict[str, str]:
     return found
 
 
-@contextmanager
-def _typed(words: list[str]) -> Iterator[None]:
-    """Types the file after < into the command, and takes both from its words."""
-    data = b""
-    if "<" in words:
-        at = words.index("<")
-        path = Path(words[at + 1])
-        # Anything but a file a shell would not type, or without end.
-        data = path.read_bytes() if path.is_file() and not path.is_symlink() else b""
-        del words[at:]
-    with patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(data))):
-        yield
+def _said(words: list[str]) -> bytes:
+    """What is said to the command by the file after <, which both leave its words."""
+    if "<" not in words:
+        return b""
+    at = words.index("<")
+    path = Path(words[at + 1])
+    del words[at:]
+    # Anything but a file a shell would not type, or without end.
+    return path.read_bytes() if path.is_file() and not path.is_symlink() else b""
+
+
+def _typed(data: bytes) -> AbstractContextManager[object]:
+    return patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(data)))
 
 
 def _called(words: list[str]) -> tuple[Done, list[str]]:
@@ -279,11 +320,20 @@ def _called(words: list[str]) -> tuple[Done, list[str]]:
         errors.append(error)
         report(error, as_json=as_json)
 
+    lines, port = _said(words), spoken.free_port()
+    words = [word.replace("PORT", str(port)) for word in words]
+    if "--page" in words:
+        done, faults = spoken.served(words, lines, port)
+        # Where it serves, Ctrl-C ended it.
+        is_known = done.status in (2, 130)
+        return done, [*faults, *[f"status {done.status}: {done.err[-600:]}"] * (not is_known)]
+    is_robot = any(word.startswith("socket:") for word in words)
     try:
         with (
-            _typed(words),
+            _typed(b"" if is_robot else lines),
             patch.object(console, "report_error", reported),
             patch.object(viewer, "review_native", lambda *_: None),
+            spoken.robot_says(lines, port) if is_robot else nullcontext(),
         ):
             done = visioncal(*words)
     except BaseException:  # noqa: BLE001 - what escapes is what is looked for

@@ -4,17 +4,21 @@ What is broken is chosen by what a file is, so that most of what comes out is re
 was made to break a reader (bombs, pickles, entities, headers that lie) has tests of its own.
 """
 
+import io
 import json
 import os
 import random
 import re
 import shutil
+import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 import cv2
 import numpy as np
+import pyarrow
+from pyarrow import parquet
 from support.fuzz.looks import moved_looks
 
 Chance: TypeAlias = random.Random
@@ -171,7 +175,45 @@ def looks_moved(data: bytes, chance: Chance) -> bytes:
     return b"".join(json.dumps(look).encode() + b"\n" for look in moved)
 
 
-# --- Pictures and arrays.
+# --- Pictures, arrays and what else is not text.
+
+
+def words_changed(data: bytes, chance: Chance) -> bytes:
+    """Words of four or eight bytes by sizes and numbers that nobody expects there."""
+    changed, reach = bytearray(data), chance.choice([500, 20_000, len(data)])
+    hostile = [struct.pack("<q", value) for value in (-1, 0, 1 << 31, 1 << 62, -(1 << 63))]
+    hostile += [struct.pack("<d", value) for value in (np.nan, np.inf, 1e300, -1e-310)]
+    for _ in range(chance.randrange(1, 4)):
+        at, word = 4 * chance.randrange(1 + min(reach, len(data)) // 4), chance.choice(hostile)
+        size = chance.choice([4, 8])
+        changed[at : at + size] = word[-size:] if chance.random() < 0.2 else word[:size]
+    return bytes(changed)
+
+
+def rows_changed(data: bytes, chance: Chance) -> bytes:
+    """A column of a parquet file that is lost, or of other values; or other rows."""
+    try:
+        table = parquet.read_table(io.BytesIO(data))
+    except (OSError, ValueError):
+        return data
+    columns = table.to_pydict()
+    name, count = chance.choice([*columns]), len(table)
+    value = chance.choice([None, "text", -1, 2**62, 1e300, float("nan"), [1.0], [[1.0]], b"\0"])
+    at = chance.randrange(max(count, 1))
+    ways = [
+        [value] * count,
+        columns[name][::-1],
+        [*columns[name][:at], None, *columns[name][at + 1 :]],
+    ]
+    columns[name] = chance.choice(ways)[:count]
+    how = chance.random()
+    if how < 0.15:
+        del columns[name]
+    rows = slice(0 if how > 0.3 else at, None if how > 0.3 else at + chance.randrange(2))
+    written = io.BytesIO()
+    columns = {key: cells[rows] for key, cells in columns.items()}
+    parquet.write_table(pyarrow.table(columns), written)
+    return written.getvalue()
 
 
 def other_picture(data: bytes, chance: Chance) -> bytes:
@@ -200,8 +242,11 @@ KINDS: dict[str, tuple[tuple[Bytes, ...], tuple[Bytes, ...]]] = {
     ".json": ((json_value, json_value, number_changed), (*ANY, *TEXT)),
     ".jsonl": ((looks_moved, looks_moved, json_line), (*ANY, *TEXT)),
     ".png": ((other_picture,), ANY),
-    ".rrd": (ANY, ANY),
-    ".npz": (ANY, ANY),
+    ".parquet": ((rows_changed,), (*ANY, words_changed)),
+    **dict.fromkeys(
+        (".rrd", ".npz", ".bag", ".mcap", ".db3", ".mp4"),
+        ((*ANY, words_changed, words_changed), ANY),
+    ),
     "": (TEXT, ANY),
 }
 # How often a file itself is broken, and else how often by the rules of what it is.

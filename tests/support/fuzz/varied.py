@@ -96,6 +96,8 @@ def _cell(rng: np.random.Generator, seed: int) -> Cell:
     model = _choice(rng, {"": 35, "built-in": 35, "mein Arm é.toml": 24, "my robot é": 6})
     rows = _choice(rng, {"poses": 25, "joints": 35, "both": 40})
     seen = "poses" if _chance(rng, 0.18) and not options.second else "images"
+    # Measured poses come without the board by which somebody measured them.
+    options = replace(options, board_scale=1.0) if seen == "poses" else options
     lens = {} if estimated else {"intrinsics": _choice(rng, {"auto": 5, "hold": 3, "refine": 2})}
     # A lens that is held, or behind poses measured elsewhere, has to be right.
     if seen == "images" and lens.get("intrinsics", "hold") != "hold" and _chance(rng, 0.5):

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TypeAlias
 
@@ -154,18 +155,17 @@ def write_session(session: Session, dest: Path) -> None:
         write_recording(dest, session, None, (), blueprint(session))
     else:
         session.save(dest)
-    try:
-        read = Session.load(dest)
-    except DataError:
-        # What a session cannot hold, such as a place outside any cell, is refused, and not left.
-        shutil.rmtree(dest) if dest.is_dir() else dest.unlink()
-        raise
-    if read.digest() != session.digest():
-        raise DataError(
-            f"{dest} does not hold the session {session.name}: their digests differ.",
-            culprits=[str(dest)],
-            next_step="Remove it, and report this with the session.",
-        )
+    # What a session cannot hold, such as a place outside any cell, is refused, and not left.
+    with ExitStack() as otherwise:
+        otherwise.callback(shutil.rmtree if dest.is_dir() else Path.unlink, dest)
+        if Session.load(dest).digest() != session.digest():
+            raise DataError(
+                f"session {session.name!r} is not the same when it is read twice, as a damaged "
+                "video or a file that is still being written.",
+                culprits=[session.name],
+                next_step="Nothing was written; take a whole copy of what it is read from.",
+            )
+        otherwise.pop_all()
 
 
 def _is_recording(path: Path) -> bool:
