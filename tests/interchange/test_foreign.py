@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from support.commands import visioncal as typed
+from support.following import follow
 from support.foreign_samples import (
     BASE_FROM_FLANGE,
     CAM_FROM_TARGET,
@@ -352,6 +353,39 @@ def test_angles_beyond_a_turn_are_not_taken_for_radians(tmp_path, logged, names,
     assert not (tmp_path / "out").exists()
     said = PoseImportOptions(form="rotation-vector-deg" if form == "ur" else form)
     convert(source, tmp_path / "out", requested=replace(HAND, robot=said))
+
+
+@pytest.mark.parametrize(
+    ("form", "unit", "said"),
+    [
+        ("ur", 1.0, ""),
+        ("ur", 1e3, " --robot-unit mm"),
+        ("rpy", 1.0, ""),
+        ("rotation-vector", 1.0, ""),
+    ],
+)
+def test_degrees_in_a_form_of_radians_are_named_first(
+    tmp_path, logged, monkeypatch, form, unit, said
+):
+    monkeypatch.chdir(tmp_path)
+    names = "x,y,z,roll,pitch,yaw" if form == "rpy" else "x,y,z,rx,ry,rz"
+    poses = written(POSE_FORMS.get(form, POSE_FORMS["ur"])) * np.repeat([unit, np.rad2deg(1)], 3)
+    logged(names, poses.tolist())
+    followed = follow("convert", "log.csv", "out", "--mount", "eye-in-hand", "--robot-form", form)
+    degrees = "euler-xyz-deg" if form == "rpy" else "rotation-vector-deg"
+    assert f"\nSay --robot-form {degrees}{said}, where" in followed.runs[0].refused().err
+    followed.last.good()
+    found = poses_of(Session.load("out"), "base_from_flange")
+    np.testing.assert_allclose(found, BASE_FROM_FLANGE, atol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "word"), [("log.csv", "columns"), ("log.json", "key")])
+def test_poses_of_unknown_names_are_asked_for_by_the_option_of_the_source(tmp_path, name, word):
+    rows = [{"foo": at, "bar": 2 * at} for at in range(4)]
+    text = json.dumps(rows) if word == "key" else "foo,bar\n1,2\n3,4\n"
+    (tmp_path / name).write_text(text)
+    step = f"Name them with --robot-{word}, or the joint angles with --joint-{word}."
+    assert raised(DataError, "foo", convert, tmp_path / name, tmp_path / "out").next_step == step
 
 
 # Names in a maker's own letters, and in others.

@@ -86,7 +86,7 @@ def test_cameras_of_a_bag_are_a_whole_cell(source, rendered, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message", "step"),
     [
-        ({"without": ("/tf",)}, "does not say where the robot was", "--robot-columns"),
+        ({"without": ("/tf",)}, "does not say where the robot was", "--robot-key"),
         ({"without": ("/camera/image_raw/compressed",)}, "no topic has images", "ros2 bag record"),
         ({"poses": "pose"}, "how the camera is mounted is not known", "--mount"),
     ],

@@ -41,7 +41,9 @@ _LINE = re.compile(r"delete ([\w./-]+), line (\d+)")
 _COLUMNS = r"(\w+_\w+(?:(?: to |, | and )\w+_\w+)*)"
 _SCALE = re.compile(rf"([Mm]ultiply|[Dd]ivide) {_COLUMNS} by (pi / 180|180 / pi|\d+(?:\.\d+)?)")
 _NEGATE = re.compile(rf"[Nn]egate {_COLUMNS}")
-_OPTION = re.compile(r"(?:[Ss]ay|[Gg]ive|[Ww]ith|[Aa]dd) (--[a-z][a-z-]+)((?: [a-z\d][\w.,+-]*)?)")
+# Options that are to be added, or replace those that were typed.
+_OPTION = re.compile(r"(--[a-z][a-z-]+)((?: [a-z\d][\w.+-]*(?:,[\w.+-]+)*)?)")
+_SAY = re.compile(rf"(?:[Ss]ay|[Gg]ive|[Ww]ith|[Aa]dd) ((?:{_OPTION.pattern} ?)+)")
 _MEANT = re.compile(r"'([^']+)'.*Did you mean ([\w./-]+)")
 # Keys of session.toml that stand in a table of their own where none of the name is there.
 _TABLES = {"resolution": "camera", "matrix": "camera", "distortion": "camera", "model": "robot"}
@@ -185,7 +187,7 @@ def _next(
                 assert ended.status == 0, trail.told(f"{item.command}: {ended.said}")
     if said.status == 2:
         last = said.err.strip().splitlines()[-1]
-        if (option := _option(last, current)) or _MEANT.search(said.err.replace("\n", " ")):
+        if (option := _options(last, current)) or _MEANT.search(said.err.replace("\n", " ")):
             yield Advice(last if option else said.err.replace("\n", " "))
 
 
@@ -320,8 +322,8 @@ def _scale(folder: Path, columns: str, factor: float, trail: _Trail) -> None:
     _change_rows(folder, changed, trail)
 
 
-def _option(said: str, current: Sequence[str]) -> list[str]:
-    """An option that is to be added, with its value; none that takes what is refused."""
+def _options(said: str, current: Sequence[str]) -> dict[str, str]:
+    """Options that are to be given, with their values; none that takes what is refused."""
     known = {
         name: param
         for words, command in every_command()
@@ -329,18 +331,24 @@ def _option(said: str, current: Sequence[str]) -> list[str]:
         for param in command.params
         for name in param.opts
     }
-    for name, value in _OPTION.findall(said):
-        param = known.get(name)
-        if param is not None and name != "--force" and bool(value) != param.is_flag:
-            return [name, *value.split()]
-    return []
+    for phrase in _SAY.finditer(said):
+        given = _OPTION.findall(phrase[1])
+        if all(name in known and bool(value) != known[name].is_flag for name, value in given):
+            return {name: value.strip() for name, value in given if name != "--force"}
+    return {}
 
 
 def _typed(said: str, current: tuple[str, ...], trail: _Trail) -> tuple[str, ...]:
-    """The command with an option added, or a word corrected; there or in session.toml."""
-    if option := _option(said, current):
-        assert option[0] not in current, trail.told(f"{option[0]} was given already")
-        return (*current, *option)
+    """The command with options added or changed, or a word corrected; there or in session.toml."""
+    if options := _options(said, current):
+        typed = list(current)
+        for name, value in options.items():
+            if name in typed:
+                typed[typed.index(name) + 1] = value
+            else:
+                typed += [name, value] if value else [name]
+        assert tuple(typed) != current, trail.told(f"{options} was given already")
+        return tuple(typed)
     meant = _MEANT.search(said)
     assert meant is not None, trail.told("nothing is to be done")
     wrong, right = meant[1], meant[2].rstrip("?.,")

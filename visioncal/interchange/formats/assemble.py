@@ -18,6 +18,7 @@ from visioncal.core.number_format import some_of
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions, rows_of
 from visioncal.interchange.formats.intrinsics import read_intrinsics, read_target_description
+from visioncal.interchange.formats.reading import named_by
 from visioncal.robot import Robot
 from visioncal.robot.files import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session import ImageStore, Session, Stream
@@ -173,8 +174,9 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
             f"{foreign.name} has {len(saw)} poses of the robot, but neither images nor poses of "
             "the target: nothing says what a camera saw.",
             culprits=[foreign.robot.places[0]],
-            next_step="Name the images with --images, or the target's poses with --camera-columns "
-            "or --camera-file. Touches of a point need a column `point`.",
+            next_step="Name the images with --images, or the target's poses with --camera-"
+            f"{named_by(foreign.robot.places[0])} or --camera-file. Touches of a point need a "
+            "column `point`.",
         )
     if dropped:
         notes.append(

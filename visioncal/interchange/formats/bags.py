@@ -195,7 +195,7 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     at_s, poses = stream.stamps_s, stream.poses.poses()
     flange = Trajectory(at_s[np.isfinite(poses[:, 0, 0])], poses[np.isfinite(poses[:, 0, 0])])
     rows, places = list[tuple[str, float, str]](), dict[str, tuple[str, bool, int]]()
-    notes = [f"The robot's motion: {words}. --robot-columns BASE,TIP or a topic names another."]
+    notes = [f"The robot's motion: {words}. --robot-key BASE,TIP or a topic names another."]
     for topic, camera in cameras.items():
         images = contents.images[topic]
         chosen, how = _chosen(np.array(images.stamps_s), flange)
@@ -375,7 +375,7 @@ def _motion(
     """The robot's motion, where it is from, the tip's frame in TF if any, and the robot's model."""
     names, tip = requested.robot.names, ""
     if len(names) == 1 and names[0] not in contents.poses:
-        raise _no_topic(names[0], [*contents.poses, *contents.parents], "--robot-columns BASE,TIP")
+        raise _no_topic(names[0], [*contents.poses, *contents.parents], "--robot-key BASE,TIP")
     is_named_pose = len(names) == 1
     if not is_named_pose and contents.moving:
         base, tip = names[:2] if len(names) > 1 else _ends(contents)
@@ -397,7 +397,7 @@ def _motion(
             f"{some_of([*contents.poses, *contents.joints]) or 'no poses'}, and neither TF of a "
             "moving arm nor joints with /robot_description.",
             culprits=[*contents.poses, *contents.joints],
-            next_step="Name its poses: --robot-columns TOPIC (of PoseStamped) or BASE,TIP (frames "
+            next_step="Name its poses: --robot-key TOPIC (of PoseStamped) or BASE,TIP (frames "
             "of TF); or record /tf, /tf_static and /robot_description, too.",
         )
     every_s = np.union1d(stamps_s, joints_s)
@@ -444,7 +444,7 @@ def _ends(contents: _Contents) -> tuple[str, str]:
         raise DataError(
             f"TF has several moving chains of {longest - 1} joints: {some_of(pairs, 6)}.",
             culprits=ends,
-            next_step=f"Say which is the robot's: --robot-columns {pairs[0]}",
+            next_step=f"Say which is the robot's: --robot-key {pairs[0]}",
         )
     base, tip = links[ends[0]][-1], ends[0]
     below = [name for name in contents.parents if tip in contents.chain(name)]
@@ -460,7 +460,7 @@ def _between(contents: _Contents, base: str, tip: str) -> tuple[FloatArray, Floa
     known = {*contents.parents, *contents.parents.values()}
     for name in (base, tip):
         if name not in known:
-            raise _no_topic(name, sorted(known), "--robot-columns BASE,TIP")
+            raise _no_topic(name, sorted(known), "--robot-key BASE,TIP")
     up, down = contents.chain(base), contents.chain(tip)
     common = next((name for name in up if name in down), None)
     edges = [
@@ -474,7 +474,7 @@ def _between(contents: _Contents, base: str, tip: str) -> tuple[FloatArray, Floa
         raise DataError(
             f"TF does not move {tip} in {base}{'' if common else ': nothing joins them'}.",
             culprits=[base, tip],
-            next_step="Name the base and the tip of the arm: --robot-columns base_link,tool0",
+            next_step="Name the base and the tip of the arm: --robot-key base_link,tool0",
         )
     tracks = {edge: Trajectory(*_rows(contents.moving[edge])) for edge in moving}
     # Timestamps of the least frequent transform; the others are interpolated.

@@ -28,6 +28,7 @@ from visioncal.interchange.formats.poses import joint_names, joints_from, pose_n
 from visioncal.interchange.formats.reading import (
     ENDINGS,
     Fields,
+    named_by,
     read_fields,
     stamp_name,
     unnamed_columns,
@@ -72,11 +73,12 @@ def foreign_from(
     joint_fields = requested.joints or joint_names(fields, used)
     used.update(joint_fields)
     if not robot_names and not joint_fields:
+        word = named_by(fields.places[0])
         raise DataError(
             f"{fields.name}: which of its fields are the robot's poses is not known; it has "
             f"{fields.listing()}.",
             culprits=[fields.name],
-            next_step="Name them with --robot-columns, or the joint angles with --joint-columns.",
+            next_step=f"Name them with --robot-{word}, or the joint angles with --joint-{word}.",
         )
     notes: tuple[str, ...] = ()
     robot, camera = PoseNumbers.empty(fields.places), None
@@ -151,9 +153,9 @@ def _image_name(fields: Fields, folder: Path | None, taken: Collection[str]) -> 
     ]
     if len(naming) > 1:
         raise DataError(
-            f"{fields.name}: {some_of(naming)} name images; one column of them is needed.",
+            f"{fields.name}: {some_of(naming)} name images; one of them is needed.",
             culprits=naming,
-            next_step="Say which with --image-column.",
+            next_step=f"Say which with --image-{named_by(fields.places[0]).rstrip('s')}.",
         )
     return next(iter(naming), "")
 
@@ -222,7 +224,7 @@ def _poses(
             f"{fields.name}: which of its fields are the {whose}'s poses is not known; it has "
             f"{fields.listing()}.",
             culprits=[fields.name],
-            next_step=f"Name them with --{whose}-columns.",
+            next_step=f"Name them with --{whose}-{named_by(fields.places[0])}.",
         )
     poses, notes = poses_from(fields, names, requested, whose)
     return poses, names, notes

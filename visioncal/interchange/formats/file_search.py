@@ -7,6 +7,7 @@ from pathlib import Path
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside, natural
+from visioncal.interchange.formats.reading import named_by
 from visioncal.session.images import IMAGE_ENDINGS
 
 
@@ -116,9 +117,9 @@ def images_beside(
             f"{folder} has {len(images)} images ({first} ... {last}), but there are {len(labels)} "
             f"poses ({labels[0]} ... {labels[-1]}); one image a pose is needed.",
             culprits=[str(folder)],
-            next_step="Name each row's image with --image-column, or remove what is over. Where "
-            "that is not known, remove the last: visioncal doctor then says from where on rows and "
-            "images are shifted.",
+            next_step=f"Name each row's image with --image-{named_by(labels[0]).rstrip('s')}, or "
+            "remove what is over. Where that is not known, remove the last: visioncal doctor then "
+            "says from where on rows and images are shifted.",
         )
     return images, (
         f"Rows and images are paired in order, {labels[0]} with {first}, {labels[-1]} with {last}; "

@@ -10,9 +10,10 @@ import numpy as np
 from visioncal.core.choices import UNITS_M
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, Reading
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FAR_M
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.foreign import PoseImportOptions
-from visioncal.interchange.formats.reading import Fields
+from visioncal.interchange.formats.reading import Fields, named_by
 from visioncal.session.columns import SELECTORS, joint_columns
 
 # An ordinal indicator is common for the degree sign, too.
@@ -239,7 +240,8 @@ def poses_from(
                 f"{fields.name}: {', '.join(names)} have {sum(sizes)} numbers; a pose has 16 or 12 "
                 "(matrix), 7 (quaternion) or 6 (three angles). There are " + fields.listing() + ".",
                 culprits=list(names),
-                next_step=f"Name the fields of the {whose}'s poses with --{whose}-columns.",
+                next_step=f"Name the fields of the {whose}'s poses with --{whose}-"
+                f"{named_by(fields.places[0])}.",
             )
         units = {without_unit(name)[1] for name in names}
         rotation, notes = _likely_rotation(
@@ -319,16 +321,27 @@ def check_radians(
         return
     largest = np.abs(np.where(there[:, None], poses.rotations, 0.0)).max(axis=1)
     row = int(largest.argmax())
-    if is_degrees or largest[row] > 2 * np.pi + 0.01:
-        size = "in degrees" if is_degrees else "too large for radians"
-        raise DataError(
-            f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
-            f"{size}, and its form is needed.",
-            culprits=[poses.places[row]],
-            next_step=f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc "
-            "for W, P, R; yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg ..."
-            + ("; or let --guess find it." if guesses else ""),
+    if not is_degrees and largest[row] <= 2 * np.pi + 0.01:
+        return
+    size = "in degrees" if is_degrees else "too large for radians"
+    needed = "its form is needed"
+    next_step = (
+        f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc for W, P, R; "
+        "yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg ..."
+    )
+    if requested.form is not None:
+        needed = f"poses of the form {requested.form} are in radians"
+        is_far = bool(np.abs(poses.positions[there]).max() > FAR_M) and poses.reading.unit == "m"
+        next_step = (
+            f"Say --{whose}-form {rotation.removesuffix('-rad')}-deg"
+            f"{f' --{whose}-unit mm' * is_far}, where these are degrees"
         )
+    raise DataError(
+        f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
+        f"{size}, and {needed}.",
+        culprits=[poses.places[row]],
+        next_step=next_step + ("; or let --guess find it." if guesses else "."),
+    )
 
 
 def _matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -29,6 +29,11 @@ _NORM_TOLERANCE = 0.01
 _MOST_NUMBERS = 200
 
 
+def named_by(place: str) -> str:
+    """What the option that names fields is called after: the `columns` of a table, else a `key`."""
+    return "columns" if ", line " in place else "key"
+
+
 @dataclass(frozen=True, eq=False)
 class Fields:
     """Named values of n rows."""

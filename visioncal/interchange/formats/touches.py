@@ -18,7 +18,7 @@ from visioncal.interchange.formats.poses import (
     pose_names,
     without_unit,
 )
-from visioncal.interchange.formats.reading import Fields, read_fields, unnamed_columns
+from visioncal.interchange.formats.reading import Fields, named_by, read_fields, unnamed_columns
 from visioncal.session import Session
 from visioncal.session.columns import joint_columns
 
@@ -58,8 +58,9 @@ def read_touches(
                 f"{path.name} has positions without rotations, and a tip beside the flange needs "
                 "both.",
                 culprits=[path.name],
-                next_step="Add the rotations, or name all columns with --robot-columns; or, for a "
-                "fixture, say --tool none where the positions are of the tip itself.",
+                next_step="Add the rotations, or name all of them with --robot-"
+                f"{named_by(fields.places[0])}; or, for a fixture, say --tool none where the "
+                "positions are of the tip itself.",
             )
         foreign = foreign_from(fields, requested)
         check_radians(foreign.robot, given, "robot", guesses=False)
