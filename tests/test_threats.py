@@ -137,7 +137,7 @@ def test_processes_of_the_page_and_of_the_simulated_cell_run_none_either(trap, t
         "from visioncal.live.page.outcome import ask_command\n"
         "from visioncal.live.simulated.controller import spawn\n"
         "if __name__ == '__main__':\n"
-        "    print(ask_command(['calibrate', 'nothing'], None, 0).title)\n"
+        "    print(ask_command(['calibrate', 'nothing'], None, ()).title)\n"
         "    spawn().close()\n",
         "utf-8",
     )

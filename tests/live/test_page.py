@@ -1,7 +1,10 @@
 """The page in headless Chromium: a calibration by typed poses alone, and checks of it."""
 
+import csv
 import re
+import shutil
 import socket
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +19,7 @@ from visioncal import Calibration, Session
 from visioncal.vision.boards.imaging import read_image
 
 pytest.importorskip("nicegui")
-pytest.importorskip("playwright.sync_api")
+expect = pytest.importorskip("playwright.sync_api").expect
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser")
 POSE = "Pose of the flange"
 
@@ -30,6 +33,11 @@ def kuka(pose, *, comma: bool = False) -> str:
     return line.replace(".", ",") if comma else line
 
 
+def row(page, number: int):
+    """The row of a view."""
+    return page.get_by_role("row", name=f"view {number}", exact=True)
+
+
 def typed(page, folder: Path, view, line: str, place: int) -> None:
     """Shows a view to the camera, and types its pose."""
     (folder / "shown").write_text(str(view.number))
@@ -39,9 +47,9 @@ def typed(page, folder: Path, view, line: str, place: int) -> None:
     page.get_by_text("Read as KUKA").wait_for()
     field.press("Enter")
     field.press("Enter")
-    page.get_by_text(f"view {place}:").wait_for()
+    row(page, place).wait_for()
     # Pressed twice, it is one view.
-    assert page.get_by_text(f"view {place + 1}:").count() == 0
+    assert row(page, place + 1).count() == 0
 
 
 def choose(page, label: str, words: str) -> None:
@@ -84,12 +92,12 @@ def calibrated(cell, browser) -> Path:
         for place, view in enumerate(views[:4], 1):
             typed(page, seen, view, kuka(view.base_from_flange(), comma=place % 2 == 0), place)
         page.get_by_role("button", name="Undo last").click()
-        page.get_by_text("view 4:").wait_for(state="detached")
+        row(page, 4).wait_for(state="detached")
         page.reload()
-        page.get_by_text("view 3:").wait_for()
+        row(page, 3).wait_for()
         with opened(browser, url) as second:
             typed(second, seen, views[3], kuka(views[3].base_from_flange()), 4)
-        page.get_by_text("view 4:").wait_for()
+        row(page, 4).wait_for()
         (seen / "shown").unlink()
         page.get_by_text("gives no picture").wait_for()
         (seen / "shown").write_text("4")
@@ -100,7 +108,7 @@ def calibrated(cell, browser) -> Path:
     with served("record", "-o", out) as (url, _), opened(browser, url) as page:
         # What was chosen is still there.
         page.get_by_role("button", name="Start").click()
-        page.get_by_text("view 8:").wait_for()
+        row(page, 8).wait_for()
         for place, view in enumerate(views[8:], 9):
             typed(page, seen, view, kuka(view.base_from_flange()), place)
         page.get_by_text("good so far").wait_for()
@@ -166,3 +174,106 @@ def test_a_check_passes_and_fails_and_is_remembered(cell, browser):
                     lines = page.get_by_text(re.compile(r"^\d{4}-\d\d-\d\d-cell-result"))
                     history = lines.all_inner_texts()
     assert ["agree" in line for line in history] == [False, True]
+
+
+def paired(folder: Path) -> tuple[list[list[str]], list[bytes]]:
+    """The table of a session without its stamps, and its images in the order of the rows."""
+    rows = [*csv.reader((folder / "views.csv").read_text().splitlines())]
+    stamp, image = rows[0].index("stamp_s"), rows[0].index("image")
+    images = [(folder / row[image]).read_bytes() for row in rows[1:]]
+    return [row[:stamp] + row[stamp + 1 :] for row in rows], images
+
+
+def pasted(page, *lines: str) -> None:
+    """Types poses, and has them taken."""
+    field = page.get_by_label(POSE)
+    field.fill("\n".join(lines))
+    page.get_by_text("Read as KUKA").wait_for()
+    field.press("Enter")
+
+
+def due(page, name: str) -> None:
+    """Waits until a picture is that of the next pose."""
+    expect(page.get_by_label("Picture of the next pose")).to_have_value(name)
+
+
+def changed(page, number: int, action: str, line: str = "") -> None:
+    """Does something with a row, and waits until it is done."""
+    page.get_by_role("button", name=f"change view {number}", exact=True).click()
+    dialog = page.get_by_role("dialog")
+    if line:
+        dialog.get_by_label("Its pose").fill(line)
+    dialog.get_by_role("button", name=action).click()
+    dialog.wait_for(state="hidden")
+
+
+def test_a_folder_typed_with_mistakes_is_the_session_typed_without(cell, browser):
+    views = Session.load(cell / "seen").views
+    lines = [kuka(view.base_from_flange()) for view in views]
+    typos = [line.replace("X ", "X 9") for line in lines]
+    for name in ("clean", "inbox"):
+        (cell / name).mkdir()
+        for number, view in enumerate(views, 1):
+            shutil.copy(cell / "seen" / view.image, cell / name / f"shot{number}.png")
+    # Of the stop before, once more: it belongs to no pose.
+    shutil.copy(cell / "inbox/shot3.png", cell / "inbox/shot3b.png")
+    board = ("--target", "charuco_9x6_30mm", "--arm", "manual", "--camera")
+    with (
+        served("record", "-o", cell / "without", *board, f"folder:{cell / 'clean'}") as (url, _),
+        opened(browser, url) as page,
+    ):
+        due(page, "shot1.png")
+        pasted(page, *lines)
+        row(page, 10).wait_for()
+    words = ("record", "-o", cell / "with", *board, f"folder:{cell / 'inbox'}")
+    with served(*words) as (url, process), opened(browser, url) as page:
+        for number, line in enumerate((lines[0], typos[1], lines[2]), 1):
+            due(page, f"shot{number}.png")
+            pasted(page, line)
+            row(page, number).wait_for()
+        page.get_by_role("button", name="Undo last").click()
+        due(page, "shot3.png")
+        # What was typed is there again.
+        expect(page.get_by_label(POSE)).to_have_value(lines[2])
+        page.get_by_label(POSE).press("Enter")
+        row(page, 3).wait_for()
+        due(page, "shot3b.png")
+        pasted(page, lines[0])
+        page.get_by_role("alert").get_by_text("View 1 has this very pose").wait_for()
+        due(page, "shot3b.png")
+        pasted(page, lines[3])
+        row(page, 4).wait_for()
+        changed(page, 4, "Take again")
+        page.get_by_role("button", name="Keep view 4").wait_for()
+        due(page, "shot4.png")
+        pasted(page, lines[3].replace("X ", "X  "))
+        row(page, 4).get_by_text("shot4.png").wait_for()
+        changed(page, 4, "Replace the pose", lines[3])
+        due(page, "shot5.png")
+        rest = [lines[4], typos[5], lines[6], typos[7], lines[9], lines[8]]
+        page.get_by_label(POSE).fill("\n".join([*rest[:3], "X 1 Y 2", *rest[3:]]))
+        page.get_by_text("Line 4: ").wait_for()
+        page.get_by_label(POSE).press("Enter")
+        pasted(page, *rest)
+        row(page, 10).wait_for()
+        page.get_by_role("button", name="Undo last").click()
+        row(page, 10).wait_for(state="detached")
+        page.reload()
+        due(page, "shot10.png")
+        pasted(page, lines[8])
+        row(page, 10).wait_for()
+        changed(page, 6, "Replace the pose", lines[5])
+        process.kill()
+    with served(*words) as (url, _), opened(browser, url) as page:
+        page.get_by_text("no further picture is there").wait_for()
+        assert page.get_by_role("row").count() == 10
+        for number in (2, 8):
+            changed(page, number, "Replace the pose", lines[number - 1])
+        # The trial finds the last mistake, and offers its remedy.
+        page.get_by_role("button", name="Exchange the poses of views 9 and 10").click()
+        page.get_by_text("good so far").wait_for()
+        page.get_by_text("of 10 views", exact=True).wait_for()
+    for made, wanted in zip(*map(paired, (cell / "with", cell / "without")), strict=True):
+        assert made == wanted
+    recorded = tomllib.loads((cell / "with/recorded.toml").read_text())
+    assert recorded["left_out"] == ["shot3b.png"]

@@ -30,7 +30,7 @@ from visioncal.interchange.outputs import CALIBRATION, VERIFY
 from visioncal.interchange.result_files import load_calibration
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.devices import ARMS, CAMERAS
-from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
+from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell, picture_name
 from visioncal.live.drivers.protocols import StoredPictures
 from visioncal.live.drivers.uvc import without_password
 from visioncal.live.page.outcome import Light
@@ -202,7 +202,8 @@ def _begun(
         check_order(cell, is_resumed=False)
         facts = CaptureFacts.of(cell, chosen.out.name, recorded, plan)
         journal = Journal.resume(chosen.out, facts, cell.clock.unix_offset_s(), 0)
-        if journal.views and isinstance(cell.camera, StoredPictures):
+        is_known = given is not None and all(map(picture_name, journal.views))
+        if journal.views and isinstance(cell.camera, StoredPictures) and not is_known:
             # Those of the views so far, and of poses that gave none.
             cell.camera.skip()
         # Of a camera's URL without its user and password.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import TypeAlias
 
 import numpy as np
@@ -30,11 +31,24 @@ class Coach:
     target: Target
     resolution: tuple[int, int]  # (width, height) of the images [px].
     camera: Camera | None  # Intrinsics for tilt and distance; None where they are not known.
-    # (rows, columns) parts of the image in which a view shows the board.
-    covered: Mask = field(default_factory=lambda: np.zeros((5, 8), dtype=bool))
-    # (4, 4) `cam_from_target` of the views; through a usual lens, where it is not known [m].
-    poses: list[FloatArray] = field(default_factory=list)
-    _views: int = 0
+    corners: dict[int, Corners] = field(default_factory=dict)  # Corners found, by view.
+    _poses: dict[int, FloatArray] = field(default_factory=dict)
+
+    @property
+    def poses(self) -> list[FloatArray]:
+        """(4, 4) `cam_from_target` of the views; of an unknown lens, through a usual one [m]."""
+        return [*self._poses.values()]
+
+    @property
+    def covered(self) -> Mask:
+        """(rows, columns) parts of the image in which a view shows the board."""
+        covered = np.zeros((5, 8), dtype=bool)
+        counts = np.array(covered.shape[::-1])
+        for corners in self.corners.values():
+            cells = np.floor(corners.px * counts / self.resolution).astype(int)
+            columns, rows = np.clip(cells, 0, counts - 1).T
+            covered[rows, columns] = True
+        return covered
 
     @property
     def lens(self) -> Camera:
@@ -46,31 +60,51 @@ class Coach:
         return Camera("brown", self.resolution, matrix, np.zeros(5))
 
     def add(self, corners: Corners) -> None:
-        """Takes a view into account."""
-        self._views += 1
-        counts = np.array(self.covered.shape[::-1])
-        cells = np.floor(corners.px * counts / self.resolution).astype(int)
-        columns, rows = np.clip(cells, 0, counts - 1).T
-        self.covered[rows, columns] = True
+        """Takes a view into account, in place of one with its number."""
+        self.drop(corners.view)
+        self.corners[corners.view] = corners
         try:
             by_view = {corners.view: corners}
             # Assumed corner noise [px]; advice needs no better.
             views = measure_poses(by_view, (self.target,), self.lens, 0.2)
         except VisioncalError:
             return
-        self.poses += [view.cam_from_target[0] for view in views]
+        self._poses.update((corners.view, view.cam_from_target[0]) for view in views)
+
+    def drop(self, view: int) -> None:
+        """Takes a view out of account."""
+        self.corners.pop(view, None)
+        self._poses.pop(view, None)
+
+    def through(self, camera: Camera) -> "Coach":
+        """The same views, through a lens that has become known."""
+        coach = Coach(self.target, self.resolution, camera)
+        for corners in self.corners.values():
+            coach.add(corners)
+        return coach
 
     @property
     def _tilts(self) -> FloatArray:
         """Angles between the optical axis and the board's normal [deg]."""
         # The target's z axis points into the board, away from the camera.
-        along = [pose[2, 2] for pose in self.poses]
+        along = [pose[2, 2] for pose in self._poses.values()]
         return np.asarray(np.rad2deg(np.arccos(np.clip(along, -1.0, 1.0))))
 
     @property
     def _distances(self) -> list[float]:
         """Distances of the camera from the board [m]."""
-        return [float(np.linalg.norm(pose[:3, 3])) for pose in self.poses]
+        return [float(np.linalg.norm(pose[:3, 3])) for pose in self._poses.values()]
+
+    def unseen(self) -> str:
+        """Names the corners of the image in which no view shows the board; empty for none."""
+        covered, rows = self.covered, {"top": slice(2), "bottom": slice(-2, None)}
+        columns = {"left": slice(2), "right": slice(-2, None)}
+        names = (
+            f"{row} {column}"
+            for row, column in product(rows, columns)
+            if self.corners and covered[rows[row], columns[column]].mean() < 0.5
+        )
+        return ", ".join(names)
 
     def words(self) -> str:
         """States the coverage: `coverage 45 %, tilts to 32 deg, 0.4 to 0.7 m away`."""
@@ -82,7 +116,7 @@ class Coach:
 
     def advice(self) -> str:
         """Advice for the next view, where a person chooses it; empty where nothing is missing."""
-        if self._views < 3:
+        if len(self.corners) < 3:
             return "another place, with the board large in the image"
         if self.poses and self.camera is not None:
             tilts = self._tilts
@@ -91,6 +125,8 @@ class Coach:
                 return f"tilt the camera: the steepest view leans by {tilts.max():.0f} deg only"
             if max(self._distances) < 1.25 * min(self._distances):
                 return f"another distance: all views are about {self._distances[0]:.2f} m away"
+        if unseen := self.unseen():
+            return f"bring the board into the image's corners: it was hardly in the {unseen}"
         if self.covered.mean() < 0.8:
             return "bring the board to where it was not yet in the image, near the edges too"
         return ""

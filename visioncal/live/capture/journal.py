@@ -2,12 +2,13 @@
 
 import errno
 import json
+import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -40,6 +41,11 @@ from visioncal.vision.targets import load_target, stored_target, target_document
 # File that names devices and plan; written before the first view.
 PROVENANCE = "recorded.toml"
 _IMAGES, _TABLE, _TARGET_FILE = "images", "views.csv", "target.toml"
+# Columns that belong to a row's picture; all others belong to its pose.
+_OF_PICTURE = re.compile("stamp_s|blur_px|motion_px|exposure_ms|picture|device_.*")
+# End of the name of an image that is to replace its row's.
+_AGAIN = "-again.png"
+_Cell = TypeVar("_Cell", float, str)
 # Reserve for tables, folders and the disk's own use.
 _SPARE_BYTES = 256_000
 
@@ -153,6 +159,11 @@ class CaptureFacts(RecordedCell):
             "safety": state.safety,
             "blur_px": f"{taken.corners.blur_px:.2f}",
             "motion_px": f"{taken.motion_px:.3f}",
+            **{
+                name: text
+                for name, text in (("picture", frame.name), ("typed", state.typed))
+                if text
+            },
         }
         if state.flange_from_tool is not None:
             tcp = pose_row(state.flange_from_tool).values()
@@ -161,6 +172,26 @@ class CaptureFacts(RecordedCell):
             texts["exposure_ms"] = f"{1e3 * frame.exposure_s:.3f}"
         texts |= {f"device_{name}": str(value) for name, value in self.settings.items()}
         return View(number, image=image, numbers=numbers, text=texts)
+
+
+def posed(view: View, pose: View | ArmState) -> View:
+    """A row with its own picture, and the pose of another row, or one that was typed."""
+    numbers, text = (
+        (pose.numbers, pose.text)
+        if isinstance(pose, View)
+        else (pose_row(pose.base_from_flange), {"safety": pose.safety, "typed": pose.typed})
+    )
+
+    def paired(own: Mapping[str, _Cell], other: Mapping[str, _Cell]) -> dict[str, _Cell]:
+        kept = {name: cell for name, cell in own.items() if _OF_PICTURE.fullmatch(name)}
+        return kept | {k: cell for k, cell in other.items() if not _OF_PICTURE.fullmatch(k)}
+
+    return replace(view, numbers=paired(view.numbers, numbers), text=paired(view.text, text))
+
+
+def picture_name(view: View) -> str:
+    """Name that the picture of a row had in its folder; empty for none."""
+    return view.text.get("picture", "")
 
 
 def state_of(view: View) -> ArmState | None:
@@ -176,7 +207,8 @@ class Journal:
 
     The table of views is replaced atomically for each view, after its image is on the disk: at any
     moment the folder holds a session of all acknowledged views, or, before the first, none. If the
-    process is killed, at most the view that is being written is lost.
+    process is killed, at most the view that is being written is lost. A row's picture is replaced
+    by way of another file, so that no picture is ever beside a pose that is not its own.
     """
 
     def __init__(self, folder: Path, facts: CaptureFacts, unix_offset_s: float) -> None:
@@ -185,6 +217,7 @@ class Journal:
         self.views: tuple[View, ...] = ()
         self._columns: tuple[str, ...] = ()
         self._facts, self._offset_s = facts, unix_offset_s
+        self._document: dict[str, Any] = {}
 
     @classmethod
     def begin(
@@ -210,8 +243,9 @@ class Journal:
         journal._check_room(views * width * height, f"{views} views")
         with named_errors(folder):
             (folder / _IMAGES).mkdir(exist_ok=True)
-        document = {"visioncal": __version__, **facts.provenance(), "settings": facts.settings}
-        journal._write(PROVENANCE, tomli_w.dumps(document))
+        facts_now = {"visioncal": __version__, **facts.provenance(), "settings": facts.settings}
+        journal._document = facts_now
+        journal._write(PROVENANCE, tomli_w.dumps(facts_now))
         return journal
 
     @classmethod
@@ -245,48 +279,82 @@ class Journal:
                 next_step="Go on with the same, or record into a new folder.",
             )
         journal = cls(folder, facts, unix_offset_s)
+        journal._document = before
         with named_errors(folder):
             (folder / _IMAGES).mkdir(exist_ok=True)
         if (folder / _TABLE).is_file():
             session = Session.load(folder)
             journal.views, journal._columns = session.views, session.columns
+        journal._settle()
         return journal
 
-    def append(self, number: int, taken: TakenView) -> View:
-        """Writes a view; when this returns, it is flushed to the disk.
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Names of a folder's pictures that are no view's and not to be given."""
+        names, used = self._document.get("left_out", []), set(map(picture_name, self.views))
+        return tuple(str(name) for name in names if name not in used)
+
+    def leave_out(self, names: Iterable[str]) -> None:
+        """Remembers which pictures are left out, instead of those before; raises DataError."""
+        if (names := sorted(names)) != self._document.get("left_out", []):
+            self._document["left_out"] = names
+            self._write(PROVENANCE, tomli_w.dumps(self._document))
+
+    def store(self, taken: Mapping[int, TakenView]) -> None:
+        """Writes views by their numbers, all of them or none, in place of those that have them.
+
+        When this returns, they are flushed to the disk.
 
         Raises:
-            DataError: It cannot be written; the session is unchanged.
+            DataError: They cannot be written; the session is unchanged.
         """
-        image = f"{_IMAGES}/{number:03d}.png"
-        view = self._facts.view_of(number, image, taken, self._offset_s)
-        # Low compression: noise hardly compresses, and speed matters more.
-        _, png = cv2.imencode(".png", taken.frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        data = png.tobytes()
-        self._check_room(len(data), f"view {number}")
-        self._write(image, data)
+        rows = {view.number: view for view in self.views}
+        for number, view in taken.items():
+            image = f"{_IMAGES}/{number:03d}{_AGAIN if number in rows else '.png'}"
+            # Low compression: noise hardly compresses, and speed matters more.
+            _, png = cv2.imencode(".png", view.frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            data = png.tobytes()
+            self._check_room(len(data), f"view {number}")
+            self._write(image, data)
+            rows[number] = self._facts.view_of(number, image, view, self._offset_s)
         if not self.views:
             for name, text in self._facts.texts().items():
                 self._write(name, text)
-        views = (*self.views, view)
-        columns = self._columns or ("view", "image", *view.numbers, *view.text)
-        self._write(_TABLE, write_csv(columns, views))
-        self.views, self._columns = views, columns
-        return view
+        self.rewrite([*rows.values()])
 
-    def undo(self) -> View:
-        """Removes the last view, of at least one, from the disk and returns it; raises DataError.
+    def rewrite(self, views: Sequence[View]) -> None:
+        """Replaces the table by rows of it, of which some may be left out or have other poses.
 
-        If the process is killed meanwhile, at most its image remains, which the next view replaces.
+        When this returns, they are flushed to the disk; a process that is killed meanwhile leaves
+        the table before or this one. Raises DataError.
         """
-        *views, last = self.views
+        known = self._columns if views and self._columns else ("view", "image")
+        filled = (name for view in views for name in (*view.numbers, *view.text))
+        columns = tuple(dict.fromkeys([*known, *filled]))
         if views:
-            self._write(_TABLE, write_csv(self._columns, views))
-        for name in (last.image, *(() if views else (_TABLE,))):
+            self._write(_TABLE, write_csv(columns, views))
+        gone = {view.image for view in self.views} - {view.image for view in views}
+        # A table without rows is none, and one whose images are gone is no session.
+        for name in (*(() if views else (_TABLE,)), *gone):
             with named_errors(self.folder / name):
                 (self.folder / name).unlink(missing_ok=True)
-        self.views, self._columns = tuple(views), self._columns if views else ()
-        return last
+        self.views, self._columns = tuple(views), columns if views else ()
+        self._settle()
+
+    def _settle(self) -> None:
+        """Gives images that replaced others their rows' own names; raises DataError."""
+        if any(view.image.endswith(_AGAIN) for view in self.views):
+            views = [*self.views]
+            for row, view in enumerate(views):
+                if view.image.endswith(_AGAIN):
+                    image = f"{view.image.removesuffix(_AGAIN)}.png"
+                    self._write(image, self.image(view))
+                    views[row] = replace(view, image=image)
+            self._write(_TABLE, write_csv(self._columns, views))
+            self.views = tuple(views)
+        for path in (self.folder / _IMAGES).glob(f"*{_AGAIN}"):
+            with named_errors(path):
+                path.unlink(missing_ok=True)
 
     def check_room(self) -> None:
         """Checks that the disk has room for one more view; raises DataError."""

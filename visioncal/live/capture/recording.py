@@ -1,6 +1,6 @@
 """Recording of views: driven to the stops of a plan, guided by hand, or on request."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -108,16 +108,30 @@ class Capture:
         self.prediction, self.watch = prediction, watch
         self.coach = Coach(target, cell.camera.resolution, lens)
         self.steps: list[CaptureEvent] = []
-        self._check = JointPoseCheck(robot)
+        self._robot = robot
         for view in journal.views:
             image = decode_image(journal.image(view))
             if not isinstance(image, str):
                 corners, _ = find_corners(image, target, view.number)
                 if isinstance(corners, Corners):
                     self.coach.add(corners)
-            state = state_of(view)
-            if state is not None:
+        self.reconcile()
+
+    def reconcile(self) -> None:
+        """Counts the views that the journal has now: some may be gone, or have other poses."""
+        views = self.journal.views
+        for number in self.coach.corners.keys() - {view.number for view in views}:
+            self.coach.drop(number)
+        self._check = JointPoseCheck(self._robot)
+        for view in views:
+            if (state := state_of(view)) is not None:
                 self._check.why_not(state)
+
+    def store(self, taken: Mapping[int, TakenView]) -> None:
+        """Stores views by their numbers, all of them or none; raises DataError."""
+        self.journal.store(taken)
+        for view in taken.values():
+            self.coach.add(view.corners)
 
     def view(
         self, number: int, place: int, count: int, next_view: int | None = None
@@ -141,8 +155,7 @@ class Capture:
             if disagreement:
                 result = Missed(disagreement)
             else:
-                self.journal.append(number, result)
-                self.coach.add(result.corners)
+                self.store({number: result})
         taken = [view.number for view in self.journal.views]
         accuracy = None if self.prediction is None else self.prediction(taken)
         advice = f"view {next_view}" if next_view else ""

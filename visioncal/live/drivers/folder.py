@@ -1,8 +1,10 @@
 """Pictures that a camera's own program saves into a folder."""
 
 import time
+from contextlib import suppress
 from pathlib import Path
 
+from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, natural, read_bytes
 from visioncal.core.types import Camera, Image
 from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
@@ -32,7 +34,10 @@ class FolderCamera:
     def __init__(self, path: str, requested: DeviceSetup | None = None) -> None:
         requested = requested or DeviceSetup()
         self.name, self.settings = f"folder {path}", dict[str, str | float]()
-        self._folder, self._given = Path(path), set[Path]()
+        self.given, self.chosen, self._folder = set[str](), "", Path(path)
+        # Sizes at the last two looks at the folder [bytes]; the newest picture that was decoded.
+        self._sizes, self._before = dict[str, int](), dict[str, int]()
+        self._decoded: tuple[tuple[str, int, int], Image | str] | None = None
         refuse_settings(self.name, requested, "in the program that takes them")
         if not path or not self._folder.is_dir():
             step = "Give the folder in which the camera's program saves: --camera folder:PATH."
@@ -46,32 +51,66 @@ class FolderCamera:
             DriverError: None came in time, or it has another resolution.
         """
         del timeout_s
-        path, image = self._next()
-        check_resolution(f"{self.name}: {path.name}", image, self.resolution, "has")
-        self._given.add(path)
-        return Frame(image, time.monotonic())
+        name, image = self._next()
+        check_resolution(f"{self.name}: {name}", image, self.resolution, "has")
+        self.given.add(name)
+        return Frame(image, time.monotonic(), name=name)
+
+    def waiting(self) -> list[str]:
+        """Returns the names of pictures that were not given, the next one first.
+
+        Raises:
+            DriverError: The folder cannot be read, or a name cannot be written into a table.
+        """
+        found = dict[Path, int]()
+        try:
+            for path in self._folder.iterdir():
+                if path.suffix.lower() in IMAGE_ENDINGS and path.name not in self.given:
+                    # It may have been removed since the folder was read.
+                    with suppress(FileNotFoundError):
+                        found[path] = path.stat().st_size
+        except OSError as error:
+            step = "Connect its disk, and make it readable."
+            raise camera_error(self.name, f"cannot be read: {error.strerror}", step) from error
+        names = [path.name for path in sorted(found, key=natural)]
+        if wrong := [ascii(name) for name in names if not name.isprintable()]:
+            step = "Rename it: letters, digits and signs of UTF-8 can be written."
+            raise camera_error(self.name, f"holds a file named {wrong[0]}", step)
+        sizes = {path.name: size for path, size in found.items()}
+        self._before, self._sizes = self._sizes, sizes
+        return sorted(names, key=lambda name: name != self.chosen)
+
+    def look(self, name: str) -> Image | str:
+        """Returns a picture without giving it, or says why it is none."""
+        path = self._folder / name
+        try:
+            now = path.stat()
+            if not self._before.get(name) == self._sizes.get(name) == now.st_size:
+                return "still being written"
+            key = (name, now.st_size, now.st_mtime_ns)
+            if self._decoded is None or self._decoded[0] != key:
+                self._decoded = key, decode_image(read_bytes(path, MOST_IMAGE_BYTES))
+        except (OSError, DataError):
+            return "cannot be read"
+        return self._decoded[1]
 
     def skip(self) -> None:
         """Counts the pictures that are there as given."""
-        self._given |= {*self._folder.glob("*")}
+        self.given |= {path.name for path in self._folder.glob("*")}
 
     def close(self) -> None:
         """Holds no resources."""
 
-    def _next(self) -> tuple[Path, Image]:
+    def _next(self) -> tuple[str, Image]:
         """Waits for the next picture."""
-        waiting, seen = Stopwatch(), None
-        why = f"has no further picture ({len(self._given)} were given)"
+        waiting = Stopwatch()
+        why = f"has no further picture ({len(self.given)} were given)"
         step = f"Save one there ({', '.join(IMAGE_ENDINGS)}), or end the recording."
         while waiting.read() < _PATIENCE_S:
-            paths = [path for path in self._folder.glob("*") if path not in self._given]
-            paths = [path for path in paths if path.suffix.lower() in IMAGE_ENDINGS]
-            if paths:
-                path = min(paths, key=natural)
-                data = read_bytes(path, MOST_IMAGE_BYTES)
-                image = decode_image(data) if seen == (path, len(data)) else "still growing"
+            for name in self.waiting()[:1]:
+                image = self.look(name)
                 if not isinstance(image, str):
-                    return path, image
-                seen, why, step = (path, len(data)), f"holds {path.name}: {image}", "Remove it."
+                    return name, image
+                why, step = f"holds {name}: {image}", "Remove it."
             time.sleep(_POLL_S)
         raise camera_error(self.name, why, step)

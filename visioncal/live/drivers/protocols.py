@@ -35,6 +35,7 @@ class ArmState:
     controller_s: float = 0.0  # Time on the controller's own clock, where it has one [s].
     stop: int | None = None  # Number of the stop by the robot's own program, where it counts them.
     pose_form: str = ""  # Form of `POSE_FORMS` in which the pose was sent; empty where unknown.
+    typed: str = ""  # The line in which a person typed the pose; empty for none.
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,7 @@ class Frame:
     image: Image  # (h, w) grey or (h, w, 3) blue, green, red.
     stamp_s: float  # Middle of the exposure, on the host's monotonic clock [s].
     exposure_s: float | None = None  # Exposure time [s], where the camera reports it.
+    name: str = ""  # Name of the file that it was; empty for none.
 
 
 class Arm(Protocol):
@@ -147,6 +149,18 @@ class CameraDevice(Protocol):
 @runtime_checkable
 class StoredPictures(CameraDevice, Protocol):
     """Pictures that another program took, whenever it did: each is given once, in their order."""
+
+    given: set[str]  # Names of those that were given, or are left out.
+    chosen: str  # Name of one that comes next whatever the order; empty for none.
+
+    def waiting(self) -> list[str]:
+        """Returns the names of those that were not given, the next one first; raises DriverError.
+
+        One that grew since the call before is not whole for `look`.
+        """
+
+    def look(self, name: str) -> Image | str:
+        """Returns one of them without giving it, or says why it is none: `unreadable: ...`."""
 
     def skip(self) -> None:
         """Counts the pictures that are there as given."""

@@ -1,13 +1,19 @@
 """What a calibration or a check says of the views so far, by the command that a user would run."""
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+from visioncal.calibration.suspects.suspect import EXCHANGED
+from visioncal.core.number_format import figure
+from visioncal.session import View
 
 # Colours of a traffic light; grey: no result yet.
 Light = Literal["green", "yellow", "red", "grey"]
@@ -23,7 +29,7 @@ class Outcome:
     reasons: tuple[str, ...]  # The likeliest first.
     next_step: str  # What to do; empty for nothing.
     folder: Path  # Where its files are; those of a trial are gone.
-    views: int  # Number of views of which it is.
+    views: tuple[View, ...]  # The rows of which it is.
     document: dict[str, Any]  # What the command printed; empty where it failed.
 
     @property
@@ -31,24 +37,47 @@ class Outcome:
         """Its page."""
         return self.folder / "report.html"
 
+    @property
+    def exchanged(self) -> tuple[int, int] | None:
+        """Numbers of two views whose poses it takes for exchanged; None for no such pair."""
+        findings = self.document.get("verdict", {}).get("findings", ())
+        pairs = (each["views"] for each in findings if each["kind"] == EXCHANGED)
+        return next(((pair[0], pair[1]) for pair in pairs if len(pair) == 2), None)
 
-def ask_command(words: Sequence[str], folder: Path | None, views: int) -> Outcome:
+    def residual(self, view: View) -> tuple[str, bool]:
+        """Residual of a row in words, and whether it was left out; empty where it is not of it."""
+        entries = self.document.get("views", ()) if any(view is one for one in self.views) else ()
+        entry = next((each for each in entries if each["view"] == view.number), None)
+        if entry is None:
+            return "", False
+        far = entry["residual_mm"]
+        words = "" if far is None else f"{figure(far)} mm"
+        return words if entry["used"] else f"{words}, left out".strip(", "), not entry["used"]
+
+
+def ask_command(words: Sequence[str], folder: Path | None, views: tuple[View, ...]) -> Outcome:
     """Runs a command of visioncal with `--json` as a process of its own, and reads its answer.
 
     Args:
         words: The command and its options, but for its output.
         folder: Where it writes; None for a trial, which draws nothing and keeps no file.
-        views: Number of views of the session.
+        views: The rows of the session.
     """
     with tempfile.TemporaryDirectory() as passing:
         if folder is None:
             folder, words = Path(passing) / "trial", (*words, "--no-report", "--no-recording")
         command = [sys.executable, "-P", "-m", "visioncal", *words, "-o", str(folder), "--json"]
-        ended = subprocess.run(command, capture_output=True, text=True, check=False)
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+            if hasattr(os, "setpriority"):
+                # Pictures and requests come first.
+                with suppress(OSError):
+                    os.setpriority(os.PRIO_PROCESS, process.pid, 10)
+            answer, complaint = process.communicate()
     try:
-        document = json.loads(ended.stdout)
+        document = json.loads(answer)
     except ValueError:
-        reasons = (ended.stderr.strip()[-2000:] or f"exit status {ended.returncode}",)
+        reasons = (complaint.strip()[-2000:] or f"exit status {process.returncode}",)
         return Outcome("red", "failed", reasons, "", folder, views, {})
     if "error" in document:
         error = document["error"]

@@ -16,10 +16,10 @@ from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.documents.pendants import PendantPose, pendant_words, read_pose
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
-from visioncal.live.drivers.manual import pose_words
 from visioncal.live.page.access import Admission
 from visioncal.live.page.outcome import Outcome
-from visioncal.live.page.station import PageText, Snapshot, Station
+from visioncal.live.page.station import PageText, Snapshot, Station, Visitor
+from visioncal.live.page.table import VIEWS, ViewTable, read_as
 
 _COLOURS = {"green": "#2e9e2e", "yellow": "#e0a800", "red": "#c62828", "grey": "#777777"}
 _PICTURE, _REPORT = "/live.jpg", "/report"
@@ -49,7 +49,12 @@ def serve(station: Station, text: PageText, host: str, port: int, *, opens: bool
             return Response("There is no report.", 404)
         return Response(outcome.report.read_bytes(), media_type="text/html")
 
+    def picture_of(number: int) -> Response:
+        picture = station.picture(number)
+        return Response(picture, media_type="image/jpeg") if picture else Response("", 404)
+
     app.get(_PICTURE)(live_picture)
+    app.get(f"{VIEWS}/{{number}}")(picture_of)
     app.get(_REPORT)(report)
     ui.page("/", title=text.title)(lambda: _Page(station, text) and None)
     app.on_shutdown(station.close)
@@ -64,11 +69,14 @@ class _Page:
     def __init__(self, station: Station, text: PageText) -> None:
         self._station, self._text = station, text
         self._shown: Snapshot | None = None
+        self._visitor = Visitor(station.snapshot)
+        self._answers = 0
         self._inputs: dict[str, ui.input] = {}
         setup = station.snapshot.setup
         with ui.row().classes("w-full items-center gap-4"):
             ui.label(text.title).classes("text-2xl")
             self._light = ui.label().classes("text-white text-xl px-4 py-1").props("role=status")
+            self._of = ui.label("")
             self._status = ui.label("").props("aria-live=polite")
         self._problem = ui.label("").classes("text-red-700 text-lg").props("role=alert")
         self._note = ui.label("").classes("text-sm")
@@ -83,9 +91,10 @@ class _Page:
         self._outcome = ui.card().classes("w-full gap-1")
         with ui.row().classes("w-full gap-4 items-start") as self._live:
             self._build_live()
+        self._table = ViewTable(station, self._visitor, self._understand)
         self._history = ui.column().classes("w-full")
         self._refresh()
-        ui.timer(0.2, self._refresh)
+        ui.timer(0.1, self._refresh)
 
     def _begin(self) -> None:
         chosen = {name: str(field.value or "") for name, field in self._inputs.items()}
@@ -94,6 +103,13 @@ class _Page:
     def _build_live(self) -> None:
         station = self._station
         with ui.column().classes("flex-1").style("min-width: min(100%, 480px)"):
+            with ui.row().classes("w-full items-center") as self._folder:
+                self._due = (
+                    ui.select([], label="Picture of the next pose", on_change=self._choose)
+                    .props("options-dense")
+                    .classes("grow")
+                )
+                ui.button("Leave it out", on_click=self._leave_out).props("flat")
             self._picture = ui.interactive_image().classes("w-full").props("alt='live picture'")
             with ui.row().classes("items-center"):
                 self._still = ui.label("").classes("text-xl font-bold")
@@ -114,86 +130,131 @@ class _Page:
                     on_change=self._read,
                 ).classes("w-full")
                 self._typed = (
-                    ui.input("Pose of the flange, as the pendant shows it", on_change=self._read)
-                    .props("autofocus autocomplete=off")
+                    ui.textarea("Pose of the flange, as the pendant shows it", on_change=self._read)
+                    .props("autofocus autogrow rows=1 autocomplete=off")
                     .classes("w-full font-mono")
-                    .on("keydown.enter", self._take)
+                    .on("keydown.enter.prevent", self._take)
                 )
                 self._understood = ui.label("").props("aria-live=polite")
+            self._told = ui.label("").classes("text-red-700").props("role=alert")
             with ui.row().classes("gap-1"):
                 self._take_button = ui.button("Take view (Enter)", on_click=self._take)
-                for words, request in (
-                    ("Undo last", station.undo),
+                self._keep = self._button("", station.again, None)
+                actions: tuple[tuple[str, Callable[..., None]], ...] = (
+                    ("Undo last", partial(station.mend, fault="not wanted")),
                     ("Another pose", station.skip),
                     (self._text.finish, station.finish),
                     ("Close", station.end),
-                ):
-                    button = ui.button(words, on_click=partial(self._ask, request))
-                    button.props["flat"] = request != station.finish
+                )
+                for words, request in actions:
+                    self._button(words, request).props["flat"] = request != station.finish
             self._missed = ui.label("").classes("text-red-700").props("role=alert")
-            self._views = ui.column().classes("gap-0 text-sm")
 
-    def _ask(self, request: Callable[[Snapshot], None]) -> None:
-        if self._shown is not None:
-            request(self._shown)
+    def _button(self, words: str, request: Callable[..., None], *more: object) -> ui.button:
+        return ui.button(words, on_click=lambda: request(self._visitor, *more))
 
-    def _read(self) -> PendantPose | None:
-        """Reads the typed pose, and says how it is understood."""
-        line = self._typed.value.strip()
-        self._understood.text = ""
-        if not line:
-            return None
+    def _choose(self) -> None:
+        name = self._due.value
+        # Set by `_refresh`, it asks for nothing.
+        if name and name != self._visitor.seen.due:
+            self._station.choose(self._visitor, name)
+
+    def _leave_out(self) -> None:
+        if due := self._visitor.seen.due:
+            self._station.choose(self._visitor, due, leaves_out=True)
+
+    def _understand(self, line: str) -> PendantPose | str:
+        """Reads a line, or says why it cannot be read."""
         try:
             read = read_pose(line, "the pose", self._form.value or None)
         except DataError as error:
-            self._understood.text = f"{error.message} {error.next_step}"
-            return None
-        words = f"Read as {read.words}: {pose_words(read.pose)}"
+            return f"{error.message} {error.next_step}"
         # No flange is within 10 mm of its base.
         is_metric = read.reading.unit == "mm" and np.abs(read.pose[:3, 3]).max() < 0.01
-        self._understood.text = f"{words}. In metres? Then write X 0.5 m." if is_metric else words
-        return None if is_metric else read
+        return f"{read_as(read)}. In metres? Then write X 0.5 m." if is_metric else read
+
+    def _lines(self) -> list[str]:
+        return [line.strip() for line in self._typed.value.splitlines() if line.strip()]
+
+    def _read(self) -> list[PendantPose]:
+        """Reads the typed poses, and says how they are understood; none where one cannot be."""
+        lines, poses, wrong = self._lines(), list[PendantPose](), list[str]()
+        for number, line in enumerate(lines, 1):
+            read = self._understand(line)
+            if isinstance(read, str):
+                wrong.append(read if len(lines) == 1 else f"Line {number}: {read}")
+            else:
+                poses.append(read)
+        words = [*map(read_as, poses)]
+        if len(lines) > 1:
+            words = [f"{len(lines)} poses, each of the next picture. The first: {words[0]}"]
+        self._understood.text = " ".join(wrong or words)
+        return [] if wrong else poses
 
     def _take(self) -> None:
-        read, shown = self._read(), self._shown
-        if read is not None and shown is not None:
-            self._station.take(read.pose, read.form.name, shown)
+        if poses := self._read():
+            self._station.take(self._visitor, poses, self._lines())
+
+    def _hear(self) -> None:
+        """Shows what became of the visitor's requests."""
+        visitor = self._visitor
+        if visitor.answers == self._answers:
+            return
+        self._answers = visitor.answers
+        self._told.text = visitor.told
+        self._table.hear(visitor.told)
+        if visitor.told:
+            return
+        if visitor.lines == tuple(self._lines()):
+            self._typed.value, visitor.lines = "", ()
+        if visitor.returned and not self._typed.value:
+            self._typed.value = visitor.returned
+        visitor.returned = ""
 
     def _refresh(self) -> None:
         """Shows what has changed in the snapshot."""
         now, before = self._station.snapshot, self._shown
-        self._shown = now
+        self._shown = self._visitor.seen = now
+        self._hear()
         if now is before:
             return
+
+        def changed(*names: str) -> bool:
+            return any(before is None or getattr(now, n) != getattr(before, n) for n in names)
+
         is_live = now.phase == "live"
         self._setup.visible = now.phase in ("setup", "stopped")
         self._live.visible = is_live or bool(now.views)
         self._problem.text = now.problem
         self._status.text = self._status_of(now)
-        if is_live and (before is None or now.pictures != before.pictures):
+        if is_live and changed("pictures"):
             self._picture.set_source(f"{_PICTURE}?{now.pictures}")
         self._still.text = {None: "", True: "still", False: "hold still"}[now.is_still]
         self._note.text = now.note
         self._sees.text, self._advice.text = now.sees, now.advice
         self._typing.visible = self._take_button.visible = now.takes_typed
         self._missed.text = now.missed
-        if before is None or now.coverage != before.coverage:
+        if changed("coverage"):
             self._coverage.content = now.coverage
-        if before is None or (now.next_pose, now.pose_form) != (before.next_pose, before.pose_form):
-            pose = now.next_pose
-            self._next.text = "" if pose is None else pose.words
+        if changed("next_pose", "pose_form", "due"):
+            # A picture that is there has its pose; a place is suggested for those to come.
+            pose = None if now.due else now.next_pose
+            words = f"Type the pose at which {now.due} was taken." if now.due else ""
+            self._next.text = words if pose is None else pose.words
             flange = None if pose is None else pose.base_from_flange
             self._next_pose.visible = self._warned.visible = flange is not None
             if flange is not None:
                 self._next_pose.text = pendant_words(flange, POSE_FORMS[now.pose_form])
-        if before is None or now.views != before.views:
-            self._views.clear()
-            with self._views:
-                for line in reversed(now.views):
-                    ui.label(line)
-            if before is not None and len(now.views) > len(before.views):
-                self._typed.value = ""
-        if before is None or (now.trial, now.outcome) != (before.trial, before.outcome):
+        self._folder.visible = now.is_stored and now.takes_typed
+        if changed("waiting", "left_out"):
+            left_out = {name: f"{name} (left out)" for name in now.left_out}
+            names = {name: name for name in now.waiting} | left_out
+            self._due.set_options(names, value=now.due or None)
+        self._keep.visible, self._keep.text = now.again is not None, f"Keep view {now.again}"
+        again = "" if now.again is None else f" {now.again} again"
+        self._take_button.text = f"Take view{again} (Enter)"
+        self._table.show(now)
+        if changed("trial", "outcome", "outdated"):
             self._show_outcome(now)
 
     def _status_of(self, now: Snapshot) -> str:
@@ -208,8 +269,11 @@ class _Page:
     def _show_outcome(self, now: Snapshot) -> None:
         shown: Outcome | None = now.outcome or now.trial
         light, words = ("grey", "no result yet") if shown is None else (shown.light, shown.title)
-        so_far = " so far" if now.outcome is None and shown is not None else ""
-        self._light.text = f"{words}{so_far}"
+        if shown is not None:
+            words += "" if now.outcome else " so far"
+            count = counted(len(shown.views), "view")
+            self._of.text = f"of {count}{f'; {now.outdated}' if now.outdated else ''}"
+        self._light.text = words
         self._light.style(f"background:{_COLOURS[light]};border-radius:1em;white-space:nowrap")
         self._outcome.clear()
         self._outcome.visible = shown is not None
@@ -224,6 +288,10 @@ class _Page:
                     ui.label(f"The files are in {shown.folder}.").classes("text-sm")
                     if shown.report.is_file():
                         ui.link("Open the report", _REPORT, new_tab=True)
+                if shown.exchanged and not now.outdated:
+                    first, second = shown.exchanged
+                    words = f"Exchange the poses of views {first} and {second}"
+                    self._button(words, self._station.mend, "exchanged", first, second)
         self._history.clear()
         with self._history:
             for light, date, line in self._text.history():

@@ -1,9 +1,8 @@
 """A recording that pages watch and steer: one thread owns arm, camera and folder."""
 
 import queue
-import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
@@ -15,20 +14,45 @@ from typing import Literal
 import numpy as np
 
 from visioncal.calibration.stages.detect import find_corners
-from visioncal.core.conventions import controller_form
-from visioncal.core.errors import DriverError, VisioncalError
-from visioncal.core.number_format import figure
+from visioncal.core.conventions import POSE_FORMS, controller_form
+from visioncal.core.documents.pendants import PendantPose, pendant_words
+from visioncal.core.errors import DataError, DriverError, VisioncalError
+from visioncal.core.number_format import counted, figure
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Rejection
 from visioncal.live.capture.cell import LiveCell
-from visioncal.live.capture.journal import Journal, RecordedCell, state_of
+from visioncal.live.capture.journal import (
+    Journal,
+    RecordedCell,
+    picture_name,
+    posed,
+    state_of,
+)
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
-from visioncal.live.capture.take import TakenView, grey_of, image_motion_px
-from visioncal.live.drivers.protocols import Answer, ArmState, MovingArm, RequestingArm
+from visioncal.live.capture.take import Missed, TakenView, grey_of, image_motion_px
+from visioncal.live.drivers.protocols import (
+    Answer,
+    ArmState,
+    Frame,
+    MovingArm,
+    RequestingArm,
+    StoredPictures,
+)
 from visioncal.live.page.drawing import coverage_svg, live_picture
 from visioncal.live.page.outcome import Light, Outcome, ask_command
 from visioncal.live.page.suggestion import NextPose, near, next_view
 from visioncal.live.planning.cell import PlanCell, flange_at
+from visioncal.session import View
+from visioncal.vision.boards.imaging import decode_image
+
+# What may be wrong with a view of the table. Where its picture has no pose, or its pose no picture,
+# those from it on are one apart.
+Fault = Literal["not wanted", "exchanged", "no pose", "no picture"]
+# Why a request is refused.
+_CHANGED = (
+    "Another browser, or the arm, changed the table meanwhile: look at it, and press again. "
+    "Nothing was done."
+)
 
 
 class TypedPoses:
@@ -37,15 +61,10 @@ class TypedPoses:
     name = "poses typed by hand"
     invitation = ""
 
-    def __init__(self) -> None:
-        # (4, 4) the pose whose view is not yet taken [m].
-        self.pending: FloatArray | None = None
-
     def request(self, timeout_s: float, wanted: str = "") -> ArmState | None:
-        """Returns the typed pose, once; it is never waited for."""
+        """Nothing: the page takes a view where a pose is typed."""
         del timeout_s, wanted
-        pose, self.pending = self.pending, None
-        return None if pose is None else ArmState(time.monotonic(), pose)
+        return None
 
     def reply(self, answer: Answer, reason: str = "") -> None:
         """Nothing: the page shows the view's report."""
@@ -98,6 +117,31 @@ class Task:
     result: Path  # That folder.
 
 
+@dataclass(frozen=True)
+class Row:
+    """A view in the table of a page."""
+
+    number: int
+    picture: str  # Name of the picture in its folder; empty where it has none.
+    version: str  # Differs for each picture that the view has had.
+    pose: str  # As it was typed, else as the pendant shows it.
+    is_typed: bool  # Whether its pose may be typed anew.
+    state: str  # What was seen in the picture.
+    residual: str = ""  # Of the newest trial; empty where that is of another picture or pose.
+    is_odd: bool = False  # Whether that left it out.
+
+
+@dataclass(eq=False)
+class Visitor:
+    """A browser: what it shows, and what became of its requests."""
+
+    seen: "Snapshot"
+    answers: int = 0  # Number of its requests that were answered.
+    told: str = ""  # Why the last of them was refused; empty where it was done.
+    lines: tuple[str, ...] = ()  # The lines of poses that were taken last.
+    returned: str = ""  # The line of the view that was taken back last.
+
+
 @dataclass(frozen=True, eq=False)
 class Snapshot:
     """What pages show."""
@@ -111,7 +155,13 @@ class Snapshot:
     is_still: bool | None = None  # None where pictures are no stream.
     arm: str = ""  # The arm's name.
     takes_typed: bool = False  # Whether poses are typed.
-    views: tuple[str, ...] = ()  # A line a view.
+    views: tuple[Row, ...] = ()
+    revision: int = 0  # Number of changes of the table so far.
+    again: int | None = None  # Number of the view that the next one replaces.
+    is_stored: bool = False  # Whether pictures are those of a folder.
+    due: str = ""  # Name of the folder's picture that belongs to the next pose.
+    waiting: tuple[str, ...] = ()  # Names of its pictures that have no pose yet.
+    left_out: tuple[str, ...] = ()  # Names of those that are to have none.
     note: str = ""  # How views are requested.
     missed: str = ""  # Why the last try gave no view.
     coverage: str = ""  # The coverage, as SVG.
@@ -120,15 +170,26 @@ class Snapshot:
     pose_form: str = ""  # The form in which poses are shown.
     trial: Outcome | None = None  # Result of the views so far.
     outcome: Outcome | None = None  # Result at the end.
+    outdated: str = ""  # What has changed since the newer of the two.
     is_judging: bool = False
+
+
+def _why_same(state: ArmState, others: Sequence[View | ArmState]) -> str:
+    """Says which of other rows, or of the lines before, has the same pose; empty for none."""
+    for other in others:
+        taken = state_of(other) if isinstance(other, View) else other
+        if taken and np.abs(taken.base_from_flange - state.base_from_flange).max() < 1e-9:
+            where = f"View {other.number}" if isinstance(other, View) else "A line before"
+            return f"{where} has this very pose: type that of this picture, or drive to another."
+    return ""
 
 
 class Station:
     """A recording that pages watch and steer.
 
     Pages read `snapshot`, which is replaced whole, and call the methods below, which put a request
-    into the queue of the thread that owns the devices. A request of a page that has not seen the
-    newest view is dropped: two browsers, or a key pressed twice, take one view.
+    into the queue of the thread that owns the devices. A request of a page that has not seen what
+    another page or the arm has changed since is refused, and its page says so.
 
     Args:
         prepare: Makes the task of a setup; raises VisioncalError.
@@ -141,6 +202,8 @@ class Station:
     _capture: Capture
     _rest: RestWatch
     _previous: Image | None  # The live picture before, in grey.
+    _shown: Image | None  # The folder's picture that is shown.
+    _skipped: set[str]  # Names of its pictures that were there before the recording went on.
     _rejected: list[FloatArray]  # (4, 4) `cam_from_target` of suggestions that were skipped [m].
 
     def __init__(self, prepare: Callable[[Setup], Task], setup: Setup, *, begins: bool) -> None:
@@ -149,6 +212,8 @@ class Station:
         self._open = ExitStack()
         self._judge = ThreadPoolExecutor(1)
         self._judging: Future[Outcome] | None = None
+        # Who made each change of the table; None for the arm.
+        self._authors: list[Visitor | None] = []
         if begins:
             self.begin(setup)
         self._thread = Thread(target=self._work, name="recording", daemon=True)
@@ -158,62 +223,218 @@ class Station:
         """Opens the devices of a setup and begins, or goes on after a failure."""
         self._requests.put(lambda: self._begin(setup))
 
-    def take(self, base_from_flange: FloatArray, form: str, seen: Snapshot) -> None:
-        """Takes a view at a pose (4, 4) [m] that was typed in a form of `POSE_FORMS`."""
+    def take(self, visitor: Visitor, poses: Sequence[PendantPose], lines: Sequence[str]) -> None:
+        """Takes views at poses that were typed in these lines, each of the next picture.
 
-        def typed() -> None:
-            cell, views = self._capture.cell, self._capture.journal.views
-            for view in views:
-                taken = state_of(view)
-                if taken and np.abs(taken.base_from_flange - base_from_flange).max() < 1e-9:
-                    same = f"View {view.number} has this very pose: type that of this picture, or "
-                    self._publish(missed=f"{same}drive to another.")
-                    return
-            if isinstance(cell.arm, TypedPoses):
-                self._publish(pose_form=form)
-                if cell.is_stored:
-                    self._publish(sees="waiting for the next picture of the folder ...")
-                cell.arm.pending = base_from_flange
+        Of a camera that is no folder it takes one view; all are taken, or none.
+        """
+        seen, typed = visitor.seen, tuple(lines)
 
-        self._put(seen, typed)
+        def take() -> str:
+            if typed == visitor.lines and seen.revision < self.snapshot.revision:
+                # A key that was pressed twice.
+                return ""
+            capture, again = self._capture, self.snapshot.again
+            cell, journal = capture.cell, capture.journal
+            if not self.snapshot.takes_typed or seen.again != again:
+                return "Another pose is wanted now: look at the page, and press again."
+            now_s = cell.clock.now()
+            states = [
+                ArmState(now_s, pose.pose, typed=line)
+                for pose, line in zip(poses, typed, strict=True)
+            ]
+            others = [view for view in journal.views if view.number != again]
+            for at, state in enumerate(states):
+                if reason := _why_same(state, [*others, *states[:at]]):
+                    return reason
+            number, place = capture.next_numbers()
+            numbers = [*([] if again is None else [again]), *range(number, number + len(states))]
+            if not cell.is_stored:
+                if len(states) > 1:
+                    return "The camera sees one place: type the pose of that one."
+                found = capture.view_at(states[0], numbers[0], place, self._task.count)
+                if isinstance(found.found, Missed):
+                    return found.words
+            else:
+                taken = self._paired(dict(zip(numbers, states, strict=False)), seen)
+                if isinstance(taken, str):
+                    return taken
+                old = [picture_name(view) for view in journal.views if view.number == again]
+                self._with_pictures(lambda: capture.store(taken), old)
+            self._publish(pose_form=poses[-1].form.name)
+            visitor.lines = typed
+            self._changed(visitor)
+            return ""
 
-    def undo(self, seen: Snapshot) -> None:
-        """Removes the last view."""
+        self._put(visitor, take)
 
-        def undo() -> None:
-            capture = self._capture
-            if capture.journal.views:
-                capture.journal.undo()
-                self._start(capture.cell, capture.journal, capture.coach.camera)
-                self._publish(views=self.snapshot.views[:-1], missed="", trial=None, outcome=None)
-                self._after_change()
+    def _paired(self, states: Mapping[int, ArmState], seen: Snapshot) -> dict[int, TakenView] | str:
+        """Views of the next pictures of the folder at some states, by number; or why not."""
+        camera, target = self._capture.cell.camera, self._task.recorded.target
+        assert isinstance(camera, StoredPictures)
+        names, taken = camera.waiting(), dict[int, TakenView]()
+        if len(names) < len(states):
+            asked, there = counted(len(states), "pose"), counted(len(names), "picture")
+            return f"{asked}, and {there} without one: save the pictures first, and press again."
+        if seen.due != names[0]:
+            return f"The picture due is {names[0]} now: look at it, and press again."
+        for (number, state), name in zip(states.items(), names, strict=False):
+            image = camera.look(name)
+            if isinstance(image, str):
+                return f"{name}: {image}. Save it again, or leave it out; nothing was taken."
+            size, needed = (
+                " x ".join(map(str, of)) for of in (image.shape[1::-1], camera.resolution)
+            )
+            found, _ = find_corners(grey_of(image), target, number)
+            if size != needed or isinstance(found, Rejection):
+                why = found.reason if isinstance(found, Rejection) else f"{size} px, not {needed}"
+                return f"{name}: {why}. Save it again, or leave it out; nothing was taken."
+            frame = Frame(image, self._capture.cell.clock.now(), name=name)
+            taken[number] = TakenView(frame, state, found, 0.0)
+        return taken
 
-        self._put(seen, undo)
+    def repose(self, visitor: Visitor, number: int, pose: PendantPose, line: str) -> None:
+        """Replaces the pose of a view by one that was typed."""
 
-    def skip(self, seen: Snapshot) -> None:
+        def repose() -> str:
+            rows = {view.number: view for view in self._capture.journal.views}
+            if number not in rows or rows[number].joints_rad is not None:
+                return "Only the pose of a view without joints can be typed: take it again."
+            state = ArmState(0.0, pose.pose, typed=line)
+            others = [view for view in rows.values() if view.number != number]
+            return _why_same(state, others) or self._repair(visitor, {**rows, number: state})
+
+        self._put(visitor, repose)
+
+    def mend(self, visitor: Visitor, fault: Fault, number: int = 0, other: int = 0) -> None:
+        """Mends how pictures and poses are paired.
+
+        Args:
+            visitor: Who asks for it.
+            fault: What is wrong with a view. Where its picture has no pose or its pose no picture,
+                the poses from it on move to the next pictures, or to those before.
+            number: The view; 0 for the last.
+            other: The view with which its pose is exchanged.
+        """
+
+        def mend() -> str:
+            poses: dict[int, View | ArmState] = {
+                view.number: view for view in self._capture.journal.views
+            }
+            first = number or max(poses, default=0)
+            if not {first, other or first} <= poses.keys():
+                return "There is no such view."
+            numbers = [at for at in poses if at >= first]
+            moved = [poses[at] for at in numbers]
+            if fault == "exchanged":
+                poses[first], poses[other] = poses[other], poses[first]
+            elif fault == "no picture":
+                poses.update(zip(numbers, moved[1:], strict=False))
+                del poses[numbers[-1]]
+            else:
+                if fault == "no pose":
+                    poses.update(zip(numbers[1:], moved, strict=False))
+                if fault == "no pose" or not number:
+                    visitor.returned = self.snapshot.views[-1].pose
+                del poses[first]
+            return self._repair(visitor, poses)
+
+        self._put(visitor, mend)
+
+    def _repair(self, visitor: Visitor, poses: Mapping[int, View | ArmState]) -> str:
+        """Gives the pictures of views these poses; the others are no longer in the table."""
+        journal = self._capture.journal
+        rows = [
+            view if poses[view.number] is view else posed(view, poses[view.number])
+            for view in journal.views
+            if view.number in poses
+        ]
+        gone = [view for view in journal.views if view.number not in poses]
+        # The last picture is due again.
+        due = picture_name(gone[0]) if gone == [journal.views[-1]] else ""
+        left_out = [] if due else map(picture_name, gone)
+        self._with_pictures(lambda: journal.rewrite(rows), left_out, due)
+        self._changed(visitor)
+        return ""
+
+    def again(self, visitor: Visitor, number: int | None) -> None:
+        """Lets the next view replace one, which stays until then; None for none."""
+
+        def again() -> str:
+            rows = {view.number for view in self._capture.journal.views}
+            self._publish(again=number if number in rows else None)
+            return ""
+
+        self._put(visitor, again)
+
+    def choose(self, visitor: Visitor, name: str, *, leaves_out: bool = False) -> None:
+        """Makes a picture of the folder the one that is due, or leaves it out."""
+
+        def choose() -> str:
+            journal = self._capture.journal
+            if not leaves_out:
+                journal.leave_out({*journal.left_out} - {name})
+            self._with_pictures(lambda: None, [name] * leaves_out, "" if leaves_out else name)
+            return ""
+
+        self._put(visitor, choose)
+
+    def _with_pictures(
+        self, write: Callable[[], None], left_out: Iterable[str], due: str = ""
+    ) -> None:
+        """Changes the table, and which pictures of a folder are left out, or is due, with it.
+
+        A process that is killed meanwhile leaves a picture that is in the table, due or left out.
+        """
+        journal, camera = self._capture.journal, self._capture.cell.camera
+        journal.leave_out({*journal.left_out, *filter(None, left_out)})
+        write()
+        journal.leave_out(journal.left_out)
+        if isinstance(camera, StoredPictures) and self.snapshot.takes_typed:
+            used = set(map(picture_name, journal.views))
+            camera.given = (self._skipped - {due}) | used | {*journal.left_out}
+            camera.chosen = due
+
+    def skip(self, visitor: Visitor) -> None:
         """Suggests another pose."""
 
-        def skip() -> None:
+        def skip() -> str:
             pose = self.snapshot.next_pose
             if pose is not None and pose.cam_from_target is not None:
                 self._rejected.append(pose.cam_from_target)
             self._advise()
+            return ""
 
-        self._put(seen, skip)
+        self._put(visitor, skip)
 
-    def finish(self, seen: Snapshot) -> None:
+    def finish(self, visitor: Visitor) -> None:
         """Judges the views, also after the devices are closed."""
-        if seen.views:
+        if visitor.seen.views:
             self._requests.put(lambda: self._ask(is_trial=False))
 
-    def end(self, seen: Snapshot) -> None:
+    def end(self, visitor: Visitor) -> None:
         """Closes the devices, and asks for another setup."""
 
-        def end() -> None:
+        def end() -> str:
             self._open.close()
-            self.snapshot = Snapshot(setup=self.snapshot.setup)
+            self.snapshot = Snapshot(setup=self.snapshot.setup, revision=len(self._authors))
+            return ""
 
-        self._put(seen, end)
+        self._put(visitor, end)
+
+    def picture(self, number: int) -> bytes | None:
+        """The picture of a view with its corners, a JPEG; None where there is none."""
+        journal = self._capture.journal
+        views = [view for view in journal.views if view.number == number]
+        try:
+            image = decode_image(journal.image(views[0])) if views else ""
+        except DataError:
+            # It was removed at this moment.
+            return None
+        if isinstance(image, str):
+            return None
+        coach = self._capture.coach
+        return live_picture(image, coach.target, coach.corners.get(number), coach.lens, None)
 
     def close(self) -> None:
         """Ends the thread, which closes the devices."""
@@ -221,11 +442,16 @@ class Station:
         self._thread.join(10.0)
         self._judge.shutdown(cancel_futures=True)
 
-    def _put(self, seen: Snapshot, request: Callable[[], None]) -> None:
+    def _put(self, visitor: Visitor, request: Callable[[], str]) -> None:
+        """Requests something, of which the answer says why it is refused."""
+        seen = visitor.seen.revision
+
         def guarded() -> None:
-            now = self.snapshot
-            if now.phase == "live" and len(now.views) == len(seen.views):
-                request()
+            visitor.told = "The recording is closed: press Start to go on."
+            if self.snapshot.phase == "live":
+                is_strange = any(author is not visitor for author in self._authors[seen:])
+                visitor.told = _CHANGED if is_strange else request()
+            visitor.answers += 1
 
         self._requests.put(guarded)
 
@@ -237,7 +463,9 @@ class Station:
         while True:
             is_live = self.snapshot.phase == "live"
             try:
-                request = self._requests.get(timeout=0.001 if is_live else 0.2)
+                # Of a folder there is nothing to be seen between two pictures.
+                is_stream = is_live and not self.snapshot.is_stored
+                request = self._requests.get(timeout=0.001 if is_stream else 0.1)
             except queue.Empty:
                 request = self._live if is_live else lambda: None
             if request is None:
@@ -261,9 +489,14 @@ class Station:
             return
         self._publish(phase="opening", setup=setup, problem="")
         self._task = self._prepare(setup)
-        self._previous, self._rejected = None, []
-        cell, journal = self._open.enter_context(self._task.begin())
-        self._start(cell, journal, cell.camera.factory or self._task.lens)
+        self._previous, self._rejected, self._shown = None, [], None
+        task = self._task
+        cell, journal = self._open.enter_context(task.begin())
+        self._capture = Capture(
+            *(cell, task.recorded.target, task.recorded.robot, cell.camera.factory or task.lens),
+            *(journal, task.options, None, self._taken),
+        )
+        self._skipped = cell.camera.given if isinstance(cell.camera, StoredPictures) else set()
         self._rest = RestWatch(journal, self._task.options.still)
         robot, arm = self._task.recorded.robot, cell.arm
         form = None if robot is None else controller_form(robot.name)
@@ -271,19 +504,16 @@ class Station:
             phase="live",
             arm=arm.name,
             takes_typed=isinstance(arm, TypedPoses),
+            is_stored=cell.is_stored,
             pose_form=setup.pose_form or ("ros" if form is None else form.name),
-            views=tuple(f"view {view.number}: recorded before" for view in journal.views),
             note=getattr(arm, "invitation", ""),
             missed="",
             trial=None,
             outcome=None,
         )
+        self._publish(views=self._rows(), due="", waiting=(), again=None)
+        self._with_pictures(lambda: None, ())
         self._advise()
-
-    def _start(self, cell: LiveCell, journal: Journal, lens: Camera | None) -> None:
-        task = self._task
-        seen = task.recorded.target, task.recorded.robot
-        self._capture = Capture(cell, *seen, lens, journal, task.options, None, self._taken)
 
     def _live(self) -> None:
         """Shows a picture, and takes a view where the arm requests one or has come to rest."""
@@ -296,6 +526,8 @@ class Station:
             self._previous = grey
             self._show(image, found)
             self._publish(is_still=moved_px <= task.options.still.image_px)
+        else:
+            self._watch_folder()
         if isinstance(cell.arm, RequestingArm):
             try:
                 take_requested(self._capture, cell.arm, task.count, 0.01)
@@ -305,16 +537,35 @@ class Station:
             except DriverError as error:
                 if not cell.is_stored:
                     raise
-                # The picture of a typed pose may still be saved.
+                # The picture of a stop may still be saved.
                 self._publish(missed=f"{error.message} {error.next_step}")
         elif isinstance(cell.arm, MovingArm) and self._rest.begins(cell.state()):
             self._capture.view(*self._capture.next_numbers(), task.count)
+
+    def _watch_folder(self) -> None:
+        """Shows the picture of a folder that is due, and which are there."""
+        camera, journal = self._capture.cell.camera, self._capture.journal
+        assert isinstance(camera, StoredPictures)
+        waiting, now = tuple(camera.waiting()), self.snapshot
+        due = waiting[0] if waiting else ""
+        if (waiting, journal.left_out) != (now.waiting, now.left_out):
+            self._publish(due=due, waiting=waiting, left_out=journal.left_out)
+        image = camera.look(due) if due else "no further picture is there"
+        if isinstance(image, str):
+            self._shown = None
+            if image != now.sees:
+                self._publish(sees=image)
+        elif image is not self._shown:
+            found, _ = find_corners(grey_of(image), self._task.recorded.target, 0)
+            self._show(image, found)
+            self._shown = image
 
     def _show(self, image: Image, found: Corners | Rejection) -> None:
         """Publishes a picture with what is found in it."""
         corners = found if isinstance(found, Corners) else None
         pose = self.snapshot.next_pose
-        wanted = None if pose is None else pose.cam_from_target
+        # A picture of a folder is not where the next one is to be.
+        wanted = None if pose is None or self.snapshot.is_stored else pose.cam_from_target
         sees = (
             f"{len(found.ids)} corners, edges {figure(found.blur_px)} px"
             if isinstance(found, Corners)
@@ -325,16 +576,48 @@ class Station:
         self._publish(picture=picture, pictures=self.snapshot.pictures + 1, sees=sees)
 
     def _taken(self, step: CaptureEvent) -> None:
-        """Publishes a view, and tries a calibration of all so far."""
+        """Publishes what became of a stop of an arm that says itself where it stands."""
+        if self.snapshot.takes_typed:
+            return
         if not isinstance(step.found, TakenView):
             self._publish(missed=step.words)
             return
-        if self._capture.cell.is_stored:
-            self._show(step.found.frame.image, step.found.corners)
-        form = step.found.state.pose_form or self.snapshot.pose_form
-        views = (*self.snapshot.views, step.words)
-        self._publish(views=views, missed="", outcome=None, pose_form=form)
+        self._publish(pose_form=step.found.state.pose_form or self.snapshot.pose_form)
+        self._changed(None)
+
+    def _changed(self, author: Visitor | None) -> None:
+        """Publishes the table, and tries a calibration of it."""
+        self._authors.append(author)
+        self._capture.reconcile()
+        now = self.snapshot
+        self._publish(trial=now.outcome or now.trial, outcome=None, missed="", again=None)
+        self._publish(views=self._rows(), outdated=self._outdated(), revision=len(self._authors))
         self._after_change()
+
+    def _rows(self) -> tuple[Row, ...]:
+        now, rows = self.snapshot, list[Row]()
+        outcome, corners = now.outcome or now.trial, self._capture.coach.corners
+        for view in self._capture.journal.views:
+            state, found = state_of(view), corners.get(view.number)
+            pose = view.text.get("typed", "")
+            if not pose and state is not None:
+                pose = pendant_words(state.base_from_flange, POSE_FORMS[now.pose_form])
+            seen = "no board" if found is None else f"{len(found.ids)} corners, edges "
+            seen += "" if found is None else f"{figure(found.blur_px)} px"
+            residual = ("", False) if outcome is None else outcome.residual(view)
+            version, is_typed = f"{view.stamp_s}", view.joints_rad is None
+            name = picture_name(view)
+            rows.append(Row(view.number, name, version, pose, is_typed, seen, *residual))
+        return tuple(rows)
+
+    def _outdated(self) -> str:
+        """What has changed since the newest outcome."""
+        outcome, views = self.snapshot.outcome or self.snapshot.trial, self._capture.journal.views
+        if outcome is None or outcome.views == views:
+            return ""
+        added = len(views) - len(outcome.views)
+        is_longer = added > 0 and outcome.views == views[: len(outcome.views)]
+        return f"{counted(added, 'view')} added since" if is_longer else "the table changed since"
 
     def _after_change(self) -> None:
         count = len(self._capture.journal.views)
@@ -346,7 +629,7 @@ class Station:
 
     def _ask(self, *, is_trial: bool) -> None:
         """Runs the judging command beside the recording; a trial, without its drawings."""
-        views = len(self._capture.journal.views)
+        views = self._capture.journal.views
         if not views:
             self._publish(missed="There is no view yet.")
             return
@@ -363,19 +646,23 @@ class Station:
             self._requests.put(lambda: self._judged(future.result()))
 
     def _judged(self, outcome: Outcome) -> None:
+        views = self._capture.journal.views
         if outcome.folder == self._task.result:
             self._publish(outcome=outcome, is_judging=False)
-        elif self.snapshot.phase == "live" and outcome.views <= len(self._capture.journal.views):
+        elif self.snapshot.phase == "live" and (outcome.document or outcome.views == views):
+            # One without a result may have met the table while it changed.
             self._publish(trial=outcome)
-            capture, fitted = self._capture, outcome.document.get("camera")
-            if fitted and capture.coach.camera is None:
+            coach, fitted = self._capture.coach, outcome.document.get("camera")
+            if fitted and coach.camera is None:
                 numbers = (np.array(fitted[name]) for name in ("matrix", "distortion"))
-                lens = Camera(fitted["model"], capture.coach.resolution, *numbers)
-                self._start(capture.cell, capture.journal, lens)
+                lens = Camera(fitted["model"], coach.resolution, *numbers)
+                self._capture.coach = coach.through(lens)
             self._advise()
+        self._publish(views=self._rows(), outdated=self._outdated())
 
     def _advise(self) -> None:
         """Publishes the coverage, and the next pose."""
+        unseen = self._capture.coach.unseen()
         coach, task, taken = self._capture.coach, self._task, len(self._capture.journal.views)
         pose: NextPose | None
         if task.count and taken >= task.count:
@@ -387,7 +674,7 @@ class Station:
             pose = self._suggested()
         self._publish(
             coverage=coverage_svg(coach.covered, coach.poses),
-            advice=coach.words(),
+            advice=f"{coach.words()}{f'; the board was hardly in the {unseen}' if unseen else ''}",
             next_pose=pose,
         )
 
