@@ -108,7 +108,7 @@ def test_no_name_of_a_recording_runs_in_the_browser(cell, tmp_path, browser):
             numbers = zip("XYZABC", [*(1e3 * matrix[:3, 3]), *angles], strict=True)
             field.fill(" ".join(f"{name} {value:.5f}" for name, value in numbers))
             field.press("Enter")
-            page.get_by_text(f"view {place}:").wait_for()
+            page.get_by_role("row", name=f"view {place}", exact=True).wait_for()
         page.get_by_role("button", name="Calibrate").click()
         page.get_by_text(f"{HOSTILE[6]}-result").wait_for()
         with page.expect_popup() as report:

@@ -35,7 +35,9 @@ class FolderCamera:
         requested = requested or DeviceSetup()
         self.name, self.settings = f"folder {path}", dict[str, str | float]()
         self.given, self.chosen, self._folder = set[str](), "", Path(path)
-        # Sizes at the last two looks at the folder [bytes]; the newest picture that was decoded.
+        # Sizes at the last two moments of comparison [bytes], and when the last was; the newest
+        # picture that was decoded.
+        self._listed_s = float("-inf")
         self._sizes, self._before = dict[str, int](), dict[str, int]()
         self._decoded: tuple[tuple[str, int, int], Image | str] | None = None
         refuse_settings(self.name, requested, "in the program that takes them")
@@ -65,19 +67,20 @@ class FolderCamera:
         found = dict[Path, int]()
         try:
             for path in self._folder.iterdir():
-                if path.suffix.lower() in IMAGE_ENDINGS and path.name not in self.given:
+                if path.suffix.lower() in IMAGE_ENDINGS:
                     # It may have been removed since the folder was read.
                     with suppress(FileNotFoundError):
                         found[path] = path.stat().st_size
         except OSError as error:
             step = "Connect its disk, and make it readable."
             raise camera_error(self.name, f"cannot be read: {error.strerror}", step) from error
-        names = [path.name for path in sorted(found, key=natural)]
+        names = [path.name for path in sorted(found, key=natural) if path.name not in self.given]
         if wrong := [ascii(name) for name in names if not name.isprintable()]:
             step = "Rename it: letters, digits and signs of UTF-8 can be written."
             raise camera_error(self.name, f"holds a file named {wrong[0]}", step)
         sizes = {path.name: size for path, size in found.items()}
-        self._before, self._sizes = self._sizes, sizes
+        if time.monotonic() - self._listed_s >= _POLL_S:
+            self._before, self._sizes, self._listed_s = self._sizes, sizes, time.monotonic()
         return sorted(names, key=lambda name: name != self.chosen)
 
     def look(self, name: str) -> Image | str:

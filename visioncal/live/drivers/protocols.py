@@ -156,7 +156,7 @@ class StoredPictures(CameraDevice, Protocol):
     def waiting(self) -> list[str]:
         """Returns the names of those that were not given, the next one first; raises DriverError.
 
-        One that grew since the call before is not whole for `look`.
+        A picture is whole for `look` once it no longer grew between two calls.
         """
 
     def look(self, name: str) -> Image | str:

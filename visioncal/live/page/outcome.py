@@ -63,16 +63,17 @@ def ask_command(words: Sequence[str], folder: Path | None, views: tuple[View, ..
         folder: Where it writes; None for a trial, which draws nothing and keeps no file.
         views: The rows of the session.
     """
+    is_trial = folder is None
     with tempfile.TemporaryDirectory() as passing:
         if folder is None:
             folder, words = Path(passing) / "trial", (*words, "--no-report", "--no-recording")
         command = [sys.executable, "-P", "-m", "visioncal", *words, "-o", str(folder), "--json"]
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
-            if hasattr(os, "setpriority"):
+            if is_trial and hasattr(os, "setpriority"):
                 # Pictures and requests come first.
                 with suppress(OSError):
-                    os.setpriority(os.PRIO_PROCESS, process.pid, 10)
+                    os.setpriority(os.PRIO_PROCESS, process.pid, 5)
             answer, complaint = process.communicate()
     try:
         document = json.loads(answer)

@@ -136,7 +136,7 @@ class _Page:
                     .on("keydown.enter.prevent", self._take)
                 )
                 self._understood = ui.label("").props("aria-live=polite")
-            self._told = ui.label("").classes("text-red-700").props("role=alert")
+            self._refusal = ui.label("").classes("text-red-700").props("role=alert")
             with ui.row().classes("gap-1"):
                 self._take_button = ui.button("Take view (Enter)", on_click=self._take)
                 self._keep = self._button("", station.again, None)
@@ -201,9 +201,9 @@ class _Page:
         if visitor.answers == self._answers:
             return
         self._answers = visitor.answers
-        self._told.text = visitor.told
-        self._table.hear(visitor.told)
-        if visitor.told:
+        self._refusal.text = visitor.refusal
+        self._table.hear(visitor.refusal)
+        if visitor.refusal:
             return
         if visitor.lines == tuple(self._lines()):
             self._typed.value, visitor.lines = "", ()

@@ -137,7 +137,7 @@ class Visitor:
 
     seen: "Snapshot"
     answers: int = 0  # Number of its requests that were answered.
-    told: str = ""  # Why the last of them was refused; empty where it was done.
+    refusal: str = ""  # Why the last of them was refused; empty where it was done.
     lines: tuple[str, ...] = ()  # The lines of poses that were taken last.
     returned: str = ""  # The line of the view that was taken back last.
 
@@ -394,6 +394,13 @@ class Station:
             used = set(map(picture_name, journal.views))
             camera.given = (self._skipped - {due}) | used | {*journal.left_out}
             camera.chosen = due
+            self._list_pictures(camera)
+
+    def _list_pictures(self, camera: StoredPictures) -> None:
+        """Publishes which pictures of a folder are there, the one that is due first."""
+        waiting, left_out = tuple(camera.waiting()), self._capture.journal.left_out
+        if (waiting, left_out) != (self.snapshot.waiting, self.snapshot.left_out):
+            self._publish(due="".join(waiting[:1]), waiting=waiting, left_out=left_out)
 
     def skip(self, visitor: Visitor) -> None:
         """Suggests another pose."""
@@ -447,10 +454,10 @@ class Station:
         seen = visitor.seen.revision
 
         def guarded() -> None:
-            visitor.told = "The recording is closed: press Start to go on."
+            visitor.refusal = "The recording is closed: press Start to go on."
             if self.snapshot.phase == "live":
                 is_strange = any(author is not visitor for author in self._authors[seen:])
-                visitor.told = _CHANGED if is_strange else request()
+                visitor.refusal = _CHANGED if is_strange else request()
             visitor.answers += 1
 
         self._requests.put(guarded)
@@ -544,16 +551,14 @@ class Station:
 
     def _watch_folder(self) -> None:
         """Shows the picture of a folder that is due, and which are there."""
-        camera, journal = self._capture.cell.camera, self._capture.journal
+        camera = self._capture.cell.camera
         assert isinstance(camera, StoredPictures)
-        waiting, now = tuple(camera.waiting()), self.snapshot
-        due = waiting[0] if waiting else ""
-        if (waiting, journal.left_out) != (now.waiting, now.left_out):
-            self._publish(due=due, waiting=waiting, left_out=journal.left_out)
+        self._list_pictures(camera)
+        due = self.snapshot.due
         image = camera.look(due) if due else "no further picture is there"
         if isinstance(image, str):
             self._shown = None
-            if image != now.sees:
+            if image != self.snapshot.sees:
                 self._publish(sees=image)
         elif image is not self._shown:
             found, _ = find_corners(grey_of(image), self._task.recorded.target, 0)

@@ -82,10 +82,10 @@ class ViewTable:
         if (read := self._read()) is not None:
             self._station.repose(self._visitor, self._number, read, self._line.value.strip())
 
-    def hear(self, told: str) -> None:
+    def hear(self, refusal: str) -> None:
         """Shows why a request was refused, or closes the dialog."""
-        self._refused.text = told
-        if not told:
+        self._refused.text = refusal
+        if not refusal:
             self._dialog.close()
 
     def show(self, now: Snapshot) -> None:
