@@ -52,7 +52,7 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         answer(f"the cell's frame is that of {cell.reference}")
     for name, edge in calibration.edges.items():
         answer(f"{name}: {edge.place_words()}, {edge.sigma_words}")
-        answer(f"  {edge.rotation_words(calibration.controller)}")
+        answer(f"  {calibration.rotation_words(name, edge)}")
     if cell is not None:
         _print_noise(cell)
     else:

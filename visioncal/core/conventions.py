@@ -14,7 +14,7 @@ from visioncal.core.choices import UNITS_M as UNITS_M
 from visioncal.core.choices import PoseForm as PoseForm
 from visioncal.core.errors import DataError
 from visioncal.core.limits import NORM_TOLERANCE
-from visioncal.core.number_format import some_of
+from visioncal.core.number_format import known_name, some_of
 from visioncal.core.transforms import compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 
@@ -242,8 +242,10 @@ class PoseNumbers:
         return [self.places[index] for index in np.flatnonzero(rows)]
 
 
-def controller_form(robot: str) -> PoseForm | None:
-    """The notation of a robot's own controller, by the name of its model; None where unknown."""
+def controller_form(robot: str, stated: str | None = None) -> PoseForm | None:
+    """The notation of a robot's controller: stated, or by its model's name; None where unknown."""
+    if stated is not None:
+        return POSE_FORMS[known_name("form of poses", stated, POSE_FORMS)]
     name = re.sub(r"[^a-z0-9]", "", robot.lower())
     forms = (form for form in POSE_FORMS.values() if form.models)
     return next((form for form in forms if re.match(form.models, name)), None)

@@ -19,7 +19,6 @@ from visioncal.core.files import one_line
 from visioncal.core.types import Mount
 from visioncal.core.version import __version__
 from visioncal.estimation.chain import edge_names
-from visioncal.results.arm import StoredRobot
 from visioncal.results.cell import CellResult
 from visioncal.results.conditions import Condition
 from visioncal.results.edge import JointCovariance, StoredEdge
@@ -28,6 +27,7 @@ from visioncal.results.lens import CameraResult, RayFrame
 from visioncal.results.parts import (
     SCHEMA,
     NeedMet,
+    RobotModel,
     SessionForm,
     SolverResult,
     StoredVerdict,
@@ -58,7 +58,7 @@ class CalibrationForm:
     solvers: Mapping[str, SolverResult]  # Result of every solver.
     camera: CameraResult | None = None  # The camera.
     ray_frame: RayFrame | None = None  # Its transform with z along the ray of the image's centre.
-    robot: StoredRobot | None = None  # The nominal robot model.
+    robot: RobotModel | None = None  # The nominal robot model, and the form of its poses.
     noise: Mapping[str, float]  # Estimated standard deviations per axis, by name.
     views: tuple[ViewResult, ...]  # One entry for each view of the session.
     rms: Rms  # Residuals over the used views.
@@ -109,7 +109,7 @@ class CellForm:
 
 # Fields of the forms that a calibration, or its cell, has under the same names.
 _CONVERTED = "schema visioncal session joint_covariance"
-_OF_PAIR = field_names_except(CalibrationForm, f"{_CONVERTED} ray_frame conditions")
+_OF_PAIR = field_names_except(CalibrationForm, f"{_CONVERTED} ray_frame conditions robot")
 _OF_CELL = field_names_except(CellForm, f"{_CONVERTED} views validation conditions")
 
 
@@ -125,7 +125,9 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
     cell, validation = calibration.cell, calibration.validation
     if cell is None:
         fields = {name: getattr(calibration, name) for name in _OF_PAIR}
-        form = CalibrationForm(ray_frame=calibration.ray_frame, **head, **fields)
+        stated = RobotModel(calibration.robot, calibration.robot_form)
+        robot = None if stated.model is None and stated.form is None else stated
+        form = CalibrationForm(robot=robot, ray_frame=calibration.ray_frame, **head, **fields)
         return write(CalibrationForm, form) | write(CalibrationSections, calibration)
     whole = CellForm(
         views=tuple(CellView.of(cell.tree, view) for view in calibration.views),
@@ -158,7 +160,9 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
             )
         known_keys = set().union(*(entry.keys for entry in entries(CalibrationForm)))
         rest = {key: value for key, value in document.items() if key not in known_keys}
+        robot = form.robot or RobotModel()
         fields = {name: getattr(form, name) for name in _OF_PAIR}
+        fields |= {"robot": robot.model, "robot_form": robot.form}
         fields |= read_fields(CalibrationSections, rest, "")
     return fields | {
         # As a session's: nothing in it may steer a terminal.

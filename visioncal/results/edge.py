@@ -1,5 +1,6 @@
 """Transform with covariance, and their form in files."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -9,6 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from visioncal.core.choices import PoseForm as PoseNotation
 from visioncal.core.codec import Array, WrittenForm
 from visioncal.core.conventions import ROTATION_FORMS
+from visioncal.core.documents.pendants import rotation_names
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, fixed
 from visioncal.core.types import FloatArray
@@ -66,23 +68,27 @@ class Edge(PoseSigmas):
         return f"({x}, {y}, {z}) mm"
 
     def rotation_words(self, controller: PoseNotation | None = None) -> str:
-        """Its rotation in words: as a rotation vector, and as a robot's controller states it."""
-        if not self.oriented:
-            return "rotation not measured"
+        """Its rotation in words, by `rotations`."""
+        forms = (f"{name} ({numbers}) {unit}" for name, numbers, unit in self.rotations(controller))
+        return ", ".join(map(str.strip, forms)) if self.oriented else "rotation not measured"
+
+    def rotations(self, controller: PoseNotation | None = None) -> Iterator[tuple[str, str, str]]:
+        """Its rotation vector, and its rotation as a robot's controller states it.
+
+        Yields:
+            Name of the form, numbers with commas between, and their unit.
+        """
         forms = [("rotation vector", "rotation-vector-deg", "deg")]
         if controller is not None:
-            names = controller.words.partition("Z, ")[2] or "rx, ry, rz"
+            names = controller.words.partition("Z, ")[2] or ", ".join(rotation_names(controller))
             unit = "" if "quaternion" in controller.rotation else controller.rotation[-3:]
             unit = "rad" if controller.rotation == "rotation-vector" else unit
             forms.append((f"{controller.name.upper()} {names}", controller.rotation, unit))
-        stated = []
         for name, rotation, unit in forms:
             numbers = ROTATION_FORMS[rotation].write(self.matrix[None, :3, :3])[0]
             # A tenth of a millidegree, and less of quaternions: under any sigma of a camera.
             decimals = 4 if unit == "deg" else 6
-            listed = ", ".join(fixed(number, decimals) for number in numbers)
-            stated.append(f"{name} ({listed}) {unit}".strip())
-        return ", ".join(stated)
+            yield name, ", ".join(fixed(number, decimals) for number in numbers), unit
 
 
 def _covariance_fault(matrix: FloatArray) -> str:

@@ -6,7 +6,9 @@ from typing import Annotated, Any, Literal
 
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.choices import POSE_FORMS, PoseForm
 from visioncal.core.codec import DROPPED, INLINE, REST, WrittenForm
+from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError
 from visioncal.core.types import Need
 from visioncal.core.verdict import Finding, Verdict, VerdictStatus
@@ -58,10 +60,25 @@ class SolverResult:
 
 
 @dataclass(frozen=True, eq=False)
-class RobotResult(ArmSections):
-    """A robot of a whole cell, with the sections on its arm."""
+class RobotModel:
+    """A robot's nominal model and its maker's form of poses."""
 
-    model: Annotated[Robot | None, _ROBOT_FORM, REST] = None  # Its nominal model, where known.
+    model: Annotated[Robot | None, _ROBOT_FORM, REST] = None  # The model, where known.
+    form: str | None = None  # The form, a name among `POSE_FORMS`, where stated.
+
+    def __post_init__(self) -> None:
+        if self.form not in (None, *POSE_FORMS):
+            raise ValueError(f"form is {self.form!r}, must be one of {', '.join(POSE_FORMS)}")
+
+    @property
+    def controller(self) -> PoseForm | None:
+        """The stated form, or that of the model's maker; None where unknown."""
+        return controller_form("" if self.model is None else self.model.name, self.form)
+
+
+@dataclass(frozen=True, eq=False)
+class RobotResult(ArmSections, RobotModel):
+    """A robot of a whole cell, with the sections on its arm."""
 
 
 @dataclass(frozen=True)

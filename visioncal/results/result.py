@@ -13,7 +13,6 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.arguments import typed
 from visioncal.core.choices import PoseForm
 from visioncal.core.codec import entries, reading
-from visioncal.core.conventions import controller_form
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
@@ -30,7 +29,7 @@ from visioncal.results.document import fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult, RayFrame, ray_frame
-from visioncal.results.parts import NeedMet, RobotResult, SolverResult
+from visioncal.results.parts import NeedMet, RobotModel, RobotResult, SolverResult
 from visioncal.results.sections import CalibrationSections, CellDetails, CellUncertainty
 from visioncal.results.selecting import selected_fields
 from visioncal.results.tree import FrameTree
@@ -38,7 +37,7 @@ from visioncal.results.views import Rms, Validation, ViewResult
 from visioncal.robot import Loads, Robot
 from visioncal.robot.loads import deflected_joints
 from visioncal.robot.thermal import ThermalModel
-from visioncal.session.frames import CELL
+from visioncal.session.frames import CELL, frames_of_kind, object_name
 from visioncal.session.selecting import PARTS, Choice, Part
 
 
@@ -65,6 +64,7 @@ class Calibration(CalibrationSections):
     verdict: Verdict  # Verdict with its reasons.
     camera: CameraResult | None = None  # The camera, where the session has one.
     robot: Robot | None = None  # The nominal robot model, where the session names a known one.
+    robot_form: str | None = None  # The form of its poses, a name among `POSE_FORMS`, where stated.
     # Tools and fixtures by transform name, as `flange_from_tool`.
     frames: Mapping[str, Frame] = field(default_factory=dict)
     # Cameras, robots and targets of a whole cell by name; None for one camera and robot. `of`
@@ -96,12 +96,22 @@ class Calibration(CalibrationSections):
             if not any(words in condition.sentence for words in stated)
         )
 
-    @property
-    def controller(self) -> PoseForm | None:
-        """The pose notation of the robot's own controller; None where unknown."""
-        robots = [robot.model for robot in self.by_name.robots.values() if robot.model is not None]
-        forms = [controller_form(robot.name) for robot in robots]
-        return forms[0] if forms and len(set(forms)) == 1 else None
+    def controller(self, *frames: str) -> PoseForm | None:
+        """The pose notation of the controller of the robot whose base or flange is among frames.
+
+        Of other frames, that of all robots; None where unknown.
+        """
+        robots, bases = self.by_name.robots, {"cell": self.by_name.reference}
+        for frame in (bases.get(frame, frame) for frame in frames):
+            name = object_name(frame, "robot") if self.cell else ""
+            if frames_of_kind((frame,), "base") or frames_of_kind((frame,), "flange"):
+                return robots.get(name, RobotModel()).controller
+        forms = {robot.controller for robot in robots.values()}
+        return forms.pop() if len(forms) == 1 else None
+
+    def rotation_words(self, name: str, edge: Edge) -> str:
+        """The rotation of a named transform in words, also in the form of its robot's poses."""
+        return edge.rotation_words(self.controller(*name.split("_from_")))
 
     @cached_property
     def by_name(self) -> CellResult:
@@ -115,7 +125,7 @@ class Calibration(CalibrationSections):
             reference="base",
             tree={"base": CELL, "flange": "base", **placed},
             cameras={} if self.camera is None else {"": self.camera},
-            robots={"": RobotResult(self.robot, **arm)},
+            robots={"": RobotResult(self.robot, self.robot_form, **arm)},
             targets={},
             noise={"": self.noise},
             moved=(),
@@ -241,8 +251,7 @@ class Calibration(CalibrationSections):
             "views used": f"{used} of {len(self.views)}",
             "views not used in the fit agree to": f"{figure(left_out.mm)} mm{turned}",
             **{
-                name: f"{edge.place_words()}, {edge.rotation_words(self.controller)}, "
-                f"{edge.sigma_words}"
+                name: f"{edge.place_words()}, {self.rotation_words(name, edge)}, {edge.sigma_words}"
                 for name, edge in [*self.placed.items()][:8]
             },
         }

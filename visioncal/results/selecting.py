@@ -74,6 +74,7 @@ def selected_fields(
         "verdict": whole.verdict,
         "camera": None if camera is None else camera.carried(jacobian),
         "robot": arm.model,
+        "robot_form": arm.form,
         "frames": _frames(whole.tree, chosen),
         **{entry.name: getattr(arm, entry.name) for entry in entries(ArmSections)},
         "clock": cell.details.clocks.get(f"{chosen.camera} and robot {robot}"),

@@ -16,6 +16,7 @@ from pydantic import (
     model_validator,
 )
 
+from visioncal.core.choices import POSE_FORMS
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import did_you_mean
@@ -86,15 +87,24 @@ class CameraTable(TableModel):
         return self
 
 
+def _form(name: str | None) -> str | None:
+    if name is not None and name not in POSE_FORMS:
+        hint = did_you_mean(name, POSE_FORMS)
+        known = f"is {name!r}, but must be one of {', '.join(POSE_FORMS)}"
+        raise ValueError(f"{known} ({hint})" if hint else known)
+    return name
+
+
 class RobotTable(TableModel):
     """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json.
 
-    Optional where poses are enough. gravity_m_s2: acceleration of gravity in the robot's base, for
-    a base that is not upright.
+    Optional where poses are enough. form: the maker's form of poses, in which results are said.
+    gravity_m_s2: acceleration of gravity in the robot's base, for a base that is not upright.
     """
 
     model: str | None = None
     tip: str | None = None
+    form: Annotated[str | None, AfterValidator(_form)] = None
     gravity_m_s2: Annotated[list[Number], Field(min_length=3, max_length=3)] | None = None
 
 

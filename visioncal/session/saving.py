@@ -112,15 +112,18 @@ def _place_inside(path: str, fallback: str) -> str:
 def digest_of(session: "Session") -> str:
     """Computes the SHA-256 digest of a session's canonical content; see `Session.digest`.
 
-    The robot's link dimensions, masses and drives, and the task's need, are not part of it.
+    The robot's link dimensions, masses and drives, the form of its poses in which results are said,
+    and the task's need are not part of it.
     """
     paths = sorted({view.image for view in session.views} - {""})
     digests = {path: session.images.sha256(path) for path in paths}
     document = {name: value for name, value in session.document.items() if name != "need"}
     if is_file(document.get("target")):
         del document["target"]
-    if "robot" in document:
+    if "robot" in document and document["robot"].keys() != {"form"}:
         document["robot"] = _pathless(document["robot"], "model")
+    else:
+        document.pop("robot", None)
     for kind, field in (("targets", "target"), ("robots", "model")):
         several = document.get(kind)
         if isinstance(several, Mapping):
@@ -168,10 +171,11 @@ def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:
 
 
 def _pathless(entry: object, field: str) -> object:
-    """Entry of one of several targets or robots without its path."""
+    """Entry of one of several targets or robots without its path, and a robot's form of poses."""
     table = {field: entry} if isinstance(entry, str) else entry
-    if isinstance(table, Mapping) and is_file(table.get(field)):
-        return {key: value for key, value in table.items() if key != field}
+    if isinstance(table, Mapping):
+        dropped = {"form", *({field} if is_file(table.get(field)) else ())}
+        return {key: value for key, value in table.items() if key not in dropped}
     return table
 
 

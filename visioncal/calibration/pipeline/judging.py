@@ -79,12 +79,14 @@ def findings_of(run: RunState) -> Findings:
 
 def _use(run: RunState) -> Remedy:
     """How a good result is used: in the robot's own program, or to locate things by it."""
-    form = None if run.robot is None else controller_form(run.robot.name)
+    stated = next((robot.form for robot in run.session.robots.values()), None)
+    form = controller_form("" if run.robot is None else run.robot.name, stated)
     words, command = "Locate things by the camera", "locate SESSION -c OUT"
     if run.mount is None:
         words, command = "Take the frames to another program", "export OUT --to ros --edge all"
     elif form is not None:
-        words, command = "Take the transform to the robot", f"export OUT --to {form.name}"
+        to = {"rpy": "urdf"}.get(form.name, form.name)
+        words, command = "Take the transform to the robot", f"export OUT --to {to}"
     elif run.mount == "instrument" or not run.session.boards:
         words, command = "Take the transform to another program", "export OUT --to text"
     again = "visioncal verify compares later stops with it."

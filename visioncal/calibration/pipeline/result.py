@@ -141,6 +141,7 @@ def _sections_of_pair(
         "views": _views(run),
         "camera": next(iter(_cameras(run).values()), None),
         "robot": run.robot,
+        "robot_form": next((robot.form for robot in session.robots.values()), None),
         "clock": next((clocked.clock for clocked in run.clocks.values()), None),
         "instrument": None
         if readings is None
@@ -315,11 +316,13 @@ def _cell(run: RunState, edges: Mapping[str, str]) -> CellResult:
     }
     models = session.robot_documents
     robots = {
-        robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
-        for name in session.robots
+        robot_key(name): RobotResult(
+            Robot.from_document(models[name]) if name in models else None, table.form
+        )
+        for name, table in session.robots.items()
     }
     for name in cell_fit.arms:
-        robots[name] = RobotResult(robots[name].model, **vars(run.assessment.arms[name].sections))
+        robots[name] = replace(robots[name], **vars(run.assessment.arms[name].sections))
     return CellResult(
         reference=cell.reference,
         tree=kept | {frame: name.partition("_from_")[0] for frame, name in edges.items()},

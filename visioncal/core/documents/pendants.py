@@ -161,16 +161,20 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
     return PendantPose(poses[0], chosen, reading)
 
 
-def pendant_words(pose: FloatArray, form: PoseForm) -> str:
-    """Writes a (4, 4) pose [m] as a pendant shows it: `X 512.30 mm, ... A 10.120 deg, ...`."""
+def rotation_names(form: PoseForm) -> tuple[str, ...]:
+    """Names of a form's rotation numbers, in lower case."""
     maker = _SAME_NAMES.get(form.name, form.name)
-    names = next(names for names, forms in _NAMED_ROTATIONS.items() if maker in forms)
-    digits, unit = (3, "deg") if form.rotation.endswith("-deg") else (5, "rad")
+    return next(names for names, forms in _NAMED_ROTATIONS.items() if maker in forms)
+
+
+def pendant_words(pose: FloatArray, form: PoseForm) -> str:
+    """Writes a (4, 4) pose [m] as a pendant shows it: `X 512.300 mm, ... A 10.1200 deg, ...`."""
+    digits, unit = (4, "deg") if form.rotation.endswith("-deg") else (6, "rad")
     # The length unit that pendants show, whatever a program's poses have.
-    words = [f"{name} {1e3 * value:.2f} mm" for name, value in zip("XYZ", pose[:3, 3], strict=True)]
-    for name, value in zip(names, write_pose(pose, form)[3:], strict=True):
+    words = [f"{name} {1e3 * value:.3f} mm" for name, value in zip("XYZ", pose[:3, 3], strict=True)]
+    for name, value in zip(rotation_names(form), write_pose(pose, form)[3:], strict=True):
         angle = f"{name.upper()} {value:.{digits}f} {unit}"
-        words.append(f"{name} {value:.5f}" if name.startswith("q") else angle)
+        words.append(f"{name} {value:.6f}" if name.startswith("q") else angle)
     return ", ".join(words)
 
 

@@ -197,7 +197,8 @@ def _made_by(job: Job, session: Session) -> dict[str, object]:
     return {
         "session_sha256": session.digest(),
         "visioncal": __version__,
-        # The need is not part of the digest, which is of the recorded facts.
+        # Neither need nor forms are part of the digest, which is of the recorded facts.
+        "forms": [robot.form for robot in session.robots.values()],
         "need": None if session.need is None else list(map(str, asdict(session.need).values())),
         "options": asdict(job.options) | {"without": list(job.options.without)},
     }

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.conventions import POSE_FORMS, PoseNumbers, Reading
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
@@ -54,6 +54,9 @@ def with_user_options(foreign: ForeignRecording, requested: ImportOptions) -> Fo
         foreign = replace(foreign, mount=requested.mount)
     if requested.target is not None:
         foreign = replace(foreign, target=read_target_description(requested.target))
+    stated = POSE_FORMS.get(requested.robot.form or foreign.form)
+    # Forms of libraries are no controller's.
+    foreign = replace(foreign, form=stated.name if stated and stated.models else "")
     if requested.tip is not None and requested.robot_model is None:
         raise DataError("--tip needs the robot that it is of; name it with --robot-model.")
     if requested.robot_model is not None:
@@ -126,6 +129,8 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
     robot = _robot(foreign, document)
+    if foreign.form:
+        document["robot"] = {**document.get("robot", {}), "form": foreign.form}
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[row.get(name, "") for name in names] for row in rows]
     session = Session.assemble(

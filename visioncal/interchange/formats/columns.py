@@ -41,7 +41,7 @@ _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 def _read_file(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads one file with a row a view, or the only one in a folder of images."""
-    fields = read_fields(_pose_file(path) or path)
+    fields = read_fields(_pose_file(path) or path, requested.robot.form)
     if requested.camera_file is None:
         return foreign_from(fields, requested, images=path if path.is_dir() else None)
     return with_camera_file(fields, read_fields(requested.camera_file), requested)
@@ -105,6 +105,7 @@ def foreign_from(
         images=paths,
         joints_rad=joints,
         stamps_s=_in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
+        form=fields.form,
         views=fields.views or view_numbers(fields),
         columns={
             name: cells for name, cells in fields.texts.items() if name not in used | {image_name}

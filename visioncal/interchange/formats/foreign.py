@@ -113,6 +113,8 @@ class ForeignRecording:
     views: tuple[int, ...] = ()  # (n,) the rows' numbers in the source; 0, 1, ... where empty.
     # The robot's poses, where they are not those of the rows but a stream beside them.
     stream: ForeignStream | None = None
+    # The form of the robot's poses, where the user or the source states a maker's.
+    form: str = ""
     # Further columns of views.csv with their (n,) cells.
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # Assumptions and omissions, in sentences for the user.

@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.core.conventions import write_pose
+from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.documents.jsons import read_arrays, read_json
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.documents.structured import read_opencv, read_yaml
@@ -253,11 +253,14 @@ _IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNOREC
 _COMMENTS = ("#", "%", "//", "!")
 
 
-def read_fields(path: Path) -> Fields:
-    """Reads a table, JSON, YAML, .npz or .npy as rows of named values; raises DataError."""
+def read_fields(path: Path, form: str | None = None) -> Fields:
+    """Reads a table, JSON, YAML, .npz or .npy as rows of named values; raises DataError.
+
+    `form` is that of a pendant's lines, a name among `POSE_FORMS`; None to recognise it.
+    """
     if path.suffix.lower() in DOCUMENTS:
         return fields_of_document(read_document(path), path)
-    if lines := _pendant(path):
+    if lines := _pendant(path, form if form in POSE_FORMS else None):
         return lines
     table = read_table(path)
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
@@ -337,7 +340,7 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
     return dict(sorted(rows.items()))
 
 
-def _pendant(path: Path) -> Fields | None:
+def _pendant(path: Path, form: str | None) -> Fields | None:
     """Lines with poses in a maker's notation, with names of images; None where there are none."""
     lines = [
         (f"{path.name}, line {at}", line)
@@ -350,7 +353,7 @@ def _pendant(path: Path) -> Fields | None:
         return None
     records, forms = [], dict[str, str]()
     for place, line in lines[first:]:
-        pose, image = read_pose(_IMAGE.sub(" ", line), place), _IMAGE.search(line)
+        pose, image = read_pose(_IMAGE.sub(" ", line), place, form), _IMAGE.search(line)
         forms.setdefault(pose.form.name, place)
         numbers = write_pose(pose.pose, pose.form)
         record = dict(zip(_NAMES[len(numbers)], numbers, strict=True))

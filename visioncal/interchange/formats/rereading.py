@@ -193,6 +193,10 @@ def reread(
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
         target = _scaled(target, candidate.board_scale)
         document["target"] = "target.toml"
+    sides = (reading.robot, candidate.recording.declared.robot)
+    if "robot" in document and len({(side.rotation, side.written) for side in sides}) > 1:
+        # Rotations of another form are not of the stated maker.
+        document["robot"] = {k: v for k, v in document["robot"].items() if k != "form"}
     streams = {name: _reread_stream(stream, reading) for name, stream in session.streams.items()}
     reread = session.with_content(
         document=_noting(session, document, changes),

@@ -99,6 +99,7 @@ def _log_residuals(
 def verdict_markdown(calibration: Calibration) -> str:
     """The verdict with its reasons and next steps, the transforms, and the views left out."""
     judged, cell, budget = calibration.verdict, calibration.cell, calibration.budget
+    turned = calibration.rotation_words
     steps = [
         f"{at}. {plain(step.words)}" + (f"  \n   `{step.command}`" if step.command else "")
         for at, step in enumerate(calibration.next_steps, 1)
@@ -109,7 +110,7 @@ def verdict_markdown(calibration: Calibration) -> str:
         if frame.verdict.status != "good"
     ]
     places = [
-        f"{name}: {edge.place_words()}, {edge.sigma_words}; {edge.rotation_words()}"
+        f"{name}: {edge.place_words()}, {edge.sigma_words}; {turned(name, edge)}"
         for name, edge in calibration.placed.items()
     ]
     used = sum(view.used for view in calibration.views)

@@ -31,8 +31,9 @@ _MOUNTS = {
 }
 
 
-def edge_facts(name: str, edge: Edge) -> list[Fact]:
+def edge_facts(calibration: Calibration, name: str, edge: Edge) -> list[Fact]:
     """Components of a transform with standard deviations and units."""
+    controller = calibration.controller(*name.split("_from_"))
     # The perturbation is in the child's frame; the components are along the parent's axes.
     parent_from_child = edge.matrix[:3, :3]
     covariance_m2 = parent_from_child @ edge.covariance[3:, 3:] @ parent_from_child.T
@@ -49,6 +50,8 @@ def edge_facts(name: str, edge: Edge) -> list[Fact]:
         quaternion = ", ".join(fixed(value, decimals) for value in rotation.as_quat())
         rows.append(Fact("rotation vector", f"[{vector}]", "deg"))
         rows.append(Fact("quaternion x, y, z, w", f"[{quaternion}]"))
+        _, *of_maker = edge.rotations(controller)
+        rows += [Fact(form, f"[{numbers}]", unit) for form, numbers, unit in of_maker]
     else:
         parent = frame_words(name.partition("_from_")[0])
         rows.append(Fact("rotation", "not measured", f"taken as that of {parent}"))

@@ -1,0 +1,76 @@
+"""Poses as the makers of robots write them, by SciPy from their manuals, without visioncal."""
+
+import re
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# By maker: the names of a pose's numbers, and its rotation from and to the last of them. Positions
+# are in millimetres, but for a UR's, which are in metres.
+MAKERS = {
+    # p[x, y, z, rx, ry, rz]: a rotation vector in radians (Script manual).
+    "ur": ("x,y,z,rx,ry,rz", Rotation.from_rotvec, Rotation.as_rotvec),
+    # A about z, B about the new y, C about the new x (System variables, FRAME).
+    "kuka": (
+        "X,Y,Z,A,B,C",
+        lambda abc: Rotation.from_euler("ZYX", abc, degrees=True),
+        lambda turn: turn.as_euler("ZYX", degrees=True),
+    ),
+    # W, P, R about the fixed x, y, z.
+    "fanuc": (
+        "X,Y,Z,W,P,R",
+        lambda wpr: Rotation.from_euler("xyz", wpr, degrees=True),
+        lambda turn: turn.as_euler("xyz", degrees=True),
+    ),
+    "yaskawa": (
+        "X,Y,Z,Rx,Ry,Rz",
+        lambda angles: Rotation.from_euler("xyz", angles, degrees=True),
+        lambda turn: turn.as_euler("xyz", degrees=True),
+    ),
+    # orient: q1 is the scalar (RAPID, data types).
+    "abb": (
+        "X,Y,Z,q1,q2,q3,q4",
+        lambda q: Rotation.from_quat(q, scalar_first=True),
+        lambda turn: turn.as_quat(scalar_first=True, canonical=True),
+    ),
+    # About the moving x, y, z (VAL 3, trsf).
+    "staubli": (
+        "X,Y,Z,Rx,Ry,Rz",
+        lambda angles: Rotation.from_euler("XYZ", angles, degrees=True),
+        lambda turn: turn.as_euler("XYZ", degrees=True),
+    ),
+    # About the moving z, y, z (DRL, posx).
+    "doosan": (
+        "X,Y,Z,A,B,C",
+        lambda abc: Rotation.from_euler("ZYZ", abc, degrees=True),
+        lambda turn: turn.as_euler("ZYZ", degrees=True),
+    ),
+}
+NUMBER = r"-?\d+\.?\d*(?:e-?\d+)?"
+
+
+def unit_m(maker):
+    return 1.0 if maker == "ur" else 1e-3
+
+
+def written(maker, pose):
+    """The numbers of a (4, 4) pose [m]."""
+    turn = MAKERS[maker][2](Rotation.from_matrix(pose[:3, :3]))
+    return [*(pose[:3, 3] / unit_m(maker)).tolist(), *turn.tolist()]
+
+
+def pose_of(maker, numbers, length_m=None):
+    """The (4, 4) pose [m] of numbers; positions in `length_m`, else as the maker has them."""
+    numbers, pose = np.array(numbers, dtype=float), np.eye(4)
+    pose[:3, 3] = numbers[:3] * (length_m or unit_m(maker))
+    pose[:3, :3] = MAKERS[maker][1](numbers[3:]).as_matrix()
+    return pose
+
+
+def shown(maker, line):
+    """The (4, 4) pose [m] of a line as a pendant shows it, `X 512.3 mm, ... A 10.1 deg ...`."""
+    names = MAKERS[maker][0].split(",")
+    found = [re.search(rf"\b{name} ({NUMBER})", line, re.IGNORECASE)[1] for name in names]
+    units = set(re.findall(rf"{NUMBER} (\w+)", line))
+    assert units == {"mm", *({"abb": (), "ur": ("rad",)}.get(maker, ("deg",)))}, line
+    return pose_of(maker, found, 1e-3)
