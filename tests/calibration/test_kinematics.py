@@ -8,6 +8,7 @@ import pytest
 from support.cells import arm_found, calibrated, known_of, reporting
 from support.live_cell import postures_in_view, true_cell
 from support.marks import slow
+from support.misfits import misfit
 from support.refusals import raised
 from support.slopes import jacobian, twists
 from support.tracked import known_of as tracked_known
@@ -38,7 +39,7 @@ from visioncal.results import to_document
 from visioncal.results.arm import FUNCTIONS, ArmLevel, ArmResult
 from visioncal.robot import Loads, Robot, load_robot
 from visioncal.robot.loads import WeightFunctions
-from visioncal.simulation import CellOptions, Payload, simulate
+from visioncal.simulation import CellOptions, Payload, cell_session, simulate
 from visioncal.simulation.arms import forward
 from visioncal.simulation.instrument_session import (
     InstrumentOptions,
@@ -537,3 +538,26 @@ def test_a_right_arm_stays_nominal_and_without_joints_no_level_can_be_asked_for(
     assert calibrated(cell, joints=False).robot_arm.kinematics is None
     with pytest.raises(DataError, match="needs the joint angles of every view"):
         calibrated(cell, joints=False, level="kinematics")
+
+
+def test_errors_of_links_count_though_no_stop_shows_them():
+    """Postures that are alike let the frames absorb them: the sigma was 0.1 mm for 2.2 mm."""
+    found = []
+    for seed, mm, mrad in ((9005, 0.10, 0.46), (9017, 0.33, 0.28)):
+        cell = simulate(
+            CellOptions(
+                seed=seed, mount="eye-to-hand", views=20, robot="generic-6r-1800",
+                dh_sigma_m=1e-3 * mm, dh_sigma_rad=1e-3 * mrad,
+            )
+        )  # fmt: skip
+        result = visioncal.calibrate(cell_session(cell, "alike", seen="poses"))
+        found += [misfit(edge, cell.transforms[name]) / 6 for name, edge in result.edges.items()]
+        # A later check is of the same arm, which repeats them: it needs no joint angles.
+        fit = result.joint_fit.shown
+        assert fit.arm is None
+        edges = slice(0, 12)
+        narrower = np.trace(result.joint_covariance) - np.trace(fit.covariance[edges, edges])
+        assert narrower > 0.0
+        assert np.linalg.eigvalsh(fit.covariance).min() > 0.0
+    # The prior of the size is within a factor of e, and so of seven in the variance.
+    assert np.mean(found) < 7.0

@@ -33,6 +33,12 @@ TWIST_UNITS: FloatArray = np.repeat([1.0, LEVER_M], 3)
 SIGNIFICANT, _LIKELY = map(float, chi2_limit([FALSE_ALARM, 0.05], 1))
 # Smaller sizes count as zero [rad].
 _NOTHING = 1e-6
+# Sizes of the errors of links [rad], and their prior: with a probability of a half log-normal about
+# 0.2 mrad and 0.1 mm a link within a factor of e, by which an arm of a metre is off by some tenths
+# of a millimetre.
+_SIZES: FloatArray = np.geomspace(2.5e-5, 1.6e-3, 7)
+_SIZE_PRIOR: FloatArray = np.exp(-0.5 * np.log(_SIZES / 2e-4) ** 2)
+_SIZE_PRIOR *= 0.5 / _SIZE_PRIOR.sum()
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +127,12 @@ def find_arm_errors(
     robot: int,
     basis: FloatArray,
 ) -> ArmErrors | None:
-    """Estimates the size of the errors of one robot's links; None where they gain no likelihood.
+    """Estimates the size of the errors of one robot's links; None for too few stops.
 
-    Every arm has link errors: their size counts even where it hardly gains likelihood.
+    Significant errors have the size of maximum likelihood. Every arm has link errors, and stops
+    whose postures are alike show none: others have the root mean square of their posterior, by the
+    likelihood on a grid of sizes and by what arms are off (half of them by nothing, as simulated
+    and calibrated ones).
 
     Args:
         likelihood: That of the robots' noise levels without these errors, at the solution.
@@ -136,17 +145,28 @@ def find_arm_errors(
     if len(np.unique(stops)) < FEWEST_STOPS or not size:
         return None
     start = likelihood.start_beside([likelihood.moved(robot, basis)], np.array([_NOTHING]))
-    sigmas, value = likelihood.beside(robot, basis, np.ones((size, 1))).most_likely(
+    beside, seen = (
+        likelihood.beside(robot, basis, np.ones((size, 1))),
+        np.repeat(likelihood.seen, 2),
+    )
+    sigmas, value = beside.most_likely(
         start,
-        np.append(np.repeat(likelihood.seen, 2), True),
+        np.append(seen, True),
         np.append(np.full(len(start) - 1, LEAST_SIGMA), _NOTHING),
         # The search stops early where the likelihood seems not to reach that without them.
         enough=likelihood.white[1],
     )
     gain = 2.0 * (likelihood.white[1] - value)
-    if gain <= 0.0:
-        return None
-    return ArmErrors(basis, float(np.sqrt(level_weight(gain)) * sigmas[-1]), gain, of_links=True)
+    if gain > SIGNIFICANT:
+        sigma = np.sqrt(level_weight(gain)) * sigmas[-1]
+    else:
+        levels = [np.append(likelihood.white[0], at) for at in _SIZES]
+        gains = [
+            likelihood.white[1] - beside.most_likely(at, np.append(seen, False))[1] for at in levels
+        ]
+        shares = _SIZE_PRIOR * np.exp(np.minimum(gains, 0.5 * SIGNIFICANT))
+        sigma = np.sqrt(shares @ _SIZES**2 / (1.0 - _SIZE_PRIOR.sum() + shares.sum()))
+    return ArmErrors(basis, float(sigma), max(gain, 0.0), of_links=True)
 
 
 def rows_of(problem: Problem, robot: str) -> Mask:

@@ -1,8 +1,8 @@
 """Sections of a result beside those on arms: clock, boards, uncertainty, fit for verification."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
@@ -179,6 +179,8 @@ class FittedArm:
     # Kind of the parameters: errors of all `links`, or parameters of the calibrated `model`.
     of: Literal["links", "model"]
     values: Vector  # (k,) estimates, zero for the nominal arm.
+    # Whether the stops show them at all; else they only count in the covariance.
+    is_shown: bool = True
     # For a model, prior standard deviations by parameter block.
     weights: Mapping[str, float] | None = None
     # (4, 4) for a model, the reported frame in its flange's frame.
@@ -214,6 +216,24 @@ class JointFit(Section):
     # (k, k) of the transforms, of lens and targets, and of the arm's errors.
     covariance: Covariance
     stops: FittedStops | None = None  # Its stops; None of a part of a whole cell.
+
+    @property
+    def shown(self) -> Self:
+        """The fit without arm errors that no stop shows: the arm repeats them, at other stops, too.
+
+        The covariance is that of the other unknowns where they are zero.
+        """
+        if self.arm is None or self.arm.is_shown:
+            return self
+        count = len(self.covariance) - len(self.arm.values)
+        cross, own = self.covariance[:count, count:], self.covariance[count:, count:]
+        left = (
+            self.covariance[:count, :count] - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
+        )
+        stops = self.stops
+        if stops is not None:
+            stops = replace(stops, by_noise=stops.by_noise[:count, :count])
+        return replace(self, arm=None, covariance=left, stops=stops)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -171,6 +171,8 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
         and stops.by_noise.shape == fit.covariance.shape
     ):
         raise ValueError(f"stops have {len(stops.boards)} boards and other shapes")
+    fit = fit.shown
+    values = np.zeros(0) if fit.arm is None else fit.arm.values
     return CalibrationPrior(
         calibration,
         fit,
