@@ -179,8 +179,8 @@ class FittedArm:
     # Kind of the parameters: errors of all `links`, or parameters of the calibrated `model`.
     of: Literal["links", "model"]
     values: Vector  # (k,) estimates, zero for the nominal arm.
-    # Whether the stops show them at all; else they only count in the covariance.
-    is_shown: bool = True
+    # True where no stop shows them: they only count in the covariance. Absent otherwise.
+    hidden: bool | None = None
     # For a model, prior standard deviations by parameter block.
     weights: Mapping[str, float] | None = None
     # (4, 4) for a model, the reported frame in its flange's frame.
@@ -223,7 +223,7 @@ class JointFit(Section):
 
         The covariance is that of the other unknowns where they are zero.
         """
-        if self.arm is None or self.arm.is_shown:
+        if self.arm is None or not self.arm.hidden:
             return self
         count = len(self.covariance) - len(self.arm.values)
         cross, own = self.covariance[:count, count:], self.covariance[count:, count:]
