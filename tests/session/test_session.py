@@ -272,6 +272,17 @@ TOML_REFUSALS = [
     ("800, 801.5", "nan, 801.5", r"camera\.matrix\[0\] is nan, but must be a finite number"),
     ("800, 801.5", "-800, 801.5", r"camera has the matrix \[-800.*fx and fy must be above 0"),
     ("matrix =", "matrx =", "has one of matrix and distortion"),
+    ("640, 400]", "640]", r"camera\.matrix is \[800, 801.5, 640\], but must be \[fx, fy, cx, cy\]"),
+    (
+        "[800, 801.5, 640, 400]",
+        "[[800, 0.5, 640], [0, 801.5, 400], [0, 0, 1]]",
+        r"but must be \[fx, fy, cx, cy\] \[px\], as \[800, 801.5, 640, 400\]",
+    ),
+    (
+        "[800, 801.5, 640, 400]",
+        "[800, 0, 0, 0, 801.5, 0, 640, 400, 1]",
+        r"but must be \[fx, fy, cx, cy\] \[px\], as \[800, 801.5, 640, 400\]",
+    ),
     ("0.1, 0, 0, 0, 0", "0.1, 0, 0, 0", "has 4 coefficients .* needs 5 or 8"),
     ('name = "oak"', 'model = "fisheye"', 'has 5 .* "fisheye" model needs 4'),
     ('name = "oak"', 'intrinsics = "fix"', "camera.intrinsics is 'fix'"),
@@ -322,6 +333,17 @@ def test_a_wrong_session_toml_is_refused_by_field(folder, old, new, words):
         edit(folder, "session.toml", old, new)
     error = refusal(folder)
     assert re.search(words, str(error))
+
+
+@pytest.mark.parametrize("rows", [True, False])
+def test_intrinsics_may_be_written_as_cv2_has_them(folder, rows):
+    matrix = "[[800, 0, 640], [0, 801.5, 400], [0, 0, 1]]"
+    edit(folder, "session.toml", "[800, 801.5, 640, 400]", matrix if rows else
+         f"[{matrix.replace('[', '').replace(']', '')}]")  # fmt: skip
+    edit(folder, "session.toml", "[0.1, 0, 0, 0, 0]", "[[0.1, 0, 0, 0, 0]]")
+    camera = Session.load(folder).camera
+    assert camera.matrix.tolist() == [800, 801.5, 640, 400]
+    assert camera.distortion.tolist() == [0.1, 0, 0, 0, 0]
 
 
 def test_all_wrong_fields_are_named_at_once(folder):

@@ -44,14 +44,33 @@ class TableModel(BaseModel):
     model_config = ConfigDict(extra="allow", strict=True, frozen=True)
 
 
+def _flat(value: object) -> object:
+    """A list without the lists in it: cv2 has coefficients and matrices by rows."""
+    if not isinstance(value, list):
+        return value
+    return [item for row in value for item in (row if isinstance(row, list) else [row])]
+
+
+def _four(value: object) -> object:
+    """fx, fy, cx, cy, also of cv2's 3 x 3 matrix, flat or by rows."""
+    match _flat(value):
+        case [fx, 0, cx, 0, fy, cy, 0, 0, 1] | [fx, fy, cx, cy]:
+            return [fx, fy, cx, cy]
+        case [fx, _, cx, _, fy, cy, x, y, _]:
+            hint = f", as {[fx, fy, cx or x, cy or y]}"
+        case _:
+            hint = ""
+    raise ValueError(f"is {value}, but must be [fx, fy, cx, cy] [px]{hint}")
+
+
 class CameraTable(TableModel):
     """`[camera]`. matrix: fx, fy, cx, cy [px]; resolution: width, height [px]."""
 
     name: str = "camera"
     resolution: Annotated[list[Side], Field(min_length=2, max_length=2)] | None = None
     model: CameraKind = "brown"
-    matrix: Annotated[list[Number], Field(min_length=4, max_length=4)] | None = None
-    distortion: list[Number] | None = None
+    matrix: Annotated[list[Number], BeforeValidator(_four)] | None = None
+    distortion: Annotated[list[Number], BeforeValidator(_flat)] | None = None
     intrinsics: Literal["auto", "hold", "refine"] = "auto"
     matrix_sigma_px: PixelSigma | None = None
     focus: Literal["auto", "fixed"] = "auto"
