@@ -220,6 +220,7 @@ def test_commands_enter_what_they_did(site, tmp_path):
     added = visioncal("history", tmp_path / "new.db", "--cell", "line 5", "--add", out).good()
     assert "1 added" in added.err
     listed = visioncal("history", file).good().out
+    assert visioncal("history", "--history", file).good().out == listed
     assert calibrated.id[:8] in listed
     assert "line 4" in listed
     shown = visioncal("history", file, "--show", verified.id[:6]).good().out

@@ -70,7 +70,8 @@ def _placed(
 
 def history_command(options: HistoryOptions) -> None:
     """Runs `visioncal history`."""
-    history = History(options.file) if options.file else History.of_site(Path.cwd())
+    file = options.file or options.history
+    history = History(file) if file else History.of_site(Path.cwd())
     if history is None:
         raise DataError(
             f"there is no {SITE_FILE} here or above.",

@@ -415,6 +415,7 @@ class HistoryOptions:
     file: Path | None = argument(
         f"The history's file; else the nearest {SITE_FILE} here or above.", default=None
     )
+    history: Path | None = option("The same file, as other commands name it.")
     cell: str | None = option("Of this cell alone; with --add: whose results they are.")
     kind: ActKind | None = option("Of this kind alone.")
     show: str | None = option("One entry in full, by the beginning of its id.", metavar="ID")
