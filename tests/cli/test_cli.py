@@ -206,6 +206,26 @@ def test_errors_as_json_have_one_form(poor, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+MISSING = {
+    "verify": "SESSION and --against are missing",
+    "dynamics gains": "SESSION, --loaded, --mass-kg and --com-mm are missing",
+    "diff one": "SECOND is missing",
+    "plan ur10e --camera 900,900,640,400": "--target, --cam, --board, --resolution are needed",
+    "fixture": "visioncal fixture TOUCHES -c OUT --cad DRAWING --tool NAME",
+    "fixture cell/points.csv": "tool that touched the points is not said, nor which points they",
+    "record -o new": "--target, --arm and --camera are missing",
+    "record -o new --arm manual": "--target and --camera are missing",
+}
+
+
+@pytest.mark.parametrize("words", MISSING)
+def test_all_that_is_missing_is_named_at_once(tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    if "cell" in words:
+        visioncal("simulate", "cell", "--touches", "--no-images").good()
+    visioncal(*words.split()).refused(MISSING[words])
+
+
 def test_simulate_writes_arms_that_warm_up_and_arms_that_bend(tmp_path):
     visioncal("simulate", tmp_path / "warm", "--warm-up", "--currents", "--views", 12).good()
     session = Session.load(tmp_path / "warm")

@@ -522,7 +522,7 @@ def test_stops_without_a_view_end_in_status_2(planned, cell, tmp_path):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ((), "--plan or --target is needed"),
+        ((), "guide the arm by hand: --follow and --target"),
         (("--target", "charuco_9x6_30mm"), "an arm is driven by a plan"),
         (("--plan", "PLAN", "--mount", "eye-to-hand"), "the plan says that already"),
         (("--plan", "PLAN", "--speed", "9"), "up to 1.5 rad/s"),

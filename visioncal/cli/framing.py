@@ -163,7 +163,8 @@ def place_frame(
         raise DataError(
             f"{command}: touches of it, or a session that shows it, are needed.",
             culprits=["TOUCHES"],
-            next_step=f"Name them: visioncal {command} TOUCHES -c OUT.",
+            next_step=f"Name them: visioncal {command} TOUCHES -c OUT"
+            f"{' --cad DRAWING --tool NAME' * (kind != 'tool')}.",
         )
     session = _image_session(source, {"--cad": cad, "--tool": tool, **request.for_touches()})
     if session is None:
@@ -231,9 +232,15 @@ def fixture_command(options: FixtureOptions) -> None:
     drawing = None if options.cad is None else read_nominal(options.cad, options.cad_unit)
 
     def by_touches(source: Path, calibration: Calibration | None) -> Frame:
-        robot = options.robot
+        robot, asked = options.robot, import_options(options)
+        if options.tool is None and calibration is None:
+            named = drawing or any(read_touches(source, asked, robot, positions=True).kinds)
+            others = "" if named else ", nor which points they are: by --cad, or a column kind"
+            raise DataError(
+                f"The tool that touched the points is not said{others}.", next_step=NO_TOOL
+            )
         tool = _tool(options.tool, calibration, robot)
-        rows = read_touches(source, import_options(options), robot, positions=tool is None)
+        rows = read_touches(source, asked, robot, positions=tool is None)
         noise_m, model = options.noise_m, _model(options)
         return touched_fixture(rows, tool, drawing, calibration, model, touch_noise_m=noise_m)
 
@@ -249,8 +256,6 @@ def _tool(option: str | None, calibration: Calibration | None, robot: str | None
     if option == "none":
         return None
     frames = {} if calibration is None else calibration.frames
-    if option is None and calibration is None:
-        raise DataError("The tool that touched the points is not said.", next_step=NO_TOOL)
     if option is None or option in frames or f"flange_from_{option}" in frames:
         return Tool.among(frames, "The calibration", option)
     path, _, name = option.rpartition(":")

@@ -15,6 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import listed
 
 # Source of a parameter that was typed.
 _TYPED = "COMMANDLINE"
@@ -38,6 +39,8 @@ class PlainCommand(TyperCommand):
         try:
             rest = super().parse_args(ctx, args)
         except _USAGE_ERROR as error:
+            if isinstance(error, typer.BadParameter):
+                self._refuse_missing(ctx, typed)
             if not wants_json:
                 raise
             param, unknown = getattr(error, "param", None), getattr(error, "option_name", "")
@@ -61,6 +64,21 @@ class PlainCommand(TyperCommand):
                     "the shell is set.",
                 )
         return rest
+
+    def _refuse_missing(self, ctx: Any, typed: list[str]) -> None:  # noqa: ANN401 - typer's own
+        """Names all that has to be given and is not, where the parser names the first alone."""
+        values, _, _ = self.make_parser(ctx).parse_args(list(typed))
+        missing = [
+            param.opts[-1] if param.opts[-1].startswith("-") else param.opts[-1].upper()
+            for param in self.get_params(ctx)
+            if param.required and values.get(param.name) in (None, ())
+        ]
+        if missing:
+            raise DataError(
+                f"{listed(missing)} {'is' if len(missing) == 1 else 'are'} missing.",
+                culprits=missing,
+                next_step=f"{ctx.command_path} --help lists what it takes.",
+            )
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
         """Runs the command; Ctrl-C ends it with a message."""

@@ -325,6 +325,8 @@ def cell_of(source: Source, words: PlanOptions, kept: Kept) -> PlanCell:
         refuse_given(words.options("camera", "resolution", "mount"), "the calibration has its own")
         return _with_noise(_calibrated(source.calibration, source.session, words, kept), words)
     missing = [f"--{name}" for name in _NEEDED if getattr(words, name) is None]
+    if "," in (words.camera or "") and words.resolution is None:
+        missing.append("--resolution")
     if missing or source.robot is None:
         raise DataError(
             f"{source.words}: {some_of(missing)} {'is' if len(missing) == 1 else 'are'} needed to "

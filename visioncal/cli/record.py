@@ -44,26 +44,29 @@ def record_command(options: RecordOptions) -> None:
         record_on_page(options)
         return
     plan = None if options.plan is None else read_plan(options.plan)
-    recorded = recorded_cell(plan, options)
+    needed = ("target", "arm", "camera")[plan is not None :]
+    missing = [f"--{name}" for name in needed if getattr(options, name) is None]
     drives = not options.follow and str(options.arm).partition(":")[0] not in REQUESTING
-    if drives and plan is None:
+    if drives and plan is None and options.arm is not None:
         raise DataError(
             "record: an arm is driven by a plan, and none is given.",
             culprits=["--plan"],
-            next_step="Make one with visioncal plan, or guide the arm by hand: --follow.",
+            next_step="Make one with visioncal plan, or guide the arm by hand: --follow "
+            "and --target.",
         )
+    if missing:
+        raise DataError(
+            f"record: {listed(missing)} {'is' if len(missing) == 1 else 'are'} missing.",
+            culprits=missing,
+            next_step="Name them, as --target charuco_9x6_30mm --arm manual --camera uvc:0; --page "
+            "asks for them.",
+        )
+    recorded = recorded_cell(plan, options)
     if not drives:
         is_dry = {"--dry-run": options.dry_run or None}
         refuse_given(is_dry, "a guided arm is not driven, so there is nothing to say of it")
     driven = plan if drives else None
     taking = taking_of(options, is_driven=drives)
-    missing = [f"--{name}" for name in ("arm", "camera") if getattr(options, name) is None]
-    if missing:
-        raise DataError(
-            f"record: {listed(missing)} {'is' if len(missing) == 1 else 'are'} missing.",
-            culprits=missing,
-            next_step="Name them, as --arm manual --camera uvc:0; --page asks for them.",
-        )
     with signals_as_interrupts(), opened(options, is_moved=drives and not options.dry_run) as cell:
         check_order(cell, is_resumed=options.resume)
         if driven is not None:
