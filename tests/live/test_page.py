@@ -250,6 +250,9 @@ def test_a_folder_typed_with_mistakes_is_the_session_typed_without(cell, browser
         row(page, 4).get_by_text("shot4.png").wait_for()
         changed(page, 4, "Replace the pose", lines[3])
         due(page, "shot5.png")
+        # Nothing is taken of what cannot be read.
+        page.get_by_label(POSE).fill("X 1\nY 2")
+        page.get_by_text("Line 2: ").wait_for()
         rest = [lines[4], typos[5], lines[6], typos[7], lines[9], lines[8]]
         page.get_by_label(POSE).fill("\n".join([*rest[:3], "X 1 Y 2", *rest[3:]]))
         page.get_by_text("Line 4: ").wait_for()

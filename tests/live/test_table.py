@@ -19,10 +19,11 @@ from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell, 
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.folder import FolderCamera
+from visioncal.live.drivers.manual import ManualArm
 from visioncal.live.drivers.protocols import ArmState, Frame
 from visioncal.live.page import station as stations
 from visioncal.live.page.outcome import Outcome
-from visioncal.live.page.station import Setup, Station, Task, TypedPoses, Visitor
+from visioncal.live.page.station import Setup, Station, Task, Visitor
 from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.targets import load_target
 
@@ -161,7 +162,7 @@ def recording(tmp_path, monkeypatch):
 
     @contextmanager
     def begun():
-        cell = LiveCell(TypedPoses(), FolderCamera(str(inbox)))
+        cell = LiveCell(ManualArm(lambda _: ""), FolderCamera(str(inbox)))
         facts = CaptureFacts.of(cell, "out", RecordedCell("eye-in-hand", BOARD, None), None)
         yield cell, Journal.resume(out, facts, 0.0, 0)
 
@@ -176,7 +177,7 @@ def recording(tmp_path, monkeypatch):
 
 def takes(station: Station, visitor: Visitor, *places: int) -> None:
     lines = [f"X {100 * place} Y 0 Z 500 A 0 B 0 C 0" for place in places]
-    station.take(visitor, [read_pose(line, "line", "kuka") for line in lines], lines)
+    station.take(visitor, [read_pose(line, "line", "kuka") for line in lines], lines, visitor.seen)
 
 
 def answered(visitor: Visitor, count: int) -> None:
@@ -192,8 +193,11 @@ def test_requests_while_a_trial_runs_are_all_done_at_once(recording):
     # Pressed faster than the page is drawn, while the trial cannot end.
     for _ in range(3):
         station.mend(visitor, "not wanted")
-    station.mend(visitor, "exchanged", 1, 2)
+    station.mend(visitor, "exchanged", 1)
     answered(visitor, 5)
+    assert "Choose a view" in visitor.refusal
+    station.mend(visitor, "exchanged", 1, 2)
+    answered(visitor, 6)
     assert visitor.refusal == ""
     assert [row.number for row in station.snapshot.views] == [1, 2, 3, 4, 5]
     # No picture is searched anew but the one that is due.

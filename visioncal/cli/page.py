@@ -31,10 +31,11 @@ from visioncal.interchange.result_files import load_calibration
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.devices import ARMS, CAMERAS
 from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell, picture_name
+from visioncal.live.drivers.manual import ManualArm
 from visioncal.live.drivers.protocols import StoredPictures
 from visioncal.live.drivers.uvc import without_password
 from visioncal.live.page.outcome import Light
-from visioncal.live.page.station import PageText, Setup, Station, Task, TypedPoses
+from visioncal.live.page.station import PageText, Setup, Station, Task
 from visioncal.live.page.suggestion import NextPose
 from visioncal.live.planning.cell import PlanCell, seen_from
 from visioncal.live.planning.path import short_order
@@ -197,7 +198,7 @@ def _begun(
     remembered: Path,
 ) -> Iterator[tuple[LiveCell, Journal]]:
     """Opens the devices and begins or resumes the session; a folder remembers what was chosen."""
-    given = TypedPoses() if setup.arm == "manual" else None
+    given = ManualArm(lambda _: "") if setup.arm == "manual" else None
     with opened(chosen, is_moved=False, given=given) as cell:
         check_order(cell, is_resumed=False)
         facts = CaptureFacts.of(cell, chosen.out.name, recorded, plan)

@@ -102,7 +102,7 @@ class _Page:
 
     def _build_live(self) -> None:
         station = self._station
-        with ui.column().classes("flex-1").style("min-width: min(100%, 480px)"):
+        with ui.column().classes("flex-1").style("min-width: min(100%, 360px)"):
             with ui.row().classes("w-full items-center") as self._folder:
                 self._due = (
                     ui.select([], label="Picture of the next pose", on_change=self._choose)
@@ -186,14 +186,14 @@ class _Page:
             else:
                 poses.append(read)
         words = [*map(read_as, poses)]
-        if len(lines) > 1:
-            words = [f"{len(lines)} poses, each of the next picture. The first: {words[0]}"]
+        if len(poses) > 1:
+            words = [f"{len(poses)} poses, each of the next picture. The first: {words[0]}"]
         self._understood.text = " ".join(wrong or words)
         return [] if wrong else poses
 
     def _take(self) -> None:
         if poses := self._read():
-            self._station.take(self._visitor, poses, self._lines())
+            self._station.take(self._visitor, poses, self._lines(), self._visitor.seen)
 
     def _hear(self) -> None:
         """Shows what became of the visitor's requests."""

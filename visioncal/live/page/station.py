@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from threading import Thread
-from typing import Literal
+from typing import Concatenate, Literal, ParamSpec
 
 import numpy as np
 
@@ -20,18 +20,12 @@ from visioncal.core.errors import DataError, DriverError, VisioncalError
 from visioncal.core.number_format import counted, figure
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Rejection
 from visioncal.live.capture.cell import LiveCell
-from visioncal.live.capture.journal import (
-    Journal,
-    RecordedCell,
-    picture_name,
-    posed,
-    state_of,
-)
+from visioncal.live.capture.journal import Journal, RecordedCell, picture_name, posed, state_of
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
 from visioncal.live.capture.take import Missed, TakenView, grey_of, image_motion_px
+from visioncal.live.drivers.manual import ManualArm
 from visioncal.live.drivers.protocols import (
-    Answer,
     ArmState,
     Frame,
     MovingArm,
@@ -45,6 +39,7 @@ from visioncal.live.planning.cell import PlanCell, flange_at
 from visioncal.session import View
 from visioncal.vision.boards.imaging import decode_image
 
+_P = ParamSpec("_P")
 # What may be wrong with a view of the table. Where its picture has no pose, or its pose no picture,
 # those from it on are one apart.
 Fault = Literal["not wanted", "exchanged", "no pose", "no picture"]
@@ -53,28 +48,6 @@ _CHANGED = (
     "Another browser, or the arm, changed the table meanwhile: look at it, and press again. "
     "Nothing was done."
 )
-
-
-class TypedPoses:
-    """Arm without a connection, whose poses are typed on a page."""
-
-    name = "poses typed by hand"
-    invitation = ""
-
-    def request(self, timeout_s: float, wanted: str = "") -> ArmState | None:
-        """Nothing: the page takes a view where a pose is typed."""
-        del timeout_s, wanted
-        return None
-
-    def reply(self, answer: Answer, reason: str = "") -> None:
-        """Nothing: the page shows the view's report."""
-
-    def state(self) -> ArmState:
-        """Never called: a view is taken at the pose that requested it."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Holds no resources."""
 
 
 @dataclass(frozen=True)
@@ -184,6 +157,29 @@ def _why_same(state: ArmState, others: Sequence[View | ArmState]) -> str:
     return ""
 
 
+def _request(
+    act: Callable[Concatenate["Station", Visitor, _P], str | None],
+) -> Callable[Concatenate["Station", Visitor, _P], None]:
+    """Has the thread of the devices do something for a browser, which gets why it is refused."""
+
+    @wraps(act)
+    def put(station: "Station", visitor: Visitor, /, *words: _P.args, **more: _P.kwargs) -> None:
+        seen = visitor.seen.revision
+
+        def guarded() -> None:
+            visitor.refusal = "The recording is closed: press Start to go on."
+            if station.snapshot.phase == "live":
+                changed = any(author is not visitor for author in station._authors[seen:])
+                visitor.refusal = (
+                    _CHANGED if changed else act(station, visitor, *words, **more) or ""
+                )
+            visitor.answers += 1
+
+        station._requests.put(guarded)
+
+    return put
+
+
 class Station:
     """A recording that pages watch and steer.
 
@@ -223,50 +219,47 @@ class Station:
         """Opens the devices of a setup and begins, or goes on after a failure."""
         self._requests.put(lambda: self._begin(setup))
 
-    def take(self, visitor: Visitor, poses: Sequence[PendantPose], lines: Sequence[str]) -> None:
+    @_request
+    def take(
+        self, visitor: Visitor, poses: Sequence[PendantPose], lines: Sequence[str], seen: Snapshot
+    ) -> str:
         """Takes views at poses that were typed in these lines, each of the next picture.
 
         Of a camera that is no folder it takes one view; all are taken, or none.
         """
-        seen, typed = visitor.seen, tuple(lines)
-
-        def take() -> str:
-            if typed == visitor.lines and seen.revision < self.snapshot.revision:
-                # A key that was pressed twice.
-                return ""
-            capture, again = self._capture, self.snapshot.again
-            cell, journal = capture.cell, capture.journal
-            if not self.snapshot.takes_typed or seen.again != again:
-                return "Another pose is wanted now: look at the page, and press again."
-            now_s = cell.clock.now()
-            states = [
-                ArmState(now_s, pose.pose, typed=line)
-                for pose, line in zip(poses, typed, strict=True)
-            ]
-            others = [view for view in journal.views if view.number != again]
-            for at, state in enumerate(states):
-                if reason := _why_same(state, [*others, *states[:at]]):
-                    return reason
-            number, place = capture.next_numbers()
-            numbers = [*([] if again is None else [again]), *range(number, number + len(states))]
-            if not cell.is_stored:
-                if len(states) > 1:
-                    return "The camera sees one place: type the pose of that one."
-                found = capture.view_at(states[0], numbers[0], place, self._task.count)
-                if isinstance(found.found, Missed):
-                    return found.words
-            else:
-                taken = self._paired(dict(zip(numbers, states, strict=False)), seen)
-                if isinstance(taken, str):
-                    return taken
-                old = [picture_name(view) for view in journal.views if view.number == again]
-                self._with_pictures(lambda: capture.store(taken), old)
-            self._publish(pose_form=poses[-1].form.name)
-            visitor.lines = typed
-            self._changed(visitor)
+        if (typed := tuple(lines)) == visitor.lines and seen.revision < self.snapshot.revision:
+            # A key that was pressed twice.
             return ""
-
-        self._put(visitor, take)
+        capture, again = self._capture, self.snapshot.again
+        cell, journal = capture.cell, capture.journal
+        if not self.snapshot.takes_typed or seen.again != again:
+            return "Another pose is wanted now: look at the page, and press again."
+        now_s = cell.clock.now()
+        states = [
+            ArmState(now_s, pose.pose, typed=line) for pose, line in zip(poses, typed, strict=True)
+        ]
+        others = [view for view in journal.views if view.number != again]
+        for at, state in enumerate(states):
+            if reason := _why_same(state, [*others, *states[:at]]):
+                return reason
+        number, place = capture.next_numbers()
+        numbers = [*([] if again is None else [again]), *range(number, number + len(states))]
+        if not cell.is_stored:
+            if len(states) > 1:
+                return "The camera sees one place: type the pose of that one."
+            found = capture.view_at(states[0], numbers[0], place, self._task.count)
+            if isinstance(found.found, Missed):
+                return found.words
+        else:
+            taken = self._paired(dict(zip(numbers, states, strict=False)), seen)
+            if isinstance(taken, str):
+                return taken
+            old = [picture_name(view) for view in journal.views if view.number == again]
+            self._with_pictures(lambda: capture.store(taken), old)
+        self._publish(pose_form=poses[-1].form.name)
+        visitor.lines = typed
+        self._changed(visitor)
+        return ""
 
     def _paired(self, states: Mapping[int, ArmState], seen: Snapshot) -> dict[int, TakenView] | str:
         """Views of the next pictures of the folder at some states, by number; or why not."""
@@ -293,53 +286,39 @@ class Station:
             taken[number] = TakenView(frame, state, found, 0.0)
         return taken
 
-    def repose(self, visitor: Visitor, number: int, pose: PendantPose, line: str) -> None:
+    @_request
+    def repose(self, visitor: Visitor, number: int, pose: PendantPose, line: str) -> str:
         """Replaces the pose of a view by one that was typed."""
+        rows = {view.number: view for view in self._capture.journal.views}
+        if number not in rows or rows[number].joints_rad is not None:
+            return "Only the pose of a view without joints can be typed: take it again."
+        state = ArmState(0.0, pose.pose, typed=line)
+        others = [view for view in rows.values() if view.number != number]
+        return _why_same(state, others) or self._repair(visitor, {**rows, number: state})
 
-        def repose() -> str:
-            rows = {view.number: view for view in self._capture.journal.views}
-            if number not in rows or rows[number].joints_rad is not None:
-                return "Only the pose of a view without joints can be typed: take it again."
-            state = ArmState(0.0, pose.pose, typed=line)
-            others = [view for view in rows.values() if view.number != number]
-            return _why_same(state, others) or self._repair(visitor, {**rows, number: state})
-
-        self._put(visitor, repose)
-
-    def mend(self, visitor: Visitor, fault: Fault, number: int = 0, other: int = 0) -> None:
-        """Mends how pictures and poses are paired.
-
-        Args:
-            visitor: Who asks for it.
-            fault: What is wrong with a view. Where its picture has no pose or its pose no picture,
-                the poses from it on move to the next pictures, or to those before.
-            number: The view; 0 for the last.
-            other: The view with which its pose is exchanged.
-        """
-
-        def mend() -> str:
-            poses: dict[int, View | ArmState] = {
-                view.number: view for view in self._capture.journal.views
-            }
-            first = number or max(poses, default=0)
-            if not {first, other or first} <= poses.keys():
-                return "There is no such view."
-            numbers = [at for at in poses if at >= first]
-            moved = [poses[at] for at in numbers]
-            if fault == "exchanged":
-                poses[first], poses[other] = poses[other], poses[first]
-            elif fault == "no picture":
-                poses.update(zip(numbers, moved[1:], strict=False))
-                del poses[numbers[-1]]
-            else:
-                if fault == "no pose":
-                    poses.update(zip(numbers[1:], moved, strict=False))
-                if fault == "no pose" or not number:
-                    visitor.returned = self.snapshot.views[-1].pose
-                del poses[first]
-            return self._repair(visitor, poses)
-
-        self._put(visitor, mend)
+    @_request
+    def mend(self, visitor: Visitor, fault: Fault, number: int = 0, other: int = 0) -> str:
+        """Mends what is wrong with a view (0: the last), or with its and another's pose."""
+        poses: dict[int, View | ArmState] = {
+            view.number: view for view in self._capture.journal.views
+        }
+        first = number or max(poses, default=0)
+        if first not in poses or (fault == "exchanged" and other not in poses):
+            return "Choose a view that is there."
+        numbers = [at for at in poses if at >= first]
+        moved = [poses[at] for at in numbers]
+        if fault == "exchanged":
+            poses[first], poses[other] = poses[other], poses[first]
+        elif fault == "no picture":
+            poses.update(zip(numbers, moved[1:], strict=False))
+            del poses[numbers[-1]]
+        else:
+            if fault == "no pose":
+                poses.update(zip(numbers[1:], moved, strict=False))
+            if fault == "no pose" or not number:
+                visitor.returned = self.snapshot.views[-1].pose
+            del poses[first]
+        return self._repair(visitor, poses)
 
     def _repair(self, visitor: Visitor, poses: Mapping[int, View | ArmState]) -> str:
         """Gives the pictures of views these poses; the others are no longer in the table."""
@@ -357,27 +336,19 @@ class Station:
         self._changed(visitor)
         return ""
 
-    def again(self, visitor: Visitor, number: int | None) -> None:
+    @_request
+    def again(self, _: Visitor, number: int | None) -> None:
         """Lets the next view replace one, which stays until then; None for none."""
+        is_there = any(view.number == number for view in self._capture.journal.views)
+        self._publish(again=number if is_there else None)
 
-        def again() -> str:
-            rows = {view.number for view in self._capture.journal.views}
-            self._publish(again=number if number in rows else None)
-            return ""
-
-        self._put(visitor, again)
-
-    def choose(self, visitor: Visitor, name: str, *, leaves_out: bool = False) -> None:
+    @_request
+    def choose(self, _: Visitor, name: str, *, leaves_out: bool = False) -> None:
         """Makes a picture of the folder the one that is due, or leaves it out."""
-
-        def choose() -> str:
-            journal = self._capture.journal
-            if not leaves_out:
-                journal.leave_out({*journal.left_out} - {name})
-            self._with_pictures(lambda: None, [name] * leaves_out, "" if leaves_out else name)
-            return ""
-
-        self._put(visitor, choose)
+        journal = self._capture.journal
+        if not leaves_out:
+            journal.leave_out({*journal.left_out} - {name})
+        self._with_pictures(lambda: None, [name] * leaves_out, "" if leaves_out else name)
 
     def _with_pictures(
         self, write: Callable[[], None], left_out: Iterable[str], due: str = ""
@@ -402,45 +373,38 @@ class Station:
         if (waiting, left_out) != (self.snapshot.waiting, self.snapshot.left_out):
             self._publish(due="".join(waiting[:1]), waiting=waiting, left_out=left_out)
 
-    def skip(self, visitor: Visitor) -> None:
+    @_request
+    def skip(self, _: Visitor) -> None:
         """Suggests another pose."""
-
-        def skip() -> str:
-            pose = self.snapshot.next_pose
-            if pose is not None and pose.cam_from_target is not None:
-                self._rejected.append(pose.cam_from_target)
-            self._advise()
-            return ""
-
-        self._put(visitor, skip)
+        pose = self.snapshot.next_pose
+        if pose is not None and pose.cam_from_target is not None:
+            self._rejected.append(pose.cam_from_target)
+        self._advise()
 
     def finish(self, visitor: Visitor) -> None:
         """Judges the views, also after the devices are closed."""
         if visitor.seen.views:
             self._requests.put(lambda: self._ask(is_trial=False))
 
-    def end(self, visitor: Visitor) -> None:
+    @_request
+    def end(self, _: Visitor) -> None:
         """Closes the devices, and asks for another setup."""
-
-        def end() -> str:
-            self._open.close()
-            self.snapshot = Snapshot(setup=self.snapshot.setup, revision=len(self._authors))
-            return ""
-
-        self._put(visitor, end)
+        self._open.close()
+        self.snapshot = Snapshot(setup=self.snapshot.setup, revision=len(self._authors))
 
     def picture(self, number: int) -> bytes | None:
         """The picture of a view with its corners, a JPEG; None where there is none."""
-        journal = self._capture.journal
-        views = [view for view in journal.views if view.number == number]
+        if all(row.number != number for row in self.snapshot.views):
+            return None
+        coach, journal = self._capture.coach, self._capture.journal
         try:
-            image = decode_image(journal.image(views[0])) if views else ""
-        except DataError:
+            view = next(view for view in journal.views if view.number == number)
+            image = decode_image(journal.image(view))
+        except (DataError, StopIteration):
             # It was removed at this moment.
             return None
         if isinstance(image, str):
             return None
-        coach = self._capture.coach
         return live_picture(image, coach.target, coach.corners.get(number), coach.lens, None)
 
     def close(self) -> None:
@@ -448,19 +412,6 @@ class Station:
         self._requests.put(None)
         self._thread.join(10.0)
         self._judge.shutdown(cancel_futures=True)
-
-    def _put(self, visitor: Visitor, request: Callable[[], str]) -> None:
-        """Requests something, of which the answer says why it is refused."""
-        seen = visitor.seen.revision
-
-        def guarded() -> None:
-            visitor.refusal = "The recording is closed: press Start to go on."
-            if self.snapshot.phase == "live":
-                is_strange = any(author is not visitor for author in self._authors[seen:])
-                visitor.refusal = _CHANGED if is_strange else request()
-            visitor.answers += 1
-
-        self._requests.put(guarded)
 
     def _publish(self, **changes: object) -> None:
         self.snapshot = replace(self.snapshot, **changes)  # type: ignore[arg-type]
@@ -510,7 +461,7 @@ class Station:
         self._publish(
             phase="live",
             arm=arm.name,
-            takes_typed=isinstance(arm, TypedPoses),
+            takes_typed=isinstance(arm, ManualArm),
             is_stored=cell.is_stored,
             pose_form=setup.pose_form or ("ros" if form is None else form.name),
             note=getattr(arm, "invitation", ""),
@@ -535,6 +486,8 @@ class Station:
             self._publish(is_still=moved_px <= task.options.still.image_px)
         else:
             self._watch_folder()
+        if self.snapshot.takes_typed:
+            return
         if isinstance(cell.arm, RequestingArm):
             try:
                 take_requested(self._capture, cell.arm, task.count, 0.01)

@@ -121,7 +121,7 @@ class ViewTable:
             ui.label("to be taken again" if again else row.state)
         pose = ui.label(row.pose).classes("grow font-mono text-sm min-w-0").props("role=cell")
         pose.style("overflow-wrap: anywhere")
-        residual = ui.label(row.residual).classes("w-24 shrink-0 text-right").props("role=cell")
+        residual = ui.label(row.residual).classes("w-32 shrink-0 text-right").props("role=cell")
         residual.classes("text-red-700" if row.is_odd else "")
         change = ui.button("Change", on_click=lambda: self._open(row)).props("flat dense")
         change.props["aria-label"] = f"change view {row.number}"
