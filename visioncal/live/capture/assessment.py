@@ -76,13 +76,6 @@ class Coach:
         self.corners.pop(view, None)
         self._poses.pop(view, None)
 
-    def through(self, camera: Camera) -> "Coach":
-        """The same views, through a lens that has become known."""
-        coach = Coach(self.target, self.resolution, camera)
-        for corners in self.corners.values():
-            coach.add(corners)
-        return coach
-
     @property
     def _tilts(self) -> FloatArray:
         """Angles between the optical axis and the board's normal [deg]."""

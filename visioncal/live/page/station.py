@@ -574,8 +574,7 @@ class Station:
         if outcome is None or outcome.views == views:
             return ""
         added = len(views) - len(outcome.views)
-        is_longer = added > 0 and outcome.views == views[: len(outcome.views)]
-        return f"{counted(added, 'view')} added since" if is_longer else "the table changed since"
+        return f"{counted(added, 'view')} added since" if added > 0 else "the table changed since"
 
     def _after_change(self) -> None:
         count = len(self._capture.journal.views)
@@ -613,8 +612,9 @@ class Station:
             coach, fitted = self._capture.coach, outcome.document.get("camera")
             if fitted and coach.camera is None:
                 numbers = (np.array(fitted[name]) for name in ("matrix", "distortion"))
-                lens = Camera(fitted["model"], coach.resolution, *numbers)
-                self._capture.coach = coach.through(lens)
+                coach.camera = Camera(fitted["model"], coach.resolution, *numbers)
+                for corners in [*coach.corners.values()]:
+                    coach.add(corners)
             self._advise()
         self._publish(views=self._rows(), outdated=self._outdated())
 
