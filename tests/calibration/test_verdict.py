@@ -437,7 +437,8 @@ def test_each_doubt_has_its_sentence(changes, status, words):
     assert verdict.status == status
     if words:
         assert words in verdict.reasons[0]
-        assert len(verdict.reasons) == (1 if len(changes) < 3 else 3 - ("worst" in changes) * 2)
+        count = 1 if len(changes) < 3 else 3 - ("worst" in changes) * 2
+        assert len(verdict.reasons) == count + (not verdict.has_accuracy)
 
 
 @pytest.mark.parametrize(
@@ -640,7 +641,7 @@ def test_what_happens_now_and_then_or_from_image_to_image_happens_at_picks() -> 
 @pytest.mark.parametrize(
     ("changes", "good_from_mm"),
     [
-        ({"held_out": Rms(30.0, 5.0), "rms": Rms(29.0, 4.8)}, 0.0),
+        ({"held_out": Rms(3.0, 0.5), "rms": Rms(2.9, 0.45)}, 0.0),
         ({"worst": directions(4e-3, 0, 0, 0)}, 0.0),
         ({"stops": 8}, 0.0),
         ({"noise_mm": 1.0}, 10.0),
@@ -660,6 +661,51 @@ def test_limits_give_way_to_the_need_and_what_is_unexplained_does_not(changes, g
     assert f"good for tasks of {good_from_mm:g}" in plain.reasons[-1] or not good_from_mm
     assert judge(replace(found, need=Need(plain.good_for_mm))).status == "good"
     assert judge(replace(found, need=Need(0.9 * plain.good_for_mm))).status == "check"
+
+
+@pytest.mark.parametrize("need", [None, NEED])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"held_out": Rms(80.0, 5.0), "rms": Rms(75.0, 4.8)},
+        {"held_out": Rms(80.0, 5.0), "rms": Rms(75.0, 4.8), "warnings": (EXCHANGED,)},
+        {"pixel_px": 4.0, "stops": 8},
+    ],
+)
+def test_nothing_is_said_of_an_accuracy_where_no_fit_explains_the_views(changes, need) -> None:
+    parts = {name: of_size(60.0).parts["calibration"] for name in ("calibration", "look", "pick")}
+    picks = (replace(of_size(0.1), parts=parts),)
+    verdict = judge(replace(changed(SOUND, **changes), picks=picks, need=need))
+    assert (verdict.status, verdict.has_accuracy) == ("bad", False)
+    assert verdict.good_for_mm is verdict.good_for_mm_uncorrected is None
+    # Neither what tasks it would be good for, nor what picks err by, nor another robot.
+    said = " ".join(verdict.reasons)
+    for words in ("good for tasks", "Picks err", "A pick", "repeats better", "95 %"):
+        assert words not in said
+    assert verdict.causes
+    assert verdict.next_steps
+    assert sum("How accurate it is cannot be said" in words for words in verdict.top) == 1
+    met = None if need is None else need_met(need, picks)
+    assert not [*need_facts(met, verdict)]
+    # A task that needs ten times as much takes it for noise, but not that everything is turned.
+    for need_mm, deg, status in ((299.0, 0.1, "check"), (301.0, 0.1, "good"), (1e3, 5.0, "check")):
+        scattered = changed(SOUND, held_out=Rms(30.0, deg), rms=Rms(29.0, deg))
+        crude = replace(scattered, picks=(of_size(30.0),), need=Need(need_mm))
+        assert judge(crude).status == status
+    # It is known where too little motion alone makes a result bad.
+    weak = judge(replace(SOUND, picks=(of_size(4.0),), worst=directions(4e-3)))
+    assert (weak.status, weak.has_accuracy) == ("bad", True)
+    assert "It would be good for tasks of" in " ".join(weak.reasons)
+
+
+def test_noise_beyond_any_such_arm_is_not_said_to_be_the_robots() -> None:
+    large = np.diag(np.repeat([1e-6, 3e-3], 3) ** 2)[None]
+    picks = (Picks("cam", "robot", dict.fromkeys(("look", "pick"), large), np.inf, 0.5),)
+    for need in (None, NEED):
+        verdict = judge(replace(changed(SOUND, noise_mm=3.0), picks=picks, need=need))
+        assert verdict.status == ("check" if need is None else "bad")
+        assert ids(verdict) == ["unexplained"]
+        assert "repeats better" not in " ".join(verdict.reasons)
 
 
 @pytest.mark.parametrize("sigma_mm", [0.1, 0.102])

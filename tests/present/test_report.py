@@ -1,5 +1,6 @@
 """Reports and certificates: complete, self-contained, safe against what sessions may be called."""
 
+import json
 import re
 import shutil
 from collections import Counter
@@ -13,6 +14,7 @@ import pytest
 from support import browser
 from support import whole_cells as two_arms
 from support.arm_documents import calibrated
+from support.cells import pairs_session
 from support.commands import visioncal
 from support.findings import with_contradiction, with_findings
 from support.pages import Page, section
@@ -22,10 +24,12 @@ from visioncal.calibration.run import Run, run
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.advice import suspects
-from visioncal.present.recording.notes import view_markdown
+from visioncal.present.recording.notes import verdict_markdown, view_markdown
 from visioncal.present.report.cell_picture import cell_picture
 from visioncal.present.report.page import render, write_certificate, write_report
 from visioncal.present.report.thumbnails import thumbnail
+from visioncal.results import Calibration
+from visioncal.results.history import entries_of
 from visioncal.results.views import worst_view
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, cell_session, simulate, write_session
@@ -196,3 +200,37 @@ def test_the_command_writes_a_certificate_of_a_recording(outputs, tmp_path):
     assert "serial number, robot 7" in Page(page.read_text("utf-8")).words
     assert visioncal("show", outputs, "--operator", "me").status == 2
     assert visioncal("show", outputs, "--certificate", "--serial", "7").status == 2
+
+
+def test_nothing_that_leaves_states_an_accuracy_where_no_fit_explains_the_views(tmp_path):
+    """Console, report, certificate, card, JSON, notes and exports of a bad result."""
+    cell, rng = simulate(CellOptions(views=12)), np.random.default_rng(1)
+    seen = cell.cam_from_target.copy()
+    # Thirty millimetres per axis: no arm repeats so, whatever else is wrong.
+    seen[:, :3, 3] += 0.03 * rng.standard_normal((12, 3))
+    pairs_session("eye-in-hand", cell.robot.base_from_flange, seen).save(tmp_path / "session")
+    out, page = tmp_path / "out", tmp_path / "certificate.html"
+    done = visioncal("calibrate", tmp_path / "session", "-o", out)
+    assert done.status == 3
+    certified = visioncal("show", out, "--certificate", "-o", page)
+    assert certified.status == 0
+    calibration = Calibration.load(out)
+    exported = visioncal("export", out, "--to", "text", "--force").good().out
+    pages = [(file.read_text()) for file in (out / "report.html", page)]
+    said = {
+        "console": done.out, "report": pages[0], "certificate": pages[1], "card": repr(calibration),
+        "notebook": calibration._repr_html_(), "notes": verdict_markdown(calibration),
+        "export": exported, "reasons": " ".join(calibration.verdict.reasons),
+    }  # fmt: skip
+    stated = re.compile(
+        r"good for|repeats better|Picks err|sigma [\d.]+ mm|± ?\d|&plusmn; ?\d|95 % of"
+    )
+    for where, text in said.items():
+        assert not stated.search(text), where
+    for where in ("console", "card", "notes", "certificate", "export"):
+        assert "its accuracy is unknown" in said[where], where
+    document = json.loads((out / "calibration.json").read_text())
+    assert "good_for_mm" not in document["verdict"]
+    assert {"unexplained", "no_accuracy"} <= {it["kind"] for it in document["verdict"]["findings"]}
+    (entry,) = entries_of(calibration)
+    assert entry.figures.keys().isdisjoint({"sigma_mm", "sigma_deg", "radius95_mm"})

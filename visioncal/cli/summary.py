@@ -51,7 +51,8 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     if cell is not None:
         answer(f"the cell's frame is that of {cell.reference}")
     for name, edge in calibration.edges.items():
-        answer(f"{name}: {edge.place_words()}, {edge.sigma_words}")
+        sigma = calibration.verdict.accuracy(edge.sigma_words)
+        answer(f"{name}: {edge.place_words()}, {sigma}")
         answer(f"  {calibration.rotation_words(name, edge)}")
     if cell is not None:
         _print_noise(cell)
@@ -67,7 +68,7 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         )
     for suspects in left_out(_not_in_verdict(calibration.verdict, calibration.views)):
         answer(f"  {suspects.words}")
-    if cell is not None:
+    if cell is not None and calibration.verdict.has_accuracy:
         answer(cell.weakest)
     solvers = solver_table(calibration)
     if verbose and solvers is not None:

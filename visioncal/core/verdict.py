@@ -27,8 +27,8 @@ _HEADLINES = {
     "check": "Check before use",
     "bad": "Bad: do not use",
 }
-# Kinds of what is no doubt: praise, and remarks.
-AGREEMENT, NOTE = "agreement", "note"
+# Kinds of what is no doubt: praise, remarks, and that a bad result's accuracy is unknown.
+AGREEMENT, NOTE, NO_ACCURACY = "agreement", "note", "no_accuracy"
 # Commands of remedies.
 CALIBRATE, ADD_VIEWS = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add"
 PLAN = f"{ADD_VIEWS} 5"
@@ -169,6 +169,15 @@ class Verdict:
     def headline(self) -> str:
         """The verdict in a few words."""
         return _HEADLINES[self.status]
+
+    @property
+    def has_accuracy(self) -> bool:
+        """Whether sigmas say how accurate it is: not where no fit explains the views."""
+        return all(finding.kind != NO_ACCURACY for finding in self.findings)
+
+    def accuracy(self, words: str) -> str:
+        """Words on the accuracy, or that it is unknown."""
+        return words if self.has_accuracy else "its accuracy is unknown"
 
     @property
     def reasons(self) -> tuple[str, ...]:

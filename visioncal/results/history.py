@@ -121,8 +121,10 @@ def entries_of(calibration: Calibration) -> Iterator[Entry]:
     """The entries of a result: itself, the frames that joined it, and its touch test."""
     # Of a cell without a camera, the first transform.
     names = sorted(calibration.edges, key=lambda name: "_from_cam" not in name)
-    edge = calibration.edges[names[0]] if names else None
-    camera, budget, noise = calibration.camera, calibration.budget, calibration.noise
+    is_known = calibration.verdict.has_accuracy
+    edge = calibration.edges[names[0]] if names and is_known else None
+    camera, noise = calibration.camera, calibration.noise
+    budget = calibration.budget if is_known else None
     figures = {
         "views": len(calibration.views),
         "used": sum(view.used for view in calibration.views),

@@ -251,7 +251,8 @@ class Calibration(CalibrationSections):
             "views used": f"{used} of {len(self.views)}",
             "views not used in the fit agree to": f"{figure(left_out.mm)} mm{turned}",
             **{
-                name: f"{edge.place_words()}, {self.rotation_words(name, edge)}, {edge.sigma_words}"
+                name: f"{edge.place_words()}, {self.rotation_words(name, edge)}, "
+                f"{self.verdict.accuracy(edge.sigma_words)}"
                 for name, edge in [*self.placed.items()][:8]
             },
         }

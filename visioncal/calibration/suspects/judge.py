@@ -13,11 +13,13 @@ from visioncal.calibration.suspects.limits import (
 )
 from visioncal.calibration.suspects.ranking import correcting, is_negligible, rank_causes
 from visioncal.calibration.suspects.registry import SUSPECTS
+from visioncal.calibration.suspects.suspect import UNEXPLAINED
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent, rounded_up
 from visioncal.core.verdict import (
     AGREEMENT,
     LEAST_LIKELY,
+    NO_ACCURACY,
     NOTE,
     SURE,
     Finding,
@@ -27,6 +29,9 @@ from visioncal.core.verdict import (
 )
 from visioncal.results import NeedMet
 from visioncal.results.conditions import uncorrected_words
+
+# Kinds of doubts that what was seen is not as modelled, however it moves.
+_MISFITS = (UNEXPLAINED, "corner_noise")
 
 
 def judge(findings: Findings) -> Verdict:
@@ -44,23 +49,20 @@ def judge(findings: Findings) -> Verdict:
     small = [warning for warning in warnings if is_negligible(warning, picks)]
     notes = remarks((*findings.notes, *(finding.words for finding in small)), NOTE)
     findings = replace(findings, warnings=[found for found in warnings if found not in small])
-    doubts = collect_findings(findings)
-    worst = least_precise(picks) if picks else None
-    good_for_mm, uncorrected_mm = _good_for_mm(worst, doubts), None
-    is_calibrated = any(pick.uncorrected is not None for pick in picks)
-    if is_calibrated:
-        uncorrected = least_precise([pick.uncorrected or pick for pick in picks])
-        uncorrected_mm = _good_for_mm(uncorrected, doubts)
+    found = collect_findings(findings)
     met = need_met(findings.need, findings.judged_picks)
-    enough, least = NeedLimits.probability
-    is_met = met is not None and met.probability >= enough
-    if met is not None and is_met:
-        doubts = [doubt for doubt in doubts if doubt.until_mm > (met.need.mm or 0.0)]
-    status: VerdictStatus = "check" if doubts else "good"
-    if met is not None and not is_met:
-        status = "check" if met.probability >= least else "bad"
-    elif met is None and any(doubt.is_fatal for doubt in doubts):
-        status = "bad"
+    is_met = met is not None and met.probability >= NeedLimits.probability[0]
+    enough_mm = (met.need.mm or 0.0) if met is not None and is_met else -1.0
+    doubts = [doubt for doubt in found if doubt.until_mm > enough_mm]
+    status = _status_of(doubts, met)
+    is_calibrated = any(pick.uncorrected is not None for pick in picks)
+    # Sigmas are those of a model, and say nothing where it does not explain what was seen.
+    is_misfit = any(doubt.is_fatal and doubt.kind in _MISFITS for doubt in doubts)
+    if is_unknown := is_misfit and status == "bad":
+        findings, picks = replace(findings, picks=()), ()
+    own = [pick.uncorrected or pick for pick in picks] if is_calibrated else []
+    worst, uncorrected = (least_precise(some) if some else None for some in (picks, own))
+    good_for_mm, uncorrected_mm = (_good_for_mm(pick, found) for pick in (worst, uncorrected))
     stated: list[Finding] = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
     if status != "good":
         stated = [
@@ -72,7 +74,10 @@ def judge(findings: Findings) -> Verdict:
                 left_out_mm=findings.held_out.mm,
             )
         ]
-    if met is not None:
+    if is_unknown:
+        words = "How accurate it is cannot be said: no fit explains what was seen."
+        stated.append(Finding(NO_ACCURACY, words))
+    elif met is not None:
         stated.insert(len(stated) * is_met, Finding("need", _need_words(findings, met)))
     elif worst is not None and good_for_mm is not None:
         stated.append(_good_for(worst, good_for_mm, status))
@@ -85,6 +90,16 @@ def judge(findings: Findings) -> Verdict:
         step = None if findings.corrects_targets else correcting(findings.need)
         stated.append(Finding("calibrated_arm", uncorrected_words(verdict), step))
     return replace(verdict, findings=in_reading_order(stated, status))
+
+
+def _status_of(doubts: Sequence[Finding], met: NeedMet | None) -> VerdictStatus:
+    """The judgement by doubts, and by a need."""
+    enough, least = NeedLimits.probability
+    if met is not None and met.probability < enough:
+        return "check" if met.probability >= least else "bad"
+    if met is None and any(doubt.is_fatal for doubt in doubts):
+        return "bad"
+    return "check" if doubts else "good"
 
 
 def in_reading_order(findings: Sequence[Finding], status: VerdictStatus) -> tuple[Finding, ...]:

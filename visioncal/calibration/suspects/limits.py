@@ -48,7 +48,7 @@ def collect_findings(judged: Findings) -> list[Finding]:
 
 def _scatter(judged: Findings) -> Iterator[Finding]:
     """Findings on left-out views that disagree with the others, or with views in the fit."""
-    words, views, is_fatal = [], list[ViewResult](), False
+    words, views, is_fatal, until_mm = [], list[ViewResult](), False, 0.0
     # A servo arm's own noise puts what is seen so far away.
     by_arm = np.max([(0.0, 0.0), *(arm.repeatability for arm in judged.arms)], axis=0)
     by_arm *= _LIMITS.repeatability * np.sqrt(3.0)
@@ -64,6 +64,9 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
             if value > max(least, _LIMITS.of_noise * noise):
                 beyond.append(f"{figure(value)} {unit} (doubt begins at {figure(least)})")
                 is_fatal |= value > bad
+                # A turn that nothing explains is no noise of any size.
+                enough = _LIMITS.good_enough * value if unit == "mm" else np.inf
+                until_mm = max(until_mm, enough if value > bad else 0.0)
         if beyond:
             views += [view for view in pair.views if view.used and view.residual_mm is not None]
             words.append(" and ".join(beyond) + (f" ({pair.name})" if pair.name else ""))
@@ -82,7 +85,7 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
             ),
             tuple(view.view for view in worst),
             is_fatal=is_fatal,
-            until_mm=0.0,
+            until_mm=until_mm,
         )
 
 

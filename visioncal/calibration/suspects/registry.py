@@ -27,7 +27,7 @@ from visioncal.calibration.suspects.suspect import (
     UNEXPLAINED,
     Suspect,
 )
-from visioncal.core.verdict import AGREEMENT, NOTE, Finding, Remedy, without
+from visioncal.core.verdict import AGREEMENT, NO_ACCURACY, NOTE, Finding, Remedy, without
 from visioncal.results.views import left_out_rms
 
 
@@ -105,7 +105,8 @@ _ENTRIES: tuple[Suspect, ...] = (
     # The remainder of a clock's jump looks like motion.
     Suspect("clock_changed", None, 1e-4, True, ("moved_slowly", *STEPS, ARM_ERRORS)),
     # The size of errors.
-    Suspect(UNEXPLAINED, None, REMARK, True, size=3, order=1),
+    # It stands for noise that no such robot has.
+    Suspect(UNEXPLAINED, None, REMARK, True, inflates=SOURCES[2:4], size=3, order=1),
     Suspect("too_few_stops", chance=FACT),
     Suspect("few_stops"),
     Suspect("weak_motion", size=5, is_sigma=True),
@@ -114,6 +115,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     *map(Suspect, SOURCES),
     Suspect("need", is_doubt=False, size=1),
     Suspect("good_for", is_doubt=False, size=2),
+    Suspect(NO_ACCURACY, is_doubt=False, size=4),
     *(Suspect(kind, is_doubt=False) for kind in (AGREEMENT, NOTE, "calibrated_arm")),
 )
 SUSPECTS: Mapping[str, Suspect] = {suspect.kind: suspect for suspect in _ENTRIES}

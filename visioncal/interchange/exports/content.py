@@ -278,7 +278,7 @@ class Content(Placement):
         is_of_lens = self.lens is not None and (any(map(is_camera, self.frames)) or self.optical)
         return [
             self.origin,
-            f"verdict {self.verdict.status}; {sigma}",
+            f"verdict {self.verdict.status}; {self.verdict.accuracy(sigma)}",
             f"{self.name}, the pose of {self.child} in {self.parent}: p_parent = R p_child + t",
             *([self.optical] if self.optical else []),
             *([_OF_LENS] if is_of_lens else []),

@@ -110,12 +110,12 @@ def verdict_markdown(calibration: Calibration) -> str:
         if frame.verdict.status != "good"
     ]
     places = [
-        f"{name}: {edge.place_words()}, {edge.sigma_words}; {turned(name, edge)}"
+        f"{name}: {edge.place_words()}, {judged.accuracy(edge.sigma_words)}; {turned(name, edge)}"
         for name, edge in calibration.placed.items()
     ]
     used = sum(view.used for view in calibration.views)
-    words = [] if cell is None else [cell.weakest]
-    words += said("summary", calibration, budget) if budget else []
+    words = [] if cell is None or not judged.has_accuracy else [cell.weakest]
+    words += said("summary", calibration, budget) if budget and judged.has_accuracy else []
     words.append(f"{used} of {len(calibration.views)} views used.")
     parts = [
         [f"# {judged.headline}", *_bullets([*judged.top, *frames])],

@@ -32,15 +32,20 @@ _MOUNTS = {
 
 
 def edge_facts(calibration: Calibration, name: str, edge: Edge) -> list[Fact]:
-    """Components of a transform with standard deviations and units."""
+    """Components of a transform with standard deviations, where these are known, and units."""
     controller = calibration.controller(*name.split("_from_"))
+    has_accuracy = calibration.verdict.has_accuracy
     # The perturbation is in the child's frame; the components are along the parent's axes.
     parent_from_child = edge.matrix[:3, :3]
     covariance_m2 = parent_from_child @ edge.covariance[3:, 3:] @ parent_from_child.T
     sigmas_mm = 1e3 * np.sqrt(np.clip(np.diag(covariance_m2), 0.0, None))
     translation_mm = 1e3 * edge.transform.translation
     rows = [
-        Fact(axis, matched(value, sigma), f"{PLUS_MINUS} {significant(sigma)} mm")
+        Fact(
+            axis,
+            matched(value, sigma),
+            f"{PLUS_MINUS} {significant(sigma)} mm" if has_accuracy else "mm",
+        )
         for axis, value, sigma in zip("xyz", translation_mm, sigmas_mm, strict=True)
     ]
     if edge.oriented:
@@ -56,7 +61,8 @@ def edge_facts(calibration: Calibration, name: str, edge: Edge) -> list[Fact]:
         parent = frame_words(name.partition("_from_")[0])
         rows.append(Fact("rotation", "not measured", f"taken as that of {parent}"))
     rotation_sigma = f", {significant(edge.sigma_deg)} deg" if edge.oriented else ""
-    return [*rows, Fact("sigma", f"{significant(edge.sigma_mm)} mm{rotation_sigma}")]
+    sigma = Fact("sigma", f"{significant(edge.sigma_mm)} mm{rotation_sigma}")
+    return [*rows, sigma if has_accuracy else Fact("sigma", "unknown")]
 
 
 def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
@@ -86,6 +92,8 @@ def stops_m(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Float
 def need_facts(need: NeedMet | None, verdict: Verdict) -> Iterator[Fact]:
     """Probability that the task's need is met, or else the tolerance that the result suits."""
     good, sent = "", ""
+    if not verdict.has_accuracy:
+        return
     if verdict.good_for_mm is not None:
         good, sent = f"{significant(rounded_up(verdict.good_for_mm))} mm", "and more"
         if verdict.good_for_mm_uncorrected is not None:
