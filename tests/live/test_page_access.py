@@ -2,9 +2,11 @@
 
 import ast
 import json
+import re
 import shutil
-import urllib.error
+import socket
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +14,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.browser import CHROMIUM
 from support.commands import visioncal as command
-from support.page import opened, served
+from support.page import PATIENT_MS, opened, served
 
 from visioncal import Session
 
 pytest.importorskip("nicegui")
-pytest.importorskip("playwright.sync_api")
+sync_api = pytest.importorskip("playwright.sync_api")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser")
 PAGE = Path(__file__).parents[2] / "visioncal" / "live" / "page"
 TARGETS = PAGE.parents[2] / "targets"
@@ -107,8 +109,11 @@ def test_no_name_of_a_recording_runs_in_the_browser(cell, tmp_path, browser):
             angles = Rotation.from_matrix(matrix[:3, :3]).as_euler("ZYX", degrees=True)
             numbers = zip("XYZABC", [*(1e3 * matrix[:3, 3]), *angles], strict=True)
             field.fill(" ".join(f"{name} {value:.5f}" for name, value in numbers))
+            page.get_by_text("Read as KUKA").wait_for()
             field.press("Enter")
             page.get_by_role("row", name=f"view {place}", exact=True).wait_for()
+            # Its field is cleared for the next pose.
+            sync_api.expect(field).to_have_value("", timeout=PATIENT_MS)
         page.get_by_role("button", name="Calibrate").click()
         page.get_by_text(f"{HOSTILE[6]}-result").wait_for()
         with page.expect_popup() as report:
@@ -166,11 +171,208 @@ def test_the_search_for_such_code_can_fail(code):
     assert len([*faults_in(code)]) == 1
 
 
-def test_other_sites_are_refused(cell):
-    with served("record", "-o", cell / "alone") as (url, _):
-        for headers in ({"Origin": "http://elsewhere.example"}, {"Host": "elsewhere.example"}):
-            asked = urllib.request.Request(f"{url}/live.jpg", headers=headers)
-            with pytest.raises(urllib.error.HTTPError, match="403"):
-                urllib.request.urlopen(asked)
-        own = urllib.request.Request(f"{url}/live.jpg", headers={"Origin": url})
-        assert urllib.request.urlopen(own).status == 200
+def answered(url: str, request: bytes) -> int:
+    """The status of the answer to what is sent as it is; 0 for none."""
+    host, _, port = url.split("/")[2].rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=10.0) as link:
+        link.sendall(request)
+        answer = link.recv(15)
+    return int(answer.split()[1]) if answer else 0
+
+
+def request_of(url: str, path: str = "/live.jpg", **headers: str) -> bytes:
+    lines = {
+        "Host": url.split("/")[2],
+        **{name.replace("_", "-"): headers[name] for name in headers},
+    }
+    head = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    return f"GET {path} HTTP/1.1\r\n{head}\r\n".encode()
+
+
+SHAKE = {
+    "Upgrade": "websocket",
+    "Connection": "Upgrade",
+    "Sec_WebSocket_Version": "13",
+    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}
+SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory):
+    """The page for this machine alone."""
+    with served("record", "-o", tmp_path_factory.mktemp("local") / "cell") as (url, process):
+        yield url, process
+
+
+@pytest.mark.parametrize(
+    ("status", "headers"),
+    [
+        (200, {}),
+        (200, {"Host": "LOCALHOST.:1", "Origin": "http://LOCALHOST.:1"}),
+        (200, {"Host": "[::1]"}),
+        (200, {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}),
+        (403, {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors"}),
+        (403, {"Origin": "http://elsewhere.example"}),
+        (403, {"Origin": "null"}),
+        (403, {"Origin": "http://["}),
+        (403, {"Host": "elsewhere.example"}),
+        (403, {"Host": "192.0.2.7"}),
+        (403, {"Host": "localhost.elsewhere.example"}),
+        (400, {"Host": "["}),
+        (400, {"Host": "localhost@elsewhere.example"}),
+        (400, {"Host": "localhost/elsewhere"}),
+        (400, {"Host": "localhost:99999999"}),
+        (400, {"Host": ""}),
+        (403, {**SHAKE, "Origin": "http://elsewhere.example"}),
+        (403, {**SHAKE}),
+    ],
+    ids=str,
+)
+def test_other_sites_are_refused(status, headers, local):
+    url = local[0]
+    assert (
+        answered(url, request_of(url, SOCKET if "Upgrade" in headers else "/live.jpg", **headers))
+        == status
+    )
+
+
+def test_no_header_ends_in_a_traceback(local):
+    url, process = local
+    hostile = ("[", "http://[", "\xff\x80", "%00%ff", '=;=;"', "a" * 9000, "-1", "99e99", "\t", "")
+    names = (
+        *("Host", "Origin", "Cookie", "Accept", "Accept-Encoding", "Accept-Language", "Range"),
+        *("If-None-Match", "If-Modified-Since", "If-Range", "X-Forwarded-For", "X-Forwarded-Host"),
+        *("X-Forwarded-Proto", "X-Forwarded-Prefix", "Content-Length", "Content-Type", "Expect"),
+        *("Transfer-Encoding", "Connection", "Upgrade", "Sec-WebSocket-Version", "Referer"),
+        *("Sec-WebSocket-Key", "Sec-WebSocket-Extensions", "Sec-WebSocket-Protocol", "Via"),
+        *("Sec-Fetch-Site", "Sec-Fetch-Mode", "Sec-Purpose", "NiceGUI-Check", "User-Agent"),
+    )
+    with urllib.request.urlopen(url) as answer:
+        page = answer.read().decode()
+    script = re.search(r'src="(/_nicegui/[^"]+)"', page)[1]
+    for name in names:
+        for value in hostile:
+            for path, more in (("/", {}), (script, {}), (SOCKET, {**SHAKE, "Origin": url})):
+                headers = {**more, name.replace("-", "_"): value}
+                request = request_of(url, path, **headers).decode().encode("latin-1")
+                assert answered(url, request) in (0, *range(100, 500)), headers
+    for line in (
+        "GET",
+        "GET / HTTP/9",
+        "\0\0",
+        "GET /\xff\0 HTTP/1.1",
+        "GET http://[ HTTP/1.1",
+        "GET //[ HTTP/1.1",
+    ):
+        assert answered(url, f"{line}\r\n\r\n".encode("latin-1")) < 500
+    twice = request_of(url).replace(b"\r\n\r\n", b"\r\nHost: elsewhere.example\r\n\r\n")
+    assert answered(url, twice) == 400
+    assert "Traceback" not in process.said()
+    assert answered(url, request_of(url)) == 200
+
+
+def test_silent_connections_take_no_place_for_long(local):
+    url, process = local
+    host, _, port = url.split("/")[2].rpartition(":")
+    silent = [socket.create_connection((host, int(port)), timeout=60.0) for _ in range(220)]
+    # Half a request, and no end of it.
+    silent[0].sendall(b"GET / HTTP/1.1\r\nHost: ")
+    # One too many is closed at once, and the others after a while.
+    for link in (silent[-1], silent[1], silent[0]):
+        with suppress(ConnectionResetError):
+            assert link.recv(1) == b""
+    for link in silent:
+        link.close()
+    assert answered(url, request_of(url)) == 200
+    assert "Traceback" not in process.said()
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    """The page for a network, in a site's folder: its address, its process, and the folder."""
+    site = tmp_path_factory.mktemp("network") / "site"
+    (site / "inside").mkdir(parents=True)
+    (site.parent / "outside").mkdir()
+    (site / "led").symlink_to(site.parent / "outside")
+    with served("record", "-o", site / "cell", host="0.0.0.0", folder=site) as (url, process):
+        yield url, process, site
+
+
+def invitation(process) -> str:
+    """The address for the next browser."""
+    return re.findall(r"http://\S+", process.said())[-1]
+
+
+def test_a_browser_of_the_network_is_let_in_by_its_token_once(network, browser):
+    url, process, site = network
+    assert f"read what is below {site}" in process.said()
+    base = url.partition("/?")[0]
+    paths = (
+        "/",
+        "/live.jpg",
+        "/report",
+        "/favicon.ico",
+        "/_nicegui/",
+        SOCKET.replace("websocket", "polling"),
+    )
+    for path in (*paths, "/?token=", "/?token=%ff", "/?token=wrong", "/nothing"):
+        assert answered(base, request_of(base, path)) == 403
+    assert answered(base, request_of(base, SOCKET, Origin=base, **SHAKE)) == 403
+    for method in ("HEAD", "POST"):
+        request = request_of(base, url.removeprefix(base)).replace(b"GET", method.encode())
+        assert answered(base, request) == 403
+    with urllib.request.urlopen(invitation(process)) as answer:
+        cookie = answer.headers["Set-Cookie"]
+    assert {"HttpOnly", "SameSite=strict", "Path=/"} <= {*re.split("; ", cookie)}
+    # It was good once, and the terminal has another one.
+    assert answered(base, request_of(base, url.removeprefix(base))) == 403
+    assert invitation(process) != url
+    let_in = {"Cookie": cookie.partition(";")[0]}
+    assert answered(base, request_of(base, **let_in)) == 200
+    assert answered(base, request_of(base, SOCKET, Origin=base, **SHAKE, **let_in)) == 101
+    elsewhere = "http://elsewhere.example"
+    for more in ({"Origin": elsewhere}, {"Host": "elsewhere.example"}, {}):
+        assert answered(base, request_of(base, SOCKET, **SHAKE, **let_in, **more)) == 403
+    assert answered(base, request_of(base, Host="elsewhere.example", **let_in)) == 403
+    assert (
+        answered(base, request_of(base, Host="elsewhere.example", Origin=elsewhere, **let_in))
+        == 403
+    )
+    wrong = {"Cookie": let_in["Cookie"][:-1]}
+    assert answered(base, request_of(base, **wrong)) == 403
+    with opened(browser, invitation(process)) as page:
+        page.get_by_role("button", name="Start").wait_for()
+        page.reload()
+        page.get_by_role("button", name="Start").wait_for()
+
+
+def test_a_browser_of_the_network_names_files_of_the_site_alone(network, browser):
+    _, process, site = network
+    outside = site.parent / "outside"
+    with opened(browser, invitation(process)) as page:
+        alert, start = page.get_by_role("alert"), page.get_by_role("button", name="Start")
+        start.wait_for()
+        for camera in (
+            *(f"folder:{outside}", "folder:../outside", "folder:led", "folder:led/..", "folder:/"),
+            *(
+                "uvc:/dev/video0",
+                "uvc:file:///etc/hosts",
+                "uvc:concat:led/x",
+                "uvc:videotestsrc ! x",
+            ),
+            *("genicam:inside/x.cti", "genicam:x.cti:a/b", f"played:{outside}", "folder:\N{NULL}"),
+        ):
+            choose(page, "Camera", camera)
+            start.click()
+            alert.get_by_text(f"is not below {site}").wait_for()
+            alert.get_by_text(repr(camera)).wait_for()
+        choose(page, "Camera", "folder:inside")
+        for label in (FIELDS[3], FIELDS[4]):
+            choose(page, label, str(outside / "x.toml"))
+            start.click()
+            alert.get_by_text(f"x.toml' is not below {site}").wait_for()
+            choose(page, label, "")
+        choose(page, FIELDS[4], "charuco_9x6_30mm")
+        start.click()
+        alert.get_by_text("has no further picture").wait_for()

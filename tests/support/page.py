@@ -52,8 +52,9 @@ def served(*words: object, host: str = "127.0.0.1", folder: Path | None = None):
                 try:
                     urllib.request.urlopen(f"http://{address}/live.jpg").close()
                     break
-                except urllib.error.HTTPError:
+                except urllib.error.HTTPError as refusal:
                     # It answers, though not everybody.
+                    refusal.close()
                     break
                 except OSError:
                     time.sleep(0.1)

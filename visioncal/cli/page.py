@@ -2,7 +2,7 @@
 
 import socket
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import date
@@ -46,6 +46,8 @@ from visioncal.vision.targets import target_from_document, target_names
 
 # What was chosen last, beside the views.
 _REMEMBERED = "page.json"
+# What a browser of the network may have OpenCV open.
+_STREAMS = ("http://", "https://", "rtsp://", "rtsps://")
 # Labels of the setup's fields, and what may be chosen; anything else may be typed.
 _FIELDS: Mapping[str, tuple[str, Sequence[str]]] = {
     "target": ("Board (a name, or its .toml)", target_names()),
@@ -92,7 +94,7 @@ def record_on_page(options: RecordOptions) -> None:
     fields = {name: _FIELDS[name] for name in words}
     text = PageText(f"Record {options.out.name}", fields, "Calibrate")
     setup = replace(_remembered(options.out), **given)
-    _serve(options.address, prepare, setup, text, begins=is_known)
+    _serve(options.address, prepare, setup, text, given.values(), begins=is_known)
 
 
 def verify_on_page(options: VerifyOptions) -> None:
@@ -150,12 +152,14 @@ def _serve(
     prepare: Callable[[Setup], Task],
     setup: Setup,
     text: PageText,
+    stated: Collection[str] = (),
     *,
     begins: bool = False,
 ) -> None:
     """Serves a page until Ctrl-C."""
     client_library("nicegui", "page")
     # It imports NiceGUI, which an extra brings.
+    from visioncal.live.page.access import Admission, address_of
     from visioncal.live.page.server import serve
 
     host, port = address or ("127.0.0.1", 8321)
@@ -168,12 +172,63 @@ def _serve(
             next_step="Another page may be open there: end it, or name another port, as --address "
             "127.0.0.1:8322; the host is an address of this computer.",
         ) from error
-    say(f"The page is at http://{host}:{port}; Ctrl-C ends. Views are on the disk at any moment.")
+    site, invite, ends = Path.cwd().resolve(), None, "Ctrl-C ends. Views are on the disk at once."
+    if host == "localhost" or getattr(address_of(host), "is_loopback", False):
+        say(f"The page is at http://{host}:{port}; {ends} Whoever uses this machine can open it.")
+    else:
+        prepare, at = partial(_confined, prepare, stated, text, site), f"{_reached(host)}:{port}"
+        say(
+            f"{ends} Whoever opens the page can take and undo views, use this machine's cameras "
+            f"and robots, and read what is below {site}. Nothing is encrypted."
+        )
+
+        def invite(query: str) -> None:
+            say(f"For one browser more, the page is at http://{at}/?{query}")
+
+    admission = Admission(host, port, invite)
     station = Station(prepare, setup, begins=begins)
     try:
-        serve(station, text, host, port, opens=sys.stdin.isatty())
+        serve(station, text, host, port, admission, opens=sys.stdin.isatty())
     finally:
         station.close()
+
+
+def _reached(host: str) -> str:
+    """The host of a page's address: of all addresses, the one by which this machine is reached."""
+    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        # Nothing is sent: this asks for the route to an address of no machine.
+        link.connect(("192.0.2.1", 9))
+        return str(link.getsockname()[0]) if host == "0.0.0.0" else host
+    return socket.gethostname() if host == "0.0.0.0" else host
+
+
+def _confined(
+    prepare: Callable[[Setup], Task], stated: Collection[str], text: PageText, site: Path, to: Setup
+) -> Task:
+    """Makes the task that a browser of the network chose, with files of the site alone.
+
+    What the command states or offers may be elsewhere; all else is read as a path, names, too.
+
+    Raises:
+        DataError: It names others.
+    """
+    for name, (label, choices) in text.fields.items():
+        value = getattr(to, name)
+        kind, _, address = value.partition(":") if name == "camera" else ("", "", value)
+        # OpenCV opens files by many kinds of addresses, and a producer of GenTL is a program.
+        is_right = kind != "uvc" or address.startswith(_STREAMS) or (address or "0").isdecimal()
+        with suppress(OSError, ValueError, RuntimeError):
+            path = Path(address).resolve()
+            is_inside = path.is_relative_to(site) and ".cti" not in address
+            if (is_right and is_inside) or value in (*stated, *choices):
+                continue
+        raise DataError(
+            f"{label}: {value[:80]!r} is not below {site}, to which a page on a network is kept.",
+            culprits=[value[:80]],
+            next_step="Start the command in a folder above it, or name it there with --camera, "
+            "--target or --robot.",
+        )
+    return prepare(to)
 
 
 def _with_devices(recording: RecordOptions, setup: Setup) -> RecordOptions:

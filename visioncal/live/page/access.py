@@ -1,12 +1,19 @@
 """Who may ask the page, and what a browser may run of its answers."""
 
+import re
 import secrets
-from collections.abc import Sequence
-from urllib.parse import urlsplit
+import socket
+from asyncio import TimerHandle, Transport
+from collections.abc import Callable
+from contextlib import suppress
+from ipaddress import IPv4Address, IPv6Address, ip_address
 
-from fastapi import Response
+import h11
+from fastapi.responses import HTMLResponse, Response
 from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 # A report draws with its own styles and pictures, and runs nothing.
 _OF_REPORTS = (
@@ -20,30 +27,139 @@ _OF_PAGES = (
     f"{_OF_REPORTS}; script-src 'self' 'nonce-%s' 'unsafe-eval'; connect-src 'self'; "
     "font-src 'self'"
 )
+# A name, an address, or one of IPv6, and a port.
+_HOST = re.compile(r"([\w.-]+|\[[\da-f:.]+\])(:\d{1,5})?", re.ASCII)
+# How many connections there may be, and how long the head of a request may take [s].
+_MOST_CONNECTIONS, _PATIENCE_S = 200, 10.0
+# A redirect would bring no cookie where the address was followed from another site.
+_WELCOME = '<meta http-equiv="refresh" content="0; url=/">'
+
+
+class Connection(H11Protocol):
+    """A connection that does not stay without requests, nor breaks by one, nor is one of too many.
+
+    The recording needs files, too, of which a process has a thousand.
+    """
+
+    _timer: TimerHandle | None = None
+
+    def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
+        """Begins to wait for a request."""
+        super().connection_made(transport)
+        if len(self.connections) > _MOST_CONNECTIONS:
+            transport.abort()
+        self._wait()
+
+    def data_received(self, data: bytes) -> None:
+        """Reads a request."""
+        try:
+            super().data_received(data)
+        except Exception:  # noqa: BLE001
+            # The parser of websockets lets errors out for texts that it does not expect.
+            self.transport.abort()
+        self._wait()
+
+    def _wait(self) -> None:
+        is_waiting = self.conn.their_state is h11.IDLE
+        if is_waiting and self._timer is None:
+            self._timer = self.loop.call_later(_PATIENCE_S, self.transport.abort)
+        elif self._timer is not None and not is_waiting:
+            self._timer.cancel()
+            self._timer = None
 
 
 class Admission:
-    """Refuses requests of other sites' pages, which a browser on this machine may have open.
+    """Lets the browsers in for which a page is; refuses what other sites' pages ask them to ask.
 
-    A page's own requests name its address as their host, and as their origin where they name one.
+    A request must name one of the page's hosts, and one by a script or for a websocket must come
+    from a page of that host. On a network each browser brings a cookie, too, which it got for a
+    token; and any address in numbers is a host there, since nobody else can point it at this one.
+
+    Args:
+        host: Address at which the page listens.
+        port: Its port.
+        invite: Shows the query of the page's address with the next browser's token to who started
+            the page; None for a page that no other machine reaches.
     """
 
-    def __init__(self, asgi: ASGIApp, hosts: Sequence[str]) -> None:
-        self._asgi, self._hosts = asgi, hosts
+    def __init__(self, host: str, port: int, invite: Callable[[str], None] | None) -> None:
+        name = socket.gethostname()
+        hosts = {host, name, f"{name}.local", "localhost", "127.0.0.1", "[::1]"}
+        # Asking for its domain may take seconds where no server answers.
+        hosts |= {socket.getfqdn()} if invite else set()
+        self._hosts, self._invite = {each.lower() for each in hosts}, invite
+        # Browsers send cookies of a host to all of its ports.
+        self._name, self._cookie = f"visioncal-{port}", secrets.token_urlsafe(32)
+        self.query = self._invited()
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answers a request, or refuses it."""
-        headers = {key.lower(): value.decode("latin-1") for key, value in scope.get("headers", ())}
-        host = headers.get(b"host", "")
-        is_known = not self._hosts or urlsplit(f"//{host}").hostname in self._hosts
-        origin = headers.get(b"origin")
-        is_own = origin is None or urlsplit(origin).netloc == host
-        if scope["type"] == "lifespan" or (is_known and is_own):
-            await self._asgi(scope, receive, _restrained(send))
-        elif scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008})
-        else:
-            await Response("Not from here.", 403)(scope, receive, send)
+    def around(self, asgi: ASGIApp) -> ASGIApp:
+        """An application that answers only those who are let in."""
+
+        async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+            kind, send, is_gone = scope["type"], _restrained(send), False
+            refused = None if kind == "lifespan" else self._refused(HTTPConnection(scope))
+
+            async def heard() -> Message:
+                nonlocal is_gone
+                message = await receive()
+                is_gone |= message["type"] == "http.disconnect"
+                return message
+
+            if refused is None:
+                try:
+                    await asgi(scope, heard, send)
+                except RuntimeError:
+                    # Starlette's, where nobody waits for the answer any more.
+                    if not is_gone:
+                        raise
+            elif kind == "websocket":
+                await send({"type": "websocket.close", "code": 1008})
+            else:
+                await refused(scope, receive, send)
+
+        return answer
+
+    def _invited(self) -> str:
+        """A query with a new token, which is shown."""
+        query = f"token={secrets.token_urlsafe(32)}"
+        if self._invite:
+            self._invite(query)
+        return query
+
+    def _refused(self, asked: HTTPConnection) -> Response | None:
+        """What a request gets that is not for the page; None for one that is."""
+        by, is_socket = asked.headers, asked.scope["type"] == "websocket"
+        host, *others = by.getlist("host") or [""]
+        match = _HOST.fullmatch(host.lower())
+        is_half = not is_socket and "websocket" in by.get("upgrade", "").lower()
+        if match is None or others or is_half:
+            return Response("The request is broken.", 400)
+        is_known = match[1].rstrip(".") in self._hosts or (self._invite and address_of(match[1]))
+        own = f"http://{host}"
+        is_own = by.get("origin", "" if is_socket else own) in (own, f"https://{host}")
+        fetched = by.get("sec-fetch-site"), by.get("sec-fetch-mode") == "navigate"
+        if not is_known or not is_own or fetched == ("cross-site", False):
+            return Response("Not from here.", 403)
+        if not self._invite or _same(asked.cookies.get(self._name, ""), self._cookie):
+            return None
+        query = asked.scope["query_string"].decode("latin-1")
+        if asked.scope.get("method") != "GET" or not _same(query, self.query):
+            return Response("Open the address that the terminal shows; it is good once.", 403)
+        self.query = self._invited()
+        welcome = HTMLResponse(_WELCOME, headers={"Cache-Control": "no-store"})
+        welcome.set_cookie(self._name, self._cookie, httponly=True, samesite="strict")
+        return welcome
+
+
+def address_of(host: str) -> IPv4Address | IPv6Address | None:
+    """The address that a host is in numbers; None for a name."""
+    with suppress(ValueError):
+        return ip_address(host.strip("[]"))
+    return None
+
+
+def _same(text: str, secret: str) -> bool:
+    return secrets.compare_digest(text.encode(), secret.encode())
 
 
 def _restrained(send: Send) -> Send:

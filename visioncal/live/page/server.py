@@ -9,14 +9,16 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from fastapi import Response
+import uvicorn
+from fastapi import FastAPI, Response
 from nicegui import app, ui
+from nicegui.helpers import schedule_browser
 
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.documents.pendants import PendantPose, pendant_words, read_pose
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
-from visioncal.live.page.access import Admission
+from visioncal.live.page.access import Admission, Connection
 from visioncal.live.page.outcome import Outcome
 from visioncal.live.page.station import PageText, Snapshot, Station, Visitor
 from visioncal.live.page.table import VIEWS, ViewTable, read_as
@@ -25,7 +27,9 @@ _COLOURS = {"green": "#2e9e2e", "yellow": "#e0a800", "red": "#c62828", "grey": "
 _PICTURE, _REPORT = "/live.jpg", "/report"
 
 
-def serve(station: Station, text: PageText, host: str, port: int, *, opens: bool) -> None:
+def serve(
+    station: Station, text: PageText, host: str, port: int, admission: Admission, *, opens: bool
+) -> None:
     """Serves the page until Ctrl-C.
 
     Args:
@@ -33,11 +37,9 @@ def serve(station: Station, text: PageText, host: str, port: int, *, opens: bool
         text: What the page asks and says.
         host: Address to listen on.
         port: Its port.
+        admission: Who is let in.
         opens: Whether to open a browser.
     """
-    loopback = ("127.0.0.1", "localhost", "::1")
-    # By another address a page may have any name.
-    app.add_middleware(Admission, hosts=loopback if host in loopback else ())
 
     def live_picture() -> Response:
         headers = {"Cache-Control": "no-store"}
@@ -53,13 +55,24 @@ def serve(station: Station, text: PageText, host: str, port: int, *, opens: bool
         picture = station.picture(number)
         return Response(picture, media_type="image/jpeg") if picture else Response("", 404)
 
-    app.get(_PICTURE)(live_picture)
-    app.get(f"{VIEWS}/{{number}}")(picture_of)
-    app.get(_REPORT)(report)
+    site = FastAPI(openapi_url=None)
+    site.get(_PICTURE)(live_picture)
+    site.get(f"{VIEWS}/{{number}}")(picture_of)
+    site.get(_REPORT)(report)
     ui.page("/", title=text.title)(lambda: _Page(station, text) and None)
     app.on_shutdown(station.close)
-    ui.run(
-        host=host, port=port, title=text.title, reload=False, show=opens, show_welcome_message=False
+    # Nothing is compressed: that would come before the answers' restraints.
+    ui.run_with(site, gzip_middleware_factory=None, show_welcome_message=False)
+    if opens:
+        schedule_browser("http", host, port, f"/?{admission.query}")
+    uvicorn.run(
+        admission.around(site),
+        host=host,
+        port=port,
+        http=Connection,
+        ws="wsproto",
+        log_level="warning",
+        proxy_headers=False,
     )
 
 
