@@ -266,9 +266,12 @@ def test_the_command_installs_what_the_extra_would():
     for extra in declared.keys() - {"dev"}:
         with pytest.raises(DriverError) as caught:
             client_library("no_such_module", extra)
-        assert [caught.value.next_step] == [
-            f"Install it: pip install '{value}'" for value in declared[extra]
-        ]
+        # What has no wheels for every Python has a marker that says so.
+        (package, _, newest) = declared[extra][0].partition("; python_version < ")
+        assert len(declared[extra]) == 1
+        assert package in caught.value.next_step
+        if not newest or f"{sys.version_info[0]}.{sys.version_info[1]}" < newest.strip("'"):
+            assert caught.value.next_step == f"Install it: pip install '{package}'"
 
 
 class Scripted:

@@ -128,6 +128,7 @@ def test_polyscope_x_is_watched_without_a_dashboard_and_not_driven():
 
 def test_a_missing_client_library_is_told_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "rtde_receive", None)
+    monkeypatch.setitem(extras._NEWEST_PYTHON, "ur", sys.version_info[:2])
     with pytest.raises(DriverError, match=r"rtde_receive cannot be imported.*pip install 'ur-rtde"):
         UrArm("127.0.0.1")
     monkeypatch.setitem(extras._NEWEST_PYTHON, "ur", (3, 10))

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import closing
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -114,6 +115,7 @@ def test_files_of_other_versions(tmp_path, monkeypatch):
     with monkeypatch.context() as newer:
         newer.setattr(module, "_FORMS", forms)
         assert [one.reason for one in history.entries()] == ["no. 1"]
+        assert [one.reason for one in history.entries()] == ["no. 1"]
     with pytest.raises(DataError, match="is of form 2, and this version of visioncal knows 1"):
         history.append(entry(2))
     # What a newer version has noted in an entry stays.
@@ -142,8 +144,9 @@ def test_files_that_cannot_be_used(tmp_path, monkeypatch):
     file.close()
     text, foreign = tmp_path / "notes.txt", tmp_path / "foreign.db"
     text.write_text("a history of the site, told in words, over a hundred bytes long" * 20)
-    with sqlite3.connect(foreign) as other:
+    with closing(sqlite3.connect(foreign)) as other:
         other.execute("CREATE TABLE music (title TEXT)")
+        other.commit()
     refused(text, "no SQLite file")
     refused(foreign, "of another program")
     refused(tmp_path, "is a folder")

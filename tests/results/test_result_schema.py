@@ -23,6 +23,7 @@ from support.samples import made_up, with_frames
 
 from visioncal.core.codec import INLINE, REST, Array, WrittenForm, entries
 from visioncal.core.errors import DataError
+from visioncal.core.types import scalar_of
 from visioncal.results import Calibration, to_document
 from visioncal.results.document import CalibrationForm, CellForm
 from visioncal.results.sections import CalibrationSections
@@ -107,7 +108,7 @@ class _Schemas:
         inner, *marks = args
         for mark in marks:
             if isinstance(mark, Array):
-                (kind,) = get_args(get_args(inner)[1])
+                kind = scalar_of(inner)
                 return _array("boolean" if kind is np.bool_ else "number", mark.shape)
             if isinstance(mark, WrittenForm):
                 return {"type": "object"} if mark.form is None else self.of(mark.form)

@@ -182,7 +182,9 @@ def absence(path: Path) -> str:
 def is_inside(path: Path, folder: Path) -> bool:
     """Whether a path, which need not exist, is in a folder after links are resolved."""
     try:
-        path.exists()  # raises where a part of it is too long
+        # Raises where a part of it is too long, or links go in a circle.
+        with suppress(FileNotFoundError, NotADirectoryError):
+            path.stat()
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):  # RuntimeError: links in a circle
         return False

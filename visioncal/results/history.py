@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -350,9 +351,14 @@ class History:
             why = f"is of form {version}, and this version of visioncal knows {len(_FORMS)}"
             raise self._refusal(why, "Use the newer version that wrote it.")
         # A view in the place of the table, or another's trigger, would run when it is read.
-        query = "SELECT sql FROM sqlite_master WHERE sql IS NOT NULL ORDER BY rowid"
-        made = [text for (text,) in file.execute(query)]
-        if made != [statement for form in _FORMS[:version] for statement in form]:
+        with closing(sqlite3.connect(":memory:")) as genuine:
+            for statement in chain.from_iterable(_FORMS[:version]):
+                genuine.execute(statement)
+            made, stored = (
+                data.execute("SELECT sql FROM sqlite_master ORDER BY rowid").fetchall()
+                for data in (genuine, file)
+            )
+        if made != stored:
             why = "has other tables, views or triggers than a history"
             raise self._refusal(why, "Name a history's file, and do not open this one elsewhere.")
         return version

@@ -285,7 +285,7 @@ def corrected_tip(nominal: Robot, corrected: Robot) -> str:
     if np.array_equal(nominal.chain.placements[-1], corrected.chain.placements[-1]):
         return nominal.tip
     _, joints = joints_of(str(nominal.document["urdf"]))
-    return nominal.tip if _of_tip(joints, nominal) else f"{nominal.tip}_corrected"
+    return nominal.tip if _of_tip(joints, nominal) is not None else f"{nominal.tip}_corrected"
 
 
 def joints_of(urdf: str) -> tuple[Element, dict[str, Element]]:
