@@ -305,6 +305,34 @@ def test_a_cell_that_is_the_other_way_round_is_doubted(mount: str) -> None:
         assert verdict.status == "check"
 
 
+@pytest.mark.parametrize(
+    ("mount", "tool_mm", "where"),
+    [
+        ("eye-in-hand", (0, 0, 0), ""),
+        # Beside the wrist the centre of a camera is some centimetres behind the flange.
+        ("eye-in-hand", (0, 0, 100), ""),
+        ("eye-in-hand", (0, 0, 130), "the camera is 71 mm behind the flange"),
+        ("eye-in-hand", (700, 0, 0), "the camera is 0.62 m away from the flange"),
+        ("eye-to-hand", (0, 0, 130), ""),
+        ("eye-to-hand", (0, 0, 600), "the target is 0.56 m away from the flange"),
+    ],
+)
+def test_a_tool_that_was_active_is_asked_for(mount, tool_mm, where) -> None:
+    cell, tool = simulate(CellOptions(views=14, mount=mount)), np.eye(4)
+    tool[:3, 3] = 1e-3 * np.array(tool_mm)
+    poses = cell.robot.base_from_flange @ tool
+    verdict = calibrate(pairs_session(mount, poses, cell.cam_from_target)).verdict
+    # It is a question, and no doubt.
+    assert (verdict.status, verdict.causes) == ("good", ())
+    asked = [finding for finding in verdict.findings if finding.kind == "carried_away"]
+    assert len(asked) == bool(where)
+    for finding in asked:
+        assert where in finding.words
+        assert "Was a tool active on the controller" in finding.words
+        assert finding.do in verdict.next_steps
+        assert finding.words in " ".join(verdict.top)
+
+
 @pytest.mark.parametrize(("freedom", "places", "flat"), [(np.inf, 1, 1.0), (15.0, 7, 0.03)])
 def test_the_chance_is_that_of_drawn_errors(freedom: float, places: int, flat: float) -> None:
     rng, count = np.random.default_rng(places), 200_000

@@ -1,4 +1,4 @@
-"""A cell the other way round: inverse poses with the other mount, which fit the views as well."""
+"""A cell the other way round, which fits the views as well, and what is carried where none is."""
 
 from collections.abc import Iterator
 
@@ -7,11 +7,13 @@ import numpy as np
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import Suspect
 from visioncal.core.limits import CLEAR_RATIO
+from visioncal.core.number_format import figure
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Remedy
 
-# What rides on a flange may be so far from it [m], also where the poses are in the board's frame.
-_NEAR_M = 0.3
+# What rides on a flange may be so far from it [m], also where the poses are in the board's frame;
+# seldom so far, or a camera so far behind the flange: more than the length of one beside the wrist.
+_NEAR_M, _FAR_M, _BEHIND_M = 0.3, 0.5, 0.05
 
 
 def _found(run: RunState) -> Iterator[Finding]:
@@ -40,6 +42,25 @@ def _found(run: RunState) -> Iterator[Finding]:
                 "alone)."
             ),
             until_mm=0.0,
+        )
+        return
+    edge = run.assessment.last_edges[carried]
+    depth_m, (*_, along_z) = -edge.matrix[2, 3], edge.matrix[:3, :3] @ edge.covariance[3:, 3:]
+    sigma_m = float(np.sqrt(max(along_z @ edge.matrix[2, :3], 0.0)))
+    where = f"{carried_m:.2f} m away from" if carried_m > _FAR_M else ""
+    if in_hand and depth_m > _BEHIND_M + 3.0 * sigma_m:
+        where = f"{figure(1e3 * depth_m)} mm behind"
+    if where:
+        thing = "camera" if in_hand else "target"
+        yield Finding(
+            "carried_away",
+            f"By the robot's poses, the {thing} is {where} the flange that carries it. Was a tool "
+            "active on the controller when they were recorded? Then they are of its tip, and the "
+            "transform is from there, and not from the flange.",
+            Remedy(
+                "Measure roughly whether that is so. If not, set the controller's tool to zero and "
+                "record again, or use the result with that tool active alone."
+            ),
         )
 
 

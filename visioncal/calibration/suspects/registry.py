@@ -84,6 +84,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     board.SHAPE,
     *growing.GROWING,
     mirrored_cell.MIRRORED_CELL,
+    Suspect("carried_away", is_doubt=False),
     Suspect("untied", _unconnected, FACT),
     Suspect("unseen_target"),
     # What was seen and read.
