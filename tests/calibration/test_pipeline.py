@@ -1,5 +1,6 @@
 """The whole way on simulated corners and poses: lenses, several boards, and what was measured."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from support.cells import board_numbers, calibrated, error_of, known_of, session_of
+from support.following import follow
 from support.misfits import misfit
 from support.refusals import raised
 
@@ -112,6 +114,34 @@ def test_a_session_that_holds_all_views_back_is_told_so():
 def without(cell, views):
     """A cell that lacks some views."""
     return cell.only([at for at in range(len(cell.corners)) if at not in views])
+
+
+@pytest.mark.parametrize(
+    ("axis", "said", "step"),
+    [
+        ("z_m", "has a predicted sigma of 6", "Measure that to 4"),
+        ("x_m", "is not determined at all", "Where the arm cannot tilt, measure that offset"),
+    ],
+)
+def test_a_stated_prior_that_does_not_suffice_is_named(axis, said, step):
+    with pytest.raises(DegenerateError, match=said) as refused:
+        calibrate(
+            scara(
+                0, {"flange_from_cam": {axis: float(X["xyz".index(axis[0]), 3]), "sigma_m": 6e-3}}
+            )
+        )
+    known = f"[prior.flange_from_cam] counts, with {axis[0]} known to 6 mm."
+    assert refused.value.message.endswith(known)
+    assert refused.value.next_step.startswith(step)
+    if axis == "z_m":
+        # What it asks for suffices.
+        needed_mm = float(refused.value.next_step.split()[3])
+        prior = {"z_m": float(X[2, 3]), "sigma_m": 1e-3 * needed_mm}
+        found = calibrate(scara(0, {"flange_from_cam": prior})).verdict
+        weak = next(finding for finding in found.findings if finding.kind == "weak_motion")
+        # A caliper on the board would not help.
+        assert "Weakly determined by the motion" in weak.words
+        assert "caliper" not in weak.do.words
 
 
 def test_each_image_is_searched_for_its_own_board(tmp_path):
@@ -407,15 +437,27 @@ def test_what_cannot_be_used_is_said():
     assert any("was not used: the closed form park cannot" in reason for reason in closed.reasons)
 
 
-def test_measured_distances_of_another_scale_are_named_and_an_arm_that_is_off_is_not():
-    cell = simulate(CellOptions(mount="eye-to-hand", views=16, board_scale=1.01, seed=2))
-    verdict = calibrate(cell_session(cell, "measured", seen="poses")).verdict
+@pytest.mark.parametrize("scale", [1.01, 0.484])
+def test_measured_distances_of_another_scale_are_named_and_mended(scale, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options = CellOptions(mount="eye-to-hand", views=16, board_scale=scale, seed=2)
+    session = cell_session(simulate(options), "measured", seen="poses")
+    verdict = calibrate(session).verdict
     assert verdict.status != "good"
     (named,) = (finding for finding in verdict.findings if finding.kind == "board_size")
     assert verdict.causes[0] is named
     # A scale's sigma is a hundredth of a percent there; the factor has five digits.
     factor = float(named.do.words.split()[-1].rstrip("."))
-    assert factor == pytest.approx(1.01, abs=4e-4)
+    assert factor == pytest.approx(scale, abs=4e-4)
+    # The sentence says the same, with two digits.
+    share, size = re.search(r"the board is ([\d.]+) % .* (larger|smaller)", named.words).groups()
+    said = 1.0 + float(share) / 100.0 * (1 if size == "larger" else -1)
+    assert said == pytest.approx(factor, abs=0.05 * abs(1.0 - scale))
+    session.save("cell")
+    assert follow("calibrate", "cell", "-o", "out").last.status == 0
+
+
+def test_an_arm_that_is_off_is_no_other_scale():
     arm = simulate(CellOptions(views=10, dh_sigma_m=2e-3))
     verdict = calibrate(cell_session(arm, "measured", seen="poses")).verdict
     assert "board_size" not in {finding.kind for finding in verdict.findings}

@@ -294,10 +294,21 @@ def _refuse_open(
     if beyond:
         frame, worst = beyond[0]
         fault = worst.fault(" at a typical noise")
+        priors = [] if worst.is_rotation else [prior for prior in problem.priors if prior.axes]
+        stated = "".join(
+            f" [prior.{prior.name}] counts, with {', '.join('xyz'[axis] for axis in prior.axes)} "
+            f"known to {figure(1e3 * prior.sigma_m)} mm."
+            for prior in priors
+        )
+        advice = words.advice(frame, worst.words if worst.is_open else "")
+        if priors and not worst.is_open:
+            # With what the views add, a tenth less meets the limit.
+            needed_m = 0.9 * min(prior.sigma_m for prior in priors) * worst.limit / worst.sigma
+            advice = f"Measure that to {figure(1e3 * needed_m)} mm (sigma_m) or better. {advice}"
         raise DegenerateError(
-            f"{words.title}: {worst.words} {fault}: {words.motion(frame)}.",
+            f"{words.title}: {worst.words} {fault}: {words.motion(frame)}.{stated}",
             culprits=[direction.words for _, direction in beyond],
-            next_step=words.advice(frame, worst.words if worst.is_open else ""),
+            next_step=advice,
         )
 
 

@@ -45,8 +45,8 @@ def distance_scale(
     percent = f"{figure(100 * abs(share))} % (sigma {figure(100 * variance**0.5)} %)"
     return Finding(
         "board_size",
-        f"By the robot's motion the distances in the measured poses (cft_) are too {short} by "
-        f"{percent}: the board is {size} by that than the program was told that measured them.",
+        f"By the robot's motion the board is {percent} {size} than the program was told that "
+        f"measured the poses: all distances in them (cft_) are too {short}.",
         Remedy(
             "Measure the board with a caliper, and measure the poses again with its true size; or "
             f"multiply cft_x_m, cft_y_m and cft_z_m by {1.0 + share:.5g}."

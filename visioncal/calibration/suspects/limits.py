@@ -182,9 +182,14 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
     if not weak:
         return
     step, by = _tilted(judged), "by the motion"
+    # The greater part of their variances, where views see the board.
+    board_m = 1e-3 * _uncertainty_mm(judged)[1]
+    is_of_board = all(
+        board_m > 0.7 * found.sigma for found in judged.worst if not found.is_rotation
+    )
     if any(warning.do == NO_JOINTS for warning in judged.warnings):
         step, by = NO_JOINTS, "by the arm's own errors"
-    elif _is_of_board(judged):
+    elif _is_of_board(judged) and is_of_board:
         step, by = MEASURE_BOARD, "by how well the board's size is stated"
     words = (
         f"Weakly determined {by}, with their sigmas: {', '.join(weak)}; doubt begins at "
