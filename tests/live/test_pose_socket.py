@@ -157,8 +157,8 @@ def another_client(robot, _):
     with client_of(robot.arm) as other:
         robot.step()
         robot.step()
-        # The new one is refused, or the one that said nothing is dropped.
-        assert select.select([other, robot.link], [], [], 0)[0]
+        # The new one is refused, unless neither has said where it stands.
+        assert robot.arm._link is None or select.select([other, robot.link], [], [], 0)[0]
 
 
 def the_same_stop_elsewhere(robot, _):
@@ -200,7 +200,6 @@ MISHAPS = (
 @pytest.mark.parametrize("first_seed", range(0, 500, 100))
 def test_after_500_broken_conversations_each_view_has_its_pose(first_seed, monkeypatch):
     monkeypatch.setattr(pose_socket, "_SLICE_S", 0.0)
-    monkeypatch.setattr(pose_socket, "_MUTE_S", 0.0)
     for seed in range(first_seed, first_seed + 100):
         robot = Robot(random.Random(seed))
         views = robot.capture.journal.views
@@ -314,18 +313,50 @@ def test_a_robot_that_does_not_come_back_ends_the_recording():
         raised(DataError, "is no port", open_arm, words, None, form=None, moves=False)
 
 
-def test_one_that_says_nothing_gives_way_and_one_that_speaks_does_not(arm):
-    with client_of(arm) as mute:
-        arm.request(0.0)
-        assert asked(arm, line_of(1))[0].startswith("busy ")
-        arm._link.since_s -= 6.0
-        with client_of(arm) as link:
-            link.sendall(line_of(1))
-            assert arm.request(0.0).stop == 1
-            arm.reply("next")
-            assert (mute.recv(99), link.recv(99)) == (b"", b"next\n")
-            arm._link.since_s -= 6.0
-            assert asked(arm, line_of(2))[0].startswith("busy ")
+def test_who_says_nothing_or_garbage_takes_no_robots_place(arm):
+    with contextlib.ExitStack() as stack:
+        silent, half, garbage, robot = (stack.enter_context(client_of(arm)) for _ in range(4))
+        half.sendall(b"1 | X 4")
+        garbage.sendall(b"GET / HTTP/1.1\r\n")
+        while arm._link is None or len(arm._waiting) < 2:
+            assert arm.request(0.0) is None
+            if select.select([garbage], [], [], 0)[0]:
+                break
+        assert garbage.recv(300).startswith(b"error 'GET / HTTP/1.1'")
+        assert garbage.recv(300) == b""
+        robot.sendall(line_of(1))
+        state = None
+        while state is None:
+            state = arm.request(0.0)
+        arm.reply("next")
+        assert (state.stop, robot.recv(99)) == (1, b"next\n")
+        # In its session it is protected from all others.
+        for other in (silent, half):
+            assert other.recv(99).startswith(b"busy ")
+        with client_of(arm) as second:
+            second.sendall(line_of(2))
+            assert arm.request(0.0) is None
+            assert second.recv(99).startswith(b"busy ")
+        robot.sendall(line_of(2))
+        assert arm.request(1.0).stop == 2
+
+
+def test_a_flood_of_silent_clients_leaves_the_robot_its_place(arm):
+    with contextlib.ExitStack() as stack:
+        for _ in range(40):
+            stack.enter_context(client_of(arm))
+            arm.request(0.0)
+        assert len(arm._waiting) <= pose_socket._MOST_WAITING
+        got, state = asked(arm, line_of(1))
+        assert (got, state.stop) == ("next\n", 1)
+
+
+def test_the_terminal_says_who_can_send_poses(arm):
+    assert arm.host == "127.0.0.1"
+    assert "Programs of this computer alone can send poses" in arm.invitation
+    shared = SocketArm("0.0.0.0", 0)
+    assert "All computers that reach this one can send poses" in shared.invitation
+    shared.close()
 
 
 def test_a_peer_that_is_dead_or_reads_nothing_is_given_up_within_seconds(arm):
@@ -333,7 +364,8 @@ def test_a_peer_that_is_dead_or_reads_nothing_is_given_up_within_seconds(arm):
         link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         link.connect(("127.0.0.1", arm.port))
-        arm.request(0.0)
+        link.sendall(line_of(1))
+        assert arm.request(1.0).stop == 1
         served = arm._link.peer
         names = ("TCP_KEEPIDLE", "TCP_KEEPINTVL", "TCP_KEEPCNT", "TCP_USER_TIMEOUT")
         idle_s, interval_s, probes, confirmed_ms = (

@@ -10,7 +10,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,15 +28,14 @@ CLIENTS = Path(__file__).parents[1] / "clients"
 PATIENCE_S = 900.0
 # Silence after which a peer that answers no probe is lost [s]; a robot connects again after it.
 _DEAD_S = 4
-# A client that said nothing for so long gives way to another [s].
-_MUTE_S = 5.0
+# Clients that may wait before one of them says where it stands.
+_MOST_WAITING = 8
 _SLICE_S = 0.05
 # Longest line in, and longest answer out [bytes].
 _MAX_LINE, _MAX_ANSWER = 500, 200
 _ENDS = re.compile(rb"[\r\n]")
 # What a client may add to a line without meaning: blanks, and the zeros of a character array.
 _FILL = b" \t\r\n\0"
-_ALL = ("", "0.0.0.0", "::")
 
 
 class _LostError(Exception):
@@ -49,8 +48,7 @@ class _Link:
 
     peer: socket.socket
     received: bytes = b""  # What is not yet read of its lines.
-    has_spoken: bool = False  # Whether it has ever sent a whole line.
-    since_s: float = field(default_factory=time.monotonic)  # When it was taken [s].
+    is_understood: bool = False  # Whether it has said where it stands.
 
     def __post_init__(self) -> None:
         self.peer.setblocking(False)
@@ -136,7 +134,9 @@ class SocketArm:
             ) from error
         self._server.setblocking(False)
         self.host, self.port = host, int(self._server.getsockname()[1])
+        # The robot's program, and before it has said where it stands, whoever may be it.
         self._link: _Link | None = None
+        self._waiting: list[_Link] = []
         self._stop: ArmState | None = None
         self._joints: int | None = None
         self._patience_s, self._idle = patience_s, Stopwatch()
@@ -145,10 +145,11 @@ class SocketArm:
     @property
     def invitation(self) -> str:
         """Where it listens, and where the robot's programs are."""
-        shared = "Every computer that reaches this one can send poses. "
+        is_own = self.host == "localhost" or self.host.startswith("127.")
+        who = "Programs of this computer alone" if is_own else "All computers that reach this one"
         return (
-            f"Waiting for the robot's own program at {self.host}:{self.port}. "
-            f"{shared if self.host in _ALL else ''}Programs for "
+            f"Waiting for the robot's own program at {self.host}:{self.port}. {who} can send "
+            "poses; the first that says where it stands is heard until it hangs up. Programs for "
             f"KUKA, ABB, FANUC and UR are in {CLIENTS}; a line as "
             "'1 | X 512.3 Y -12.5 Z 800 A 10 B 0 C 180' says where it stands."
         )
@@ -179,8 +180,12 @@ class SocketArm:
                 except DataError as error:
                     self._refused = error.message
                     self.reply("error", f"{error.message} {error.next_step}")
+                    # One that never said where it stands takes no robot's place.
+                    if self._link is not None and not self._link.is_understood:
+                        self._drop(self._link)
                 else:
                     self._idle.restart()
+                    self._prefer()
                     return self._stop
             if self._idle.read() > self._patience_s:
                 refused = f" It was last refused: {self._refused}" if self._refused else ""
@@ -205,7 +210,7 @@ class SocketArm:
         if link is None:
             return
         words = " ".join(f"{answer} {reason}".split()).encode("ascii", "replace")
-        with self._dropped_if_lost():
+        with self._dropped_if_lost(link):
             # What came before the answer did not wait for it.
             link.receive()
             link.send(words[: _MAX_ANSWER - 1])
@@ -219,7 +224,8 @@ class SocketArm:
 
     def close(self) -> None:
         """Closes link and port, by which the robot's program learns that nothing listens."""
-        self._drop()
+        for link in (*self._waiting, *([self._link] if self._link else [])):
+            self._drop(link)
         self._server.close()
 
     def _understood(self, line: str) -> ArmState:
@@ -251,10 +257,16 @@ class SocketArm:
     def _next_line(self) -> str | None:
         """Whole line that the client waits for an answer to; None where there is none."""
         self._accept()
-        link = self._link
-        if link is None:
-            return None
-        with self._dropped_if_lost():
+        for link in [self._link] if self._link else [*self._waiting]:
+            line = self._line_of(link)
+            if line is not None:
+                self._waiting = [other for other in self._waiting if other is not link]
+                self._link = link
+                return line
+        return None
+
+    def _line_of(self, link: _Link) -> str | None:
+        with self._dropped_if_lost(link):
             link.receive()
             link.received = link.received.lstrip(_FILL)
             first, *rest = _ENDS.split(link.received, maxsplit=1)
@@ -263,7 +275,7 @@ class SocketArm:
                 raise _LostError
             if not rest:
                 return None
-            link.received, link.has_spoken = rest[0], True
+            link.received = rest[0]
             # A program that went away does not wait at its stop.
             link.receive()
             link.refuse_more()
@@ -274,36 +286,42 @@ class SocketArm:
         return None
 
     def _accept(self) -> None:
-        """Takes the client that connects, or refuses it while there is another."""
+        """Takes the client that connects, or refuses it while the robot's program is there."""
         try:
             peer, _ = self._server.accept()
         except OSError:
             return
-        link, now = _Link(peer), self._link
+        now = self._link
         if now is not None:
             # The same program may have hung up, and connects again.
-            with self._dropped_if_lost():
+            with self._dropped_if_lost(now):
                 now.receive()
-            if not now.has_spoken and time.monotonic() > now.since_s + _MUTE_S:
-                self._drop()
-        if self._link is None:
-            self._link = link
-            return
-        with suppress(_LostError):
-            link.send(b"busy another program is connected")
-        link.close()
+        self._waiting.append(_Link(peer))
+        if self._link is not None:
+            self._prefer()
+        elif len(self._waiting) > _MOST_WAITING:
+            self._drop(self._waiting[0])
+
+    def _prefer(self) -> None:
+        """Keeps the program that said where it stands, and refuses all others."""
+        if self._link is not None:
+            self._link.is_understood = True
+        for link in [*self._waiting]:
+            with suppress(_LostError):
+                link.send(b"busy another program is connected")
+            self._drop(link)
 
     @contextmanager
-    def _dropped_if_lost(self) -> Iterator[None]:
+    def _dropped_if_lost(self, link: _Link) -> Iterator[None]:
         try:
             yield
         except _LostError:
-            self._drop()
+            self._drop(link)
 
-    def _drop(self) -> None:
-        if self._link is not None:
-            self._link.close()
-        self._link = None
+    def _drop(self, link: _Link) -> None:
+        link.close()
+        self._waiting = [other for other in self._waiting if other is not link]
+        self._link = None if self._link is link else self._link
 
     def _linger(self, *, is_answered: bool) -> None:
         """Answers `done` to whatever comes, until an answered program has closed its link."""
@@ -311,14 +329,14 @@ class SocketArm:
         # How long a robot may take to read it and to close the link [s].
         while lingering.read() < 3.0 and not (is_answered and self._link is None):
             if self._next_line() is not None and self._link is not None:
-                with self._dropped_if_lost():
+                with self._dropped_if_lost(self._link):
                     self._link.send(b"done")
                     is_answered = True
             self._wait()
 
     def _wait(self) -> None:
-        links = [self._server] if self._link is None else [self._server, self._link.peer]
-        select.select(links, [], [], _SLICE_S)
+        links = [self._link] if self._link else self._waiting
+        select.select([self._server, *(link.peer for link in links)], [], [], _SLICE_S)
 
 
 def _joints(text: str) -> FloatArray:
