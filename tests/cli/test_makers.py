@@ -1,5 +1,6 @@
 """The maker of a robot is kept: what goes in as its pendant shows it comes out so, everywhere."""
 
+import csv
 import json
 import re
 import shlex
@@ -8,20 +9,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
 from support import readers
 from support.aligned_cells import made_up_cell
-from support.commands import visioncal, write_table
-from support.makers import MAKERS, NUMBER, pose_of, written
+from support.commands import turned_poses, visioncal, write_poses, write_table
+from support.makers import MAKERS, NUMBER, pose_of, shown, written
 from support.refusals import raised
+from support.rotations import CASES
 
 from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import controller_form
+from visioncal.core.documents.pendants import pendant_words, read_pose
 from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose
 from visioncal.present.recording.notes import verdict_markdown
 from visioncal.results import Calibration, RobotResult, to_document
 from visioncal.robot import load_robot
 from visioncal.session import Session
-from visioncal.session.columns import MEASURED_CAM_POSE
+from visioncal.session.columns import MEASURED_CAM_POSE, POSE
+from visioncal.simulation import CellOptions, cell_session, simulate
 
 
 @pytest.fixture(scope="module")
@@ -201,3 +207,191 @@ def test_each_robot_of_a_cell_has_its_own_form(tmp_path):
         assert np.abs(turn[:3, :3] - edge.matrix[:3, :3]).max() < 3e-6
     assert result.controller("cam_top", "target_plate") is None
     assert result.of(camera="top", robot="b", target="plate").controller().name == "fanuc"
+
+
+# --- At work: everything that is typed or shown is in the form of the calibration's robot.
+
+GAUGE = ("--tool", "none", "--clearance-mm", 150)
+# Three decimals of a millimetre, and four of a degree or six of a radian or a quaternion: half of
+# the last digits, of three angles.
+SHOWN = 3e-6
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """A calibrated arm that errs, and the folder of a later look at its board."""
+    folder = tmp_path_factory.mktemp("work")
+    options = replace(CellOptions(), seed=21, offset_sigma_rad=1e-3, branches=True)
+    for name, each in (
+        ("fit", replace(options, views=25)),
+        ("look", replace(options, views=3, recording=1)),
+    ):
+        cell_session(simulate(each), name, seen="corners").save(folder / name)
+    calibrated(folder / "fit", folder / "out")
+    return folder, Calibration.load(folder / "out")
+
+
+@pytest.fixture
+def of_maker(work, tmp_path):
+    """Its result as that of an arm of some maker."""
+
+    def saved(maker):
+        out = tmp_path / f"of {maker}"
+        out.mkdir(exist_ok=True)
+        replace(work[1], robot_form=maker).save(out / "calibration.json")
+        return out
+
+    return saved
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_a_shown_pose_is_the_pose_and_is_read_again(maker):
+    rng = np.random.default_rng(5)
+    for rotations in CASES.values():
+        for pose in compose(np.array(rotations), rng.uniform(-2, 2, (len(rotations), 3))):
+            line = pendant_words(pose, POSE_FORMS[maker])
+            assert np.abs(shown(maker, line) - pose).max() < SHOWN
+            assert np.abs(read_pose(line, "the line", maker).pose - pose).max() < SHOWN
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_the_touch_test_sends_the_robot_by_its_own_form(work, of_maker, maker):
+    words = ("touch-test", work[0] / "look", "-c", of_maker(maker), *GAUGE)
+    said = visioncal(*words).good().out
+    assert POSE_FORMS[maker].words in said.splitlines()[0]
+    points = json.loads(visioncal(*words, "--json").good().out)["points"]
+    for what in ("hover", "touch"):
+        lines = re.findall(rf"^  {what}: (.*)$", said, re.MULTILINE)
+        assert len(lines) == len(points) == 5
+        for line, point in zip(lines, points, strict=True):
+            turn = Rotation.from_rotvec(point[what][3:])
+            target = RigidTransform.from_components(point[what][:3], turn).as_matrix()
+            assert np.abs(shown(maker, line) - target).max() < SHOWN
+            assert point[f"{what}_{maker}"] == line
+
+
+def test_the_form_is_that_of_the_model_s_maker_or_as_typed(work):
+    words = ("touch-test", work[0] / "look", "-c", work[0] / "out", *GAUGE)
+    assert "Universal Robots" in visioncal(*words).good().out.splitlines()[0]
+    said = visioncal(*words, "--robot-form", "abb").good().out
+    assert "q1, q2, q3, q4" in said.splitlines()[0]
+    visioncal(*words, "--robot-form", "kuak").refused("Did you mean kuka?")
+
+
+def touches(maker, poses, path, columns):
+    """A table of touches, as its maker writes poses, with a controller's digits and more."""
+    rows = [[f"{value:.9f}" for value in written(maker, pose)] for pose in poses]
+    return write_table(path, MAKERS[maker][0].split(","), rows, columns)
+
+
+def printed(maker, name, text):
+    """The transform that tcp or fixture prints."""
+    place = re.search(rf"{name}: \(([^)]*)\) mm", text)[1]
+    turn = re.search(rf"{name}: .*{maker.upper()} [^(]*\(([^)]*)\)", text)[1]
+    return pose_of(maker, [*place.split(","), *turn.split(",")], 1e-3)
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_touches_are_read_and_frames_are_told_in_the_robot_s_form(of_maker, maker, tmp_path):
+    rng = np.random.default_rng(2)
+    tip, place = np.array([0.01, -0.02, 0.16]), np.array([0.5, -0.1, 0.2])
+    poses = turned_poses(rng, np.tile(place, (8, 1)), tip, np.eye(3))
+    drawn = np.array([[0, 0, 0], [0.2, 0, 0], [0.2, 0.15, 0], [0, 0.15, 0], [0.1, 0.1, 0.05]])
+    jig = RigidTransform.from_components([0.4, -0.3, 0.1], Rotation.from_rotvec([0.3, 0.1, 1.2]))
+    onto = turned_poses(rng, jig.apply(drawn), tip, np.eye(3))
+    names = [f"P{at}" for at in range(len(drawn))]
+    cad = write_table(tmp_path / "cad.csv", ("x_m", "y_m", "z_m"), drawn.tolist(), {"point": names})
+    made = {"tcp": (poses, {}, ()), "fixture": (onto, {"point": names}, ("--cad", cad))}
+    for command, (flanges, columns, more) in made.items():
+        # The same by our own columns, which no maker's form changes.
+        ours = write_poses(tmp_path / "ours.csv", flanges, columns)
+        typed = touches(maker, flanges, tmp_path / "typed.csv", columns)
+        found = []
+        for source, out in ((ours, of_maker(maker)), (typed, of_maker(maker))):
+            tool = () if command == "tcp" else ("--tool", tmp_path / "tool.json")
+            words = (command, source, "-c", out, *more, *tool)
+            done = visioncal(*words, "--force")
+            assert done.status == 0, done.said
+            (name, frame) = next(iter(Calibration.load(out).frames.items()))
+            found.append(frame.edge.matrix)
+            if frame.oriented:
+                assert np.abs(printed(maker, name, done.out) - frame.edge.matrix).max() < SHOWN
+            if command == "tcp":
+                visioncal(command, ours, "-o", tmp_path / "tool.json", "--force")
+        # A tenth of a micrometre, and 1e-9 of a quaternion, as our own table has.
+        assert np.abs(found[0] - found[1]).max() < 1e-6
+    assert np.abs(found[1] - jig.as_matrix()).max() < 1e-6
+
+
+def test_touches_of_another_maker_are_refused_until_it_is_said(of_maker, tmp_path):
+    poses = turned_poses(
+        np.random.default_rng(2), np.tile([0.5, -0.1, 0.2], (8, 1)), np.ones(3) / 10, np.eye(3)
+    )
+    table = touches("kuka", poses, tmp_path / "t.csv", {})
+    done = visioncal("tcp", table, "-c", of_maker("fanuc")).refused(
+        "are not FANUC X, Y, Z, W, P, R"
+    )
+    assert "--robot-form kuka" in done.err
+    visioncal("tcp", table, "-c", of_maker("fanuc"), "--robot-form", "kuka").good()
+    lines = tmp_path / "lines.txt"
+    lines.write_text("\n".join(pendant_words(pose, POSE_FORMS["staubli"]) for pose in poses))
+    visioncal("tcp", lines, "-c", of_maker("kuka")).refused("not of 'kuka'")
+    # Rx, Ry, Rz are of three makers, and the calibration says of which.
+    visioncal("tcp", lines, "-c", of_maker("staubli"), "--name", "tip").good()
+    tip = Calibration.load(tmp_path / "of staubli").frames
+    assert np.abs(tip["flange_from_tip"].edge.matrix[:3, 3] - 0.1).max() < 1e-5
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_targets_are_typed_and_sent_in_the_robot_s_form(work, of_maker, maker, tmp_path):
+    poses = poses_of(Session.load(work[0] / "fit"))[:6]
+    labels = {"what": [f"pick {at}" for at in range(len(poses))]}
+    ours = write_poses(tmp_path / "ours.csv", np.array(poses), labels)
+    typed = touches(maker, poses, tmp_path / "typed.csv", labels)
+    names, out, sent = MAKERS[maker][0].split(","), of_maker(maker), {}
+    for name, source in (("ours", ours), ("typed", typed)):
+        file = tmp_path / f"{name}-sent.csv"
+        visioncal("correct", source, "-c", out, "-o", file).good()
+        with file.open() as rows:
+            sent[name] = list(csv.DictReader(rows))
+    own = [f"{maker}_{name.lower()}" for name in names]
+    assert list(sent["typed"][0])[: 1 + len(names)] == ["what", *names]
+    for row, beside in zip(sent["typed"], sent["ours"], strict=True):
+        place = [float(beside[name]) for name in POSE]
+        target = RigidTransform.from_components(place[:3], Rotation.from_quat(place[3:]))
+        # The tables differ by what a controller's digits leave.
+        for pose in (
+            pose_of(maker, [row[name] for name in names]),
+            pose_of(maker, [beside[name] for name in own]),
+        ):
+            assert np.abs(pose - target.as_matrix()).max() < 1e-6
+        assert float(row["moved_mm"]) > 0.1
+
+
+def test_targets_that_no_form_explains_are_refused(work, of_maker, tmp_path):
+    poses = poses_of(Session.load(work[0] / "fit"))[:6]
+    fanuc = touches("fanuc", poses, tmp_path / "t.csv", {})
+    visioncal("correct", fanuc, "-c", of_maker("kuka")).refused("--robot-form fanuc")
+    visioncal("correct", fanuc, "-c", of_maker("kuka"), "--robot-form", "fanuc").good()
+    nobody = replace(work[1].robot, name="mine")
+    out = tmp_path / "nobody"
+    out.mkdir()
+    document = {**nobody.document, "name": "mine"}
+    replace(work[1], robot=type(nobody).from_document(document)).save(out / "calibration.json")
+    done = visioncal("correct", fanuc, "-c", out).refused("x_m, y_m, z_m", "--robot-form")
+    assert done.out == ""
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_a_pixel_is_placed_from_a_pose_as_the_pendant_shows_it(work, of_maker, maker):
+    pose = poses_of(Session.load(work[0] / "fit"))[0]
+    words = ("locate", "-c", of_maker(maker), "--pixel", "640,400", "--plane", "z=0", "--json")
+    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    ours = ",".join(f"{value:.9f}" for value in (*pose[:3, 3], *turn))
+    found = [
+        json.loads(visioncal(*words, "--pose", typed).good().out)[0]["p_base_m"]
+        for typed in (ours, pendant_words(pose, POSE_FORMS[maker]))
+    ]
+    # Half a metre from the camera, seen at up to 45 degrees.
+    assert np.abs(np.subtract(*found)).max() < 5 * SHOWN
+    visioncal(*words, "--pose", "X 1 Y 2").refused("no pose that is known")

@@ -453,7 +453,7 @@ def test_pixels_are_placed_on_planes(cell):
         ({"pixel": ["1,2"], "plane": "base_from_cam"}, "no frame in the base"),
         ({"pixel": ["1,2"], "plane": "0,0,0,5"}, "has no direction"),
         ({"pixel": ["1,2"], "plane": "z=0", "plane_sigma": -1.0}, "standard deviation"),
-        ({"pixel": ["1,2"], "plane": "z=0", "pose": "0,0,0,0,0,0,2"}, "norm is 2"),
+        ({"pixel": ["1,2"], "plane": "z=0", "pose": "0,0,0,0,0,0,2"}, "not a quaternion"),
     ],
 )
 def test_mistakes_are_named(cell, options, words):

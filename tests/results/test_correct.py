@@ -358,7 +358,6 @@ def test_ways_through_singular_postures_are_found(stored, result):
     ("text", "words"),
     [
         ("{POSE}\n400,100,200,0,1,0,0\n", "Positions are in metres"),
-        ("x_mm,y_mm,z_mm,qx,qy,qz,qw\n0.4,0.1,0.2,0,1,0,0\n", "Write metres"),
         ("x_m,y_m,z_m,qx,qy,qz,q4\n0.4,0.1,0.2,0,1,0,0\n", "qw are missing"),
         ("{POSE}\n0.4,0.1,,0,0,0,1\n", "column z_m: it is empty"),
         ("{POSE}\n0.4,0.1,0.2,0,0,1,1\n", "norm is 1.41"),

@@ -71,6 +71,6 @@ def shown(maker, line):
     """The (4, 4) pose [m] of a line as a pendant shows it, `X 512.3 mm, ... A 10.1 deg ...`."""
     names = MAKERS[maker][0].split(",")
     found = [re.search(rf"\b{name} ({NUMBER})", line, re.IGNORECASE)[1] for name in names]
-    units = set(re.findall(rf"{NUMBER} (\w+)", line))
+    units = set(re.findall(rf"{NUMBER} (mm|m|deg|rad)\b", line))
     assert units == {"mm", *({"abb": (), "ur": ("rad",)}.get(maker, ("deg",)))}, line
     return pose_of(maker, found, 1e-3)

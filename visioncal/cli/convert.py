@@ -14,6 +14,7 @@ from visioncal.interchange.formats import (
     PoseImportOptions,
     convert,
 )
+from visioncal.results import Calibration
 
 # Options that are named as the import's.
 _AS_TYPED = (
@@ -53,11 +54,15 @@ def convert_command(options: ConvertOptions) -> None:
     say(f"wrote {options.dest}\nsha256 {session.digest()}")
 
 
-def import_options(poses: RobotPoseOptions) -> ImportOptions:
-    """The import options of a robot's poses."""
+def import_options(
+    poses: RobotPoseOptions, calibration: Calibration | None = None
+) -> ImportOptions:
+    """The import options of a robot's poses, which are usually in the form of its calibration."""
+    usual = None if calibration is None else calibration.controller()
     return ImportOptions(
         robot=PoseImportOptions(
-            poses.robot_columns or (), poses.robot_form, poses.robot_unit, poses.robot_inverse
+            *(poses.robot_columns or (), poses.robot_form, poses.robot_unit, poses.robot_inverse),
+            None if usual is None else usual.name,
         ),
         joints=poses.joint_columns or (),
         joints_deg=poses.joint_unit == "deg",

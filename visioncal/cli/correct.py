@@ -9,11 +9,14 @@ import typer
 from visioncal.cli.console import check_usable, print_json, say, warn
 from visioncal.cli.parsing import numbers_in
 from visioncal.cli.result_options import CorrectOptions
+from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
 from visioncal.core.number_format import did_you_mean, figure, mm_and_deg
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
+from visioncal.interchange.formats import PoseImportOptions
+from visioncal.interchange.formats.touches import read_typed
 from visioncal.interchange.result_files import load_calibration
 from visioncal.results import Calibration
 from visioncal.results.compensation.correction import (
@@ -59,7 +62,11 @@ def correct_command(
     arm = CalibratedArm.of(calibration, or_nominal=moved is not None)
     if file is not None:
         check_free(file, force=options.force)
-    targets = read_targets(options.targets, arm.real)
+    usual, stated = calibration.controller(), controller_form("", options.robot_form)
+    form = stated or usual
+    given = PoseImportOptions(form=options.robot_form, usual=None if form is None else form.name)
+    typed = None if form is None else read_typed(options.targets, given)
+    targets = read_targets(options.targets, arm.real, typed)
     flange_from_tool = _tool(calibration, options.tool)
     before, after = moved or (np.eye(4), np.eye(4))
     base_from_flange = before @ targets.base_from_tool @ invert(flange_from_tool) @ after
@@ -92,7 +99,7 @@ def correct_command(
         )
     sigma_mm = predicted_sigma_mm(calibration, base_from_flange[:, :3, 3], corrected.q)
     base_from_tool = corrected.base_from_flange @ flange_from_tool
-    columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm)
+    columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm, form)
     warnings = [*bad, *_warn_turns(arm, targets, corrected, options.widest_deg)]
     if options.payload_kg and not arm.compliance.any():
         warnings.append(

@@ -14,6 +14,7 @@ from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import FixtureOptions, FrameOptions, TcpOptions
 from visioncal.cli.summary import print_verdict
+from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import pose_difference
@@ -114,11 +115,10 @@ def _keep_and_report(place: _Place, frame: Frame, source: Path, options: FrameOp
         report_written(written, quiet=True, status=exit_status(verdict))
         return
     print_verdict(verdict, place.name)
-    edge, rotation = frame.edge, "rotation not measured"
-    if frame.oriented:
-        vector = edge.transform.rotation.as_rotvec(degrees=True)
-        turn = ", ".join(f"{value:.3f}" for value in vector)
-        rotation = f"turned by ({turn}) deg, sigma {figure(edge.sigma_deg)} deg"
+    edge, form = frame.edge, POSE_FORMS.get(options.robot_form or "")
+    form = place.calibration.controller() if form is None and place.calibration else form
+    rotation = edge.rotation_words(form)
+    rotation += f", sigma {figure(edge.sigma_deg)} deg" if frame.oriented else ""
     answer(f"{place.name}: {edge.place_words(3)}, sigma {figure(edge.sigma_mm)} mm; {rotation}")
     fit = f"rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per axis"
     answer(f"{frame.method}: {fit}")
@@ -220,7 +220,7 @@ def tcp_command(options: TcpOptions) -> None:
     """Runs `visioncal tcp`."""
 
     def by_touches(source: Path, calibration: Calibration | None) -> Frame:
-        rows = read_touches(source, import_options(options), options.robot)
+        rows = read_touches(source, import_options(options, calibration), options.robot)
         model, noise_m = _model(options), options.noise_m
         return touched_tool(rows, calibration, model, touch_noise_m=noise_m)
 
@@ -232,7 +232,7 @@ def fixture_command(options: FixtureOptions) -> None:
     drawing = None if options.cad is None else read_nominal(options.cad, options.cad_unit)
 
     def by_touches(source: Path, calibration: Calibration | None) -> Frame:
-        robot, asked = options.robot, import_options(options)
+        robot, asked = options.robot, import_options(options, calibration)
         if options.tool is None and calibration is None:
             named = drawing or any(read_touches(source, asked, robot, positions=True).kinds)
             others = "" if named else ", nor which points they are: by --cad, or a column kind"

@@ -7,14 +7,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import typer
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.cli.console import check_usable, print_json, say, warn
 from visioncal.cli.parsing import FORMS, POSE, numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import LocateOptions
+from visioncal.core.conventions import PoseForm, controller_form, stated_pose
+from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.errors import DataError
-from visioncal.core.limits import NORM_TOLERANCE
 from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.types import FloatArray, Target
 from visioncal.frames.camera_chain import CalibratedCamera, Plane
@@ -59,7 +59,8 @@ def locate_command(options: LocateOptions) -> None:
         refuse_given({"--pose": options.pose}, "the session has the poses of its views")
     else:
         refuse_given({"--view": options.view}, "only a session has views")
-    flange, joints_rad = None if options.pose is None else _flange(options.pose), None
+    form = controller_form("", options.robot_form) or calibrated.controller()
+    flange, joints_rad = None if options.pose is None else _flange(options.pose, form), None
     if options.pixel:
         given = {"--point-mm": options.point, "--target": target}
         refuse_given(given, "a pixel is placed by its plane")
@@ -109,18 +110,11 @@ def _chosen(session: Session, view: int | None) -> tuple[View, ...]:
     return chosen
 
 
-def _flange(values: Sequence[float]) -> FloatArray:
-    """Checks a pose of the robot, (4, 4) `base_from_flange` [m]."""
-    norm = float(np.linalg.norm(values[3:]))
-    if abs(norm - 1.0) > NORM_TOLERANCE:
-        raise DataError(
-            f"--pose: the quaternion's norm is {norm:.6g}, but must be 1 to within "
-            f"{NORM_TOLERANCE:g}.",
-            culprits=["--pose"],
-            next_step=f"Give {POSE}: metres, and a unit quaternion.",
-        )
-    turn = Rotation.from_quat(values[3:])
-    return np.asarray(RigidTransform.from_components(values[:3], turn).as_matrix())
+def _flange(words: str, form: PoseForm | None) -> FloatArray:
+    """Reads a pose of the robot, (4, 4) `base_from_flange` [m]."""
+    if words.count(",") != POSE.count(",") or is_marked_pose(words):
+        return read_pose(words, "--pose", None if form is None else form.name).pose
+    return stated_pose(numbers_in(words, "--pose", POSE), "--pose")
 
 
 def _flange_of(

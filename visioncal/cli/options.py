@@ -48,6 +48,9 @@ json_flag = partial(flag, "Print the result as JSON to stdout, without words.", 
 force_flag = partial(flag, "Replace what is there under the same name; never a folder.", "--force")
 force_bad = partial(flag, "Use a result even if its verdict is bad.", "--force")
 force_both = partial(flag, "Replace an existing file; and use a result that is bad.", "--force")
+form_option = partial(
+    option, "Form of poses; else the calibration's robot's.", "--robot-form", metavar="kuka|abb|..."
+)
 yes_flag = partial(flag, "Do not ask: the cell is clear, a hand on the stop button.", "--yes")
 seed_option = partial(option, "Random seed.", "--seed", default=0, min=0)
 camera_name = partial(option, "Of a whole cell: which camera, as left.", "--camera")

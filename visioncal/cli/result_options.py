@@ -21,6 +21,7 @@ from visioncal.cli.options import (
     force_bad,
     force_both,
     force_flag,
+    form_option,
     json_flag,
     numbers_option,
     option,
@@ -275,10 +276,11 @@ class CorrectOptions(LoadOptions, PartOptions):
     status 3: nothing was, as the calibration's verdict is bad.
     """
 
-    targets: Path = argument("A table with the columns of views.csv; others are kept.")
+    targets: Path = argument("A table as views.csv, or as X,Y,Z,A,B,C; others are kept.")
     calibration: Path = against_option("-c", "--against", "--calibration")
     out: Path | None = out_file()
     tool: str | None = option("Frame of the targets: a tool, or cam; else the flange.")
+    robot_form: str | None = form_option()
     seed_joints: str | None = option("Joints [rad] near the first target's.", metavar="Q1,Q2,...")
     widest_deg: float = option(
         "Warn of wider turns.", default=math.degrees(WIDEST_RAD), min=1e-3, max=720.0
@@ -366,6 +368,7 @@ class TouchTestOptions(ActOptions):
         "Length of that gauge, beyond all on the flange.", min=0.0, max=2e3
     )
     height_mm: float = option("Height of the hover.", default=50.0, min=1.0, max=1000.0)
+    robot_form: str | None = form_option()
     gaps_mm: str | None = option("Gaps from tip to point, in order.", metavar="A,B,C,D,E")
     force: bool = force_bad()
     as_json: bool = json_flag()
@@ -395,9 +398,12 @@ class LocateOptions:
     camera: str | None = camera_name()
     robot: str | None = robot_name()
     view: int | None = option("Which of the session's views; else all that show the target.")
-    pose: tuple[float, ...] | None = numbers_option(
-        "Pose of the flange at the image, in metres, for a camera on the flange.", form=POSE
+    pose: str | None = option(
+        f"Pose of the flange at the image, for a camera on it: {POSE} in metres, or as a pendant "
+        "shows it.",
+        metavar="POSE",
     )
+    robot_form: str | None = form_option()
     sigma_px: float | None = option("Noise of a feature; else that of the corners.")
     force: bool = force_bad()
     as_json: bool = json_flag()

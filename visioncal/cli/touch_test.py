@@ -21,6 +21,8 @@ from visioncal.cli.history import enter
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import TouchTestOptions
+from visioncal.core.conventions import POSE_FORMS, PoseForm, controller_form
+from visioncal.core.documents.pendants import pendant_words
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.frames.touch_test import (
@@ -36,8 +38,6 @@ from visioncal.results import Calibration, to_document
 from visioncal.results.compensation.correction import correct
 from visioncal.results.history import entries_of
 from visioncal.session import Session
-
-_FORM = "Flange targets: x, y, z [mm], rotation vector [rad]; hover first, then touch."
 
 
 def touch_test_command(options: TouchTestOptions) -> None:
@@ -68,9 +68,12 @@ def touch_test_command(options: TouchTestOptions) -> None:
         for warning in check_usable(verdict, what, force=options.force):
             warn(warning)
     points = located.points
-    targets = [_target(result, located, point, 1e-3 * options.height_mm) for point in points]
+    known = controller_form("", options.robot_form) or result.controller()
+    form = known or POSE_FORMS["ur"]
+    targets = [_target(result, located, point, 1e-3 * options.height_mm, form) for point in points]
     if options.gaps_mm is None:
-        _report(points, targets, as_json=options.as_json)
+        unknown = "" if known else " (--robot-form kuka, fanuc, abb ...: as its pendant shows it)"
+        _report(points, targets, f"{form.words}{unknown}", as_json=options.as_json)
         return
     test = evaluate_gaps(points, numbers_in(options.gaps_mm, "--gaps-mm"), touching)
     extended = replace(result, touch_test=test)
@@ -98,9 +101,13 @@ def _touching(calibration: Calibration, path: Path, tool: str | None) -> Tool | 
 
 
 def _target(
-    calibration: Calibration, located: TouchTargets, point: TouchPoint, height_m: float
+    calibration: Calibration,
+    located: TouchTargets,
+    point: TouchPoint,
+    height_m: float,
+    form: PoseForm,
 ) -> dict[str, Any]:
-    """Targets of the robot for its own controller."""
+    """Targets of the robot for its own controller, also in the form of its poses."""
     touch, hover = point.base_from_flange, located.above(point, height_m)
     document: dict[str, Any] = {
         "name": point.name,
@@ -123,24 +130,23 @@ def _target(
         transform = RigidTransform.from_matrix(pose)
         turn = transform.rotation.as_rotvec().tolist()
         document[name] = [*transform.translation.tolist(), *turn]
+        document[f"{name}_{form.name}"] = pendant_words(pose, form)
     return document
 
 
 def _report(
-    points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]], *, as_json: bool
+    points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]], form: str, *, as_json: bool
 ) -> None:
     if as_json:
         print_json({"points": targets})
         return
-    answer(_FORM)
+    answer(f"Flange targets: {form}; hover first, then touch.")
     for point, target in zip(points, targets, strict=True):
         x, y, z = 1e3 * point.base_m
         answer(
             f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within "
             f"{figure(point.radius95_mm)} mm"
         )
-        for name in ("hover", "touch"):
-            place, turn = target[name][:3], target[name][3:]
-            numbers = [*(f"{1e3 * item:.2f}" for item in place), *(f"{item:.5f}" for item in turn)]
-            answer(f"  {name}: {', '.join(numbers)}")
+        for key in (key for key in target if key.startswith(("hover_", "touch_"))):
+            answer(f"  {key.partition('_')[0]}: {target[key]}")
     answer("Enter the gaps with --gaps-mm, in this order.")

@@ -242,6 +242,12 @@ class PoseNumbers:
         return [self.places[index] for index in np.flatnonzero(rows)]
 
 
+def stated_pose(numbers: Sequence[float], place: str) -> FloatArray:
+    """(4, 4) pose of x, y, z [m], qx, qy, qz, qw as stated at a place; raises DataError."""
+    row = np.array([numbers], dtype=float)
+    return np.asarray(PoseNumbers(row[:, :3], row[:, 3:], Reading(), (place,)).poses()[0])
+
+
 def controller_form(robot: str, stated: str | None = None) -> PoseForm | None:
     """The notation of a robot's controller: stated, or by its model's name; None where unknown."""
     if stated is not None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.core.choices import POSE_FORMS, PoseForm
+from visioncal.core.choices import PoseForm
 from visioncal.core.codec import DROPPED, INLINE, REST, WrittenForm
 from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError
@@ -66,13 +66,9 @@ class RobotModel:
     model: Annotated[Robot | None, _ROBOT_FORM, REST] = None  # The model, where known.
     form: str | None = None  # The form, a name among `POSE_FORMS`, where stated.
 
-    def __post_init__(self) -> None:
-        if self.form not in (None, *POSE_FORMS):
-            raise ValueError(f"form is {self.form!r}, must be one of {', '.join(POSE_FORMS)}")
-
     @property
     def controller(self) -> PoseForm | None:
-        """The stated form, or that of the model's maker; None where unknown."""
+        """The stated form, or that of the model's maker; None where unknown; raises DataError."""
         return controller_form("" if self.model is None else self.model.name, self.form)
 
 

@@ -10,7 +10,7 @@ may as well separate numbers or thousands, the line is refused.
 
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -165,6 +165,11 @@ def rotation_names(form: PoseForm) -> tuple[str, ...]:
     """Names of a form's rotation numbers, in lower case."""
     maker = _SAME_NAMES.get(form.name, form.name)
     return next(names for names, forms in _NAMED_ROTATIONS.items() if maker in forms)
+
+
+def forms_named(names: Sequence[str]) -> list[str]:
+    """Forms whose rotation numbers have these names, in lower case."""
+    return [form.name for form in POSE_FORMS.values() if rotation_names(form) == tuple(names)]
 
 
 def pendant_words(pose: FloatArray, form: PoseForm) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.arguments import typed
-from visioncal.core.conventions import PoseNumbers, Reading
+from visioncal.core.conventions import stated_pose
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import known_name
 from visioncal.core.transforms import adjoint, invert
@@ -48,6 +48,12 @@ _EVERYTHING = Selection()
 _ALL = "all"
 # Such a name needs no quotes in YAML, XML, Python or a shell, and is no command option.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*", re.ASCII)
+# Advice where a camera's body is named.
+_OF_BODY = (
+    "Say where that one is in {0}, as ros2 run tf2_ros tf2_echo {0} camera_color_optical_frame "
+    "prints it: its offset in metres for the zeros below (all of 0,0,0,0,0,0,1 where the name is "
+    f"that of the optical frame after all). Run: {AGAIN} --child-from-cam 0,0,0,-0.5,0.5,-0.5,0.5"
+)
 # Names of bodies, and of the frames beside optical ones in the drivers of depth cameras: their x is
 # forward (REP 103).
 _BODY = re.compile(r"(?:.*[_/])?(?:link|(?:color|depth|infra[12]?)_frame)", re.IGNORECASE)
@@ -187,7 +193,7 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
     given = (selection.parent, selection.child)
     named = given[::-1] if selection.inverse else given
     if selection.child_from_cam is not None:
-        child = named[1] or ""
+        child = named[1]
         child_from_cam = _child_from_cam(selection.child_from_cam, child, frames[1])
         # T exp(x) C^-1 = T C^-1 exp(adjoint(C) x).
         edge = _carried(edge, edge.matrix @ invert(child_from_cam), adjoint(child_from_cam))
@@ -195,7 +201,8 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         optical = f"{child} is another frame than the optical one, which stands in it at ({stated})"
         name, frames = f"{name} * cam_from_{child}", (frames[0], "")
     if form.holds != "lens":
-        _check_optical(frames, named)
+        _check_optical(frames[0], named[0], "Give it the name of an optical frame.")
+        _check_optical(frames[1], named[1], _OF_BODY)
     if selection.inverse:
         # (T exp(x))^-1 = T^-1 exp(-adjoint(T) x): the lever arm turns rotation into translation.
         edge = _carried(edge, invert(edge.matrix), adjoint(edge.matrix))
@@ -244,40 +251,30 @@ def _carried(edge: Edge, matrix: FloatArray, jacobian: FloatArray) -> Edge:
     return Edge(matrix, np.asarray(jacobian @ edge.covariance @ jacobian.T))
 
 
-def _child_from_cam(numbers: Sequence[float], child: str, frame: str) -> FloatArray:
+def _child_from_cam(numbers: Sequence[float], child: str | None, frame: str) -> FloatArray:
     """(4, 4) pose of a camera's optical frame in the frame that is exported; raises DataError."""
-    places, pose = ("--child-from-cam",), np.array([numbers], dtype=float)
     # No part of a camera is farther away [m].
-    if not (child and is_camera(frame)) or pose.shape != (1, 7) or not np.abs(pose).max() <= 3.0:
+    if child is None or not is_camera(frame) or max(map(abs, numbers[:3])) > 3.0:
         raise DataError(
             f"--child-from-cam is ({', '.join(f'{value:g}' for value in numbers)}), for {frame} "
             f"under the name {child!r}; where a camera's optical frame is in a frame with a name "
             "is needed, in metres, at most 3 m away.",
-            culprits=places,
+            culprits=["--child-from-cam"],
             next_step="Give x,y,z,qx,qy,qz,qw and a name, as --child camera_link, of a camera.",
         )
-    numbers_of = PoseNumbers(pose[:, :3], pose[:, 3:], Reading(), places)
-    return np.asarray(numbers_of.poses()[0])
+    return stated_pose(numbers, "--child-from-cam")
 
 
-def _check_optical(frames: Sequence[str], named: Sequence[str | None]) -> None:
-    """Refuses names of cameras' bodies for their optical frames; raises DataError."""
-    of_child = (
-        "Say where that one is in {name}, as ros2 run tf2_ros tf2_echo {name} "
-        "camera_color_optical_frame prints it: its offset in metres for the zeros below (all of "
-        "0,0,0,0,0,0,1 where the name is that of the optical frame after all). Run: "
-        f"{AGAIN} --child-from-cam 0,0,0,-0.5,0.5,-0.5,0.5"
-    )
-    steps = ("Give it the name of an optical frame.", of_child)
-    for frame, name, step in zip(frames, named, steps, strict=True):
-        if name and is_camera(frame) and _BODY.fullmatch(name):
-            raise DataError(
-                f"{name!r} is by its name the frame of a camera's body, x forward, and what was "
-                f"calibrated is its optical frame, z forward and x right: under that name it would "
-                "be wrong by a turn of 90 degrees or more.",
-                culprits=[name],
-                next_step=step.format(name=name),
-            )
+def _check_optical(frame: str, name: str | None, next_step: str) -> None:
+    """Refuses the name of a camera's body for its optical frame; raises DataError."""
+    if name and is_camera(frame) and _BODY.fullmatch(name):
+        raise DataError(
+            f"{name!r} is by its name the frame of a camera's body, x forward, and what was "
+            "calibrated is its optical frame, z forward and x right: under that name it would be "
+            "wrong by a turn of 90 degrees or more.",
+            culprits=[name],
+            next_step=next_step.format(name),
+        )
 
 
 def _check_takes(form: ExportFormat, selection: Selection) -> None:

@@ -23,6 +23,8 @@ class PoseImportOptions:
     form: str | None = None  # A name among `POSE_FORMS` or `ROTATION_FORMS`.
     unit: str | None = None  # A name among `UNITS_M`.
     inverse: bool | None = None  # Whether the inverse of the pose is written.
+    # The robot's own form, among `POSE_FORMS`, in which poses are whose names fit it.
+    usual: str | None = None
 
     @property
     def rotation(self) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from visioncal.core.choices import UNITS_M
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, Reading
+from visioncal.core.documents.pendants import forms_named
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.types import FloatArray
@@ -207,6 +208,8 @@ def poses_from(
     position of three numbers and a rotation, ordered as names such as rvec and tvec show. Raises
     DataError.
     """
+    if whose == "robot" and requested.form is None:
+        requested = replace(requested, form=_usual_form(names, requested.usual))
     if whose == "robot" and fields.form:
         # The rows themselves state the form of their poses.
         if requested.form not in (None, fields.form):
@@ -257,6 +260,23 @@ def poses_from(
         )
     reading = replace(requested, unit=unit).reading(Reading(rotation))
     return PoseNumbers(positions, rotations, reading, fields.places), notes
+
+
+def _usual_form(names: Sequence[str], usual: str | None) -> str | None:
+    """The robot's own form, where names of a pose's numbers fit it; raises DataError."""
+    plain, units = zip(*map(without_unit, names), strict=True)
+    form, makers = POSE_FORMS.get(usual or ""), forms_named([name.lower() for name in plain[3:]])
+    if form is None or "ros" in makers:
+        return None
+    if makers and form.name not in makers:
+        raise DataError(
+            f"{', '.join(names)} are not {form.words}, the form of this robot's poses.",
+            culprits=names,
+            next_step=f"Say whose they are, as --robot-form {makers[0]}.",
+        )
+    fits = len(names) == 3 + ROTATION_FORMS[form.rotation].size
+    fits &= {*units[3:]} <= {"", *(_DEGREES if form.rotation.endswith("-deg") else ("rad",))}
+    return form.name if fits and (makers or all(map(str.isdecimal, names))) else None
 
 
 def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:

@@ -1,11 +1,12 @@
 """Reads touches and CAD points from tables in any form that `convert` reads."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from visioncal.core.conventions import POSE_FORMS, UNITS_M, Reading
+from visioncal.core.conventions import POSE_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
@@ -16,11 +17,12 @@ from visioncal.interchange.formats.poses import (
     check_radians,
     known_names,
     pose_names,
+    poses_from,
     without_unit,
 )
 from visioncal.interchange.formats.reading import Fields, named_by, read_fields, unnamed_columns
 from visioncal.session import Session
-from visioncal.session.columns import joint_columns
+from visioncal.session.columns import POSE, joint_columns
 
 _NAMES = ("point", "name", "label", "id")
 _AXES = ("x", "y", "z")
@@ -44,7 +46,8 @@ def read_touches(
     """
     if path.is_dir() or path.suffix.lower() == ".rrd":
         return touches_of(Session.load(path), robot)
-    fields, given, joints_rad = _of_robot(read_fields(path), robot), requested.robot, None
+    given, joints_rad = requested.robot, None
+    fields = _of_robot(read_fields(path, given.form or given.usual), robot)
     named = pose_names(fields, given.names, unnamed_columns(fields)["robot"], "robot", ())
     if positions and (not named or (given.names and len(named) == 3)):
         maker = POSE_FORMS.get(given.form or "")
@@ -72,15 +75,30 @@ def read_touches(
     return TouchRows(path.name, labels, fields.places, poses, joints_rad, kinds, points)
 
 
+def read_typed(path: Path, given: PoseImportOptions) -> tuple[tuple[str, ...], PoseNumbers] | None:
+    """Columns of poses in a maker's form, and the poses; None where there are none.
+
+    Raises:
+        DataError: The table cannot be read, or its poses are in another form.
+    """
+    fields = read_fields(path, given.form or given.usual)
+    names = pose_names(fields, (), unnamed_columns(fields)["robot"], "robot", ())
+    is_ours = not names or names == POSE
+    return None if is_ours else (names, poses_from(fields, names, given, "robot")[0])
+
+
 def robots_of(path: Path) -> tuple[str, ...]:
     """Names of the robots in a table or session of touches, in their order; may be empty.
 
     Raises:
-        DataError: It cannot be read.
+        DataError: A session cannot be read.
     """
     if path.is_dir() or path.suffix.lower() == ".rrd":
         return tuple(filter(None, Session.load(path).robots))
-    return tuple(filter(None, dict.fromkeys(read_fields(path).texts.get("robot", ()))))
+    with suppress(DataError):
+        return tuple(filter(None, dict.fromkeys(read_fields(path).texts.get("robot", ()))))
+    # A pendant's lines name none, whosever form they are in.
+    return ()
 
 
 def _of_robot(fields: Fields, robot: str | None) -> Fields:

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from visioncal.core.conventions import PoseForm, PoseNumbers, Reading, write_pose
 from visioncal.core.documents.columns import Column, TableReader
+from visioncal.core.documents.pendants import rotation_names
 from visioncal.core.documents.tables import TextTable, csv_text, read_table
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
@@ -29,17 +31,22 @@ class Targets:
     places: tuple[str, ...]  # (m,) the rows' lines: `targets.csv, line 3`.
     base_from_tool: FloatArray  # (m, 4, 4) the targets, of the flange or of a tool [m].
     q_seed: FloatArray  # (m, n) joint seeds [rad or m], NaN in a row without.
+    names: tuple[str, ...]  # The columns of the targets' poses.
+    reading: Reading  # How they are written there.
 
     def __len__(self) -> int:
         return len(self.places)
 
 
-def read_targets(path: Path, robot: Robot) -> Targets:
+def read_targets(
+    path: Path, robot: Robot, typed: tuple[tuple[str, ...], PoseNumbers] | None = None
+) -> Targets:
     """Reads a table of targets.
 
     Args:
         path: A table with x_m ... qw, and optional seeds q1_rad ...; other columns are kept.
         robot: The robot that the joints belong to.
+        typed: The columns of poses in another form, and these poses; None for x_m ... qw.
 
     Raises:
         DataError: It cannot be read, has been corrected already, or rows are no targets in metres
@@ -55,16 +62,15 @@ def read_targets(path: Path, robot: Robot) -> Targets:
             culprits=done,
             next_step="Correct the targets that they came from, or rename the column.",
         )
-    missing = [name for name in POSE if name not in columns]
+    names = POSE if typed is None else typed[0]
+    missing = [name for name in names if name not in columns]
     if missing:
-        other = [column for column in columns if column.lower() in ("x_mm", "y_mm", "z_mm")]
         hint = did_you_mean(missing[0], columns)
         raise DataError(
             f"{name}: the columns {', '.join(missing)} are missing; there are {some_of(columns)}.",
             culprits=missing,
-            next_step="Write metres, in x_m, y_m, z_m."
-            if other
-            else f"{hint} A header row names x_m, y_m, z_m [m] and qx, qy, qz, qw.".strip(),
+            next_step=f"{hint} A header row names x_m, y_m, z_m [m] and qx, qy, qz, qw; or a "
+            "maker's numbers, as X, Y, Z, A, B, C with --robot-form kuka.".strip(),
         )
     joints, wanted = joint_columns(columns), joint_names(robot)
     if joints not in ((), wanted):
@@ -74,7 +80,7 @@ def read_targets(path: Path, robot: Robot) -> Targets:
             next_step="Name one for each joint, or none.",
         )
     reader = TableReader(table)
-    poses = reader.numbers(*(Column(name, is_needed=True) for name in POSE))
+    poses = reader.numbers(*(Column(name, is_needed=True) for name in names))
     joints = joint_columns(table.columns)
     seeds = np.full((len(poses), robot.joint_count), np.nan)
     if joints:
@@ -82,10 +88,12 @@ def read_targets(path: Path, robot: Robot) -> Targets:
         reader.complete(joints)
     reader.check()
     places = tuple(map(table.place, range(len(poses))))
+    if typed is not None:
+        return Targets(table, places, typed[1].poses(), seeds, names, typed[1].reading)
     reader.unit(QUATERNION)
     reader.check()
     rotations = Rotation.from_quat(poses[:, 3:]).as_matrix()
-    return Targets(table, places, compose(rotations, poses[:, :3]), seeds)
+    return Targets(table, places, compose(rotations, poses[:, :3]), seeds, POSE, Reading())
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
@@ -94,7 +102,11 @@ def joint_names(robot: Robot) -> tuple[str, ...]:
 
 
 def columns_to_send(
-    targets: Targets, corrected: Corrected, base_from_tool: FloatArray, sigma_mm: FloatArray
+    targets: Targets,
+    corrected: Corrected,
+    base_from_tool: FloatArray,
+    sigma_mm: FloatArray,
+    form: PoseForm | None = None,
 ) -> dict[str, FloatArray]:
     """Corrected values of all targets, (m,) by column name.
 
@@ -103,19 +115,25 @@ def columns_to_send(
         corrected: The corrected commands.
         base_from_tool: (m, 4, 4) corrected Cartesian targets, of the flange or the tool [m].
         sigma_mm: (m,) predicted sigma of each [mm]; NaN where there is none.
+        form: In which poses that are not in a maker's form are written, too.
     """
-    names = tuple(f"q{index}_rad" for index in range(1, corrected.q.shape[1] + 1))
-    turns = Rotation.from_matrix(base_from_tool[:, :3, :3]).as_quat(canonical=True)
+    sent = PoseNumbers.written(base_from_tool, targets.reading, targets.places)
+    poses = dict(zip(targets.names, np.hstack([sent.positions, sent.rotations]).T, strict=True))
+    if form is not None and targets.names == POSE:
+        numbers = np.array([write_pose(pose, form) for pose in base_from_tool]).T
+        names = (f"{form.name}_{name}" for name in (*"xyz", *rotation_names(form)))
+        poses |= dict(zip(names, numbers, strict=True))
+    joints = tuple(f"q{index}_rad" for index in range(1, corrected.q.shape[1] + 1))
     correction = invert(targets.base_from_tool) @ base_from_tool
     columns: dict[str, FloatArray] = {
-        **dict(zip(POSE, np.column_stack([base_from_tool[:, :3, 3], turns]).T, strict=True)),
-        **dict(zip(names, corrected.q.T, strict=True)),
+        **poses,
+        **dict(zip(joints, corrected.q.T, strict=True)),
         "moved_mm": 1e3 * np.linalg.norm(correction[:, :3, 3], axis=1),
         "moved_deg": np.rad2deg(rotation_angle(correction)),
     }
     if np.isfinite(sigma_mm).all():
         columns["sigma_mm"] = sigma_mm
-    if len(names) < 6:
+    if len(joints) < 6:
         columns["off_deg"] = np.rad2deg(corrected.off_rad)
     return columns
 
