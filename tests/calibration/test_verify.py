@@ -8,15 +8,24 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 from support.beyond import with_field
-from support.cells import board_numbers, calibrated, known_of, reporting, session_of
+from support.cells import (
+    board_numbers,
+    calibrated,
+    known_of,
+    pairs_session,
+    reporting,
+    session_of,
+)
 from support.commands import visioncal
 from support.later import ANYHOW, Change, again, knock, known_again, usual
 from support.misfits import misfit
 from support.pages import Page
 from support.refusals import raised
+from support.wrong_arms import target_in_camera
 
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.recovery import causes_found, changed, moved_along, parted, recover
+from visioncal.calibration.run import calibrate
 from visioncal.calibration.verification import to_document, triggers_of, verdict_of, verify
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
@@ -24,6 +33,7 @@ from visioncal.calibration.verification.messages import signed_axis
 from visioncal.calibration.verification.prediction import predict_detected, predict_stops
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
+from visioncal.core.types import MOUNTS
 from visioncal.results import Calibration
 from visioncal.results.history import History
 from visioncal.robot import load_robot
@@ -535,3 +545,24 @@ def test_an_act_ends_where_nothing_changed_and_where_the_proof_fails(cell, tmp_p
     assert not (tmp_path / "act/exports/ur").exists()
     visioncal(*act, "--to", "ur", "--force")
     assert (tmp_path / "act/exports/ur").exists()
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("what", ["camera", "board"])
+def test_half_a_turn_is_no_metre(what, mount):
+    """By poses of the target, as a camera that is turned so far sees none in its image."""
+    cell, rng = simulate(CellOptions(views=20, mount=mount)), np.random.default_rng(2)
+    calibration = calibrate(pairs_session(mount, cell.robot.base_from_flange, cell.cam_from_target))
+    x, z = cell.transforms.values()
+    turn = exp(knock(rng, 0.0, 180.0))
+    moved = (x @ turn, z) if what == "camera" else (x, z @ turn)
+    flange = cell.robot.true_base_from_flange[:8]
+    seen = target_in_camera(mount, *moved, flange) @ exp(2e-5 * rng.standard_normal((8, 6)))
+    found = verify(pairs_session(mount, cell.robot.base_from_flange[:8], seen), calibration).named[
+        0
+    ]
+    assert found.cause.kind == what
+    values = found.explained.values
+    assert abs(np.rad2deg(np.linalg.norm(values[:3])) - 180.0) < 0.1
+    # The robot's noise of these stops, and no metre.
+    assert np.linalg.norm(exp(values)[:3, 3]) < 5e-3

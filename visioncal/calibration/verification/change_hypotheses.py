@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.prediction import PredictedStops
 from visioncal.core.limits import FEWEST_VIEWS
-from visioncal.core.transforms import adjoint, invert, log
+from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.model_evidence import TURN_PER_M, ChangeHypothesis
@@ -42,10 +42,13 @@ def causes_of(
         prior: The calibration as a prior.
         board_placed_anew: Whether the board was moved on purpose, so that its pose is not checked.
     """
-    measured, changes = predicted.problem.observations.measured, log(predicted.away(prior))
+    measured, away = predicted.problem.observations.measured, predicted.away(prior)
+    changes = log(away)
     # The camera's edge: a twist on its right, transformed to the target's side.
     moved = adjoint(invert(measured))
-    camera = ChangeHypothesis(CAMERA, MOTION_UNITS, moved)
+    # Steps from zero do not reach half a turn, and logarithms near it have no mean.
+    undoing = log(mean_transform(measured @ invert(away) @ invert(measured)))
+    camera = ChangeHypothesis(CAMERA, MOTION_UNITS, moved, start=undoing)
     # A board that is larger by a share is seen nearer by the same share.
     nearer = np.zeros((len(measured), 6, 1))
     nearer[:, 3:, 0] = np.einsum("nji,nj->ni", measured[:, :3, :3], measured[:, :3, 3])
@@ -61,7 +64,7 @@ def causes_of(
             continue
         # The board's edge: a twist on its right.
         by_place = np.where(shown[:, None, None], -np.eye(6), 0.0)
-        start, name = changes[shown].mean(axis=0), f"{BOARD} {names[index]}".strip()
+        start, name = log(mean_transform(away[shown])), f"{BOARD} {names[index]}".strip()
         place = ChangeHypothesis(name, MOTION_UNITS, by_place, start=start, at=at)
         other = replace(size, units=np.array([_OTHER_SIZE_PER_M]))
         causes += [place, _simultaneous(REPLACED, place, other)]
