@@ -148,6 +148,8 @@ def _board(rng: np.random.Generator, camera: Camera) -> Target:
     sigma_m = square_m * _log_uniform(rng, 1e-4, 1e-3)
     if kind == "charuco":
         name = str(rng.choice(list(DICTIONARIES)))
+        # The smallest dictionary has 50 markers, and every second square has one.
+        name = name if columns * rows <= 100 else name.replace("4X4_50", "4X4_250")
         return Target("varied", kind, columns, rows, square_m, sigma_m, legacy=_chance(rng, 0.3),
                       marker_m=round(rng.uniform(0.55, 0.7) * square_m, 4),
                       dictionary=name)  # fmt: skip
