@@ -329,3 +329,38 @@ def test_letters_that_a_terminal_does_not_have_are_written_as_their_numbers(
         done = called(program, words, b"", env={**os.environ, "PYTHONIOENCODING": "ascii"})
         assert done.returncode == 0, done.stderr
         assert rb"Zelle \xfc \U0001f4f7" in done.stdout + done.stderr
+
+
+def test_no_name_steers_the_terminal(inputs, tmp_path):
+    hostile = "\x1b]0;title\x07\x1b[31m\u202e"
+    session = tmp_path / "session"
+    shutil.copytree(inputs / "pairs", session)
+    toml = session / "session.toml"
+    text = toml.read_text("utf-8")
+    key = hostile.replace("\x1b", "\\u001b").replace("\x07", "\\u0007")
+    documents = (
+        f'"{key}" = 1\n{text}',
+        f'target = "{key}.toml"\n{text}',
+        text.replace('"ur10e"', f'"{key}.toml"'),
+        text.replace("[robot]", f'["{key}"]'),
+    )
+    for changed in documents:
+        toml.write_text(changed, "utf-8")
+        calls = (
+            ["calibrate", session, "-o", tmp_path / "out", "--no-report"],
+            ["doctor", session],
+            ["diff", tmp_path / hostile, session],
+        )
+        for words in calls:
+            said = visioncal(*words).said
+            assert said.strip()
+            assert all(letter.isprintable() for letter in said.replace("\n", "")), said
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+
+
+@pytest.mark.parametrize("created", ["9999-12-31T23:59:59-12:00", "0001-01-01T00:00:00+12:00"])
+def test_a_result_from_the_ends_of_the_calendar_enters_no_history(created, inputs, tmp_path):
+    result = json.loads((inputs / "pairs_out" / "calibration.json").read_text("utf-8"))
+    (tmp_path / "calibration.json").write_text(json.dumps(result | {"created": created}), "utf-8")
+    done = visioncal("history", tmp_path / "h.db", "--add", tmp_path / "calibration.json")
+    done.refused("not a time")

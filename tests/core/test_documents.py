@@ -95,10 +95,16 @@ def test_aliases_cost_nothing(file):
         ("[" + "1," * 1_200_000 + "1]", "more than 1,000,000 values"),
         ("[1,\n2,\n}", "line 3"),
         ("", "no JSON"),
+        ('{"\\ud800": 1}', "half a letter"),
+        ('["a\\uDFFFb"]', "half a letter"),
     ],
 )
 def test_json_that_is_refused(text, words):
     raised(DataError, words, parse_json, text, "it")
+
+
+def test_pairs_of_utf_16_in_json_are_letters():
+    assert parse_json('["\\uD83D\\ude00"]', "it") == ["\N{GRINNING FACE}"]
 
 
 def test_json_numbers_that_are_none():
@@ -268,6 +274,7 @@ HOSTILE = {
     "one-byte float.npy": (npy("<f1", "(3,)", b"abc"), "no (arrays|numbers)"),
     "cut.npy": (npy("<f8", "(3,)", bytes(19)), "no arrays"),
     "hidden size.npy": (npy("<f8", f"({10**11}, {10**11}, 0)"), "no arrays"),
+    "texts of nothing.npy": (npy("<U0", "(10000000000,)"), "more than 1,000,000 values"),
     "open shape.npy": (npy("<i8", "(3"), "no arrays"),
     # Fields of the entry in the archive's directory: flags, packing, and where the file begins.
     "encrypted.npz": (changed(WHOLE, b"PK\x01\x02", 8, 1), "no arrays"),
@@ -282,6 +289,10 @@ HOSTILE = {
     "odd number.xml": (
         "<s><a type_id='opencv-matrix'><rows>1</rows><cols>1</cols><data>1_0</data></a></s>",
         "'1_0'; numbers are needed",
+    ),
+    "attributes.xml": (
+        f"<s {' '.join(f'a{at}={chr(34)}1{chr(34)}' for at in range(1000))}/>",
+        "s has 1000 attributes",
     ),
     "numbers.xml": (b"<s><a>" + b"1 " * 1_200_000 + b"</a></s>", "more than 1,000,000 values"),
     "numbers in parts.xml": (

@@ -18,7 +18,7 @@ from visioncal import calibrate
 from visioncal.calibration.stages.motion import motion_of
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import pose_difference
-from visioncal.interchange.formats import ImportOptions, PoseImportOptions, convert
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions, convert, lerobot
 from visioncal.interchange.formats.lerobot import FrameImages
 from visioncal.session import Session
 
@@ -153,6 +153,9 @@ def test_a_hostile_description_of_a_data_set_is_refused(version, source, rendere
             convert(path, tmp_path / "out", requested=BOARD)
         assert caught.value.culprits
         assert len(caught.value.message) < 500
+    # A playlist may name any file of the machine.
+    file.write_text(json.dumps(info | {"video_path": "list.m3u8"}))
+    raised(DataError, "ends in .mp4", convert, path, tmp_path / "out", requested=BOARD)
     # What says how much there is is no reason to look for as much.
     file.write_text(json.dumps(info | {"total_episodes": 10**12}))
     assert convert(path, tmp_path / "out", requested=BOARD).views
@@ -223,3 +226,72 @@ def test_a_video_that_is_not_the_same_when_read_twice_leaves_nothing(
     monkeypatch.setattr(FrameImages, "load", lambda *at: load(*at) + b"%d" % next(read))
     raised(DataError, "read twice", convert, path, tmp_path / "out", requested=BOARD)
     assert not (tmp_path / "out").exists()
+
+
+def test_no_more_rows_of_a_data_set_are_read_than_fit(source, rendered, tmp_path, monkeypatch):
+    path = write_dataset(tmp_path / "set", source, rendered, "v3.0", "ur10e")
+    # As of a file of some hundred kB that holds as many equal rows as a memory does not.
+    monkeypatch.setattr(lerobot, "MAX_VALUES", 10)
+    raised(DataError, "more than 200 values", convert, path, tmp_path / "out", requested=BOARD)
+
+
+def setting(kind, path, value, which=lambda _: True):
+    """Sets a field of messages of a type, such as `transforms.0.transform.rotation.w`."""
+    *to, last = path.split(".")
+
+    def change(each, at, message):
+        if each == kind and which(at):
+            for name in to:
+                message = message[0] if name == "0" else getattr(message, name)
+            object.__setattr__(message, last, value)
+
+    return change
+
+
+PLACE, TURN = "transforms.0.transform.translation.", "transforms.0.transform.rotation."
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (setting("TFMessage", f"{PLACE}x", np.nan), "Rows of base_link from wrist_3_link, wrist"),
+        (setting("TFMessage", f"{TURN}w", 1e300), "Rows of base_link from wrist_3_link, wrist"),
+        (setting("TFMessage", f"{PLACE}x", 1e308), "are no poses, and were left out"),
+        (setting("TFMessage", "transforms.0.child_frame_id", "base_link"), "where the robot was"),
+        (setting("TFMessage", "transforms", []), "where the robot was"),
+        (setting("Image", "height", 2**31), r"camera.resolution\[1\]"),
+        (setting("Image", "step", 0), "has 1024000 bytes"),
+        (setting("Image", "width", 0), r"camera.resolution\[0\]"),
+        (setting("Image", "encoding", "mono16"), "cannot be read as a bag"),
+        (setting("Image", "encoding", "\x1b[31m"), "its images are of encoding"),
+        (setting("Image", "data", np.zeros(0, np.uint8)), "has 0 bytes"),
+        (setting("CameraInfo", "k", np.full(9, np.nan)), "the nine numbers"),
+        (setting("CameraInfo", "d", np.ones(100_000)), "100000 coefficients"),
+        (setting("CameraInfo", "distortion_model", "=1"), "the lens model '=1'"),
+    ],
+)
+def test_messages_that_lie_are_refused(change, message, source, rendered, tmp_path):
+    path = bag(tmp_path / "b", source, rendered, change=change)
+    raised(DataError, message, convert, path, tmp_path / "out", requested=BOARD)
+    assert not (tmp_path / "out").exists()
+
+
+def test_frames_that_go_round_are_refused(source, rendered, tmp_path):
+    def change(kind, at, message):
+        if kind == "TFMessage":
+            names = ("a", "b") if at % 2 else ("b", "a")
+            object.__setattr__(message.transforms[0], "child_frame_id", names[0])
+            message.transforms[0].header.frame_id = names[1]
+
+    path = bag(tmp_path / "b", source, rendered, change=change)
+    raised(DataError, "go round", convert, path, tmp_path / "out", requested=BOARD)
+
+
+def test_poses_that_are_none_are_left_out(source, rendered, tmp_path):
+    whole = convert(bag(tmp_path / "b", source, rendered), tmp_path / "whole", requested=BOARD)
+    # As tf2 does, of which a buffer keeps no such transform.
+    change = setting("TFMessage", f"{TURN}w", 0.0, lambda at: at % 50 == 7)
+    path = bag(tmp_path / "c", source, rendered, change=change)
+    session = convert(path, tmp_path / "out", requested=BOARD)
+    assert len(session.views) == len(whole.views)
+    assert any("Rows of base_link from wrist_3_link" in said for said in session.warnings)

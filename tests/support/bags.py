@@ -1,7 +1,10 @@
 """Bags of ROS 1 and ROS 2, written by rosbags from a session's folder."""
 
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,6 +34,8 @@ class BagOptions:
     poses: str = "tf"  # or `pose`: a topic of PoseStamped.
     frames_s: float = 0.2
     names: tuple[str, ...] = ("",)  # Namespaces of the cameras, all of which see the same.
+    # Changes a message in place, by its type and its number among those of the topic.
+    change: Callable[[str, int, Any], object] = lambda *_: None
 
 
 def motion(session: Session) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +61,7 @@ class _Bag:
             frames = "geometry_msgs/TransformStamped[] transforms"
             self.types.register(get_types_from_msg(frames, "tf2_msgs/msg/TFMessage"))
         self.of = {name.rsplit("/", 1)[1]: each for name, each in self.types.types.items()}
-        self.messages, self.rng = [], np.random.default_rng(0)
+        self.messages, self.rng, self.counts = [], np.random.default_rng(0), Counter()
 
     def header(self, at_s, frame):
         sec, rest = divmod(round(1e9 * at_s), 10**9)
@@ -78,6 +83,8 @@ class _Bag:
 
     def add(self, topic, kind, message, at_s):
         if topic not in self.options.without:
+            self.options.change(kind.rpartition("/")[2], self.counts[topic], message)
+            self.counts[topic] += 1
             late_s = abs(self.rng.normal(0.0, self.options.jitter_s))
             self.messages.append((at_s + late_s, topic, kind, message))
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from visioncal.core.errors import DataError, VerdictError, VisioncalError
-from visioncal.core.files import MOST_TOML_BYTES
+from visioncal.core.files import MOST_TOML_BYTES, one_line
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
@@ -36,7 +36,12 @@ def say(words: str, label: str = "", style: str = "bold", *, is_answer: bool = F
     from rich.text import Text
 
     # No markup: names and texts of files may have brackets.
-    console(is_answer=is_answer).print(Text.assemble((label, style), words))
+    console(is_answer=is_answer).print(Text.assemble((plain(label), style), plain(words)))
+
+
+def plain(words: str) -> str:
+    """A text of several lines, in which nothing steers the terminal."""
+    return "\n".join(map(one_line, words.split("\n")))
 
 
 def warn(words: str) -> None:
@@ -66,11 +71,13 @@ def print_table(
     from rich.table import Column, Table
     from rich.text import Text
 
-    first, *rest = map(Text, titles)
+    first, *rest = (Text(plain(title)) for title in titles)
     columns = (Column(first, no_wrap=True), *(Column(name, overflow="fold") for name in rest))
     table = Table(*columns, box=None, pad_edge=False, caption=caption, caption_justify="left")
     for at, cells in enumerate(rows):
-        table.add_row(*map(Text, cells), style="bold green" if at == bold else "")
+        table.add_row(
+            *(Text(plain(cell)) for cell in cells), style="bold green" if at == bold else ""
+        )
     shown = console(is_answer=not is_message)
     # Names of cells' frames are long, and are not truncated.
     shown.width = max(shown.width, 110)
@@ -84,7 +91,7 @@ def asked(question: str) -> str:
         EOFError: The input has ended.
         DataError: The line does not end.
     """
-    console().print(question, markup=False, end="")
+    console().print(plain(question), markup=False, end="")
     line = sys.stdin.readline(MOST_TOML_BYTES)
     if len(line) == MOST_TOML_BYTES:
         raise DataError(

@@ -285,10 +285,10 @@ def check_values(document: object, label: str, largest: float | None = None) -> 
             )
 
 
-def too_many(where: str) -> DataError:
+def too_many(where: str, most: int = MAX_VALUES) -> DataError:
     """Builds the error for a document with too many values."""
     return DataError(
-        f"{where}: more than {MAX_VALUES:,} values; documents up to that size are read.",
+        f"{where}: more than {most:,} values; documents up to that size are read.",
         culprits=[where],
         next_step="Cut the recording into parts.",
     )

@@ -216,7 +216,7 @@ def _utc(created: str) -> str:
     """A time as entries have it, so that their order as texts is that of the acts."""
     with reading(f"the time {created!r}", "a time", "Take the result as it was written."):
         then = datetime.fromisoformat(created)
-    return (then if then.tzinfo else then.replace(tzinfo=UTC)).astimezone(UTC).isoformat()
+        return (then if then.tzinfo else then.replace(tzinfo=UTC)).astimezone(UTC).isoformat()
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,8 @@ def read_arrays(path: Path) -> Mapping[str, Array]:
             culprits=[where],
             next_step="Keep the poses in a file of their own.",
         )
+    if sum(np.size(array) for array in arrays.values()) > MAX_VALUES:
+        raise too_many(where)
     kinds = {name: getattr(array, "dtype", np.dtype("V")).kind for name, array in arrays.items()}
     wrong = [name for name, kind in kinds.items() if kind not in "fiubUS"]
     if wrong:
@@ -96,6 +98,15 @@ def parse_json(text: str, where: str, largest: float | None = None) -> object:
     except RecursionError as error:
         raise too_deep(where) from error
     check_values(value, where, largest)
+    try:
+        # Half of a pair of UTF-16, which JSON can name, can be written nowhere.
+        if "\\ud" in text or "\\uD" in text:
+            json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        half = ascii(error.object[error.start])
+        raise DataError(
+            f"{where} holds {half} alone, which is half a letter; text is needed.", culprits=[where]
+        ) from error
     return value
 
 

@@ -159,6 +159,13 @@ def parse_xml(data: bytes, where: str) -> Element:
         element, depth = pending.pop()
         if depth > MAX_DEPTH:
             raise too_deep(where)
+        # Readers of robots' descriptions compare each attribute with all others of its element.
+        if len(element.attrib) > MAX_DEPTH:
+            raise DataError(
+                f"{where}: {element.tag[:60]} has {len(element.attrib)} attributes; up to "
+                f"{MAX_DEPTH} are read.",
+                culprits=[where],
+            )
         pending += [(child, depth + 1) for child in element]
     return root
 

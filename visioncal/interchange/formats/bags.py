@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise, takewhile
+from math import hypot
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypeAlias
@@ -87,6 +88,8 @@ class _Contents:
     moving: dict[tuple[str, str], "array[float]"] = field(default_factory=dict)
     still: dict[tuple[str, str], "array[float]"] = field(default_factory=dict)
     descriptions: list[str] = field(default_factory=list)
+    # What has poses that are none, which are left out, as tf2 does.
+    refused: set[str] = field(default_factory=set)
 
     @cached_property
     def parents(self) -> dict[str, str]:
@@ -123,7 +126,7 @@ class BagImages(ListedImages[tuple[str, bool, int]]):
             rows = reader.messages(connections=connections, start=at_ns, stop=at_ns + 1)
             connection, _, raw = next(iter(rows))
             message = reader.deserialize(raw, connection.msgtype)
-        return bytes(message.data) if is_compressed else _png(message, topic)
+            return bytes(message.data) if is_compressed else _png(message, topic)
 
 
 @contextmanager
@@ -164,9 +167,16 @@ def _png(message: Message, topic: str) -> bytes:
             culprits=[topic],
             next_step="Record the topic of its rectified or compressed images.",
         )
-    is_wide = message.encoding in ("mono16", "16UC1")
+    is_wide, data = message.encoding in ("mono16", "16UC1"), bytes(message.data)
+    if not 0 < message.width <= message.step or len(data) != message.height * message.step:
+        raise DataError(
+            f"topic {topic}: an image of {message.width} x {message.height} px with rows of "
+            f"{message.step} bytes has {len(data)} bytes.",
+            culprits=[topic],
+            next_step="Record it anew, or name another topic with --image-key.",
+        )
     kind = np.dtype("u2" if is_wide else "u1").newbyteorder(">" if message.is_bigendian else "<")
-    lines = np.frombuffer(bytes(message.data), "u1").reshape(message.height, message.step)
+    lines = np.frombuffer(data, "u1").reshape(message.height, message.step)
     used = lines[:, : message.step - message.step % message.width]
     pixels = np.ascontiguousarray(used).view(kind).reshape(message.height, message.width, -1)
     pixels = pixels.astype("u2" if is_wide else "u1")
@@ -195,7 +205,8 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     at_s, poses = stream.stamps_s, stream.poses.poses()
     flange = Trajectory(at_s[np.isfinite(poses[:, 0, 0])], poses[np.isfinite(poses[:, 0, 0])])
     rows, places = list[tuple[str, float, str]](), dict[str, tuple[str, bool, int]]()
-    notes = [f"The robot's motion: {words}. --robot-key BASE,TIP or a topic names another."]
+    how = "--robot-key BASE,TIP or a topic names another."
+    notes = [f"The robot's motion: {words}. {how}{_refused(contents)}"]
     for topic, camera in cameras.items():
         images = contents.images[topic]
         chosen, how = _chosen(np.array(images.stamps_s), flange)
@@ -246,11 +257,17 @@ def _stamp_s(message: Message, received_ns: int) -> float:
     return (stamp.sec + 1e-9 * stamp.nanosec) or 1e-9 * received_ns
 
 
-def _seven(position: Message, rotation: Message) -> tuple[float, ...]:
-    return (
-        *(position.x, position.y, position.z),
-        *(rotation.x, rotation.y, rotation.z, rotation.w),
-    )
+def _seven(
+    contents: _Contents, name: str, position: Message, rotation: Message
+) -> tuple[float, ...]:
+    """The numbers of a pose; none where it is no pose, by the tolerance of tf2."""
+    turn = rotation.x, rotation.y, rotation.z, rotation.w
+    seven = (position.x, position.y, position.z, *turn)
+    # No map is as large, nor are numbers that are none.
+    if all(abs(number) < 1e9 for number in seven) and abs(hypot(*turn) - 1.0) <= 0.005:
+        return seven
+    contents.refused.add(name)
+    return ()
 
 
 def _add_image(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
@@ -278,14 +295,18 @@ def _add_joints(contents: _Contents, topic: str, message: Message, received_ns: 
 
 def _add_pose(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
     pose = message.pose
-    values = contents.poses.setdefault(topic, array("d"))
-    values.extend((_stamp_s(message, received_ns), *_seven(pose.position, pose.orientation)))
+    if seven := _seven(contents, topic, pose.position, pose.orientation):
+        values = contents.poses.setdefault(topic, array("d"))
+        values.extend((_stamp_s(message, received_ns), *seven))
 
 
 def _add_frames(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
     for each in message.transforms:
         edge = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
-        moved = _seven(each.transform.translation, each.transform.rotation)
+        name, moved = " from ".join(edge), each.transform
+        moved = _seven(contents, name, moved.translation, moved.rotation)
+        if not moved or edge[0] == edge[1]:
+            continue
         if "static" in topic:
             contents.still[edge] = array("d", (0.0, *moved))
         else:
@@ -395,7 +416,7 @@ def _motion(
         raise DataError(
             "The bag does not say where the robot was: it has "
             f"{some_of([*contents.poses, *contents.joints]) or 'no poses'}, and neither TF of a "
-            "moving arm nor joints with /robot_description.",
+            f"moving arm nor joints with /robot_description.{_refused(contents)}",
             culprits=[*contents.poses, *contents.joints],
             next_step="Name its poses: --robot-key TOPIC (of PoseStamped) or BASE,TIP (frames "
             "of TF); or record /tf, /tf_static and /robot_description, too.",
@@ -437,6 +458,12 @@ def _ends(contents: _Contents) -> tuple[str, str]:
         for _, child in contents.moving
         if not any(parent == child for parent, _ in contents.moving)
     }
+    if not links:
+        raise DataError(
+            f"The moving frames of TF go round: {some_of([*contents.parents], 6)}.",
+            culprits=[*contents.parents],
+            next_step="Name the base and the tip of the arm: --robot-key base_link,tool0",
+        )
     longest = max(map(len, links.values()))
     ends = [child for child, above in links.items() if len(above) == longest]
     if len(ends) > 1:
@@ -453,6 +480,11 @@ def _ends(contents: _Contents) -> tuple[str, str]:
         next((name for name in _BASES if name in above), base),
         next((name for name in _TIPS if name in below), tip),
     )
+
+
+def _refused(contents: _Contents) -> str:
+    names = some_of(sorted(contents.refused), 6)
+    return f" Rows of {names} are no poses, and were left out." if names else ""
 
 
 def _between(contents: _Contents, base: str, tip: str) -> tuple[FloatArray, FloatArray]:

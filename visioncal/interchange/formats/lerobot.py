@@ -19,7 +19,7 @@ from visioncal.core.documents.jsons import parse_json
 from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
 from visioncal.core.extras import client_library
-from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes, read_text
+from visioncal.core.files import MAX_VALUES, MOST_IMAGE_BYTES, read_bytes, read_text, too_many
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.interchange.formats.file_search import path_inside
@@ -73,6 +73,14 @@ def _parquet(path: Path, columns: list[str], rows: IntArray | None = None) -> di
     """The columns of a parquet file, of some rows or of all."""
     parquet = client_library("pyarrow.parquet", "lerobot")
     try:
+        facts = parquet.read_metadata(path)
+        groups = map(facts.row_group, range(facts.num_row_groups))
+        parts = (group.column(at) for group in groups for at in range(facts.num_columns))
+        names = tuple(columns)
+        values = sum(part.num_values for part in parts if part.path_in_schema.startswith(names))
+        # Some letters of a file may stand for any number of values.
+        if values > (most := 20 * MAX_VALUES):
+            raise too_many(str(path), most)
         table = parquet.read_table(path, columns=columns)
         if rows is not None:
             table = table.take(rows)
@@ -123,6 +131,10 @@ class _Info:
                 raise _refusal(f"meta/info.json: video_path asks for {found[0]}", "video_path")
             return str(known_value).rjust(int(found[2] or 0), "0")
 
+        # Lists of other files, which FFmpeg would follow out of the folder, have other endings.
+        if not self.video_path.endswith(".mp4"):
+            words = f"meta/info.json: video_path is {self.video_path[:80]!r}"
+            raise _refusal(f"{words}; a place that ends in .mp4 is needed", "video_path")
         return re.sub(r"\{([^{}:]*)(?::0?([0-9]?)d?)?\}", value, self.video_path)
 
 
