@@ -142,9 +142,11 @@ def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
     assert error @ np.linalg.solve(known.joint_covariance, error) < 32.9
     budget = known.uncertainty.budget_mm
     assert 0.0 < budget["temperature"] < budget["total"]
-    # A check has no use for what the drift's parameters are: the edges' covariance has them.
-    prior_calibration = CalibrationPrior.of(known)
-    assert prior_calibration.covariance[:12, :12] == pytest.approx(known.joint_covariance, rel=1e-9)
+    # A check has no use for what the drift's parameters are: the edges' covariance has them. It is
+    # of the same arm, and errors of links that no stop shows are in no check.
+    assert known.joint_fit.covariance[:12, :12] == pytest.approx(known.joint_covariance, rel=1e-9)
+    narrower = np.diag(CalibrationPrior.of(known).covariance)[:12]
+    assert (narrower <= np.diag(known.joint_covariance) * (1.0 + 1e-9)).all()
 
 
 def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):

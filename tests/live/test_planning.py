@@ -163,8 +163,11 @@ def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
     q = cell.robot.joints[:3]
     world = predict_worlds([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
     solved = found[0].assessment
-    # How well levels of noise are known is told of data alone.
-    covariance = solved.covariance - solved.covariance_by_source["noise_level"]
+    # How well levels of noise are known, and errors of the arm that no stop shows, are told of data
+    # alone.
+    assert not found[0].robot_arm.errors.gain
+    sources = solved.covariance_by_source
+    covariance = solved.covariance - sources["noise_level"] - sources["arm"]
     sigmas = np.sqrt(np.diag(covariance)[:6])
     # The plan's weak prior of 0.2 m and rad is all that differs.
     assert np.sqrt(np.diag(world.covariance([]))[:6]) == pytest.approx(sigmas, rel=1e-4)
