@@ -32,7 +32,7 @@ from visioncal.estimation.model_evidence import (
 )
 from visioncal.estimation.normal_equations import Whitening, normal_equations
 from visioncal.estimation.outliers import distances, inliers_and_moves, refine_inliers
-from visioncal.estimation.problem_parts import ROBOT, Effect, FramePrior, Noise, State
+from visioncal.estimation.problem_parts import ROBOT, Effect, FramePrior, Noise, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     Solution,
@@ -215,6 +215,33 @@ def test_priors_of_frames_have_the_jacobian_of_central_differences():
         )
         # In units of sigmas of a millimetre: rounding of 1e-16 m over steps of 1e-6.
         np.testing.assert_allclose(slopes, problem.prior_rows(prior, state)[1], atol=1e-6)
+
+
+def test_noise_does_not_pass_for_a_smaller_board_where_the_arm_can_follow():
+    # The board's size is known to 5 %, the arm's not at all: the stops say nothing about either.
+    rng = np.random.default_rng(3)
+    cell = world(rng, 40, 1.0)
+    pairs = [pair for pair in cell.pairs if pair[:2] == ("cam_left", "target_a")]
+    exact = dict.fromkeys(cell.robot_sigmas, (1e-06, 1e-06))
+    problem = observed(replace(cell, pairs=pairs, robot_sigmas=exact), rng, noise=10.0)
+    kept = ("base_a", "flange_a", "cam_left", "target_a")
+    tree = replace(problem.tree, branches={name: problem.tree.branches[name] for name in kept})
+    covariance = 100.0 * problem.observations.covariance
+    problem = replace(
+        problem,
+        tree=tree,
+        poses={"a": problem.poses["a"]},
+        observations=replace(problem.observations, covariance=covariance),
+    )
+    wide = PriorInformation(1e-4 * np.eye(1), np.zeros(1))
+    larger = {"a": by_size(problem.poses["a"])[:, :, None]}
+    arm, size = Effect.free("arm", wide, flange_jacobian=larger), 0.05
+    problem = problem.with_effects([arm, joint.target_sizes(problem, ["target_a"], size)])
+    state = problem.start(cell.truth)
+    noise = Noise(np.array([exact["a"]]), np.zeros(0))
+    found, _ = solve_problem(problem.sized_at(state), state, noise)
+    # Slopes at the measured poses make it 20 % smaller: four sigmas of what is stated.
+    assert abs(found.values[-1]) < 0.2 * size
 
 
 def test_repeated_views_of_a_still_board_count_as_one():

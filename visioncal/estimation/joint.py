@@ -7,7 +7,7 @@ Relinearising at the solution until convergence is Gauss-Newton's method on the 
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -181,6 +181,7 @@ def _fitted(
     if others is not None:
         first = len(start.values) - len(others)
         start = State(start.edges, np.concatenate([start.values[:first], others]))
+    problem = problem.sized_at(start)
     return ConvergedFit(corners, problem, fit_problem(problem, start, model.noise))
 
 
@@ -214,6 +215,7 @@ def measured_scale(
     problem, state, optics = fitted.problem, fitted.fit.state, fitted.camera_parameters
     widened = problem.with_effects([*problem.effects, target_sizes(problem, [frame])])
     extended = State(state.edges, np.append(state.values, 0.0))
+    widened = widened.sized_at(extended)
     information, gradient = normal_equations(widened, extended, fitted.fit.noise)
     covariance = covariance_among(information, widened.moving)
     total, scale, stated = np.zeros(widened.size), 0.0, 0.0
@@ -250,7 +252,8 @@ def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf)
     of_frames = (observed[:, None] == np.array(frames))[:, None]
     jacobian = by_size(problem.observations.measured)[:, :, None] * of_frames
     prior = PriorInformation(sigma**-2.0 * np.eye(len(frames)), np.zeros(len(frames)))
-    return Effect.free("sizes of targets", prior, jacobian)
+    effect = Effect.free("sizes of targets", prior, jacobian)
+    return replace(effect, sizes=np.arange(len(frames)))
 
 
 def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:

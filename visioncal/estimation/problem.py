@@ -20,7 +20,14 @@ import numpy as np
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, Observations, State
+from visioncal.estimation.problem_parts import (
+    Effect,
+    FramePrior,
+    Noise,
+    Observations,
+    State,
+    by_size,
+)
 from visioncal.estimation.tree import PathStep, Tree
 
 # Uninformative variance of a flange error that was not observed [rad^2 and m^2].
@@ -154,6 +161,24 @@ class Problem:
         """Returns the problem with other effects; itself if they are unchanged."""
         kept = tuple(effect for effect in effects if len(effect))
         return self if kept == self.effects else replace(self, effects=kept)
+
+    def sized_at(self, state: State) -> "Problem":
+        """Returns the problem with the slopes by targets' sizes at the poses predicted by a state.
+
+        Slopes at measured poses have the noise of these. Where arm and frames can follow a size,
+        such noise is least with targets of no size (errors in variables: Fuller 1987, 1.1).
+        """
+        noise = by_size(invert(self.predicted(state)) @ self.measured(state))[:, :, None]
+
+        def corrected(effect: Effect) -> Effect:
+            if effect.by_sensor is None or not len(effect.sizes):
+                return effect
+            slopes = effect.by_sensor.copy()
+            sized = slopes[:, :, effect.sizes]
+            slopes[:, :, effect.sizes] = sized - noise * sized.any(axis=1, keepdims=True)
+            return replace(effect, by_sensor=slopes, sizes=effect.sizes[:0])
+
+        return self.with_effects([corrected(effect) for effect in self.effects])
 
     @cached_property
     def unknown(self) -> Mapping[str, int]:

@@ -87,6 +87,8 @@ class Effect:
     rows_concerned: Mask | None = None
     # Number of the last values that are random coefficients, which no stop determines.
     random: int = 0
+    # Indices of the values that are relative sizes of targets, with slopes at the measured poses.
+    sizes: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @classmethod
     def free(

@@ -68,7 +68,7 @@ class CellFit:
 
     def with_joint_fit(self, fitted: ConvergedFit) -> Self:
         """Takes over a joint fit of lenses, boards and frames."""
-        problem = self.full_problem(fitted.linearised)
+        problem = self.full_problem(fitted.linearised).sized_at(fitted.fit.state)
         inlier_fit = replace(self.inlier_fit, problem=problem, fit=fitted.fit)
         return replace(self, inlier_fit=inlier_fit, linearised_corners=fitted.linearised)
 

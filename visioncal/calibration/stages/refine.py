@@ -189,6 +189,7 @@ def _estimated(
             noise = replace(noise, robots=robots)
     in_order = [values[effect.name] for effect in problem.effects]
     state = State(fitted.fit.state.edges, np.concatenate(in_order))
+    problem = problem.sized_at(state)
     levels, lenses, boards = dict[str, LensLevels](), dict[str, LensSizes](), optics.board_sizes
     for name in optics.problems:
         rows, uneven = cell_fit.rows(seen), UNEVEN_LINKS if cell_fit.has_links else 1.0

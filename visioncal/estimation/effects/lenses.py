@@ -69,6 +69,11 @@ class CameraParameters:
         """Indices of the printed boards; see `CornerProblem.printed`."""
         return self._one.printed
 
+    @property
+    def scales(self) -> IntArray:
+        """Indices of the printed boards' scales."""
+        return self.places(next(iter(self.problems)))[self._one.scale]
+
     def shape_of(self, target: int) -> IntArray:
         """Indices of the values of one target's shape; of a printed board the scale comes first."""
         return self.places(next(iter(self.problems)))[self._one.points_of(target)]
@@ -308,7 +313,8 @@ class LinearisedCorners:
         )
         values = np.append(self.camera_parameters.values[self.free], np.zeros(fields))
         held = np.append(self.held, np.zeros(fields, dtype=bool))
-        return Effect(LENSES, values, prior, held, by_sensor, random=fields)
+        scales = np.flatnonzero(np.isin(self.free, self.camera_parameters.scales))
+        return Effect(LENSES, values, prior, held, by_sensor, random=fields, sizes=scales)
 
     @property
     def views(self) -> tuple[int, ...]:
