@@ -120,7 +120,7 @@ def fit_jointly(
         ConvergenceError: The fit diverges: the robot's poses do not belong to the images.
     """
     with diverging():
-        fitted = _fitted(model, optics.linearised(), frames, others)
+        fitted = _fitted(model, optics.linearised(), frames, others, model.noise)
         for _ in range(8):
             sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
             if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
@@ -128,7 +128,8 @@ def fit_jointly(
             corners = _stepped(fitted)
             if corners is fitted.linearised:
                 raise np.linalg.LinAlgError("the corners follow no part of the step")
-            previous, fitted = fitted, _fitted(model, corners, fitted.frames, fitted.others)
+            previous = fitted
+            fitted = _fitted(model, corners, fitted.frames, fitted.others, fitted.fit.noise)
             if not (previous.fit.settled or fitted.fit.settled):
                 break
         return fitted
@@ -175,6 +176,7 @@ def _fitted(
     corners: LinearisedCorners,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None,
+    noise: Noise | None,
 ) -> ConvergedFit:
     problem = model.problem(corners)
     start = problem.start(frames)
@@ -182,7 +184,7 @@ def _fitted(
         first = len(start.values) - len(others)
         start = State(start.edges, np.concatenate([start.values[:first], others]))
     problem = problem.sized_at(start)
-    return ConvergedFit(corners, problem, fit_problem(problem, start, model.noise))
+    return ConvergedFit(corners, problem, fit_problem(problem, start, noise))
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ def levenberg_marquardt(
             # derivatives.
             if predicted <= _LITTLE:
                 return now.state, True
-            damping *= 10
+            damping = max(10.0 * damping, START_DAMPING)
             if damping > 1.0 / NEAR_DAMPING:
                 return now.state, True
     return now.state, False

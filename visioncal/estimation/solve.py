@@ -41,6 +41,8 @@ _STEPS = 30
 # Relative change of noise levels at convergence, far below their uncertainty.
 _LEVELS_SETTLED = 1e-3
 
+# Largest share of a change of the levels that the next change repeats: it bounds extrapolation.
+_MOST_SHARE = 0.9
 # Bounds of a sensor's noise relative to its stated noise.
 _SENSOR_RANGE = (1e-3, 1e4)
 
@@ -75,6 +77,7 @@ def fit_problem(
     is_unchanged = is_near and _are_close(given, noise)
     if is_unchanged:
         noise = given
+    last = np.zeros_like(noise.sensors)
     for turn in range(0 if is_unchanged else turns):
         start, previous = state, noise
         state, _ = solve_problem(
@@ -85,6 +88,13 @@ def fit_problem(
         noise = estimate_noise(problem, state, noise)
         if _are_close(previous, noise):
             break
+        # Levels of sensors and robots follow each other slowly: extrapolated (Aitken 1926).
+        change = np.log(noise.sensors / previous.sensors)
+        share = float(
+            np.clip(change @ last / max(float(last @ last), np.finfo(float).tiny), 0.0, _MOST_SHARE)
+        )
+        noise = replace(noise, sensors=noise.sensors * np.exp(change * share / (1.0 - share)))
+        last = np.zeros_like(change) if share > 0.0 else change
     # A solve keeps the weights of its start: solve once more from the solution.
     state, settled = solve_problem(problem, state, noise, is_near=True)
     return Solution(state, noise, settled)

@@ -118,7 +118,6 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
-    cell_fit = replace(cell_fit, inlier_fit=with_camera_levels(cell, poses, cell_fit.inlier_fit))
     cell_fit, noise = _calibrate_arms(cell_fit, observed, final)
     if level != "hand-eye":
         # The many unknowns of functions of the joints would slow each update of the inliers down.
@@ -365,9 +364,9 @@ def initial_inliers(start: Start) -> InlierFit:
     """Finds the inliers, and the priors that they do not contradict."""
     cell, problem, state = start.cell, start.problem, start.state
     movable, observations = _movable_frames(cell, problem), problem.observations
-    stated_levels = len(starting_noise(problem).sensors)
-    # Before the lenses are fitted, cameras disagree about one stop by more than their corners say:
-    # a board shrunk to nothing would reconcile them, and all stops would be explained.
+    # Cameras may disagree about one stop by more than their corners say, and not before the lenses
+    # are fitted alone: a board shrunk to nothing would reconcile them, or a robot's noise of
+    # decimetres, and all stops would be explained.
     problem = _with_camera_levels(cell, start.poses, problem)
     # Targets whose corners were seen: other poses have no known covariance.
     pairs = zip(observations.observed, observations.sensors.tolist(), strict=True)
@@ -381,16 +380,9 @@ def initial_inliers(start: Start) -> InlierFit:
     else:
         loose = replace(problem, priors=with_loose_positions(cell.priors))
         inliers = _with_priors(cell, inliers_and_moves(loose, state, movable)).refitted()
-    # Sizes are estimated from the corners, with the lenses, and the cameras' noise beside them.
-    noise = replace(inliers.fit.noise, sensors=inliers.fit.noise.sensors[:stated_levels])
-    fit = replace(inliers.fit, state=State(inliers.fit.state.edges, np.zeros(0)), noise=noise)
-    observations = replace(inliers.problem.observations, sensors=observations.sensors)
-    problem = replace(
-        inliers.problem.with_effects(()),
-        observations=observations,
-        least_levels=start.problem.least_levels,
-    )
-    return replace(inliers, problem=problem, fit=fit)
+    # Sizes are estimated from the corners, with the lenses.
+    fit = replace(inliers.fit, state=State(inliers.fit.state.edges, np.zeros(0)))
+    return replace(inliers, problem=inliers.problem.with_effects(()), fit=fit)
 
 
 def updated_inliers(cell: Cell, inliers: InlierFit) -> InlierFit:
@@ -400,18 +392,6 @@ def updated_inliers(cell: Cell, inliers: InlierFit) -> InlierFit:
         inliers = refine_inliers(replace(inliers, problem=loose), _movable_frames(cell, loose))
         inliers = _with_priors(cell, inliers)
     return refine_inliers(inliers, _movable_frames(cell, inliers.problem))
-
-
-def with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], inliers: InlierFit) -> InlierFit:
-    """Estimates the noise level of cameras, too, now that outliers are removed."""
-    levelled = _with_camera_levels(cell, poses, inliers.problem)
-    if levelled is inliers.problem:
-        return inliers
-    # The calibration of the arms starts from this fit.
-    noise = inliers.fit.noise
-    unit_levels = np.ones(len(levelled.least_levels) - len(noise.sensors))
-    noise = replace(noise, sensors=np.concatenate([noise.sensors, unit_levels]))
-    return replace(inliers, problem=levelled, fit=replace(inliers.fit, noise=noise)).refitted()
 
 
 def _with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], problem: Problem) -> Problem:
