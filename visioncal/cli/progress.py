@@ -19,6 +19,8 @@ WORDS = {
     "clock": "compare the clocks",
     "joints": "check the joint angles",
     "solve": "solve for all frames",
+    "lenses": "fit lenses, boards and frames, with outliers left out",
+    "arms": "fit the arms, and look again for outliers and moves",
     "examine": "leave views out and predict them",
     "judge": "judge the result",
     "write": "write the result, report and recording",
@@ -91,9 +93,11 @@ def _lines(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
     start_s, over = time.monotonic(), Event()
 
     def say() -> None:
-        last = ""
+        last, pauses = "", 0
         while not over.wait(PAUSE_S):
-            if steps.line != last:
+            pauses += 1
+            # What takes long is said again each minute.
+            if steps.line != last or pauses % 30 == 0:
                 last = steps.line
                 console().print(f"{last} ({time.monotonic() - start_s:.0f} s)", markup=False)
 

@@ -200,6 +200,8 @@ def _calibrate_arms(
     """
     noise = cell_fit.inlier_fit.fit.noise
     for iteration in range(_ROUNDS + 1):
+        if observed.progress is not None:
+            observed.progress("arms", iteration, _ROUNDS + 1)
         if cell_fit.level != "hand-eye":
             arms = _choose_levels(cell_fit, noise)
             erring = [name for name, arm in arms.items() if arm.has_free_errors]
@@ -243,7 +245,9 @@ def _fit_with_inliers(start: CellFit, observed: Observed) -> CellFit:
     # In a whole cell the inliers are updated at the end, once the arms are calibrated: a frame
     # that moved must not be taken for outliers.
     cell_fit = start
-    for _ in range(_ROUNDS):
+    for iteration in range(_ROUNDS):
+        if observed.progress is not None:
+            observed.progress("lenses", iteration, _ROUNDS)
         # Errors of an arm are sought beside the stated lenses and boards, which may hide them.
         if any(arm.errors and arm.errors.is_significant for arm in cell_fit.arms.values()):
             cell_fit = replace(cell_fit, linearised_corners=None)
