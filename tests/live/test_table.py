@@ -3,6 +3,7 @@
 import shutil
 import time
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -182,6 +183,48 @@ def takes(station: Station, visitor: Visitor, *places: int) -> None:
 
 def answered(visitor: Visitor, count: int) -> None:
     wait_until(lambda: visitor.answers == count)
+
+
+def test_the_session_keeps_the_form_in_which_all_poses_were_typed(recording):
+    station, visitor = recording.station, Visitor(recording.station.snapshot)
+    lines = {"kuka": "X 900 Y 0 Z 500 A 10 B 0 C 180", "fanuc": "X 900 Y 0 Z 500 W 180 P 0 R 10"}
+    lines |= {"ros": "0.9 0 0.5 0 0 0 1"}
+    takes(station, visitor, 1, 2)
+    answered(visitor, 1)
+    # A library is no maker, and poses in two forms are of none.
+    for count, (form, kept) in enumerate(
+        (("fanuc", None), ("kuka", "kuka"), ("ros", None), ("kuka", "kuka")), 2
+    ):
+        station.repose(visitor, 1, read_pose(lines[form], "line", form), lines[form])
+        answered(visitor, count)
+        assert not visitor.refusal
+        table = Session.load(recording.out).declaration.robot
+        assert (table and table.form) == kept
+    station.mend(visitor, "not wanted", 2)
+    answered(visitor, 6)
+    station.repose(visitor, 1, read_pose(lines["ros"], "line", "ros"), lines["ros"])
+    answered(visitor, 7)
+    assert Session.load(recording.out).declaration.robot is None
+
+
+def test_a_resumed_recording_goes_on_in_its_form(tmp_path):
+    def typed(form):
+        view = taken(10, 0.1)
+        return replace(view, state=replace(view.state, pose_form=form))
+
+    Journal.begin(tmp_path / "cell", FACTS, 0.0, 0).store({1: typed("kuka")})
+    toml = tmp_path / "cell" / "session.toml"
+    edited = toml.read_text() + "\n[need]\nmm = 0.5\n"
+    toml.write_text(edited)
+    journal = Journal.resume(tmp_path / "cell", FACTS, 0.0, 0)
+    assert journal.form == "kuka"
+    journal.store({2: typed("kuka")})
+    # Whoever adds to the file meanwhile keeps it.
+    assert toml.read_text() == edited
+    assert Session.load(tmp_path / "cell").robots[""].form == "kuka"
+    journal.store({3: typed("abb")})
+    session = Session.load(tmp_path / "cell")
+    assert (session.robots[""].form, session.need.mm) == (None, 0.5)
 
 
 def test_requests_while_a_trial_runs_are_all_done_at_once(recording):

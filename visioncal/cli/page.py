@@ -19,7 +19,7 @@ from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.choices import CameraMount
 from visioncal.core.codec import read
-from visioncal.core.conventions import POSE_FORMS
+from visioncal.core.conventions import POSE_FORMS, controller_form
 from visioncal.core.documents.jsons import parse_stored, read_json
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.extras import client_library
@@ -86,6 +86,7 @@ def record_on_page(options: RecordOptions) -> None:
             taking_of(chosen, is_driven=False),
             ("calibrate", str(out)),
             out.with_name(f"{out.name}-result"),
+            None if recorded.robot is None else controller_form(recorded.robot.name),
         )
 
     words = (*described, *_DEVICES)
@@ -137,7 +138,7 @@ def verify_on_page(options: VerifyOptions) -> None:
             *(recorded, lens.camera, stops, CheckLimits.stops),
             taking_of(chosen, is_driven=False),
             ("verify", str(out), "--against", str(against), *moved, *entered),
-            _result(out),
+            *(_result(out), calibration.controller()),
         )
 
     asked = {"against": ("Cell", found), **{name: _FIELDS[name] for name in _DEVICES}}

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import tomli_w
 
+from visioncal.core.choices import POSE_FORMS
 from visioncal.core.errors import DataError
 from visioncal.core.files import (
     flush_folder,
@@ -41,8 +42,11 @@ from visioncal.vision.targets import load_target, stored_target, target_document
 # File that names devices and plan; written before the first view.
 PROVENANCE = "recorded.toml"
 _IMAGES, _TABLE, _TARGET_FILE = "images", "views.csv", "target.toml"
+_SESSION = "session.toml"
 # Columns that belong to a row's picture; all others belong to its pose.
 _OF_PICTURE = re.compile("stamp_s|blur_px|motion_px|exposure_ms|picture|device_.*")
+# Column of the form in which a pose was typed or sent.
+_FORM = "pose_form"
 # End of the name of an image that is to replace its row's.
 _AGAIN = "-again.png"
 _Cell = TypeVar("_Cell", float, str)
@@ -119,7 +123,7 @@ class CaptureFacts(RecordedCell):
                 model, text = robot_file(robot.document, named)
                 texts[model] = text
             document["robot"] = {"model": model, "tip": robot.tip}
-        texts["session.toml"] = tomli_w.dumps(document)
+        texts[_SESSION] = tomli_w.dumps(document)
         return texts
 
     def provenance(self) -> dict[str, Any]:
@@ -159,12 +163,9 @@ class CaptureFacts(RecordedCell):
             "safety": state.safety,
             "blur_px": f"{taken.corners.blur_px:.2f}",
             "motion_px": f"{taken.motion_px:.3f}",
-            **{
-                name: text
-                for name, text in (("picture", frame.name), ("typed", state.typed))
-                if text
-            },
         }
+        named = {"picture": frame.name, "typed": state.typed, _FORM: state.pose_form}
+        texts |= {name: text for name, text in named.items() if text}
         if state.flange_from_tool is not None:
             tcp = pose_row(state.flange_from_tool).values()
             texts["tcp"] = " ".join(f"{value:.9g}" for value in tcp)
@@ -179,7 +180,10 @@ def posed(view: View, pose: View | ArmState) -> View:
     numbers, text = (
         (pose.numbers, pose.text)
         if isinstance(pose, View)
-        else (pose_row(pose.base_from_flange), {"safety": pose.safety, "typed": pose.typed})
+        else (
+            pose_row(pose.base_from_flange),
+            {"safety": pose.safety, "typed": pose.typed, _FORM: pose.pose_form},
+        )
     )
 
     def paired(own: Mapping[str, _Cell], other: Mapping[str, _Cell]) -> dict[str, _Cell]:
@@ -187,6 +191,14 @@ def posed(view: View, pose: View | ArmState) -> View:
         return kept | {k: cell for k, cell in other.items() if not _OF_PICTURE.fullmatch(k)}
 
     return replace(view, numbers=paired(view.numbers, numbers), text=paired(view.text, text))
+
+
+def _form_of(views: Sequence[View]) -> str:
+    """The maker's form in which all poses were typed or sent; empty where there is none."""
+    forms = {view.text.get(_FORM, "") for view in views}
+    form = POSE_FORMS.get(forms.pop()) if len(forms) == 1 else None
+    # Those of libraries are no controller's.
+    return form.name if form and form.models else ""
 
 
 def picture_name(view: View) -> str:
@@ -218,6 +230,8 @@ class Journal:
         self._columns: tuple[str, ...] = ()
         self._facts, self._offset_s = facts, unix_offset_s
         self._document: dict[str, Any] = {}
+        # The maker's form in which all poses were typed or sent; empty where there is none.
+        self.form = ""
 
     @classmethod
     def begin(
@@ -285,6 +299,7 @@ class Journal:
         if (folder / _TABLE).is_file():
             session = Session.load(folder)
             journal.views, journal._columns = session.views, session.columns
+            journal.form = _form_of(session.views)
         journal._settle()
         return journal
 
@@ -317,9 +332,6 @@ class Journal:
             self._check_room(len(data), f"view {number}")
             self._write(image, data)
             rows[number] = self._facts.view_of(number, image, view, self._offset_s)
-        if not self.views:
-            for name, text in self._facts.texts().items():
-                self._write(name, text)
         self.rewrite([*rows.values()])
 
     def rewrite(self, views: Sequence[View]) -> None:
@@ -331,6 +343,18 @@ class Journal:
         known = self._columns if views and self._columns else ("view", "image")
         filled = (name for view in views for name in (*view.numbers, *view.text))
         columns = tuple(dict.fromkeys([*known, *filled]))
+        form = _form_of(views)
+        if views and not self.views:
+            self.form = ""
+            for name, text in self._facts.texts().items():
+                self._write(name, text)
+        if views and form != self.form:
+            # Whoever edits the file meanwhile keeps all else.
+            document = read_toml(self.folder / _SESSION, _SESSION)
+            robot = {k: v for k, v in document.pop("robot", {}).items() if k != "form"}
+            robot |= {"form": form} if form else {}
+            self._write(_SESSION, tomli_w.dumps(document | ({"robot": robot} if robot else {})))
+            self.form = form
         if views:
             self._write(_TABLE, write_csv(columns, views))
         gone = {view.image for view in self.views} - {view.image for view in views}

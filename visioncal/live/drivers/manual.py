@@ -84,7 +84,7 @@ class ManualArm:
             pose = self._read(line)
             if isinstance(pose, str):
                 raise DriverError(pose, culprits=["stdin"], next_step="Correct it: a pose a line.")
-            return ArmState(time.monotonic(), pose.pose)
+            return ArmState(time.monotonic(), pose.pose, pose_form=pose.form.name)
         line = self._answer("Pose of the flange: ")
         while True:
             pose = self._read(line)
@@ -96,7 +96,7 @@ class ManualArm:
                 "again: "
             )
             if not line.strip():
-                return ArmState(time.monotonic(), pose.pose)
+                return ArmState(time.monotonic(), pose.pose, pose_form=pose.form.name)
 
     def close(self) -> None:
         """Holds no resources."""

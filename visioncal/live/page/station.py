@@ -14,7 +14,7 @@ from typing import Concatenate, Literal, ParamSpec
 import numpy as np
 
 from visioncal.calibration.stages.detect import find_corners
-from visioncal.core.conventions import POSE_FORMS, controller_form
+from visioncal.core.conventions import POSE_FORMS, PoseForm
 from visioncal.core.documents.pendants import PendantPose, pendant_words
 from visioncal.core.errors import DataError, DriverError, VisioncalError
 from visioncal.core.number_format import counted, figure
@@ -88,6 +88,7 @@ class Task:
     options: CaptureOptions
     command: Sequence[str]  # The command's words, without the folder that it writes.
     result: Path  # That folder.
+    usual: PoseForm | None = None  # The form of its controller's poses, where it is known.
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,8 @@ class Station:
             return "Another pose is wanted now: look at the page, and press again."
         now_s = cell.clock.now()
         states = [
-            ArmState(now_s, pose.pose, typed=line) for pose, line in zip(poses, typed, strict=True)
+            ArmState(now_s, pose.pose, typed=line, pose_form=pose.form.name)
+            for pose, line in zip(poses, typed, strict=True)
         ]
         others = [view for view in journal.views if view.number != again]
         for at, state in enumerate(states):
@@ -292,7 +294,7 @@ class Station:
         rows = {view.number: view for view in self._capture.journal.views}
         if number not in rows or rows[number].joints_rad is not None:
             return "Only the pose of a view without joints can be typed: take it again."
-        state = ArmState(0.0, pose.pose, typed=line)
+        state = ArmState(0.0, pose.pose, typed=line, pose_form=pose.form.name)
         others = [view for view in rows.values() if view.number != number]
         return _why_same(state, others) or self._repair(visitor, {**rows, number: state})
 
@@ -456,14 +458,13 @@ class Station:
         )
         self._skipped = cell.camera.given if isinstance(cell.camera, StoredPictures) else set()
         self._rest = RestWatch(journal, self._task.options.still)
-        robot, arm = self._task.recorded.robot, cell.arm
-        form = None if robot is None else controller_form(robot.name)
+        arm, usual = cell.arm, "ros" if self._task.usual is None else self._task.usual.name
         self._publish(
             phase="live",
             arm=arm.name,
             takes_typed=isinstance(arm, ManualArm),
             is_stored=cell.is_stored,
-            pose_form=setup.pose_form or ("ros" if form is None else form.name),
+            pose_form=setup.pose_form or journal.form or usual,
             note=getattr(arm, "invitation", ""),
             missed="",
             trial=None,
