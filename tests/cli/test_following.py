@@ -1,5 +1,7 @@
 """Advice that is followed to its end: it runs, mends, and does not come again."""
 
+import csv
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -8,10 +10,12 @@ import pytest
 import tomli_w
 from PIL import Image
 from support.commands import Done
+from support.edited import rewritten
 from support.following import follow
 from support.fuzz.broken_sessions import BROKEN, edit, sound_session
 from support.marks import slow
 
+from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, cell_session, simulate
 
 SIZE = "In session.toml, write resolution = [640, 480]."
@@ -148,3 +152,125 @@ def test_a_board_that_nobody_finds_is_looked_for_by_a_person(place):
     followed = follow("calibrate", "cell", "-o", "out")
     assert followed.done == ()
     assert "not mirrored" in followed.last.refused().said
+
+
+def text(old: str, new: str, name: str = "session.toml"):
+    """Replaces a text of a session's file."""
+    return lambda folder: edit(folder, lambda before: before.replace(old, new), name)
+
+
+def cells(change):
+    """Changes each row of views.csv, given its number."""
+    return lambda folder: rewritten(folder, change)
+
+
+def logged(*, header=True, units=False, separator=",", image=True, rows=15):
+    """Writes poses beside a session as a table of somebody else's."""
+
+    def planted(folder: Path) -> None:
+        with (folder / "views.csv").open(newline="", encoding="utf-8") as file:
+            read = [*csv.DictReader(file)][:rows]
+        lines = [["image", "x", "y", "z", "qx", "qy", "qz", "qw"]] * header
+        lines += [["", "m", "m", "m", "", "", "", ""]] * units
+        lines += [[row["image"][7:], *(row[name] for name in POSE)] for row in read]
+        if separator == ";":
+            lines = [
+                [cell.replace(".", ",").replace(",png", ".png") for cell in it] for it in lines
+            ]
+        table = "\n".join(separator.join(line[not image :]) for line in lines)
+        (folder.parent / "log.csv").write_text(f"{table}\n", "utf-8")
+
+    return planted
+
+
+def as_windows_has_it(folder: Path) -> None:
+    for name in ("session.toml", "views.csv"):
+        data = (folder / name).read_bytes().replace(b"\n", b"\r\n")
+        (folder / name).write_bytes(b"\xef\xbb\xbf" + data)
+
+
+def half_copied(folder: Path) -> None:
+    for path in sorted((folder / "images").iterdir())[8:]:
+        path.unlink()
+
+
+def nothing(_folder: Path) -> None:
+    pass
+
+
+def calibrate(path: str) -> tuple[str, ...]:
+    return "calibrate", path, "-o", "out"
+
+
+FOCAL, CELL = "    914.2,\n    913.6,", calibrate("cell")
+MATRIX = f"matrix = [\n{FOCAL}\n    645.3,\n    396.8,\n]"
+CONVERT = ("convert", "log.csv", "new", "--images", "cell/images", "--mount", "eye-in-hand")
+CONVERT += ("--target", "charuco_9x6_30mm")
+# What somebody did wrong, the command, and how it ends: with that status and those words.
+DONE_WRONG = {
+    "a typing error in the path": (nothing, calibrate("cel"), 0, "good"),
+    "a table for the session": (nothing, calibrate("cell/views.csv"), 0, "good"),
+    "the folder of the images": (nothing, calibrate("cell/images"), 0, "good"),
+    "the folder above": (nothing, calibrate("."), 0, "good"),
+    "no session.toml": (lambda it: (it / "session.toml").unlink(), CELL, 2, "does not exist"),
+    "no views.csv": (lambda it: (it / "views.csv").unlink(), CELL, 2, "views.csv does not exist"),
+    "no images": (lambda it: shutil.rmtree(it / "images"), CELL, 2, "Copy them there"),
+    "half of the images": (half_copied, CELL, 0, "Only 8 views"),
+    "a table that is cut": (
+        lambda it: edit(it, lambda was: was[:-40], "views.csv"), CELL, 0, "good",
+    ),
+    "centimetres": (
+        cells(lambda _, row: row | {name: str(100 * float(row[name])) for name in POSE[:3]}),
+        CELL, 0, "good",
+    ),
+    "one decimal comma": (
+        cells(lambda at, row: row | {"x_m": row["x_m"].replace(".", ",")} if at == 3 else row),
+        CELL, 0, "good",
+    ),
+    "names of a quaternion exchanged": (
+        text("qx,qy,qz,qw", "qw,qx,qy,qz", "views.csv"), CELL, 0, "good",
+    ),
+    "columns exchanged": (
+        cells(lambda _, row: row | {"x_m": row["y_m"], "y_m": row["x_m"]}), CELL, 3, "bad",
+    ),
+    "Windows' line ends and marks": (as_windows_has_it, CELL, 0, "good"),
+    "tabs": (text(",", "\t", "views.csv"), CELL, 0, "good"),
+    "another board": (text("charuco_9x6_30mm", "charuco_7x5_36mm"), CELL, 0, "good"),
+    "cv2's matrix": (
+        text(MATRIX, "matrix = [[914.2, 0, 645.3], [0, 913.6, 396.8], [0, 0, 1]]"), CELL, 0, "good",
+    ),
+    "a comma in the matrix": (text("914.2", "914,2"), CELL, 2, "must be [fx, fy, cx, cy] [px]"),
+    "a focal length in mm": (text(FOCAL, "3.6, 3.6,"), CELL, 2, "fx and fy are in pixels"),
+    "a lens of twice the size": (text(FOCAL, "1828.4, 1827.2,"), CELL, 0, "good"),
+    "[cam] for [camera]": (text("[camera]", "[cam]"), CELL, 0, "good"),
+    "a path as Windows writes it": (
+        text("charuco_9x6_30mm", "C:\\Zelle\\b.toml"), CELL, 2, "paths with /",
+    ),
+    "images by their whole paths": (
+        cells(lambda _, row: row | {"image": f"C:\\me\\{row['image']}"}),
+        CELL, 2, "as images/000.png",
+    ),
+    "typographic quotes": (
+        text('"eye-in-hand"', "\N{LEFT DOUBLE QUOTATION MARK}eye-in-hand"),
+        CELL, 2, '"double quotes"',
+    ),
+    "Excel's semicolons": (logged(separator=";"), CONVERT, 0, "wrote new"),
+    "no header": (logged(header=False), CONVERT, 0, "wrote new"),
+    "a row of units": (logged(units=True), CONVERT, 0, "wrote new"),
+    "one pose too few": (logged(image=False, rows=14), CONVERT, 2, "one image a pose is needed"),
+    "a session for a result": (
+        nothing, ("verify", "cell", "--against", "cell"), 2, "Run visioncal",
+    ),
+}  # fmt: skip
+QUICK = ("a typing error", "no ", "a row", "[cam]", "a focal", "one pose", "a path")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name.startswith(QUICK) else slow(name) for name in DONE_WRONG]
+)
+def test_what_is_done_wrong_ends_in_a_result_or_in_words(place, name):
+    plant, words, status, said = DONE_WRONG[name]
+    plant(sound_session(place / "cell"))
+    followed = follow(*words)
+    assert followed.last.status == status, followed.last.said
+    assert said in followed.last.said

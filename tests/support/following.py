@@ -45,6 +45,8 @@ _NEGATE = re.compile(rf"[Nn]egate {_COLUMNS}")
 _OPTION = re.compile(r"(--[a-z][a-z-]+)((?: [a-z\d][\w.+-]*(?:,[\w.+-]+)*)?)")
 _SAY = re.compile(rf"(?:[Ss]ay|[Gg]ive|[Ww]ith|[Aa]dd) ((?:{_OPTION.pattern} ?)+)")
 _MEANT = re.compile(r"'([^']+)'.*Did you mean ([\w./-]+)")
+_FOLDER = re.compile(r"Name the session's folder: (\S+)$", re.MULTILINE)
+_FOR = re.compile(r"Write (\w+) for (\w+)\.")
 # Keys of session.toml that stand in a table of their own where none of the name is there.
 _TABLES = {"resolution": "camera", "matrix": "camera", "distortion": "camera", "model": "robot"}
 # Commands that show or propose something, and leave the input as it is: a person goes on.
@@ -187,6 +189,8 @@ def _next(
                 assert ended.status == 0, trail.told(f"{item.command}: {ended.said}")
     if said.status == 2:
         last = said.err.strip().splitlines()[-1]
+        if _FOLDER.search(last) or _FOR.search(last):
+            yield Advice(last)
         if (option := _options(last, current)) or _MEANT.search(said.err.replace("\n", " ")):
             yield Advice(last if option else said.err.replace("\n", " "))
 
@@ -349,9 +353,12 @@ def _typed(said: str, current: tuple[str, ...], trail: _Trail) -> tuple[str, ...
                 typed += [name, value] if value else [name]
         assert tuple(typed) != current, trail.told(f"{options} was given already")
         return tuple(typed)
-    meant = _MEANT.search(said)
-    assert meant is not None, trail.told("nothing is to be done")
-    wrong, right = meant[1], meant[2].rstrip("?.,")
+    if folder := _FOLDER.search(said):
+        first = next(at for at, word in enumerate(current[1:], 1) if not word.startswith("-"))
+        return (*current[:first], folder[1], *current[first + 1 :])
+    meant, other = _MEANT.search(said), _FOR.search(said)
+    assert meant or other, trail.told("nothing is to be done")
+    wrong, right = (meant[1], meant[2].rstrip("?.,")) if meant else (other[2], other[1])
     if wrong in current:
         return tuple(right if word == wrong else word for word in current)
     path = _folder(current) / "session.toml"

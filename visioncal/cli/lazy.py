@@ -33,21 +33,24 @@ class PlainCommand(TyperCommand):
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - typer's own
-        """Parses the options; with `--json`, a usage error becomes a DataError."""
-        wants_json = "--json" in args
+        """Parses the options; a usage error becomes a DataError."""
         typed = list(args)
         try:
             rest = super().parse_args(ctx, args)
         except _USAGE_ERROR as error:
-            if isinstance(error, typer.BadParameter):
-                self._refuse_missing(ctx, typed)
-            if not wants_json:
-                raise
-            param, unknown = getattr(error, "param", None), getattr(error, "option_name", "")
-            names = [*param.opts] if param else [unknown] if unknown else []
+            message, param = error.format_message(), getattr(error, "param", None)
+            names = [param.opts[-1]] if param else [getattr(error, "option_name", "")]
+            # The parser names the first of what is missing alone.
+            if param is not None and param.required:
+                given, _, _ = self.make_parser(ctx).parse_args(list(typed))
+                required = [each for each in self.params if each.required]
+                if missing := [each for each in required if given.get(each.name) in (None, ())]:
+                    names = [each.opts[-1] for each in missing]
+                    names = [name if name.startswith("-") else name.upper() for name in names]
+                    message = f"{listed(names)} {'is' if len(names) == 1 else 'are'} missing."
             raise DataError(
-                error.format_message(),
-                culprits=names[-1:],
+                message,
+                culprits=[*filter(None, names)],
                 next_step=f"{ctx.command_path} --help lists what it takes.",
             ) from None
         paths = (param for param in self.params if isinstance(ctx.params.get(param.name), Path))
@@ -64,21 +67,6 @@ class PlainCommand(TyperCommand):
                     "the shell is set.",
                 )
         return rest
-
-    def _refuse_missing(self, ctx: Any, typed: list[str]) -> None:  # noqa: ANN401 - typer's own
-        """Names all that has to be given and is not, where the parser names the first alone."""
-        values, _, _ = self.make_parser(ctx).parse_args(list(typed))
-        missing = [
-            param.opts[-1] if param.opts[-1].startswith("-") else param.opts[-1].upper()
-            for param in self.get_params(ctx)
-            if param.required and values.get(param.name) in (None, ())
-        ]
-        if missing:
-            raise DataError(
-                f"{listed(missing)} {'is' if len(missing) == 1 else 'are'} missing.",
-                culprits=missing,
-                next_step=f"{ctx.command_path} --help lists what it takes.",
-            )
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
         """Runs the command; Ctrl-C ends it with a message."""

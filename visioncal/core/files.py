@@ -244,8 +244,8 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
         raise DataError(
             f"{label} is not valid TOML: {error}.",
             culprits=[label],
-            next_step='Text is written in "double quotes", lists in [brackets, like, this]; tables '
-            "and keys are there once.",
+            next_step='Text is written in "double quotes", paths with /, lists in [brackets, like, '
+            "this]; tables and keys are there once.",
         ) from error
     except RecursionError as error:
         raise too_deep(label) from error

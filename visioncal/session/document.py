@@ -103,6 +103,12 @@ class CameraTable(TableModel):
             raise ValueError("has no resolution, and its matrix holds for one alone")
         if self.matrix is not None and min(self.matrix[:2]) <= 0:
             raise ValueError(f"has the matrix {self.matrix}, but fx and fy must be above 0")
+        # No lens of a camera sees more than 170 degrees without distortion.
+        if self.matrix and min(self.matrix[:2]) < 0.04 * max(self.resolution or ()):
+            raise ValueError(
+                f"has the matrix {self.matrix}, but fx and fy are in pixels: the focal length over "
+                "the side of a pixel, both in mm"
+            )
         return self
 
 

@@ -153,6 +153,7 @@ def inside_path(path: str) -> str:
             f"the path {path!r} leaves the session's folder; a path inside it, relative to it, "
             "is needed.",
             culprits=[path],
-            next_step="Copy the file into the session's folder.",
+            next_step="Copy the file into the session's folder, if it is not there, and write its "
+            "path in that, as images/000.png.",
         )
     return "/".join(parts)

@@ -6,6 +6,7 @@ the session's folder, and a warning names each of them.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -252,9 +253,10 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
     )
     for kind, example in examples:
         if view is not None and not declaration.named(kind):
+            near = get_close_matches(kind, declaration.model_extra or (), 1)
             raise DataError(
                 f"session.toml: {kind} is missing, but view {view.number} has "
                 f"{'an image' if view.image else 'rows in corners.csv'}.",
                 culprits=[f"session.toml: {kind}"],
-                next_step=f"Add {example}.",
+                next_step=f"Write {kind} for {near[0]}." if near else f"Add {example}.",
             )

@@ -1,7 +1,9 @@
 """Session: the recording of a cell, read from a folder and written to one."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Unpack
@@ -127,9 +129,14 @@ class Session:
                 culprits=[str(path)],
                 next_step=f"Its recording is the session: name {recording}.",
             )
-        document = parse_toml(
-            read_text_inside(path, "session.toml", MOST_TOML_BYTES), "session.toml"
-        )
+        try:
+            text = read_text_inside(path, "session.toml", MOST_TOML_BYTES)
+        except DataError as error:
+            if (near := _nearest_session(path)) is None:
+                raise
+            step = f"Name the session's folder: {shlex.quote(str(near))}"
+            raise DataError(error.message, culprits=error.culprits, next_step=step) from error
+        document = parse_toml(text, "session.toml")
         streams = read_streams(path)
         # Streams are enough for identifying an arm's dynamics.
         if table is None and (not streams or (path / "views.csv").exists()):
@@ -568,3 +575,12 @@ def _build(
         named = {view.number: session.board_of(view) for view in seen}
         check_points(corners, [named[index] for index in corners.views.tolist()], session.boards)
     return session
+
+
+def _nearest_session(path: Path) -> Path | None:
+    """The folder of a session above a path, below it, or beside it under a similar name."""
+    found = [path.parent / "session.toml", *sorted(path.glob("*/session.toml"))]
+    if not path.exists():
+        beside = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
+        found += [beside[name] for name in get_close_matches(path.name, beside, 1)]
+    return next((file.parent for file in found if file.is_file()), None)

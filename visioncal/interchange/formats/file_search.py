@@ -118,7 +118,7 @@ def images_beside(
             f"poses ({labels[0]} ... {labels[-1]}); one image a pose is needed.",
             culprits=[str(folder)],
             next_step=f"Name each row's image with --image-{named_by(labels[0]).rstrip('s')}, or "
-            "remove what is over. Where that is not known, remove the last: visioncal doctor then "
+            "remove what is over. Where that is not known, remove the last, and doctor "
             "says from where on rows and images are shifted.",
         )
     return images, (

@@ -95,7 +95,8 @@ class Fields:
             raise DataError(
                 f"{place}: {full} holds {text[:40]!r}; a number is needed.",
                 culprits=[place],
-                next_step="Correct the cell, or leave the whole pose of that row empty.",
+                next_step=f"Correct the cell, or delete {place}; or leave the whole pose of that "
+                "row empty.",
             )
         return self.numbers[full].reshape(len(self), -1)
 
@@ -207,6 +208,8 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
     names = [str(at) for at in range(1, len(fields.texts) + 1)]
     if not names or list(fields.texts) != names:
         return {"time": (), "robot": (), "camera": ()}
+    # Names of images are no part of a pose.
+    names = [name for name in names if not all(map(_IMAGE.fullmatch, fields.texts[name]))]
     time, robot, camera = _LAYOUTS.get(len(names), (0, 0, 0))
     is_numeric = set(names) == set(fields.numbers)
     if is_numeric and len(names) == 12:
