@@ -252,7 +252,7 @@ NAMED = {
 }
 # Files that cannot be read as they stand are refused, with what to type.
 REFUSED = {
-    "[cam] for [camera]": "Add [camera]",
+    "[cam] for [camera]": "Write camera for cam",
     "images turned clockwise": "In session.toml, write resolution = ",
 }
 
