@@ -35,7 +35,7 @@ _MOST_CONNECTIONS, _PATIENCE_S = 200, 10.0
 _WELCOME = '<meta http-equiv="refresh" content="0; url=/">'
 
 
-class Connection(H11Protocol):
+class Connection(H11Protocol):  # type: ignore[misc]
     """A connection that does not stay without requests, nor breaks by one, nor is one of too many.
 
     The recording needs files, too, of which a process has a thousand.
@@ -43,7 +43,7 @@ class Connection(H11Protocol):
 
     _timer: TimerHandle | None = None
 
-    def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: Transport) -> None:
         """Begins to wait for a request."""
         super().connection_made(transport)
         if len(self.connections) > _MOST_CONNECTIONS:
