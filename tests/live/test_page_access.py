@@ -272,6 +272,96 @@ def test_no_header_ends_in_a_traceback(local):
     assert answered(url, request_of(url)) == 200
 
 
+def test_no_message_of_a_browser_ends_in_a_traceback(local, browser):
+    url, process = local
+    with opened(browser, url) as page:
+        client = page.evaluate("window.clientId")
+        events = (
+            "event",
+            "handshake",
+            "javascript_response",
+            "ack",
+            "log",
+            "too_large_message",
+            "x",
+        )
+        contents = (
+            None,
+            [],
+            {},
+            {"client_id": client},
+            {"client_id": []},
+            {"client_id": client}
+            | {
+                name: value
+                for name in (
+                    "id",
+                    "listener_id",
+                    "args",
+                    "request_id",
+                    "result",
+                    "next_message_id",
+                    "level",
+                    "message",
+                    "tab_id",
+                    "document_id",
+                    "msg",
+                    "error",
+                )
+                for value in ({"a": [None]},)
+            },
+        )
+        hostile = [f"42{json.dumps([event, content])}" for event in events for content in contents]
+        hostile += [f"42{json.dumps([event])}" for event in events]
+        hostile += [
+            "",
+            "4",
+            "42",
+            "42[",
+            "42{}",
+            "4" + "2" + "[" * 5000,
+            "43[]",
+            "43",
+            "44",
+            "45",
+            "47",
+        ]
+        hostile += [
+            "451-[]",
+            '451-["event",{"_placeholder":true,"num":9}]',
+            "40/else,",
+            "41/else,",
+            "6",
+        ]
+        hostile += [
+            "9",
+            "x",
+            "\x00",
+            "2",
+            "3",
+            "1",
+            "0{}",
+            "5",
+            '42/,["event",{}]',
+            "429999999999[]",
+        ]
+        page.evaluate(
+            """async ([path, messages]) => {
+                messages.push(new Uint8Array([4, 255]));
+                for (const message of messages) await new Promise(end => {
+                    const link = new WebSocket(path);
+                    link.onclose = link.onerror = end;
+                    link.onopen = () => {
+                        link.send("40"), link.send(message), setTimeout(() => link.close(), 30);
+                    };
+                });
+            }""",
+            [SOCKET, hostile],
+        )
+        assert "Traceback" not in process.said(), process.said()[-3000:]
+        sync_api.expect(page.get_by_text("Start", exact=True)).to_be_visible()
+
+
 def test_silent_connections_take_no_place_for_long(local):
     url, process = local
     host, _, port = url.split("/")[2].rpartition(":")

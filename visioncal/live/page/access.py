@@ -10,6 +10,7 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 
 import h11
 from fastapi.responses import HTMLResponse, Response
+from socketio import AsyncServer
 from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -29,6 +30,8 @@ _OF_PAGES = (
 )
 # A name, an address, or one of IPv6, and a port.
 _HOST = re.compile(r"([\w.-]+|\[[\da-f:.]+\])(:\d{1,5})?", re.ASCII)
+# Kinds of packets (Engine.IO, protocol 4); a browser sends none that is binary.
+_PACKETS = tuple("0123456")
 # How many connections there may be, and how long the head of a request may take [s].
 _MOST_CONNECTIONS, _PATIENCE_S = 200, 10.0
 # A redirect would bring no cookie where the address was followed from another site.
@@ -102,6 +105,9 @@ class Admission:
             async def heard() -> Message:
                 nonlocal is_gone
                 message = await receive()
+                is_frame = message["type"] == "websocket.receive"
+                if is_frame and not (message.get("text") or "").startswith(_PACKETS):
+                    return {"type": "websocket.disconnect", "code": 1002}
                 is_gone |= message["type"] == "http.disconnect"
                 return message
 
@@ -149,6 +155,28 @@ class Admission:
         welcome = HTMLResponse(_WELCOME, headers={"Cache-Control": "no-store"})
         welcome.set_cookie(self._name, self._cookie, httponly=True, samesite="strict")
         return welcome
+
+
+def refuse_malformed(messages: AsyncServer) -> None:
+    """Ends the connection of a browser whose message does not have the form that is expected.
+
+    Errors of the page's own handlers do not arrive here: NiceGUI reports them.
+
+    Args:
+        messages: Server of the page's messages (Socket.IO).
+    """
+    connections = messages.eio
+    handle = connections.handlers["message"]
+
+    async def handled(connection: str, message: str | bytes) -> None:
+        try:
+            await handle(connection, message)
+        except Exception:  # noqa: BLE001
+            await connections.disconnect(connection)
+
+    # Handlers in tasks of their own would raise where nobody hears.
+    messages.async_handlers = False
+    connections.on("message", handled)
 
 
 def address_of(host: str) -> IPv4Address | IPv6Address | None:

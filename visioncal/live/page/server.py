@@ -11,14 +11,14 @@ from functools import partial
 import numpy as np
 import uvicorn
 from fastapi import FastAPI, Response
-from nicegui import app, ui
+from nicegui import app, core, ui
 from nicegui.helpers import schedule_browser
 
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.documents.pendants import PendantPose, pendant_words, read_pose
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
-from visioncal.live.page.access import Admission, Connection
+from visioncal.live.page.access import Admission, Connection, refuse_malformed
 from visioncal.live.page.outcome import Outcome
 from visioncal.live.page.station import PageText, Snapshot, Station, Visitor
 from visioncal.live.page.table import VIEWS, ViewTable, read_as
@@ -63,6 +63,7 @@ def serve(
     app.on_shutdown(station.close)
     # Nothing is compressed: that would come before the answers' restraints.
     ui.run_with(site, gzip_middleware_factory=None, show_welcome_message=False)
+    refuse_malformed(core.sio)
     if opens:
         schedule_browser("http", host, port, f"/?{admission.query}")
     uvicorn.run(
