@@ -17,6 +17,7 @@ from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import calibrate, run
 from visioncal.calibration.stages.detect import detect
+from visioncal.calibration.stages.distance_scale import distance_scale
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
@@ -461,3 +462,21 @@ def test_an_arm_that_is_off_is_no_other_scale():
     arm = simulate(CellOptions(views=10, dh_sigma_m=2e-3))
     verdict = calibrate(cell_session(arm, "measured", seen="poses")).verdict
     assert "board_size" not in {finding.kind for finding in verdict.findings}
+
+
+def test_a_head_that_only_turns_says_nothing_of_the_scale():
+    rng = np.random.default_rng(3)
+    pan, tilt = rng.uniform(-0.4, 0.4, (2, 18))
+    turns = Rotation.from_euler("ZY", np.column_stack([pan, tilt])).as_matrix()
+    noise = exp(rng.normal(size=(18, 6)) * np.repeat([3e-3, 5e-4], 3))
+    for off_m in (0.0, 1e-4):
+        # Axes that meet, and that do not quite, so that the head moves by a thirtieth of a mm.
+        head = compose(turns, off_m * turns[:, :, 0] + np.array([0.0, 0.0, 0.25]))
+        seen = invert(X) @ invert(head) @ Z @ noise
+        assert distance_scale(head, seen, X) is None
+    # An arm that moves by decimetres does, with the same noise.
+    arm = compose(turns, rng.uniform(-0.2, 0.2, (18, 3)))
+    seen = invert(X) @ invert(arm) @ Z @ noise
+    seen[:, :3, 3] /= 1.1
+    found = distance_scale(arm, seen, X)
+    assert "by 1.1" in found.do.words or "by 1.09" in found.do.words

@@ -235,3 +235,16 @@ def test_touches_alone_are_no_session_of_a_camera(real_data, tmp_path):
         real_data / "tcp_pivot_rvbust/poses.csv", tmp_path / "s", "--mount=eye-in-hand"
     ).refused("neither images nor poses of the target")
     assert not (tmp_path / "s").exists()
+
+
+def test_a_pan_tilt_head_of_a_urdf_of_any_name(real_data, tmp_path):
+    case, out = real_data / "field/cases/pan-tilt", tmp_path / "s"
+    seen = "board_x,board_y,board_z,board_qx,board_qy,board_qz,board_qw"
+    arm = ("--robot-model", case / "ptu.urdf", "--tip", "tilt", "--mount=eye-in-hand")
+    joints = ("--joint-columns", "pan_joint,tilt_joint", "--camera-columns", seen)
+    convert(case / "pantilt.csv", out, *arm, *joints).good()
+    assert (out / "ptu.urdf").is_file()
+    result = visioncal.calibrate(out)
+    # The case states whole millimetres; one sigma of the result is 1.1 mm.
+    assert away_mm(result, "flange_from_cam", [53.0, 18.0, 88.0]) < 1.1
+    assert not any(finding.kind == "board_size" for finding in result.verdict.findings)

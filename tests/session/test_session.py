@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.edited import changed as edit
 from support.refusals import raised
+from support.urdf_arm import URDF
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Need
@@ -245,6 +246,14 @@ def test_the_digest_sees_facts_and_not_their_spelling(folder, tmp_path):
         target_document=session.target_document,
     )
     assert whole.digest() == digest
+    digests = []
+    for name in ("robot", "ptu"):
+        copied = tmp_path / name
+        shutil.copytree(folder, copied)
+        (copied / f"{name}.urdf").write_text(URDF)
+        edit(copied, "session.toml", 'model = "ur10e"\ntip = "tool0"', f'model = "{name}.urdf"')
+        digests.append(Session.load(copied).digest())
+    assert digests[0] == digests[1] != digest
     changed = [
         ("views.csv", "0.6,0,0.3", "0.6000000000000001,0,0.3"),
         ("views.csv", "holdout", "fit"),

@@ -158,6 +158,9 @@ def digest_of(session: "Session") -> str:
 
 def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:
     """A robot's document without dimensions, masses and drives of the links."""
+    if "urdf" in document:
+        # The name is that of its file, and not of its content.
+        return {**document, "name": "robot"}
     joints = document.get("joint")
     if not isinstance(joints, list | tuple):
         return dict(document)

@@ -13,8 +13,11 @@ def distance_scale(
 ) -> Finding | None:
     """Estimates the scale error of measured distances.
 
-    parent_from_flange * flange_from_seer * cam_from_target is the same for all views; its position
-    is linear in the scale of the measured distances, and in both unknown positions.
+    parent_from_flange * flange_from_seer * cam_from_target is the same for all views. Its position
+    over the scale is linear in the inverse of the scale, and in both unknown positions over the
+    scale. Thus the misfit is one of the camera, which errs more than the robot, and a robot that
+    only turns, as a pan-tilt head, determines no scale: the inverse regression would take zero,
+    which makes all positions the same.
 
     Args:
         parent_from_flange: (m, 4, 4) the robot's poses; their inverses for a static camera.
@@ -29,18 +32,19 @@ def distance_scale(
     if 3 * count < 14:
         return None
     turned = parent_from_flange[:, :3, :3]
-    seen = (turned @ flange_from_seer[:3, :3] @ cam_from_target[:, :3, 3:])[..., 0]
+    seen = (turned @ flange_from_seer[:3, :3] @ cam_from_target[:, :3, 3:]).reshape(-1)
     same = np.broadcast_to(-np.eye(3), (count, 3, 3))
-    a = np.concatenate([turned, same, seen[..., None]], axis=2).reshape(3 * count, 7)
-    b = -parent_from_flange[:, :3, 3].reshape(-1)
-    solution, *_ = np.linalg.lstsq(a, b)
-    misfit = float(np.sum((b - a @ solution) ** 2))
-    unscaled, *_ = np.linalg.lstsq(a[:, :6], b - a[:, 6])
-    unscaled_misfit = float(np.sum((b - a[:, 6] - a[:, :6] @ unscaled) ** 2))
-    if CLEAR_RATIO**2 * misfit > unscaled_misfit:
+    a = np.concatenate([turned, same, parent_from_flange[:, :3, 3:]], axis=2).reshape(-1, 7)
+    solution, _, rank, _ = np.linalg.lstsq(a, -seen)
+    misfit = float(np.sum((seen + a @ solution) ** 2))
+    unscaled, *_ = np.linalg.lstsq(a[:, :6], -seen - a[:, 6])
+    unscaled_misfit = float(np.sum((seen + a[:, 6] + a[:, :6] @ unscaled) ** 2))
+    is_determined = rank == 7 and solution[6] > 0.0
+    if not is_determined or CLEAR_RATIO**2 * misfit > unscaled_misfit:
         return None
-    share = float(solution[6]) - 1.0
-    variance = misfit / (3 * count - 7) * np.linalg.pinv(a.T @ a)[6, 6]
+    scale = 1.0 / float(solution[6])
+    share = scale - 1.0
+    variance = scale**4 * misfit / (3 * count - 7) * np.linalg.pinv(a.T @ a)[6, 6]
     short, size = ("short", "larger") if share > 0.0 else ("long", "smaller")
     percent = f"{figure(100 * abs(share))} % (sigma {figure(100 * variance**0.5)} %)"
     return Finding(

@@ -331,6 +331,9 @@ def _robot(foreign: ForeignRecording, document: dict[str, Any]) -> dict[str, Any
     arm = {name: str(value) for name, value in foreign.arm.items()}
     robot = read_robot_document(arm["model"], tip=arm.get("tip"))
     Robot.from_document(robot)
-    suffix = Path(arm["model"]).suffix.lower()
-    document["robot"] = arm | ({"model": f"robot{suffix}"} if suffix in ROBOT_SUFFIXES else {})
+    file = Path(arm["model"])
+    suffix = file.suffix.lower()
+    # Results are in the form of the maker that a URDF's file names.
+    name = file.name if suffix == ".urdf" else f"robot{suffix}"
+    document["robot"] = arm | ({"model": name} if suffix in ROBOT_SUFFIXES else {})
     return robot
