@@ -32,7 +32,6 @@ from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.journal import CaptureFacts, Journal
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.recording import CaptureEvent
-from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.messages import summary_of
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.plan_file import PlanFile, plan_document, read_plan
@@ -50,24 +49,21 @@ _TAKING = CaptureOptions(speed=1.05, acceleration=1.4)
 _SLIPPED, _SLIP_DEG = 2, 0.4
 
 
-def record_simulated(session: Path, plan: Path, stops: int, seed: int) -> None:
-    """Plans stops of a simulated cell and records them, with its truth beside the session.
-
-    Args:
-        session: Folder of the session, which does not exist.
-        plan: Folder of the plan.
-        stops: Number of planned stops.
-        seed: Of everything random.
-
-    Raises:
-        DriverError: The client library is missing, or a device failed.
-        DataError: The views cannot be written, or stops gave none.
-    """
-    bench = Bench(seed)
-    plan.parent.mkdir(parents=True, exist_ok=True)
+def _record(options: DemoOptions, session: Path) -> None:
+    """Plans stops from rough poses and records them, with the truth beside the new session."""
+    bench, folder = Bench(options.seed), options.out / "plan"
+    folder.parent.mkdir(parents=True, exist_ok=True)
     # From the begin, so that the next demonstration replaces one that was interrupted.
     write_truth(session, truth_of(bench.truth))
-    _drive(bench, _planned(bench.known, stops, seed, plan), session)
+    # Fewer candidates than for a real plan, as a demonstration should be short.
+    request = PlanRequest(purpose_of("hand-eye"), options.views, candidates=600, seed=options.seed)
+    with shown_progress(quiet=False) as progress:
+        plan = make_plan(bench.known, request, progress=progress)
+        written = write_plan(folder, plan, plan_document(plan, {"kind": "demo"}))
+    report_written(written, quiet=True)
+    say(f"plan: {summary_of(plan)}")
+    # Read back, as a recording does.
+    _drive(bench, read_plan(folder), session)
 
 
 def _drive(bench: Bench, planned: PlanFile, session: Path) -> None:
@@ -98,18 +94,6 @@ def _drive(bench: Bench, planned: PlanFile, session: Path) -> None:
     say(f"where views were taken the flange was within {1e3 * away_mm:.0f} um of what was recorded")
 
 
-def _planned(known: PlanCell, stops: int, seed: int, folder: Path) -> PlanFile:
-    """Plans stops from the rough poses, and reads them back as a recording does."""
-    # Fewer candidates than for a real plan, as a demonstration should be short.
-    request = PlanRequest(purpose_of("hand-eye"), stops, candidates=600, seed=seed)
-    with shown_progress(quiet=False) as progress:
-        plan = make_plan(known, request, progress=progress)
-        written = write_plan(folder, plan, plan_document(plan, {"kind": "demo"}))
-    report_written(written, quiet=True)
-    say(f"plan: {summary_of(plan)}")
-    return read_plan(folder)
-
-
 def demo_command(options: DemoOptions) -> None:
     """Runs `visioncal demo`."""
     if options.live:
@@ -119,7 +103,7 @@ def demo_command(options: DemoOptions) -> None:
         # An earlier demonstration's; nothing else is ever removed.
         shutil.rmtree(session, ignore_errors=True)
     if options.live:
-        record_simulated(session, options.out / "plan", options.views, options.seed)
+        _record(options, session)
     with shown_progress(quiet=False) as progress:
         if not options.live:
             cell = simulate(
@@ -170,11 +154,8 @@ def _rehearse(options: DemoOptions, result: Path) -> None:
 
 def chi_square(calibration: Calibration, truth: Truth) -> tuple[float, float]:
     """Squared Mahalanobis distance of the errors of both transforms, and the limit of its test."""
-    errors = [
-        log(invert(truth.transforms[name]) @ edge.matrix)
-        for name, edge in calibration.edges.items()
-    ]
-    twists = np.concatenate(errors)
+    edges = calibration.edges.items()
+    twists = np.concatenate([log(invert(truth.transforms[name]) @ at.matrix) for name, at in edges])
     squared = float(twists @ np.linalg.solve(calibration.joint_covariance, twists))
     # Errors of one board's corners are correlated by hundredths of a pixel, and joints deviate from
     # their encoders: a covariance of independent noise underestimates by up to 1.5.

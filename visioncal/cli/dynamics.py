@@ -48,7 +48,7 @@ from visioncal.dynamics.identified import (
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, validate
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
-from visioncal.dynamics.payload import Payload, drive_gains, estimate_payload
+from visioncal.dynamics.payload import drive_gains, estimate_payload
 from visioncal.dynamics.plan_files import MotionPlan, motion_document
 from visioncal.dynamics.run import (
     IdentificationRequest,
@@ -308,19 +308,32 @@ def dynamics_payload_command(options: DynamicsPayloadOptions) -> None:
         f"mass {mass} (sigma {significant(payload.mass_sigma_kg)}{gains})",
         f"centre {centre} mm in the flange's frame",
     ]
+    # A UR's program has kg, m and kg m^2.
+    at_m = ", ".join(f"{value:.5f}" for value in payload.centre_m)
+    on_ur = f"set_target_payload({payload.mass_kg:.4f}, [{at_m}]"
     if payload.consistent:
         inertia = ", ".join(f"{value:.4g}" for value in payload.inertia_kg_m2)
         lines.append(f"inertia about it (xx, xy, yy, xz, yz, zz) {inertia} kg m^2")
+        xx, xy, yy, xz, yz, zz = payload.inertia_kg_m2.tolist()
+        on_ur += f", [{', '.join(f'{value:.6f}' for value in (xx, yy, zz, xy, xz, yz))}]"
     else:
         lines.append("its inertia is lost in the noise")
     left = ", ".join(significant(rm) for rm in payload.rms_nm.tolist())
     lines.append(f"unexplained {left} N m, joint by joint")
-    typer.echo("\n".join([*lines, f"on a UR: {_ur_words(payload)}"]))
+    typer.echo("\n".join([*lines, f"on a UR: {on_ur})"]))
 
 
 def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
     """Estimates the torque constants of an arm's drives from a known body on its flange."""
-    body = _body(options)
+    centre, about = 1e-3 * np.array(options.com_mm), symmetric_matrices(np.array(options.inertia))
+    body = Inertias.of_bodies(np.array([options.mass_kg]), centre[None], about[None])
+    if not (options.mass_kg > 0.0 and body.consistent):
+        raise DataError(
+            f"--mass-kg {options.mass_kg:g} and --inertia {options.inertia} are those of no body.",
+            culprits=["--mass-kg", "--inertia"],
+            next_step="A mass above 0 kg is needed, and an inertia about its centre; none stands "
+            "for a body as small as a point.",
+        )
     without = select_arm(Session.load(options.session), options.named)
     robot = robot_of(without)
     empty = current_streams(without, robot, options.cutoff_hz)
@@ -330,7 +343,7 @@ def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
         options.cutoff_hz or empty[0].cutoff_hz,
     )
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
-    gains = drive_gains(base, empty, full, body)
+    gains = drive_gains(base, empty, full, np.asarray(body.values[0]))
     if options.as_json:
         rows: list[dict[str, str | float]] = [{"joint": name} for name in robot.joint_names]
         # Only the joint where its gain is not determined.
@@ -357,27 +370,3 @@ def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
             "--gains needs all joints: move those that are not determined more, or take a body "
             "that is heavier or whose centre is farther from their axes."
         )
-
-
-def _ur_words(payload: Payload) -> str:
-    """The payload as a UR's program sets it, in kg, m and kg m^2."""
-    centre = ", ".join(f"{value:.5f}" for value in payload.centre_m)
-    if not payload.consistent:
-        return f"set_target_payload({payload.mass_kg:.4f}, [{centre}])"
-    xx, xy, yy, xz, yz, zz = payload.inertia_kg_m2.tolist()
-    inertia = ", ".join(f"{value:.6f}" for value in (xx, yy, zz, xy, xz, yz))
-    return f"set_target_payload({payload.mass_kg:.4f}, [{centre}], [{inertia}])"
-
-
-def _body(options: DynamicsGainsOptions) -> FloatArray:
-    """(10,) the body's inertial parameters in the flange's frame."""
-    centre, about = 1e-3 * np.array(options.com_mm), symmetric_matrices(np.array(options.inertia))
-    body = Inertias.of_bodies(np.array([options.mass_kg]), centre[None], about[None])
-    if not (options.mass_kg > 0.0 and body.consistent):
-        raise DataError(
-            f"--mass-kg {options.mass_kg:g} and --inertia {options.inertia} are those of no body.",
-            culprits=["--mass-kg", "--inertia"],
-            next_step="A mass above 0 kg is needed, and an inertia about its centre; none stands "
-            "for a body as small as a point.",
-        )
-    return np.asarray(body.values[0])

@@ -88,20 +88,32 @@ def plan_command(options: PlanOptions, session: Path | None = None) -> str:
         1e-3 * options.clearance_mm,
         floor_of(options),
     )
-    boxes = boxes_of(options)
+    kept = (limits, boxes_of(options))
     purpose_of(options.purpose, "--for")
     start, words = chosen_part(find_source(options.source), options)
     if options.to_verify:
-        return _plan_to_verify(options, start, words, (limits, boxes), session)
+        return _plan_to_verify(options, start, words, kept, session)
+    if words.add is not None and words.stops is not None:
+        raise DataError(
+            "--add and --stops exclude each other: stops are added to what was recorded, or "
+            "planned without it.",
+            culprits=["--add", "--stops"],
+            next_step="Leave one out.",
+        )
     with shown_progress(quiet=options.as_json) as progress:
-        cell, begun = _begin(start, words, (limits, boxes), progress)
+        begun = None
+        if words.add is not None or (start.session is not None and start.calibration is None):
+            begun = begun_session(start, words, kept, progress)
+        cell = cell_of(start, words, kept) if begun is None else begun.cell
         # Cosine between the z axes of board and base.
         if words.board is not None and cell.mount == "eye-in-hand" and cell.z[2, 2] > 0.7:
             warn(
                 "this --board lies face down: its z points into the "
                 "paper, and a board that lies face up ends in 180 0 0"
             )
-        plan = make_plan(cell, _request(options, cell), begun=begun, progress=progress)
+        # Without --add, only the cell is the recorded one.
+        added_to = None if words.add is None else begun
+        plan = make_plan(cell, _request(options, cell), begun=added_to, progress=progress)
         progress("write", 0, 1)
         document = plan_document(plan, {"kind": start.words})
         written = write_plan(options.out, plan, document)
@@ -180,8 +192,21 @@ def _request(stops: PlanOptions, cell: PlanCell) -> PlanRequest:
 
 
 def boxes_of(kept: ClearanceOptions) -> tuple[Box, ...]:
-    """Obstacles; raises DataError."""
-    return tuple(_box_of(box) for box in kept.boxes or ())
+    """Obstacles of NAME:x,y,z:sx,sy,sz, centre in the base and lengths [mm]; raises DataError."""
+    boxes = []
+    for words in kept.boxes or ():
+        parts = words.split(":")
+        if len(parts) != 3 or not parts[0].strip():
+            raise DataError(
+                f"--box is {words[:80]!r}; NAME:X,Y,Z:SX,SY,SZ is needed, with the centre in the "
+                "base and the lengths in mm.",
+                culprits=["--box"],
+                next_step="Such as --box name:500,0,300:400,400,400",
+            )
+        centre_m = 1e-3 * np.array(numbers_in(parts[1], "--box", "x,y,z"))
+        size_m = 1e-3 * np.array(numbers_in(parts[2], "--box", "sx,sy,sz"))
+        boxes.append(Box(parts[0].strip(), compose(np.eye(3), centre_m), size_m))
+    return tuple(boxes)
 
 
 def floor_of(kept: ClearanceOptions) -> float | None:
@@ -189,41 +214,6 @@ def floor_of(kept: ClearanceOptions) -> float | None:
     if kept.floor.strip().lower() == "none":
         return None
     return 1e-3 * numbers_in(kept.floor, "--floor", "z")[0]
-
-
-def _box_of(words: str) -> Box:
-    """Parses a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm]."""
-    parts = words.split(":")
-    if len(parts) != 3 or not parts[0].strip():
-        raise DataError(
-            f"--box is {words[:80]!r}; NAME:X,Y,Z:SX,SY,SZ is needed, with the centre in the base "
-            "and the lengths in mm.",
-            culprits=["--box"],
-            next_step="Such as --box name:500,0,300:400,400,400",
-        )
-    centre = numbers_in(parts[1], "--box", "x,y,z")
-    size = numbers_in(parts[2], "--box", "sx,sy,sz")
-    return Box(parts[0].strip(), compose(np.eye(3), 1e-3 * np.array(centre)), 1e-3 * np.array(size))
-
-
-def _begin(
-    source: Source,
-    words: PlanOptions,
-    kept: Kept,
-    progress: Progress,
-) -> tuple[PlanCell, SessionStart | None]:
-    """The cell, and the recorded session where stops are added to one."""
-    if words.add is not None and words.stops is not None:
-        raise DataError(
-            "--add and --stops exclude each other: stops are added to what was recorded, or "
-            "planned without it.",
-            culprits=["--add", "--stops"],
-            next_step="Leave one out.",
-        )
-    if words.add is None and (source.session is None or source.calibration is not None):
-        return cell_of(source, words, kept), None
-    begun = begun_session(source, words, kept, progress)
-    return begun.cell, begun if words.add is not None else None
 
 
 def _report(plan: Plan) -> None:

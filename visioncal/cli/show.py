@@ -20,9 +20,23 @@ from visioncal.results.views import worst_view
 def show_command(options: ShowOptions) -> None:
     """Runs `visioncal show`."""
     if not options.viewer:
-        signed = {"operator": options.operator} if options.operator else {}
-        signed |= dict(options.serial or ())
-        _write_page(options.result, options.out, signed if options.certificate else None)
+        from visioncal.present.report.page import write_certificate, write_report
+
+        stored = load_stored(options.result)
+        if options.certificate:
+            out = options.out or Path("certificate.html")
+            signed = {"operator": options.operator} if options.operator else {}
+            signed |= dict(options.serial or ())
+            write_certificate(out, stored.calibration, stored.session, signed)
+        else:
+            out = options.out or Path("report.html")
+            write_report(
+                out, stored.calibration, stored.session, stored.evidence, stored.note, stored.review
+            )
+            # A cell's page shows nothing that a recording adds.
+            if stored.note and stored.calibration.cell is None:
+                say(stored.note)
+        say(f"wrote {out}")
         return
     if options.web and options.view is not None:
         raise typer.BadParameter("--view goes without --web: a browser opens at the first view.")
@@ -42,25 +56,6 @@ def show_command(options: ShowOptions) -> None:
             say("No browser could be opened; visit the address above.")
 
     review_web(file, opened)
-
-
-def _write_page(result: Path, out: Path | None, signed: dict[str, str] | None) -> None:
-    """Writes the report, or the certificate with what a person adds to it."""
-    from visioncal.present.report.page import write_certificate, write_report
-
-    stored = load_stored(result)
-    if signed is not None:
-        out = out or Path("certificate.html")
-        write_certificate(out, stored.calibration, stored.session, signed)
-    else:
-        out = out or Path("report.html")
-        write_report(
-            out, stored.calibration, stored.session, stored.evidence, stored.note, stored.review
-        )
-        # A cell's page shows nothing that a recording adds.
-        if stored.note and stored.calibration.cell is None:
-            say(stored.note)
-    say(f"wrote {out}")
 
 
 def _row(file: Path, view: int | None) -> int | None:

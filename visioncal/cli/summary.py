@@ -10,7 +10,7 @@ from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Camera, FloatArray
 from visioncal.present.advice import left_out
 from visioncal.present.facts import solver_table
-from visioncal.results import Calibration, CellResult, Remedy, Verdict, ViewResult
+from visioncal.results import Calibration, Remedy, Verdict, ViewResult
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 
@@ -55,7 +55,16 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         answer(f"{name}: {edge.place_words()}, {sigma}")
         answer(f"  {calibration.rotation_words(name, edge)}")
     if cell is not None:
-        _print_noise(cell)
+        for name, levels in cell.noise.items():
+            words = [
+                f"{figure(value)} {key.rpartition('_')[2]}"
+                for key, value in levels.items()
+                if key != "level"
+            ]
+            level = levels.get("level", 1.0)
+            if level > 1.2 or not words:
+                words.append(f"{figure(level)} times what is said of it")
+            answer(f"noise of {name}: {', '.join(words)}")
     else:
         used = sum(view.used for view in calibration.views)
         held = calibration.validation.held_out
@@ -73,20 +82,6 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     solvers = solver_table(calibration)
     if verbose and solvers is not None:
         print_table(solvers.titles, [row.cells for row in solvers.rows])
-
-
-def _print_noise(cell: CellResult) -> None:
-    """Prints the noise of a whole cell."""
-    for name, levels in cell.noise.items():
-        words = [
-            f"{figure(value)} {key.rpartition('_')[2]}"
-            for key, value in levels.items()
-            if key != "level"
-        ]
-        level = levels.get("level", 1.0)
-        if level > 1.2 or not words:
-            words.append(f"{figure(level)} times what is said of it")
-        answer(f"noise of {name}: {', '.join(words)}")
 
 
 def _not_in_verdict(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResult]:

@@ -1,7 +1,6 @@
 """`visioncal touch-test`."""
 
 import shlex
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -73,7 +72,19 @@ def touch_test_command(options: TouchTestOptions) -> None:
     targets = [_target(result, located, point, 1e-3 * options.height_mm, form) for point in points]
     if options.gaps_mm is None:
         unknown = "" if known else " (--robot-form kuka, fanuc, abb ...: as its pendant shows it)"
-        _report(points, targets, f"{form.words}{unknown}", as_json=options.as_json)
+        if options.as_json:
+            print_json({"points": targets})
+            return
+        answer(f"Flange targets: {form.words}{unknown}; hover first, then touch.")
+        for point, target in zip(points, targets, strict=True):
+            x, y, z = 1e3 * point.base_m
+            answer(
+                f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within "
+                f"{figure(point.radius95_mm)} mm"
+            )
+            for key in (key for key in target if key.startswith(("hover_", "touch_"))):
+                answer(f"  {key.partition('_')[0]}: {target[key]}")
+        answer("Enter the gaps with --gaps-mm, in this order.")
         return
     test = evaluate_gaps(points, numbers_in(options.gaps_mm, "--gaps-mm"), touching)
     extended = replace(result, touch_test=test)
@@ -132,21 +143,3 @@ def _target(
         document[name] = [*transform.translation.tolist(), *turn]
         document[f"{name}_{form.name}"] = pendant_words(pose, form)
     return document
-
-
-def _report(
-    points: Sequence[TouchPoint], targets: Sequence[dict[str, Any]], form: str, *, as_json: bool
-) -> None:
-    if as_json:
-        print_json({"points": targets})
-        return
-    answer(f"Flange targets: {form}; hover first, then touch.")
-    for point, target in zip(points, targets, strict=True):
-        x, y, z = 1e3 * point.base_m
-        answer(
-            f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within "
-            f"{figure(point.radius95_mm)} mm"
-        )
-        for key in (key for key in target if key.startswith(("hover_", "touch_"))):
-            answer(f"  {key.partition('_')[0]}: {target[key]}")
-    answer("Enter the gaps with --gaps-mm, in this order.")

@@ -106,7 +106,7 @@ class Comparison:
         """Whether both are the same result of one session, but for rounding."""
         pairs: list[tuple[Any, Any]] = [] if self.lens is None else [(self.lens.a, self.lens.b)]
         pairs += [(edge.twist, np.zeros(6)) for edge in self.edges]
-        pairs += [(first, second) for first, second in self.noise.values()]
+        pairs += self.noise.values()
         return (
             self.same_session
             and not (self.only_in_a or self.only_in_b)
@@ -163,7 +163,9 @@ def compare(
     names = [name for name in a.edges if name in b.edges]
     # Two tests for each transform, and one for the lens.
     limit = FALSE_ALARMS / (2 * len(names) + 1)
-    freedom = (_freedom(a), _freedom(b))
+    # Of a noise level: three residuals a view less half of twelve unknowns.
+    used = [sum(view.used for view in each.views) for each in (a, b)]
+    freedom = [max(3 * count - 6, 1) for count in used]
     edges = tuple(_edge_change(name, *_comparable(a, b, name), freedom, limit) for name in names)
     levels = (_levels(a), _levels(b))
     lens = _lens_change(a.camera, b.camera, limit)
@@ -189,11 +191,9 @@ def _comparable(a: Calibration, b: Calibration, name: str) -> tuple[Edge, Edge]:
     """A transform in both; a camera's in the frame of its centre ray, where both have that."""
     # The optical axis depends on the lens model's parameters; the direction of a ray does not.
     first, second = a.ray_frame, b.ray_frame
-    if name != edge_names(a.mount)[0] or first is None or second is None:
-        return a.edges[name], b.edges[name]
-    if not np.array_equal(first.px, second.px):
-        return a.edges[name], b.edges[name]
-    return first.transform, second.transform
+    if name == edge_names(a.mount)[0] and first and second and np.array_equal(first.px, second.px):
+        return first.transform, second.transform
+    return a.edges[name], b.edges[name]
 
 
 def _levels(calibration: Calibration) -> Mapping[str, float]:
@@ -205,36 +205,22 @@ def _levels(calibration: Calibration) -> Mapping[str, float]:
     }
 
 
-def _freedom(calibration: Calibration) -> int:
-    """Degrees of freedom of a noise level: three residuals a view less half of twelve unknowns."""
-    used = sum(view.used for view in calibration.views)
-    return max(3 * used - 6, 1)
-
-
-def _edge_change(name: str, a: Edge, b: Edge, freedom: tuple[int, int], limit: float) -> EdgeChange:
+def _edge_change(name: str, a: Edge, b: Edge, freedom: Sequence[int], limit: float) -> EdgeChange:
     first, second = a.matrix, b.matrix
     twist = log(invert(first) @ second)
     # First order of log(exp(-error_a) * exp(twist) * exp(error_b)) in both errors.
     by_a, by_b = inverse_right_jacobian(-twist), inverse_right_jacobian(twist)
     covariances = (by_a @ a.covariance @ by_a.T, by_b @ b.covariance @ by_b.T)
     moved_mm, moved_deg = pose_difference(first, second)
-    rotation, translation = (
-        _hotelling(twist[part], [each[part, part] for each in covariances], freedom, limit)
-        for part in (slice(0, 3), slice(3, 6))
-    )
-    return EdgeChange(
-        name, twist, covariances[0] + covariances[1], moved_mm, moved_deg, translation, rotation
-    )
-
-
-def _hotelling(
-    difference: FloatArray, covariances: Sequence[FloatArray], freedom: Sequence[int], limit: float
-) -> Significance:
-    """Tests a difference whose covariance is the sum of two of estimated scale."""
-    sizes = np.array([np.trace(covariance) for covariance in covariances]) + _LEAST_SIGMA**2
-    combined = sizes.sum() ** 2 / np.sum(sizes**2 / np.array(freedom))
-    squared, count = _squared_distance(difference, covariances[0] + covariances[1]), len(difference)
-    return Significance(float(fdtrc(count, combined, squared / count)), limit)
+    covariance, tests = covariances[0] + covariances[1], []
+    for part in (slice(0, 3), slice(3, 6)):
+        # The covariance is the sum of two of estimated scale.
+        sizes = np.array([np.trace(each[part, part]) for each in covariances]) + _LEAST_SIGMA**2
+        combined = sizes.sum() ** 2 / np.sum(sizes**2 / np.array(freedom))
+        squared = _squared_distance(twist[part], covariance[part, part])
+        tests.append(Significance(float(fdtrc(3, combined, squared / 3)), limit))
+    rotation, translation = tests
+    return EdgeChange(name, twist, covariance, moved_mm, moved_deg, translation, rotation)
 
 
 def _squared_distance(difference: FloatArray, covariance: FloatArray) -> float:

@@ -57,9 +57,7 @@ def conditions_of(calibration: "Calibration") -> Iterator[Condition]:
 
 def _of_lens(lens: CameraResult, camera: str) -> Iterator[Condition]:
     tilt = sensor_tilt(lens)
-    if tilt is None or math.degrees(tilt.rad) < _PARALLEL_DEG:
-        return
-    if tilt.rad < 3.0 * tilt.sigma_rad:
+    if tilt is None or tilt.rad < max(math.radians(_PARALLEL_DEG), 3.0 * tilt.sigma_rad):
         return
     of, deg = f"{camera}: " if camera else "", math.degrees(tilt.rad)
     sigma = f" (sigma {figure(math.degrees(tilt.sigma_rad))})" if tilt.sigma_rad else ""

@@ -58,7 +58,21 @@ class CalibratedArm:
         nominal, real = calibration.robot, calibration.calibrated_robot
         is_known = or_nominal or calibration.arm_is_calibrated
         if nominal is None or real is None or not is_known:
-            raise _without_arm(calibration)
+            name = calibration.session_name
+            if calibration.arm is None:
+                raise DataError(
+                    f"calibration {name!r} has no calibrated arm: its session had no joint angles "
+                    "of every view or no known robot model, or it was made with --level hand-eye.",
+                    next_step="Record q1_rad ... with every view, name the arm in [robot] model, "
+                    "and calibrate with --level auto or kinematics.",
+                )
+            raise DataError(
+                f"calibration {name!r} has no calibrated arm (level {calibration.arm.level}): its "
+                "views do not distinguish the arm from its nominal model, so there is nothing to "
+                "correct.",
+                next_step="Send the targets as they are; or calibrate with more views, all over "
+                "the workspace.",
+            )
         if real.joint_count < _LEAST_JOINTS:
             raise DataError(
                 f"robot {real.name} has {real.joint_count} joints, and {_LEAST_JOINTS} are needed "
@@ -83,23 +97,6 @@ class CalibratedArm:
         return np.asarray(
             q - joint_deflections(self.real, q, self.compliance, loads, self.weight_moments)
         )
-
-
-def _without_arm(calibration: Calibration) -> DataError:
-    name = calibration.session_name
-    if calibration.arm is None:
-        return DataError(
-            f"calibration {name!r} has no calibrated arm: its session had no joint angles of every "
-            "view or no known robot model, or it was made with --level hand-eye.",
-            next_step="Record q1_rad ... with every view, name the arm in [robot] model, and "
-            "calibrate with --level auto or kinematics.",
-        )
-    return DataError(
-        f"calibration {name!r} has no calibrated arm (level {calibration.arm.level}): its "
-        "views do not distinguish the arm from its nominal model, so there is nothing to correct.",
-        next_step="Send the targets as they are; or calibrate with more views, all over the "
-        "workspace.",
-    )
 
 
 def predicted_sigma_mm(
