@@ -12,11 +12,12 @@ from support.misfits import misfit
 from support.refusals import raised
 
 from visioncal import simulation
+from visioncal.core.choices import SIMULATED_CELLS
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.results import Calibration
 from visioncal.session import Session
-from visioncal.simulation import cell_names, cell_session, read_cell, simulate
+from visioncal.simulation import cell_session, read_cell, simulate
 
 # Chi-square of six exceeds this in one case of a thousand.
 MOST = 22.5
@@ -88,7 +89,7 @@ def test_a_second_board_is_placed_along(place):
     assert "without images" in visioncal("plan", place / "two", "--add", 2).err
 
 
-@pytest.mark.parametrize("name", cell_names())
+@pytest.mark.parametrize("name", SIMULATED_CELLS)
 def test_cells_that_come_with_visioncal_are_calibrated(name, place):
     folder, out = place / name, place / f"{name}-out"
     done("simulate", folder, "--cell", name, "--no-images", "--views", 20)

@@ -7,7 +7,7 @@ estimator, so that an error in a projection or in a kinematic chain cannot cance
 from visioncal.simulation.arms import ArmOptions, Heat, Payload, arm_named, forward
 from visioncal.simulation.boards import BOARDS
 from visioncal.simulation.cell import SimulatedCell
-from visioncal.simulation.cell_files import cell_names, read_cell
+from visioncal.simulation.cell_files import read_cell
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,
@@ -62,7 +62,6 @@ __all__ = [
     "Truth",
     "WarmUpOptions",
     "arm_named",
-    "cell_names",
     "cell_session",
     "forward",
     "measured_poses",

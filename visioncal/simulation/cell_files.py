@@ -42,23 +42,19 @@ _RANGES = {"scale": (0.5, 2.0), "bow_m": (-0.05, 0.05), "share_seen": (1e-6, 1.0
 _SIGNED = ("tilt_rad", "turn_rad", "shift_m", "camera_minus_robot_s")
 
 
-def cell_names() -> tuple[str, ...]:
-    """Names of the cells that come with visioncal."""
-    return tuple(sorted(_shipped()))
-
-
 def read_cell(name_or_path: str) -> NetworkOptions:
     """Reads the description of a cell.
 
     Args:
-        name_or_path: A name from `cell_names`, or the path of a `.toml`.
+        name_or_path: A name among `SIMULATED_CELLS`, or the path of a `.toml`.
 
     Raises:
         DataError: There is no such cell, or a field is unknown, missing, of another type or out of
             range.
     """
+    shipped = {path.stem: path for path in _FOLDER.glob("*.toml")}
     path = find_described(
-        name_or_path, what="cell", shipped=_shipped(), suffixes=(".toml",), folder=None
+        name_or_path, what="cell", shipped=shipped, suffixes=(".toml",), folder=None
     )
     document = parse_toml(read_text(path), path.name)
     with reading(path.name, "a cell", "See the README of simulation for its keys."):
@@ -92,10 +88,6 @@ def read_cell(name_or_path: str) -> NetworkOptions:
                 next_step="Add a table [instruments.NAME], or leave the points out.",
             )
         return read(NetworkOptions, content, "")
-
-
-def _shipped() -> dict[str, Path]:
-    return {path.stem: path for path in _FOLDER.glob("*.toml")}
 
 
 def _check(kind: type, row: Mapping[str, Any], path: str, tables: tuple[str, ...] = ()) -> None:

@@ -144,20 +144,16 @@ def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False
         rng.uniform(0.01, 0.05, count),
         around((1.1, 1.2, 0.9, 0.08, 0.08, 0.07)),
     )
-    return replace(
-        nominal,
-        bodies=tuple(_disturbed(body, 0.2, rng) for body in nominal.bodies),
-        gears=gears,
-    )
-
-
-def _disturbed(body: LinkBody, share: float, rng: np.random.Generator) -> LinkBody:
-    kg = body.kg * np.exp(share * rng.standard_normal())
-    second_moments = 0.5 * np.trace(body.inertia_kg_m2) * np.eye(3) - body.inertia_kg_m2
-    stretch = np.sqrt(kg / body.kg) * (np.eye(3) + 0.5 * share * rng.standard_normal((3, 3)))
-    second_moments = stretch @ second_moments @ stretch.T
-    centre = body.centre_m + 0.01 * rng.standard_normal(3)
-    return LinkBody(float(kg), centre, np.trace(second_moments) * np.eye(3) - second_moments)
+    bodies = []
+    for body in nominal.bodies:
+        kg = body.kg * np.exp(0.2 * rng.standard_normal())
+        second_moments = 0.5 * np.trace(body.inertia_kg_m2) * np.eye(3) - body.inertia_kg_m2
+        stretch = np.sqrt(kg / body.kg) * (np.eye(3) + 0.1 * rng.standard_normal((3, 3)))
+        second_moments = stretch @ second_moments @ stretch.T
+        centre = body.centre_m + 0.01 * rng.standard_normal(3)
+        inertia = np.trace(second_moments) * np.eye(3) - second_moments
+        bodies.append(LinkBody(float(kg), centre, inertia))
+    return replace(nominal, bodies=tuple(bodies), gears=gears)
 
 
 def drive_torques(built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
@@ -358,19 +354,15 @@ def with_exercises(cell: SimulatedCell, exercised: Mapping[str, Exercised]) -> S
     )
 
 
-def write_exercise(options: ExerciseOptions, folder: Path | str) -> Path:
+def write_exercise(options: ExerciseOptions, folder: Path) -> None:
     """Writes the streams `excite`, `sweeps` and `fresh` of an arm, and its ground truth.
-
-    Returns:
-        The session's folder.
 
     Raises:
         DataError: The arm's dynamics are unknown, or the folder cannot be written.
     """
-    folder, recording = Path(folder), exercise(options)
+    recording = exercise(options)
     exercise_session(options.robot, recording.streams, folder.name).save(folder)
     write_truth(folder, {"schema": 1, "options": asdict(options), "arm": asdict(recording.arm)})
-    return folder
 
 
 def exercise_session(robot: str, streams: Mapping[str, Stream], name: str = "exercise") -> Session:

@@ -112,13 +112,12 @@ def session_of(
     return Session.assemble(facts | document, list(rows[0]), cells, MemoryImages({}))
 
 
-def write_tracked(shop: InstrumentRecord, folder: Path | str) -> Path:
+def write_tracked(shop: InstrumentRecord, folder: Path) -> None:
     """Writes a session's folder, and the truth in `<folder>.truth.json` beside it.
 
     Raises:
         DataError: The folder cannot be written.
     """
-    folder = Path(folder)
     session_of(shop, name=folder.name).save(folder)
     content = {
         "schema": 1,
@@ -130,4 +129,3 @@ def write_tracked(shop: InstrumentRecord, folder: Path | str) -> Path:
         "arm": asdict(shop.true_arm),
     }
     write_truth(folder, content)
-    return folder

@@ -15,8 +15,6 @@ from visioncal.simulation.boards import Sheet, centre_m
 from visioncal.simulation.layout import (
     CELL,
     MIDDLE_M,
-    BoardAt,
-    CameraAt,
     CellOptions,
     NetworkOptions,
     RandomStream,
@@ -187,9 +185,31 @@ def mounted(options: NetworkOptions) -> dict[str, FloatArray]:
         place = place + rng.normal(0.0, 0.01, 3)
         placed[frame_name("base", robot.name)] = compose(rotation.as_matrix(), place)
     for camera in options.cameras:
-        placed[frame_name("camera", camera.name)] = _camera(camera, rng)
+        name = frame_name("camera", camera.name)
+        if camera.on != CELL:
+            aside = rng.uniform([0.05, -0.02, 0.03], [0.09, 0.02, 0.07])
+            rotation = Rotation.from_euler("z", 0.5 * np.pi) * _skew(rng, 0.05)
+            placed[name] = compose(rotation.as_matrix(), aside)
+            continue
+        goal = np.array(camera.looks_at_m) + rng.normal(0.0, 0.01, 3)
+        away = np.array(camera.place_m) - goal
+        # For a camera looking straight down, the cell's y counts as upright.
+        away[1] -= 1e-6
+        distance = float(np.linalg.norm(away))
+        placed[name] = looking_at(goal, away / distance, distance)
     for board in options.boards:
-        placed[frame_name("target", board.name)] = _board(board, rng)
+        # The board's z points into its plate.
+        rotation = Rotation.from_euler("ZX", [rng.uniform(-0.5, 0.5), np.pi])
+        if board.on != CELL:
+            rotation = rotation * _skew(rng, 0.05)
+            place = np.array([0.0, 0.0, 0.06]) + rng.normal(0.0, 0.005, 3)
+        else:
+            place = np.array(board.place_m)
+            ahead = np.array([*(np.array(MIDDLE_M) - place)[:2], 0.0])
+            lean = np.cross([0.0, 0.0, 1.0], ahead / max(float(np.linalg.norm(ahead)), 1e-9))
+            rotation = Rotation.from_rotvec(board.tilt_rad * lean) * rotation * _skew(rng, 0.01)
+        matrix = rotation.as_matrix()
+        placed[frame_name("target", board.name)] = compose(matrix, place - matrix @ centre_m(board))
     for point in options.points:
         placed[frame_name("point", point.name)] = compose(np.eye(3), np.array(point.place_m))
     for instrument in options.instruments:
@@ -197,35 +217,6 @@ def mounted(options: NetworkOptions) -> dict[str, FloatArray]:
         name = frame_name("instrument", instrument.name)
         placed[name] = compose(turn, np.array(instrument.place_m))
     return placed
-
-
-def _camera(camera: CameraAt, rng: np.random.Generator) -> FloatArray:
-    if camera.on != CELL:
-        aside = rng.uniform([0.05, -0.02, 0.03], [0.09, 0.02, 0.07])
-        return compose(
-            (Rotation.from_euler("z", 0.5 * np.pi) * _skew(rng, 0.05)).as_matrix(), aside
-        )
-    goal = np.array(camera.looks_at_m) + rng.normal(0.0, 0.01, 3)
-    away = np.array(camera.place_m) - goal
-    # For a camera looking straight down, the cell's y counts as upright.
-    away[1] -= 1e-6
-    distance = float(np.linalg.norm(away))
-    return looking_at(goal, away / distance, distance)
-
-
-def _board(board: BoardAt, rng: np.random.Generator) -> FloatArray:
-    centre = centre_m(board)
-    # The board's z points into its plate.
-    rotation = Rotation.from_euler("ZX", [rng.uniform(-0.5, 0.5), np.pi])
-    if board.on != CELL:
-        matrix = (rotation * _skew(rng, 0.05)).as_matrix()
-        held = np.array([0.0, 0.0, 0.06]) + rng.normal(0.0, 0.005, 3)
-        return compose(matrix, held - matrix @ centre)
-    place = np.array(board.place_m)
-    ahead = np.array([*(np.array(MIDDLE_M) - place)[:2], 0.0])
-    lean = np.cross([0.0, 0.0, 1.0], ahead / max(float(np.linalg.norm(ahead)), 1e-9))
-    matrix = (Rotation.from_rotvec(board.tilt_rad * lean) * rotation * _skew(rng, 0.01)).as_matrix()
-    return compose(matrix, place - matrix @ centre)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ camera takes frames at its own rate, and the controller reports joints and poses
 Faults of mounting, motion and rows are planted while a cell is observed.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import apply, apply_each, compose, exp, invert
-from visioncal.core.types import Camera, Corners, FloatArray, Mask
+from visioncal.core.types import Corners, FloatArray, Mask
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.session.columns import POSE
@@ -59,19 +59,6 @@ _LEAST_COSINE = 0.5
 _OF_SEVERAL = {RandomStream.ARM: RandomStream.ARMS, RandomStream.ROBOT: RandomStream.ROBOTS}
 
 
-def board_in_view(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
-    """(s,) mask of stops at which a board is in view and not too oblique."""
-    points = apply(cam_from_target, corners_m(sheet))
-    directions = points / np.linalg.norm(points, axis=2, keepdims=True)
-    facing = np.einsum("mni,mi->mn", directions, cam_from_target[:, :3, 2]) > _LEAST_COSINE
-    visible = facing.all(axis=1) & (directions[:, :, 2] > _LEAST_COSINE).all(axis=1)
-    if not visible.any():
-        return np.asarray(visible)
-    share = sees(camera, points[visible], MARGIN_PX).mean(axis=1)
-    visible[visible] = share >= (LEAST_SHARE if is_seen_in_part(sheet.target) else 1.0)
-    return np.asarray(visible)
-
-
 def detected(sheet: Sheet, exact: Corners, sigma_px: float, noise: np.random.Generator) -> Corners:
     """Corners of a view as detected, with noise.
 
@@ -108,7 +95,7 @@ def moved_cell(
             heat[f"{robot.name}_heat"] = warming.recorded(temperatures=True)
         jitter = robot.jitter(layout.stops, _stream(options, RandomStream.ROBOT, index))
         rng = _stream(options, RandomStream.WRONG, index)
-        joints, wrong_stops = misreported(arm, q, robot.wrong_stops, rng)
+        joints, wrong_stops = _misreported(arm, q, robot.wrong_stops, rng)
         robots[robot.name] = SimulatedRobot(
             options=robot,
             arm=arm,
@@ -242,8 +229,15 @@ def parent_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
 
 def _shown(cell: SimulatedCell, camera: str, board: str, pose: FloatArray) -> Mask:
     """(s,) mask of stops at which a camera's image of a board is recorded."""
-    layout, options = cell.layout, cell.options
-    seen = board_in_view(cell.camera(camera).camera, cell.board(board), pose)
+    layout, options, sheet = cell.layout, cell.options, cell.board(board)
+    # In view, and not too oblique.
+    points = apply(pose, corners_m(sheet))
+    directions = points / np.linalg.norm(points, axis=2, keepdims=True)
+    facing = np.einsum("mni,mi->mn", directions, pose[:, :3, 2]) > _LEAST_COSINE
+    seen = np.asarray(facing.all(axis=1) & (directions[:, :, 2] > _LEAST_COSINE).all(axis=1))
+    if seen.any():
+        share = sees(cell.camera(camera).camera, points[seen], MARGIN_PX).mean(axis=1)
+        seen[seen] = share >= (LEAST_SHARE if is_seen_in_part(sheet.target) else 1.0)
     at_board = [board_at.name for board_at in layout.boards].index(board)
     if isinstance(options, CellOptions):
         # The board that a stop aims at is in view.
@@ -288,19 +282,12 @@ def _read(
     return readings
 
 
-def misreported(
+def _misreported(
     arm: DhArm, moved: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, tuple[int, ...]]:
-    """Reported joint angles: the true ones, except for some stops with a wrong report.
+    """Reported angles (s, n) [rad] for the true ones, `moved`, and the wrong stops, ascending.
 
-    Args:
-        arm: Nominal arm.
-        moved: (s, n) true joint angles [rad].
-        count: Number of stops whose report is off by 5 to 30 mm and 1 to 5 degrees.
-        rng: Source of randomness.
-
-    Returns:
-        (s, n) reported joint angles [rad], and the wrong stops, ascending.
+    At `count` stops the report is off by 5 to 30 mm and 1 to 5 degrees of the nominal arm's flange.
     """
     chosen = np.sort(rng.permutation(len(moved))[:count])
     joints = moved.copy()
@@ -531,13 +518,9 @@ def _rolling_shutter(frames: SimulatedCell, passage: Passage) -> SimulatedCell:
 
     def rolled(sight: SimulatedSight) -> SimulatedSight:
         seen_from = frames.seen_from("", sight.camera, sight.board)
-
-        def before(row_jitter: FloatArray, q: FloatArray) -> FloatArray:
-            return seen_from(robot.flange_at(q) @ row_jitter)
-
         exact = passage.frame(
             float(passage.taken_s[sight.stop]),
-            partial(before, jitter[sight.stop]),
+            lambda q: seen_from(robot.flange_at(q) @ jitter[sight.stop]),
             frames.camera(),
             frames.board(sight.board),
             sight.view,
@@ -602,16 +585,6 @@ class Round:
     minutes: float = 100.0  # Duration of the repetitions [min].
     pace_s: float = 5.0  # Time between views [s].
 
-    def schedule(self) -> tuple[FloatArray, Sequence[int]]:
-        """(m,) times [s], and indices of the views."""
-        stamps = list(self.pace_s * np.arange(self.first))
-        shown = list(range(self.first))
-        again = np.linspace(0, self.first - 1, self.references).astype(int).tolist()
-        for begin in np.arange(self.every_s, 60.0 * self.minutes, self.every_s):
-            stamps += list(begin + self.pace_s * np.arange(self.references))
-            shown += again
-        return np.array(stamps), shown
-
 
 @dataclass(frozen=True, eq=False)
 class WarmUpOptions:
@@ -644,9 +617,14 @@ def simulate_warm_up(options: WarmUpOptions) -> SimulatedCell:
         DataError: As `simulate`.
     """
     heat, warming = options.heats, options.warming()
-    stamps_s, shown = options.round.schedule()
-    postures = simulate(replace(options.cell, views=options.round.first)).robot.joints
-    cold = simulate(options.cell, postures[list(shown)])
+    times = options.round
+    stamps, shown = [times.pace_s * np.arange(times.first)], [*range(times.first)]
+    for begin in np.arange(times.every_s, 60.0 * times.minutes, times.every_s):
+        stamps.append(begin + times.pace_s * np.arange(times.references))
+        shown += np.linspace(0, times.first - 1, times.references).astype(int).tolist()
+    stamps_s = np.concatenate(stamps)
+    postures = simulate(replace(options.cell, views=times.first)).robot.joints
+    cold = simulate(options.cell, postures[shown])
     robot, links_c = cold.robot, warming.at(stamps_s)
     warm_poses = heated_flanges(
         robot.true_arm, heat, robot.joints, links_c, robot.true_base_from_flange

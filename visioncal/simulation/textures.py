@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from visioncal.core.types import FloatArray, Image, Mask, Target
+from visioncal.core.types import FloatArray, Image, Target
 from visioncal.simulation.boards import unit_m
 from visioncal.vision.printing.pattern import dark_cells, dark_discs
 from visioncal.vision.targets import extent_m
@@ -107,7 +107,13 @@ def _dark_shares(target: Target, shape: tuple[int, int], texel_m: float) -> Floa
     dark = np.zeros(shape, np.float32)
     low, _ = extent_m(target)
     for grid in dark_cells(target):
-        _stamp(dark, grid.dark, (grid.corner_m - low) / texel_m, grid.cell_m / texel_m)
+        corner = (grid.corner_m - low) / texel_m
+        (top, down), (left, across) = (
+            _overlaps(start, grid.cell_m / texel_m, grid.dark.shape[axis], shape[axis])
+            for axis, start in enumerate(corner[::-1].tolist())
+        )
+        window = dark[top : top + down.shape[1], left : left + across.shape[1]]
+        window += down.T @ grid.dark @ across
     for disc in (dark_discs(target) - [*low, 0.0]) / texel_m:
         centre, radius = disc[:2], float(disc[2])
         # Circles' edges are straight within a texel.
@@ -119,16 +125,6 @@ def _dark_shares(target: Target, shape: tuple[int, int], texel_m: float) -> Floa
         inside = np.clip(radius - np.hypot(x[None], y[:, None]) + 0.5, 0.0, 1.0)
         np.maximum(dark[top:bottom, left:right], inside, out=dark[top:bottom, left:right])
     return dark
-
-
-def _stamp(dark: Float32Array, cells: Mask, corner: FloatArray, cell: float) -> None:
-    """Adds the dark area of an upright grid of cells that starts at `corner` [texels]."""
-    (top, down), (left, across) = (
-        _overlaps(start, cell, cells.shape[axis], dark.shape[axis])
-        for axis, start in enumerate(corner[::-1].tolist())
-    )
-    window = dark[top : top + down.shape[1], left : left + across.shape[1]]
-    window += down.T @ cells @ across
 
 
 def _overlaps(start: float, cell: float, count: int, texels: int) -> tuple[int, Float32Array]:

@@ -11,7 +11,7 @@ from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.transforms import apply, compose, exp, invert
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray
 from visioncal.session import frame_name
 from visioncal.session.columns import pose_row
 from visioncal.simulation.arms import forward, inverse, reach_m
@@ -154,7 +154,16 @@ def _touched(
         goals[:, :3, 3] = contacts[pending] - rotations.apply(on_flange[pending])
         # The true flange pose deviates by its repeatability.
         goals = goals @ exp(-robot.options.sigma * rng.standard_normal((count, 6)))
-        solutions, good = _inverse_with_deflection(robot, goals, home)
+        # Of the real arm: each step reduces the error by the ratio of deflection.
+        solutions, aims = np.tile(home, (count, 1)), goals
+        for _ in range(6):
+            reach = inverse(robot.true_arm, aims, solutions)
+            solutions = reach.joints
+            poses = robot.flange_at(solutions)
+            aims = goals @ invert(poses) @ aims
+        good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
+        good &= np.abs(poses - goals).max(axis=(1, 2)) < 1e-8
+        good &= lowest_m(robot.arm, solutions) > 0.0
         joints[np.flatnonzero(pending)[good]] = solutions[good]
         pending[pending] = np.logical_not(good)
         if not pending.any():
@@ -164,22 +173,6 @@ def _touched(
         f"{len(contacts)} touches.",
         next_step="Take another robot or seed.",
     )
-
-
-def _inverse_with_deflection(
-    robot: SimulatedRobot, goals: FloatArray, home: FloatArray
-) -> tuple[FloatArray, Mask]:
-    """(m, n) joints that bring the real arm to (m, 4, 4), and (m,) mask of valid ones."""
-    joints, aims = np.tile(home, (len(goals), 1)), goals
-    # Each reduces the error by the ratio of deflection.
-    for _ in range(6):
-        reach = inverse(robot.true_arm, aims, joints)
-        joints = reach.joints
-        poses = robot.flange_at(joints)
-        aims = goals @ invert(poses) @ aims
-    good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
-    good &= np.abs(poses - goals).max(axis=(1, 2)) < 1e-8
-    return joints, good & (lowest_m(robot.arm, joints) > 0.0)
 
 
 def write_touches(touched: Mapping[str, Touching], folder: Path) -> None:
