@@ -15,11 +15,7 @@ from visioncal.calibration.pipeline.reading import (
     read_readings,
 )
 from visioncal.calibration.pipeline.result import result_of, view_evidence
-from visioncal.calibration.pipeline.run_state import (
-    CalibrationOptions,
-    RunState,
-    initial_state,
-)
+from visioncal.calibration.pipeline.run_state import CalibrationOptions, RunState, initial_state
 from visioncal.calibration.pipeline.solving import solve
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.calibration.stages.cell import read_cell

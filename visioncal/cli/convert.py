@@ -8,12 +8,7 @@ from visioncal.cli.console import print_table, say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import ConvertOptions, RobotPoseOptions
 from visioncal.core.errors import DataError
-from visioncal.interchange.formats import (
-    DoubtfulSession,
-    ImportOptions,
-    PoseImportOptions,
-    convert,
-)
+from visioncal.interchange.formats import DoubtfulSession, ImportOptions, PoseImportOptions, convert
 from visioncal.results import Calibration
 
 # Options that are named as the import's.

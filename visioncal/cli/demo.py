@@ -9,14 +9,7 @@ import numpy as np
 import typer
 
 from visioncal.calibration.run import run
-from visioncal.cli.console import (
-    EXIT_BAD,
-    answer,
-    exit_status,
-    print_table,
-    report_written,
-    say,
-)
+from visioncal.cli.console import EXIT_BAD, answer, exit_status, print_table, report_written, say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.record import check_all, record_driven, say_line
 from visioncal.cli.recover import recover_command

@@ -8,14 +8,7 @@ from dataclasses import replace
 import numpy as np
 import typer
 
-from visioncal.cli.console import (
-    answer,
-    exit_status,
-    print_json,
-    print_table,
-    report_written,
-    say,
-)
+from visioncal.cli.console import answer, exit_status, print_json, print_table, report_written, say
 from visioncal.cli.dynamics_options import (
     FRICTION,
     PLANNED_FRICTION,
@@ -38,13 +31,7 @@ from visioncal.core.threads import signals_as_interrupts
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.excitation import ExcitationRequest, excite
-from visioncal.dynamics.identified import (
-    CLASSES,
-    UNKNOWN,
-    Identified,
-    judge,
-    to_document,
-)
+from visioncal.dynamics.identified import CLASSES, UNKNOWN, Identified, judge, to_document
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, validate
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms

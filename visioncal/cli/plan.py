@@ -12,11 +12,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.cli.console import answer, print_json, report_written, say, warn
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.session_options import (
-    MOST_FOR_NEED,
-    ClearanceOptions,
-    PlanOptions,
-)
+from visioncal.cli.session_options import MOST_FOR_NEED, ClearanceOptions, PlanOptions
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import listed, some_of
@@ -38,11 +34,7 @@ from visioncal.live.planning.messages import need_words, summary_of
 from visioncal.live.planning.plan import Plan, PlanRequest, make_plan
 from visioncal.live.planning.plan_file import plan_document
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.live.planning.recorded import (
-    SessionStart,
-    calibrate_partially,
-    start_from_session,
-)
+from visioncal.live.planning.recorded import SessionStart, calibrate_partially, start_from_session
 from visioncal.live.planning.repeated import stops_to_repeat
 from visioncal.results import Calibration
 from visioncal.robot import Robot, load_robot

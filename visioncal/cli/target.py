@@ -6,11 +6,7 @@ from dataclasses import fields
 import typer
 
 from visioncal.cli.console import answer, print_json, say
-from visioncal.cli.session_options import (
-    BoardOptions,
-    TargetCheckOptions,
-    TargetMakeOptions,
-)
+from visioncal.cli.session_options import BoardOptions, TargetCheckOptions, TargetMakeOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
 from visioncal.core.number_format import known_name

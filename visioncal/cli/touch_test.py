@@ -8,14 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.cli.console import (
-    EXIT_BAD,
-    answer,
-    check_usable,
-    print_json,
-    report_written,
-    warn,
-)
+from visioncal.cli.console import EXIT_BAD, answer, check_usable, print_json, report_written, warn
 from visioncal.cli.history import enter
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress

@@ -11,12 +11,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, interpolated
 from visioncal.dynamics.model import JointMotion, Measured
-from visioncal.dynamics.reading import (
-    RecordedSamples,
-    StampClock,
-    even_parts,
-    gap_notes,
-)
+from visioncal.dynamics.reading import RecordedSamples, StampClock, even_parts, gap_notes
 
 # Cut-off of the low-pass: a rigid arm's torques, but for the corners of friction, lie within so
 # many times the motion's bandwidth; below the least there is little to estimate noise from, above

@@ -20,12 +20,7 @@ from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
 from visioncal.estimation.field_modes import FieldModes, field_modes
-from visioncal.estimation.lens_field import (
-    Coefficients,
-    LensLevels,
-    breathing_columns,
-    lens_part,
-)
+from visioncal.estimation.lens_field import Coefficients, LensLevels, breathing_columns, lens_part
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.poses import fit_poses

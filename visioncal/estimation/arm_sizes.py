@@ -25,13 +25,7 @@ from scipy.special import ive
 
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
-from visioncal.estimation.armmodel import (
-    BACKLASH,
-    COMPLIANCE,
-    HARMONICS,
-    WEIGHT,
-    JointFunctions,
-)
+from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT, JointFunctions
 from visioncal.estimation.linalg import gram
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedEstimate
 from visioncal.estimation.problem import Problem

@@ -24,12 +24,7 @@ from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.solve import (
-    Solution,
-    covariance_of,
-    fit_problem,
-    fitted_covariance,
-)
+from visioncal.estimation.solve import Solution, covariance_of, fit_problem, fitted_covariance
 
 # Values that change by less than this share of their sigma have converged.
 _SETTLED = 0.02

@@ -19,13 +19,7 @@ from scipy.special import expit, logit
 
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import (
-    NULL_SHARE,
-    covariance_root,
-    gram,
-    inverse_roots,
-    times_root,
-)
+from visioncal.estimation.linalg import NULL_SHARE, covariance_root, gram, inverse_roots, times_root
 
 # Bounds of the standard deviations, in units of the residuals [rad and m].
 LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2

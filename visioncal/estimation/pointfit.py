@@ -23,13 +23,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import TOUCH_NOISE_M, check_sides, refuse_poor, worst_of
-from visioncal.estimation.points import (
-    FEWEST_POINTS,
-    GroupFit,
-    Placement,
-    PointProblem,
-    fit_groups,
-)
+from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem, fit_groups
 from visioncal.estimation.procrustes import align, spreads
 from visioncal.estimation.robust import SETS, small_sets
 

@@ -24,11 +24,7 @@ from visioncal.estimation.linalg import (
     squared_lengths,
 )
 from visioncal.estimation.mixed import LEAST_SIGMA
-from visioncal.estimation.normal_equations import (
-    Whitening,
-    fisher_information,
-    normal_equations,
-)
+from visioncal.estimation.normal_equations import Whitening, fisher_information, normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import START_SIGMA, robot_likelihood

@@ -23,12 +23,7 @@ from visioncal.estimation.moves import fitted_change, moved
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.solve import (
-    Solution,
-    equations_from,
-    fit_problem,
-    fitted_covariance,
-)
+from visioncal.estimation.solve import Solution, equations_from, fit_problem, fitted_covariance
 
 FRAME, JOINT, SIZE, DRIFT = "frame", "joint", "size", "drift"
 # Sizes of changes with equal prior probability, and the unit of each value.

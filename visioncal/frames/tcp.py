@@ -10,12 +10,7 @@ from visioncal.core.limits import ToolLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import AGAIN, Finding, Remedy
-from visioncal.estimation.pivot import (
-    PivotFit,
-    Touches,
-    TouchKind,
-    fit_pivot,
-)
+from visioncal.estimation.pivot import PivotFit, Touches, TouchKind, fit_pivot
 from visioncal.estimation.placing import assumed_words
 from visioncal.frames.fixture import FitSettings, PointsFit
 from visioncal.frames.touches import (

@@ -7,13 +7,7 @@ import numpy as np
 from visioncal.core.number_format import decimals_for, fixed, signed, significant
 from visioncal.present.facts import PLUS_MINUS
 from visioncal.present.tables import Fact, Table, TableRow
-from visioncal.results.arm import (
-    NOMINAL,
-    ArmErrorsResult,
-    ArmResult,
-    ElasticResult,
-    ThermalResult,
-)
+from visioncal.results.arm import NOMINAL, ArmErrorsResult, ArmResult, ElasticResult, ThermalResult
 
 # What each model level estimates.
 LEVELS = {

@@ -17,12 +17,7 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, CameraKind, FloatArray
 from visioncal.estimation.lens_field import LensLevels, displacements
 from visioncal.results.edge import Covariance, Edge, StoredEdge, StoredPose
-from visioncal.vision.camera import (
-    intrinsics,
-    normalise,
-    project_with_jacobian,
-    with_intrinsics,
-)
+from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian, with_intrinsics
 
 # Places of p1 and p2 among Brown's intrinsics.
 _DECENTRING = (6, 7)

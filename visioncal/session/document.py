@@ -289,10 +289,8 @@ class Declaration(TableModel):
         return self.robot if len(self.robots) != 1 else next(iter(self.robots.values()))
 
 
-def read_declaration(
-    document: Mapping[str, Any], label: str, *, observed: bool = True
-) -> Declaration:
-    """Checks the content of a session.toml, named `label` in messages; raises DataError.
+def read_declaration(document: Mapping[str, Any], *, observed: bool) -> Declaration:
+    """Checks the content of a session.toml; raises DataError.
 
     `observed` says whether there are views, which need something that observed them.
     """
@@ -303,11 +301,11 @@ def read_declaration(
         problems = [_problem(entry) for entry in error.errors()]
     else:
         problems = list(_contradictions(declaration, observed))
-        hints = [key for key in _unknown_keys(declaration, "", label) if "Did you mean" in key]
+        hints = [key for key in _unknown_keys(declaration, "") if "Did you mean" in key]
     if problems:
         raise DataError(
-            f"{label}: {'; '.join(f'{field} {words}' for field, words in problems)}.",
-            culprits=[f"{label}: {field}" for field, _ in problems],
+            f"session.toml: {'; '.join(f'{field} {words}' for field, words in problems)}.",
+            culprits=[f"session.toml: {field}" for field, _ in problems],
             next_step=" ".join(hints),
         )
     return declaration
@@ -370,26 +368,26 @@ def _far_priors(declaration: Declaration) -> Iterator[tuple[str, str]]:
                 yield f"prior.{edge}.{axis}", words
 
 
-def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
+def declaration_warnings(declaration: Declaration) -> Iterator[str]:
     """Warnings: unknown keys, unknown priors, a principal point outside the image."""
-    yield from _unknown_keys(declaration, "", label)
+    yield from _unknown_keys(declaration, "")
     edges = [*_EDGES, *(f"{edge}_{name}" for edge in _EDGES for name in declaration.targets)]
     for edge in declaration.prior:
         if not declaration.has_names and edge not in edges:
             hint = did_you_mean(edge, edges)
-            yield f"{label}: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
+            yield f"session.toml: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
 
 
-def _unknown_keys(table: BaseModel, path: str, label: str) -> Iterator[str]:
+def _unknown_keys(table: BaseModel, path: str) -> Iterator[str]:
     fields = type(table).model_fields
     known = [field.alias or name for name, field in fields.items()]
     for key in table.model_extra or {}:
         hint = did_you_mean(key, known)
-        yield f"{label}: {path}{key} is not a known field and is ignored. {hint}".strip()
+        yield f"session.toml: {path}{key} is not a known field and is ignored. {hint}".strip()
     for name in fields:
         value = getattr(table, name)
         if isinstance(value, BaseModel):
-            yield from _unknown_keys(value, f"{path}{name}.", label)
+            yield from _unknown_keys(value, f"{path}{name}.")
         elif name in ("prior", "clocks", *(f"{kind}s" for kind in KINDS)):
             for key, entry in cast(Mapping[str, BaseModel], value).items():
-                yield from _unknown_keys(entry, f"{path}{name}.{key}.", label)
+                yield from _unknown_keys(entry, f"{path}{name}.{key}.")

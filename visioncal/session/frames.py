@@ -189,9 +189,26 @@ class _DeclaredTree:
                 if parent is not None:
                     parents[frame] = parent
         missing = [name for name in undeclared if name not in parents]
-        if missing:
-            raise self._undetermined_error(missing)
-        return {frame: _carrier(parents, frame, self) or CELL for frame in self.frames}
+        if not missing:
+            return {frame: _carrier(parents, frame, self) or CELL for frame in self.frames}
+        mount = self.declaration.mount
+        if mount is not None and not self.robots:
+            raise DataError(
+                f'views.csv: no row says where the robot is, which mount = "{mount}" needs.',
+                culprits=["views.csv: x_m", "views.csv: q1_rad"],
+                next_step="Give each row the flange's pose, as x_m, y_m, z_m, qx, qy, qz, qw, or "
+                "the joints' angles, as q1_rad, q2_rad and so on with [robot] in session.toml; or "
+                "its time, as stamp_s, and the poses by their times in streams/robot.csv.",
+            )
+        places = [*(frame_name("flange", robot) for robot in self.robots), CELL]
+        example = "\n".join(f'{name} = "{places[0]}"' for name in missing)
+        among = ", ".join(f'"{place}"' for place in places)
+        raise DataError(
+            f"session.toml: it is not said what {some_of(missing)} "
+            f"{'hangs' if len(missing) == 1 else 'hang'} on, and it does not follow from the rest.",
+            culprits=[f"{_WHERE}.{name}" for name in missing],
+            next_step=f"Say it, each by one of {among}:\n[frames]\n{example}",
+        )
 
     def _inferred_parent(self, frame: str, parents: Mapping[str, str]) -> str | None:
         """Inferred parent of a frame; None where ambiguous."""
@@ -228,26 +245,6 @@ class _DeclaredTree:
             if has_robot_state(view) and frame in observed(self.declaration, view)
         }
         return frame_name("flange", named.pop()) if len(named) == 1 else None
-
-    def _undetermined_error(self, missing: Sequence[str]) -> DataError:
-        mount = self.declaration.mount
-        if mount is not None and not self.robots:
-            return DataError(
-                f'views.csv: no row says where the robot is, which mount = "{mount}" needs.',
-                culprits=["views.csv: x_m", "views.csv: q1_rad"],
-                next_step="Give each row the flange's pose, as x_m, y_m, z_m, qx, qy, qz, qw, or "
-                "the joints' angles, as q1_rad, q2_rad and so on with [robot] in session.toml; or "
-                "its time, as stamp_s, and the poses by their times in streams/robot.csv.",
-            )
-        places = [*(frame_name("flange", robot) for robot in self.robots), CELL]
-        example = "\n".join(f'{name} = "{places[0]}"' for name in missing)
-        among = ", ".join(f'"{place}"' for place in places)
-        return DataError(
-            f"session.toml: it is not said what {some_of(missing)} "
-            f"{'hangs' if len(missing) == 1 else 'hang'} on, and it does not follow from the rest.",
-            culprits=[f"{_WHERE}.{name}" for name in missing],
-            next_step=f"Say it, each by one of {among}:\n[frames]\n{example}",
-        )
 
 
 def observed(declaration: Declaration, view: View) -> tuple[str, str]:

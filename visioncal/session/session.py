@@ -53,18 +53,8 @@ from visioncal.session.observations import (
 )
 from visioncal.session.saving import digest_of, save_session
 from visioncal.session.selecting import Choice, keep_views, select
-from visioncal.session.streams import (
-    Stream,
-    check_stream,
-    gap_warnings,
-    read_streams,
-)
-from visioncal.session.table import (
-    View,
-    check_times,
-    parse_csv,
-    read_views,
-)
+from visioncal.session.streams import Stream, check_stream, gap_warnings, read_streams
+from visioncal.session.table import View, check_times, parse_csv, read_views
 
 _NO_VIEWS = TextTable("", ("view",), (), ())
 
@@ -132,7 +122,13 @@ class Session:
         try:
             text = read_text_inside(path, "session.toml", MOST_TOML_BYTES)
         except DataError as error:
-            if (near := _nearest_session(path)) is None:
+            # The session's folder above, below, or beside it under a similar name.
+            found = [path.parent / "session.toml", *sorted(path.glob("*/session.toml"))]
+            if not path.exists():
+                beside = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
+                found += [beside[name] for name in get_close_matches(path.name, beside, 1)]
+            near = next((file.parent for file in found if file.is_file()), None)
+            if near is None:
                 raise
             step = f"Name the session's folder: {shlex.quote(str(near))}"
             raise DataError(error.message, culprits=error.culprits, next_step=step) from error
@@ -403,21 +399,24 @@ class Session:
     @cached_property
     def declaration(self) -> Declaration:
         """Typed content of session.toml: the clock, the priors, the instrument."""
-        return read_declaration(self.document, "session.toml", observed=bool(self.views))
+        return read_declaration(self.document, observed=bool(self.views))
 
     @property
     def name(self) -> str:
         """The session's name, on one line: nothing in it may steer a terminal."""
         return one_line(self.declaration.name)
 
-    @property
+    @cached_property
     def mount(self) -> Mount:
         """`eye-in-hand`, `eye-to-hand`, or `instrument` where an instrument observes the robot.
 
         Several cameras without declaration are `eye-in-hand` only if all are on flanges.
         """
         declared = self.declaration.mount
-        if self.is_read_by_instrument or (declared is None and not self.cameras):
+        # All observations are an instrument's; otherwise the camera's are used.
+        is_read = any(view.reading_m is not None for view in self.views)
+        is_read = is_read and not any(map(is_camera_observation, self.views))
+        if is_read or (declared is None and not self.cameras):
             return "instrument"
         if declared is not None:
             return declared
@@ -486,12 +485,6 @@ class Session:
         """
         return observations_of(self.declaration, self.views, self.frames)
 
-    @cached_property
-    def is_read_by_instrument(self) -> bool:
-        """Whether all observations are an instrument's; otherwise the camera's are used."""
-        seen = any(is_camera_observation(view) for view in self.views)
-        return not seen and any(view.reading_m is not None for view in self.views)
-
     @property
     def boards(self) -> Mapping[str, Target]:
         """Printed targets by name, which is empty for the only one."""
@@ -539,7 +532,7 @@ def _build(
     corners: CornerTable | None = None,
 ) -> Session:
     """Builds a session from its content, with all checks."""
-    declaration = read_declaration(document, "session.toml", observed=bool(table.rows))
+    declaration = read_declaration(document, observed=bool(table.rows))
     columns, views = table.columns, read_views(table, with_corners=corners is not None)
     targets, target_document = read_targets(declaration, folder, target_document)
     several = targets if len(targets) > 1 else {}
@@ -547,7 +540,7 @@ def _build(
         columns, views, corners = with_corners(columns, views, corners, tuple(several))
     check_images_can_be_used(declaration, views)
     warnings = [
-        *declaration_warnings(declaration, "session.toml"),
+        *declaration_warnings(declaration),
         *cols.column_warnings(columns, "views.csv"),
         *target_warnings(declaration, target_document),
     ]
@@ -575,12 +568,3 @@ def _build(
         named = {view.number: session.board_of(view) for view in seen}
         check_points(corners, [named[index] for index in corners.views.tolist()], session.boards)
     return session
-
-
-def _nearest_session(path: Path) -> Path | None:
-    """The folder of a session above a path, below it, or beside it under a similar name."""
-    found = [path.parent / "session.toml", *sorted(path.glob("*/session.toml"))]
-    if not path.exists():
-        beside = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
-        found += [beside[name] for name in get_close_matches(path.name, beside, 1)]
-    return next((file.parent for file in found if file.is_file()), None)

@@ -22,11 +22,7 @@ from visioncal.simulation.layout import (
     SweepOptions,
     Swept,
 )
-from visioncal.simulation.optics import (
-    CAMERAS,
-    project,
-    rays,
-)
+from visioncal.simulation.optics import CAMERAS, project, rays
 from visioncal.simulation.recordings import Round, WarmUpOptions, simulate, simulate_warm_up, sweep
 from visioncal.simulation.records import (
     Truth,

@@ -6,11 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray, Target
-from visioncal.vision.targets import (
-    corner_positions,
-    extent_m,
-    load_target,
-)
+from visioncal.vision.targets import corner_positions, extent_m, load_target
 
 
 def _tags() -> Target:

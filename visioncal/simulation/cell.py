@@ -9,13 +9,7 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, Corners, FloatArray, chosen_rows
 from visioncal.session import Stream, frame_name
 from visioncal.simulation.arms import DhArm, Payload
-from visioncal.simulation.layout import (
-    BoardAt,
-    CameraAt,
-    CellOptions,
-    NetworkOptions,
-    RobotAt,
-)
+from visioncal.simulation.layout import BoardAt, CameraAt, CellOptions, NetworkOptions, RobotAt
 
 
 @dataclass(frozen=True, eq=False)

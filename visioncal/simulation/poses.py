@@ -8,12 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import apply, compose
 from visioncal.core.types import Camera, FloatArray
-from visioncal.simulation.boards import (
-    Sheet,
-    centre_m,
-    corners_m,
-    outline_m,
-)
+from visioncal.simulation.boards import Sheet, centre_m, corners_m, outline_m
 from visioncal.simulation.optics import rays, sees
 from visioncal.vision.targets import extent_m, is_seen_in_part
 

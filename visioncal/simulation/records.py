@@ -211,12 +211,8 @@ def cell_session(
     ]
     corners = None
     if seen == "corners":
-        counts = [len(sight.corners.ids) for sight in sights]
-        corners = CornerTable(
-            np.repeat([sight.view for sight in sights], counts),
-            np.concatenate([sight.corners.ids for sight in sights]),
-            np.concatenate([sight.corners.px for sight in sights]),
-            ("",) * sum(counts),
+        corners = CornerTable.of_lists(
+            [(sight.view, sight.corners.ids, sight.corners.px) for sight in sights]
         )
     documents = {
         board.name: target_document(board.target)

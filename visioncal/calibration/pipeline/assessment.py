@@ -39,11 +39,7 @@ from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import (
-    Solution,
-    covariance_of,
-    fit_problem,
-)
+from visioncal.estimation.solve import Solution, covariance_of, fit_problem
 from visioncal.estimation.steps import Step
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
 from visioncal.results.sections import ClockResult, Intervals

@@ -8,11 +8,7 @@ import numpy as np
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit, within
 from visioncal.calibration.stages.handeye import closed_form_state
-from visioncal.calibration.stages.validate import (
-    HeldOutResiduals,
-    needed_frames,
-    pose_residuals,
-)
+from visioncal.calibration.stages.validate import HeldOutResiduals, needed_frames, pose_residuals
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply_each
 from visioncal.core.types import FloatArray, IntArray

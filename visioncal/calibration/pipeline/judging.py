@@ -12,12 +12,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.need import PickInputs, predict_picks
 from visioncal.calibration.suspects.judge import judge
-from visioncal.calibration.suspects.judged import (
-    Findings,
-    JudgedArm,
-    JudgedPair,
-    Sensor,
-)
+from visioncal.calibration.suspects.judged import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.calibration.suspects.misread_poses import BY_CHAIN, with_misreading
 from visioncal.calibration.suspects.registry import found_in
 from visioncal.calibration.suspects.suspect import EXCHANGED

@@ -31,10 +31,7 @@ from visioncal.core.limits import CONTRADICTION
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import ConvergedFit, fit_jointly, target_sizes
-from visioncal.estimation.observability import (
-    chain_words,
-    check_determined,
-)
+from visioncal.estimation.observability import chain_words, check_determined
 from visioncal.estimation.outliers import (
     InlierFit,
     all_as_inliers,

@@ -18,10 +18,7 @@ from visioncal.estimation.identifiability import (
     observability_indices,
     undetermined,
 )
-from visioncal.estimation.parameters import (
-    free_parameters,
-    parameter_moves,
-)
+from visioncal.estimation.parameters import free_parameters, parameter_moves
 from visioncal.estimation.workspace import postures
 from visioncal.results.arm import (
     ArmParameter,

@@ -12,11 +12,7 @@ from visioncal.core.types import Image, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.images import IMAGE_ENDINGS, FolderImages
-from visioncal.session.kinds import (
-    declared_targets,
-    is_camera_observation,
-    is_instrument_reading,
-)
+from visioncal.session.kinds import declared_targets, is_camera_observation, is_instrument_reading
 from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.boards import kind_of
 from visioncal.vision.boards.identify import describe, identify

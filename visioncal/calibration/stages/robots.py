@@ -7,10 +7,7 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.guess.fit import distances
-from visioncal.calibration.guess.joints import (
-    JointGuess,
-    guess_joints,
-)
+from visioncal.calibration.guess.joints import JointGuess, guess_joints
 from visioncal.calibration.stages.joints import MatchedJoints
 from visioncal.calibration.stages.motion import lacks_robot_state
 from visioncal.calibration.stages.observed import Observed

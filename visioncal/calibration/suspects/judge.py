@@ -7,10 +7,7 @@ import numpy as np
 
 from visioncal.calibration.stages.need import Picks, least_precise, need_met
 from visioncal.calibration.suspects.judged import Findings
-from visioncal.calibration.suspects.limits import (
-    collect_findings,
-    remedy_for_uncertainty,
-)
+from visioncal.calibration.suspects.limits import collect_findings, remedy_for_uncertainty
 from visioncal.calibration.suspects.ranking import correcting, is_negligible, rank_causes
 from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.calibration.suspects.suspect import UNEXPLAINED

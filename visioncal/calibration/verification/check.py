@@ -8,12 +8,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
-from visioncal.calibration.verification.change_hypotheses import (
-    CAMERA,
-    NOISE,
-    PAIRS,
-    causes_of,
-)
+from visioncal.calibration.verification.change_hypotheses import CAMERA, NOISE, PAIRS, causes_of
 from visioncal.calibration.verification.prediction import (
     PredictedStops,
     board_changes,

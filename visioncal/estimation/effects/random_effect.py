@@ -13,12 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.mixed import (
-    LEAST_SIGMA,
-    MOST_SIGMA,
-    PriorInformation,
-    level_weight,
-)
+from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, PriorInformation, level_weight
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.robot_likelihood import robot_likelihood

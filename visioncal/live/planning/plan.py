@@ -14,11 +14,7 @@ from visioncal.core.number_format import figure, percent, some_of
 from visioncal.core.types import FloatArray, IntArray, Need, Progress
 from visioncal.live.planning.candidates import Candidates, candidates
 from visioncal.live.planning.cell import PlanCell
-from visioncal.live.planning.design import (
-    Accuracy,
-    Design,
-    choose_stops,
-)
+from visioncal.live.planning.design import Accuracy, Design, choose_stops
 from visioncal.live.planning.information import WORLDS, World, predict_worlds
 from visioncal.live.planning.path import Route, order_stops
 from visioncal.live.planning.pick_probability import (

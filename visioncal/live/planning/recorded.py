@@ -16,10 +16,7 @@ from visioncal.core.types import FloatArray, Mount, Progress
 from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.normal_equations import (
-    fisher_information,
-    normal_equations,
-)
+from visioncal.estimation.normal_equations import fisher_information, normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.live.planning.cell import Box, Limits, PlanCell

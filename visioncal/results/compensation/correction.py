@@ -11,13 +11,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.choices import WIDEST_RAD as WIDEST_RAD
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M, WIDE_RAD
-from visioncal.core.transforms import (
-    compose,
-    invert,
-    nearest_rotation,
-    rigid_fault,
-    rotation_angle,
-)
+from visioncal.core.transforms import compose, invert, nearest_rotation, rigid_fault, rotation_angle
 from visioncal.core.types import FloatArray, Mask
 from visioncal.results import Calibration
 from visioncal.results.arm import WorkspacePlace
