@@ -372,7 +372,7 @@ def test_degrees_in_a_form_of_radians_are_named_first(
     poses = written(POSE_FORMS.get(form, POSE_FORMS["ur"])) * np.repeat([unit, np.rad2deg(1)], 3)
     logged(names, poses.tolist())
     followed = follow("convert", "log.csv", "out", "--mount", "eye-in-hand", "--robot-form", form)
-    degrees = "euler-xyz-deg" if form == "rpy" else "rotation-vector-deg"
+    degrees = "rpy-deg" if form == "rpy" else "rotation-vector-deg"
     assert f"\nSay --robot-form {degrees}{said}, where" in followed.runs[0].refused().err
     followed.last.good()
     found = poses_of(Session.load("out"), "base_from_flange")
@@ -396,6 +396,12 @@ NAMES = [
     ("yaskawa", "x,y,z,Rx,Ry,Rz"),
     ("doosan", "x,y,z,a,b,c"),
     ("kuka", "X,Y,Z,A,B,C"),
+    ("xarm", "x,y,z,roll,pitch,yaw"),
+    ("mecademic", "x,y,z,alpha,beta,gamma"),
+    ("kawasaki", "X,Y,Z,O,A,T"),
+    ("comau", "X,Y,Z,A,E,R"),
+    ("realman", "x,y,z,rx,ry,rz"),
+    ("rpy-deg", "x,y,z,roll,pitch,yaw"),
 ]
 
 

@@ -9,7 +9,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support import commands
+from support.following import follow
 
 import visioncal
 from visioncal.core.transforms import compose, invert, mean_transform, pose_difference
@@ -248,3 +250,19 @@ def test_a_pan_tilt_head_of_a_urdf_of_any_name(real_data, tmp_path):
     # The case states whole millimetres; one sigma of the result is 1.1 mm.
     assert away_mm(result, "flange_from_cam", [53.0, 18.0, 88.0]) < 1.1
     assert not any(finding.kind == "board_size" for finding in result.verdict.findings)
+
+
+def test_whole_degrees_are_read_at_the_second_attempt(real_data, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = real_data / "field/cases/rounded-poses/rounded.csv"
+    matrix = ",".join(f"m{at}" for at in range(16))
+    words = ("--camera-columns", matrix, "--mount", "eye-in-hand", "--robot-form", "rpy")
+    followed = follow("convert", source, "s", *words)
+    assert "--robot-form rpy-deg --robot-unit mm" in followed.runs[0].refused("in radians").err
+    assert followed.last.status == 0
+    assert len(followed.runs) == 2
+    first = Session.load(tmp_path / "s").views[0].base_from_flange()
+    assert np.allclose(first.translation, [0.760, 0.464, 0.533])
+    turn = Rotation.from_euler("xyz", [-151, 11, 155], degrees=True)
+    # To rounding.
+    assert (first.rotation.inv() * turn).magnitude() < 1e-12

@@ -52,6 +52,17 @@ LINES = {
         W_FIRST
     ),
     "posx(400, -100, 300, 10, 20, 170)": Rotation.from_euler("ZYZ", [10, 20, 170], degrees=True),
+    "X 400 Y -100 Z 300 O 10 A 20 T 170": Rotation.from_euler("ZYZ", [10, 20, 170], degrees=True),
+    "POS(X:400 Y:-100 Z:300 A:10 E:20 R:170)": Rotation.from_euler(
+        "ZYZ", [10, 20, 170], degrees=True
+    ),
+    "X 400 Y -100 Z 300 α 10 β -20 γ 170": Rotation.from_euler(  # noqa: RUF001
+        "XYZ", [10, -20, 170], degrees=True
+    ),
+    "x 400 mm y -100 mm z 300 mm roll 0.1 rad pitch -0.2 rad yaw 3 rad": Rotation.from_euler(
+        "xyz", [0.1, -0.2, 3.0]
+    ),
+    "1 0 0 0, 0 0 1 0, 0 -1 0 0, 0.4 -0.1 0.3 1": Rotation.from_euler("x", 90, degrees=True),
     "x_m 0.4 y_m -0.1 z_m 0.3 qx 0.5 qy -0.5 qz 0.5 qw 0.5": Rotation.from_quat(
         [0.5, -0.5, 0.5, 0.5]
     ),
@@ -64,6 +75,67 @@ def test_a_line_means_what_its_maker_says(line):
     found = read_pose(line, "the line")
     # To rounding.
     assert np.abs(found.pose - a_pose(LINES[line])).max() < 1e-12
+
+
+def about(axis, degrees):
+    """A rotation about a coordinate axis, written out."""
+    at, cos, sin = "xyz".index(axis), np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn, (j, k) = np.eye(3), ((at + 1) % 3, (at + 2) % 3)
+    turn[j, j], turn[j, k], turn[k, j], turn[k, k] = cos, -sin, sin, cos
+    return turn
+
+
+def moving_zyz(first, second, third):
+    """The matrix of Comau's eDO_core (vZYZm), term by term."""
+    (sa, se, sr), (ca, ce, cr) = (f(np.radians([first, second, third])) for f in (np.sin, np.cos))
+    return np.array(
+        [
+            [ca * ce * cr - sa * sr, -(sa * cr + ca * ce * sr), ca * se],
+            [sa * ce * cr + ca * sr, ca * cr - sa * ce * sr, sa * se],
+            [-se * cr, se * sr, ce],
+        ]
+    )
+
+
+def oat(first, second, third):
+    """The quaternion of Kawasaki's O, A, T in the rc_visard manual, as a matrix."""
+    (so, sa, st), (co, ca, ct) = (
+        f(np.radians([first, second, third]) / 2) for f in (np.sin, np.cos)
+    )
+    x, y = co * sa * st - so * sa * ct, co * sa * ct + so * sa * st
+    z, w = so * ca * ct + co * ca * st, co * ca * ct - so * ca * st
+    return Rotation.from_quat([x, y, z, w]).as_matrix()
+
+
+def fixed_xyz(first, second, third):
+    return about("z", third) @ about("y", second) @ about("x", first)
+
+
+MAKERS_MATRICES = {
+    "xarm": fixed_xyz,
+    "techman": fixed_xyz,
+    "realman": lambda *angles: fixed_xyz(*np.degrees(angles)),
+    "rpy-deg": fixed_xyz,
+    "mecademic": lambda a, b, c: about("x", a) @ about("y", b) @ about("z", c),
+    "kawasaki": oat,
+    "comau": moving_zyz,
+}
+
+
+@pytest.mark.parametrize("form", MAKERS_MATRICES)
+def test_makers_angles_are_composed_as_their_manuals_have_it(form):
+    scale, size = (1e3, 1) if form in ("rpy-deg", "realman") else (1, 1e-3)
+    angles = np.array([[10, 20, 170], [-75.5, 33.25, 120], [180, 0, 0], [0, 45, -90]])
+    for turn in np.radians(angles) if form == "realman" else angles:
+        numbers = (400 / scale, -100 / scale, 300 / scale, *turn)
+        found = read_pose(" ".join(map(repr, map(float, numbers))), "the line", form)
+        expected = compose(MAKERS_MATRICES[form](*turn), size * np.array(numbers[:3]))
+        # To rounding.
+        assert np.abs(found.pose - expected).max() < 1e-12
+    if form == "xarm":
+        # The SDK's examples start so: the flange above the table, facing it.
+        down = read_pose("300 0 300 180 0 0", "the line", form).pose
+        assert np.allclose(down[:3, :3], np.diag([1, -1, -1]), atol=1e-12)
 
 
 @pytest.mark.parametrize("form", POSE_FORMS)
@@ -170,7 +242,16 @@ def test_points_are_understood_as_ever_and_commas_as_points_or_not_at_all(number
         # Such a line must not take for ever.
         (40 * "1" + "x", None, "is no pose"),
         ("X 1 mm Y 2 m Z 3 mm A 4 B 5 C 6", None, "is no pose"),
-        ("1 2 3 4 5 6", None, "ur, kuka, fanuc, yaskawa, staubli, doosan"),
+        (
+            "1 2 3 4 5 6",
+            None,
+            "ur, kuka, fanuc, yaskawa, staubli, doosan, xarm, mecademic, kawasaki",
+        ),
+        ("X 1 Y 2 Z 3 RX 4 RY 5 RZ 6", None, "a pose of ur, yaskawa, staubli, techman;"),
+        ("X 1 Y 2 Z 3 roll 4 pitch 5 yaw 6", None, "a pose of xarm, rpy, rpy-deg;"),
+        ("X 1 Y 2 Z 3 O 4 A 5 T 6", "comau", "a pose of kawasaki, not of 'comau'"),
+        ("1 2 3 4 5 6 7", "kuka", "a pose of ros, not of 'kuka'"),
+        (" ".join(map(str, range(16))), None, "is no pose"),
         ("p[0.4, 0, 0, 0, 0, 0]", "kuka", "a pose of ur, not of 'kuka'"),
         ("p[400, 0, 0, 0, 0, 0]", None, "400 m from the base"),
         ("[[400,0,0],[0.5,0.5,0.5,0.4]]", None, "not a quaternion w, x, y, z"),

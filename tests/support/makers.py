@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 # By maker: the names of a pose's numbers, and its rotation from and to the last of them. Positions
-# are in millimetres, but for a UR's, which are in metres.
+# are in millimetres, but for those of METRES.
 MAKERS = {
     # p[x, y, z, rx, ry, rz]: a rotation vector in radians (Script manual).
     "ur": ("x,y,z,rx,ry,rz", Rotation.from_rotvec, Rotation.as_rotvec),
@@ -45,12 +45,50 @@ MAKERS = {
         lambda abc: Rotation.from_euler("ZYZ", abc, degrees=True),
         lambda turn: turn.as_euler("ZYZ", degrees=True),
     ),
+    # Roll, pitch, yaw about the fixed x, y, z (xArm user manual, terms and definitions).
+    "xarm": (
+        "X,Y,Z,roll,pitch,yaw",
+        lambda rpy: Rotation.from_euler("xyz", rpy, degrees=True),
+        lambda turn: turn.as_euler("xyz", degrees=True),
+    ),
+    # Intrinsic XYZ (mecademicpy, MovePose).
+    "mecademic": (
+        "X,Y,Z,alpha,beta,gamma",
+        lambda angles: Rotation.from_euler("XYZ", angles, degrees=True),
+        lambda turn: turn.as_euler("XYZ", degrees=True),
+    ),
+    # O about z, A about the new y, T about the new z (rc_visard manual, pose formats).
+    "kawasaki": (
+        "X,Y,Z,O,A,T",
+        lambda oat: Rotation.from_euler("ZYZ", oat, degrees=True),
+        lambda turn: turn.as_euler("ZYZ", degrees=True),
+    ),
+    # eDO_core, vZYZm.
+    "comau": (
+        "X,Y,Z,A,E,R",
+        lambda aer: Rotation.from_euler("ZYZ", aer, degrees=True),
+        lambda turn: turn.as_euler("ZYZ", degrees=True),
+    ),
+    # Roll, pitch, yaw, intrinsic ZYX [rad and m] (SDK FAQ).
+    "realman": (
+        "x,y,z,rx,ry,rz",
+        lambda angles: Rotation.from_euler("xyz", angles),
+        lambda turn: turn.as_euler("xyz"),
+    ),
+    # setRPY of Rx, Ry, Rz (tmr_ros1).
+    "techman": (
+        "X,Y,Z,Rx,Ry,Rz",
+        lambda angles: Rotation.from_euler("xyz", angles, degrees=True),
+        lambda turn: turn.as_euler("xyz", degrees=True),
+    ),
 }
+# Of these, those in metres and radians.
+METRES = ("ur", "realman")
 NUMBER = r"-?\d+\.?\d*(?:e-?\d+)?"
 
 
 def unit_m(maker):
-    return 1.0 if maker == "ur" else 1e-3
+    return 1.0 if maker in METRES else 1e-3
 
 
 def written(maker, pose):
@@ -72,5 +110,5 @@ def shown(maker, line):
     names = MAKERS[maker][0].split(",")
     found = [re.search(rf"\b{name} ({NUMBER})", line, re.IGNORECASE)[1] for name in names]
     units = set(re.findall(rf"{NUMBER} (mm|m|deg|rad)\b", line))
-    assert units == {"mm", *({"abb": (), "ur": ("rad",)}.get(maker, ("deg",)))}, line
+    assert units == {"mm", *([] if maker == "abb" else ["rad" if maker in METRES else "deg"])}, line
     return pose_of(maker, found, 1e-3)

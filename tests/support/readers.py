@@ -175,6 +175,17 @@ def doosan(text):
     return _angled(text, "#", pattern, lambda a, b, c: rz(a) @ ry(b) @ rz(c))
 
 
+def numbers_of(rotation, scale=1000, degrees=True):
+    """Reads x, y, z and three angles with commas between."""
+
+    def read(text):
+        x, y, z, *angles = _numbers(text.strip(), "#,#,#,#,#,#")
+        turn = rotation(*(np.radians(angles) if degrees else angles))
+        return transform(turn, np.array([x, y, z]) / scale)
+
+    return read
+
+
 def abb(text):
     x, y, z, q1, q2, q3, q4 = _numbers(code(text, "!"), "[[#,#,#],[#,#,#,#]]")
     return transform(of_quaternion(q2, q3, q4, q1), np.array([x, y, z]) / 1000)
@@ -290,4 +301,10 @@ READERS = {
     "staubli": staubli,
     "yaskawa": yaskawa,
     "doosan": doosan,
+    "xarm": numbers_of(lambda r, p, y: rz(y) @ ry(p) @ rx(r)),
+    "mecademic": numbers_of(lambda a, b, c: rx(a) @ ry(b) @ rz(c)),
+    "kawasaki": numbers_of(lambda o, a, t: rz(o) @ ry(a) @ rz(t)),
+    "comau": numbers_of(lambda a, e, r: rz(a) @ ry(e) @ rz(r)),
+    "realman": numbers_of(lambda x, y, z: rz(z) @ ry(y) @ rx(x), 1, degrees=False),
+    "techman": numbers_of(lambda x, y, z: rz(z) @ ry(y) @ rx(x)),
 }

@@ -81,8 +81,7 @@ class Edge(PoseSigmas):
         forms = [("rotation vector", "rotation-vector-deg", "deg")]
         if controller is not None:
             names = controller.words.partition("Z, ")[2] or ", ".join(rotation_names(controller))
-            unit = "" if "quaternion" in controller.rotation else controller.rotation[-3:]
-            unit = "rad" if controller.rotation == "rotation-vector" else unit
+            unit = {"deg": "deg", "rad": "rad", "tor": "rad"}.get(controller.rotation[-3:], "")
             forms.append((f"{controller.name.upper()} {names}", controller.rotation, unit))
         for name, rotation, unit in forms:
             numbers = ROTATION_FORMS[rotation].write(self.matrix[None, :3, :3])[0]

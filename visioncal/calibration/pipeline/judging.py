@@ -80,7 +80,7 @@ def _use(run: RunState) -> Remedy:
     if run.mount is None:
         words, command = "Take the frames to another program", "export OUT --to ros --edge all"
     elif form is not None:
-        to = {"rpy": "urdf"}.get(form.name, form.name)
+        to = form.name if form.models or form.name == "ros" else "urdf"
         words, command = "Take the transform to the robot", f"export OUT --to {to}"
     elif run.mount == "instrument" or not run.session.boards:
         words, command = "Take the transform to another program", "export OUT --to text"

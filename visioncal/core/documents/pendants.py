@@ -35,6 +35,8 @@ _THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}(?:,[0-9]{3})+|[+-]?[0-9]{1,3}(?:\
 # Typographic signs; soft hyphens are not among them, because they may be minus or nothing.
 _SIGNS = str.maketrans(
     dict.fromkeys("\N{DEGREE SIGN}\N{MASCULINE ORDINAL INDICATOR}\N{RING ABOVE}", " deg")
+    | {"\N{GREEK SMALL LETTER ALPHA}": " alpha ", "\N{GREEK SMALL LETTER BETA}": " beta "}
+    | {"\N{GREEK SMALL LETTER GAMMA}": " gamma "}
     | dict.fromkeys("\N{MINUS SIGN}\N{EN DASH}\N{HYPHEN}\N{NON-BREAKING HYPHEN}", "-")
     | {
         "\N{ARABIC DECIMAL SEPARATOR}": ".",
@@ -50,19 +52,19 @@ _MARKED = (
     ("doosan", re.compile(r"(?<!\w)posx\s*\(([^()]*)\)")),
     ("abb", re.compile(r"\[\s*\[([^\[\]]*\]\s*,\s*\[[^\[\]]*)\]")),
 )
-_NAMED_ROTATIONS: Mapping[tuple[str, ...], tuple[str, ...]] = {
-    ("a", "b", "c"): ("kuka",),
-    ("w", "p", "r"): ("fanuc",),
-    ("q1", "q2", "q3", "q4"): ("abb",),
-    ("qx", "qy", "qz", "qw"): ("ros",),
-    ("rx", "ry", "rz"): ("ur", "yaskawa", "staubli"),
-}
-# Forms whose numbers have the names of another, which is meant unless they are stated.
-_SAME_NAMES = {"doosan": "kuka", "rpy": "ur"}
+_NAMED_ROTATIONS = dict.fromkeys(
+    tuple(names.split())
+    for form in POSE_FORMS.values()
+    for names in (form.names, form.also)
+    if names
+)
 # Forms by the count of bare numbers; seven are the columns of views.csv.
 _BARE_FORMS: Mapping[int, tuple[str, ...]] = {
-    6: ("ur", "kuka", "fanuc", "yaskawa", "staubli", "doosan"),
+    6: tuple(
+        form.name for form in POSE_FORMS.values() if form.models and len(form.names.split()) == 3
+    ),
     7: ("ros",),
+    16: ("franka",),
 }
 # Greatest position of an arm [m], and greatest angle in radians.
 _FAR_M, _TURNED_RAD = 10.0, 2.0 * np.pi + 0.01
@@ -87,10 +89,11 @@ class _PendantNumbers:
     """The numbers of a line, their possible forms, and units stated in the line."""
 
     numbers: tuple[float, ...]
-    forms: tuple[str, ...]
+    forms: tuple[str, ...]  # Those that are meant unless another is stated.
     length: str = ""
     angle: str = ""
     doubt: str = ""  # Why its commas may mean several things; empty where they do not.
+    names: tuple[str, ...] = ()  # Those of the rotation's numbers, in lower case.
 
 
 def is_marked_pose(line: str) -> bool:
@@ -142,8 +145,8 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
     rotation = chosen.rotation
     if written.angle == "deg" and rotation == "rotation-vector":
         rotation = "rotation-vector-deg"
-    if written.angle == "rad":
-        rotation = rotation.replace("-deg", "-rad")
+    if written.angle and rotation.startswith("euler"):
+        rotation = rotation[:-3] + written.angle
     reading = Reading(rotation, written.length or chosen.unit)
     numbers = np.array(written.numbers)
     poses = PoseNumbers(numbers[None, :3], numbers[None, 3:], reading, (where,)).poses()
@@ -163,17 +166,20 @@ def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
 
 def rotation_names(form: PoseForm) -> tuple[str, ...]:
     """Names of a form's rotation numbers, in lower case."""
-    maker = _SAME_NAMES.get(form.name, form.name)
-    return next(names for names, forms in _NAMED_ROTATIONS.items() if maker in forms)
+    return tuple(form.names.split())
 
 
 def forms_named(names: Sequence[str]) -> list[str]:
     """Forms whose rotation numbers have these names, in lower case."""
-    return [form.name for form in POSE_FORMS.values() if rotation_names(form) == tuple(names)]
+    joined = " ".join(names)
+    forms = POSE_FORMS.values() if joined else ()
+    return [form.name for form in forms if joined in (form.names, form.also)]
 
 
 def pendant_words(pose: FloatArray, form: PoseForm) -> str:
     """Writes a (4, 4) pose [m] as a pendant shows it: `X 512.300 mm, ... A 10.1200 deg, ...`."""
+    if form.rotation.startswith("matrix"):
+        return ", ".join(f"{value:.6f}" for value in pose.T.ravel())
     digits, unit = (4, "deg") if form.rotation.endswith("-deg") else (6, "rad")
     # The length unit that pendants show, whatever a program's poses have.
     words = [f"{name} {1e3 * value:.3f} mm" for name, value in zip("XYZ", pose[:3, 3], strict=True)]
@@ -223,7 +229,7 @@ def _numbers(text: str, forms: tuple[str, ...]) -> _PendantNumbers | None:
 def _named(line: str) -> _PendantNumbers | None:
     entries = [(match[1].lower(), match[2], match[3]) for match in _NAMED.finditer(line)]
     there = [name for name, _, _ in entries]
-    for names, forms in _NAMED_ROTATIONS.items():
+    for names in _NAMED_ROTATIONS:
         needed = ("x", "y", "z", *names)
         # Two poses in a line are ambiguous.
         if any(there.count(name) != 1 for name in needed):
@@ -234,20 +240,24 @@ def _named(line: str) -> _PendantNumbers | None:
         # One unit for each, and of the right kind.
         if len(lengths) > 1 or len(angles) > 1 or lengths - {"m", "mm"} or angles & {"m", "mm"}:
             return None
-        # Of the manufacturers with Rx, Ry, Rz only Universal Robots uses radians.
-        likely = ("ur",) if angles == {"rad"} and "ur" in forms else forms
-        units = (next(iter(found), "") for found in (lengths, angles))
+        forms = [POSE_FORMS[name] for name in forms_named(names)]
+        meant = [form for form in forms if form.likely or tuple(form.also.split()) == names]
+        # Of the manufacturers with Rx, Ry, Rz Universal Robots uses radians.
+        radians = [form for form in meant if angles == {"rad"} and form.rotation[-4:] != "-deg"]
+        likely = tuple(form.name for form in radians or meant)
+        length, angle = (next(iter(found), "") for found in (lengths, angles))
         words = [cells[name][0] for name in needed]
         values = _values(words)
         if values is None:
-            return _PendantNumbers((), likely, doubt="it has decimal commas and decimal points")
+            doubt = "it has decimal commas and decimal points"
+            return _PendantNumbers((), likely, doubt=doubt, names=names)
         with_commas = [word for word in words if "," in word]
         # No angle has thousands.
         grouped = [word for word in words[:3] if _THOUSANDS.fullmatch(word)]
         if with_commas and with_commas == grouped:
             doubt = f"the comma of {with_commas[0]} may be decimal, or group thousands"
-            return _PendantNumbers((), likely, doubt=doubt)
-        return _PendantNumbers(values, likely, *units)
+            return _PendantNumbers((), likely, doubt=doubt, names=names)
+        return _PendantNumbers(values, likely, length, angle, names=names)
     return None
 
 
@@ -276,15 +286,23 @@ def _bare(line: str) -> _PendantNumbers | None:
             found, count = _PendantNumbers(values, ()), len(values)
     if found is None or count not in _BARE_FORMS:
         return None
+    if count == 16:
+        columns = np.reshape(found.numbers, (4, 4))
+        if (columns[:, 3] != (0.0, 0.0, 0.0, 1.0)).any():
+            return None
+        pose = (*columns[3, :3].tolist(), *columns[:3, :3].ravel().tolist())
+        found = _PendantNumbers(pose, ())
     return replace(found, forms=_BARE_FORMS[count])
 
 
 def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:
     if stated is None and len(written.forms) == 1:
         return written.forms[0]
-    # Bare numbers may be of any form that the user states.
+    # Bare numbers may be of any form that the user states and that has as many.
     is_bare = written.forms in _BARE_FORMS.values()
-    fits = is_bare or not {stated, _SAME_NAMES.get(stated or "")}.isdisjoint(written.forms)
+    count = len(written.numbers) - 3
+    is_bare &= stated in POSE_FORMS and len(POSE_FORMS[stated or ""].names.split()) == count
+    fits = is_bare or stated in (*written.forms, *forms_named(written.names))
     if stated is not None and stated in POSE_FORMS and fits:
         return stated
     makers = ", ".join(written.forms)

@@ -16,7 +16,7 @@ from visioncal.interchange.exports.content import Content, ExportFormat, Holds, 
 
 # A nanometre and 2e-10 rad, which is a nanometre at five metres.
 _DECIMALS = {"m": 9, "mm": 6}
-_ROTATION_DECIMALS = {"rotation-vector": 10, "quaternion-wxyz": 10}
+_ROTATION_DECIMALS = dict.fromkeys(("rotation-vector", "quaternion-wxyz", "euler-xyz-rad"), 10)
 # By form of poses: what starts a comment, empty where nothing does, and the pose's numbers.
 _LANGUAGES: Mapping[str, tuple[str, str]] = {
     # Universal Robots, script manual.
@@ -28,9 +28,10 @@ _LANGUAGES: Mapping[str, tuple[str, str]] = {
     # RAPID's `pose`: trans of type pos, rot of type orient (RAPID reference manual).
     "abb": ("!", "[[{},{},{}],[{},{},{},{}]]"),
     "staubli": ("//", "{{{}, {}, {}, {}, {}, {}}}"),
-    "yaskawa": ("", "{},{},{},{},{},{}"),
     "doosan": ("#", "posx({}, {}, {}, {}, {}, {})"),
 }
+# Of all other makers, as Yaskawa's jobs have them.
+_NUMBERS = ("", "{},{},{},{},{},{}")
 
 
 _RAPID_WORDS = """
@@ -77,7 +78,7 @@ def _identifier(language: str, name: str) -> str:
 
 def _write(language: str, statement: str, content: Content) -> str:
     """Writes a statement: {pose}, {child}, {load}, {active} and {number} are filled in."""
-    form, (mark, shape) = POSE_FORMS[language], _LANGUAGES[language]
+    form, (mark, shape) = POSE_FORMS[language], _LANGUAGES.get(language, _NUMBERS)
     pose = write_pose(content.matrix, form)
     decimals = _ROTATION_DECIMALS.get(form.rotation, 8)
     numbers = [fixed(value, _DECIMALS[form.unit]) for value in pose[:3]]
@@ -121,8 +122,12 @@ _POSES = {
     "fanuc": "FANUC: X, Y, Z, W, P, R as in an .LS program [mm, deg]",
     "abb": "ABB RAPID pose: [[x,y,z],[q1,q2,q3,q4]] [mm, quaternion w first]",
     "staubli": "Staubli VAL 3 trsf: {x, y, z, rx, ry, rz} [mm, deg]",
-    "yaskawa": "Yaskawa: X,Y,Z,Rx,Ry,Rz as in a job [mm, deg]",
     "doosan": "Doosan DRL: posx(x, y, z, a, b, c) [mm, deg about z, y, z]",
+}
+_POSES |= {
+    form.name: f"{form.words} [{form.unit}, {form.rotation[-3:]}]"
+    for form in POSE_FORMS.values()
+    if form.models and form.name not in _POSES
 }
 _FRAMES: tuple[tuple[str, Holds, str, str], ...] = (
     (

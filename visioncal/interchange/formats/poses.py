@@ -111,11 +111,7 @@ ROBOT_KEYS: tuple[tuple[str, ...], ...] = (
     ("R_gripper2base", "t_gripper2base"),
     ("x", "y", "z", "qx", "qy", "qz", "qw"),
     ("tx", "ty", "tz", "qx", "qy", "qz", "qw"),
-    ("x", "y", "z", "rx", "ry", "rz"),
-    ("x", "y", "z", "roll", "pitch", "yaw"),
-    ("x", "y", "z", "a", "b", "c"),
-    ("x", "y", "z", "w", "p", "r"),
-    ("x", "y", "z", "q1", "q2", "q3", "q4"),
+    *dict.fromkeys(("x", "y", "z", *form.names.split()) for form in POSE_FORMS.values()),
     ("pose",),
     ("robot",),
     ("robot.rvec", "robot.tvec"),
@@ -230,6 +226,8 @@ def poses_from(
     if sum(sizes) in (12, 16) and 9 not in sizes:
         positions, rotations = _matrices(flat)
         rotation = "matrix"
+        requested = _by_rows(requested, sum(sizes))
+        unit = requested.unit
     else:
         positions, rotations, rotation_names = flat[:, :3], flat[:, 3:], tuple(names[3:] or names)
         if len(blocks) == 2:
@@ -260,6 +258,13 @@ def poses_from(
         )
     reading = replace(requested, unit=unit).reading(Reading(rotation))
     return PoseNumbers(positions, rotations, reading, fields.places), notes
+
+
+def _by_rows(requested: PoseImportOptions, count: int) -> PoseImportOptions:
+    """Options of matrices: whether 16 numbers are by rows or by columns is known."""
+    if count == 12 or not requested.rotation.startswith("matrix"):
+        return requested
+    return replace(requested, form=None, unit=requested.reading(Reading()).unit)
 
 
 def _usual_form(names: Sequence[str], usual: str | None) -> str | None:
@@ -345,16 +350,19 @@ def check_radians(
         return
     size = "in degrees" if is_degrees else "too large for radians"
     needed = "its form is needed"
-    next_step = (
-        f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc for W, P, R; "
-        "yaskawa or staubli for Rx, Ry, Rz; rotation-vector-deg, euler-ZYX-deg ..."
-    )
+    makers = defaultdict[str, list[str]](list)
+    for form in POSE_FORMS.values():
+        if form.models and form.rotation.endswith("-deg"):
+            makers[form.words.partition("Z, ")[2]].append(form.name)
+    listed = (f"{' or '.join(forms)} for {names}" for names, forms in makers.items())
+    next_step = f"Say --{whose}-form: {'; '.join(listed)}; rotation-vector-deg, euler-ZYX-deg ..."
     if requested.form is not None:
         needed = f"poses of the form {requested.form} are in radians"
         is_far = bool(np.abs(poses.positions[there]).max() > FAR_M) and poses.reading.unit == "m"
+        degrees = f"{rotation.removesuffix('-rad')}-deg"
+        degrees = f"{requested.form}-deg" if f"{requested.form}-deg" in POSE_FORMS else degrees
         next_step = (
-            f"Say --{whose}-form {rotation.removesuffix('-rad')}-deg"
-            f"{f' --{whose}-unit mm' * is_far}, where these are degrees"
+            f"Say --{whose}-form {degrees}{f' --{whose}-unit mm' * is_far}, where these are degrees"
         )
     raise DataError(
         f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
