@@ -32,7 +32,7 @@ from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.identified import CLASSES, UNKNOWN, Identified, judge, to_document
-from visioncal.dynamics.identify import SLOW_RAD_S, Options, validate
+from visioncal.dynamics.identify import SLOW_RAD_S, Options, predict, validate
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.payload import drive_gains, estimate_payload
@@ -44,7 +44,6 @@ from visioncal.dynamics.run import (
     identify_session,
     robot_of,
     select_arm,
-    validate_session,
 )
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.interchange.outputs import Written, write_dynamics, write_motions
@@ -208,8 +207,8 @@ def dynamics_identify_command(options: DynamicsIdentifyOptions) -> None:
 def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
     """Predicts the torques of a session's streams, and prints the prediction errors."""
     identified = Identified.load(options.against)
-    request = _requested(options)
-    predictions = validate_session(Session.load(options.session), identified, request)
+    streams = conditioned_streams(Session.load(options.session), identified, _requested(options))
+    predictions = [predict(identified, stream) for stream in streams]
     if options.as_json:
         documents = []
         for prediction in predictions:
@@ -226,7 +225,9 @@ def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
         return
     for prediction in predictions:
         answer("\n".join([prediction.label, *prediction.notes]))
-        validation, fitted = validate(identified, prediction), identified.fitted_rms_nm
+        validation = validate(identified, prediction)
+        # Of the worst stream.
+        fitted = np.max([stream.rms_nm for stream in identified.streams], axis=0)
         print_table(
             ("joint", "predicted to [N m]", "of its range", "fitted to [N m]"),
             [

@@ -106,10 +106,17 @@ class BaseModel:
     @property
     def names(self) -> tuple[str, ...]:
         """Expression of each base parameter, such as `m6*cz6 + 0.0922*m5`."""
-        return tuple(
-            _sum_text(self.model.names, row, int(own))
-            for row, own in zip(self.dependence, self.independent, strict=True)
-        )
+        names, texts = self.model.names, []
+        for row, kept in zip(self.dependence, self.independent.tolist(), strict=True):
+            # The kept standard parameter is first.
+            text = names[kept]
+            for index in np.flatnonzero(row):
+                if index != kept:
+                    size = abs(float(row[index]))
+                    factor = "" if abs(size - 1.0) < 1e-9 else f"{size:.4g}*"
+                    text += f" {'-' if row[index] < 0.0 else '+'} {factor}{names[index]}"
+            texts.append(text)
+        return tuple(texts)
 
     def regressor(self, motion: JointMotion) -> FloatArray:
         """Regressor of the base parameters: derivatives (m, n, b) of the torques."""
@@ -132,17 +139,6 @@ def random_motion(model: DynamicModel, rng: np.random.Generator) -> JointMotion:
     shape = (200, model.robot.joint_count)
     q, dq, ddq = (rng.uniform(-value, value, shape) for value in (np.pi, 3.0, 10.0))
     return JointMotion(np.arange(200.0), q, dq, ddq)
-
-
-def _sum_text(names: tuple[str, ...], row: FloatArray, kept: int) -> str:
-    """A base parameter as text, its kept standard parameter first."""
-    text = names[kept]
-    for index in np.flatnonzero(row):
-        if index != kept:
-            size = abs(float(row[index]))
-            factor = "" if abs(size - 1.0) < 1e-9 else f"{size:.4g}*"
-            text += f" {'-' if row[index] < 0.0 else '+'} {factor}{names[index]}"
-    return text
 
 
 def condition_of(base: BaseModel, motion: JointMotion, weights: FloatArray) -> float:
@@ -190,8 +186,10 @@ def check_joints_move(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         return
     names = base.model.robot.joint_names
     stopped = [f"joint {index + 1} ({names[index]})" for index in still]
-    kept = zip(base.names, base.independent, strict=True)
-    lost = [name for name, at in kept if _joint_of(base.model.names[at]) in still + 1]
+    # The joint, from 1, of a parameter as `m4*cx4` or `Fc4`.
+    kept = [base.model.names[at] for at in base.independent]
+    joints = [int(name[len(name.rstrip("0123456789")) :]) for name in kept]
+    lost = [name for name, at in zip(base.names, joints, strict=True) if at in still + 1]
     raise DegenerateError(
         f"dynamics: {some_of(stopped)} {'stands' if len(stopped) == 1 else 'stand'} still in "
         f"{some_of([stream.label for stream in streams])} "
@@ -200,11 +198,6 @@ def check_joints_move(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         culprits=stopped,
         next_step=_NEXT,
     )
-
-
-def _joint_of(name: str) -> int:
-    """The joint, from 1, of a parameter as `m4*cx4` or `Fc4`."""
-    return int(name[len(name.rstrip("0123456789")) :])
 
 
 def check_identifiable(base: BaseModel, blocks: Sequence[NoiseBlock]) -> None:

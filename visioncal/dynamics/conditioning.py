@@ -129,26 +129,20 @@ def window_of(band_hz: float, rate_hz: float, longest: int) -> int:
     return int(min(max(2 * round(half) + 1, _ORDER + 3), longest - 1 + longest % 2))
 
 
-def smoothed_motion(
-    times_s: FloatArray, q: FloatArray, dq: FloatArray | None, window: int
-) -> tuple[JointMotion, bool]:
+def _smoothed_motion(samples: RecordedSamples, window: int) -> tuple[JointMotion, bool]:
     """Smooths and differentiates evenly sampled angles (Savitzky and Golay 1964).
 
-    Accelerations are derivatives of the reported speeds where that is less noisy.
-
-    Args:
-        times_s: (m,) [s].
-        q: (m, n) joint angles [rad].
-        dq: (m, n) reported speeds [rad/s], if any.
-        window: Samples of a smoothing polynomial.
+    Accelerations are derivatives of the reported speeds where that is less noisy. A smoothing
+    polynomial has `window` samples.
 
     Returns:
-        The motion at all m times, valid from half a window on from either end, and whether the
+        The motion at all times, valid from half a window on from either end, and whether the
         reported speeds agree with the angles.
     """
     # It imports scipy.stats, for which no other command shall wait.
     from scipy.signal import savgol_filter
 
+    times_s, q, dq = samples.times_s, samples.q, samples.dq
     step = float(times_s[-1] - times_s[0]) / (len(times_s) - 1)
 
     def fitted(values: FloatArray, order: int) -> FloatArray:
@@ -344,7 +338,7 @@ def condition(
         if len(part) < len(lowpass.taps) + 2 * window:
             continue
         samples = part.samples
-        motion, part_agrees = smoothed_motion(samples.times_s, samples.q, samples.dq, window)
+        motion, part_agrees = _smoothed_motion(samples, window)
         speeds_agree &= part_agrees
         inner = slice(window // 2, -(window // 2))
         measured = Measured(motion.chosen(inner), samples.torques_nm[inner])

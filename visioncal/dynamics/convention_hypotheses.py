@@ -175,24 +175,20 @@ def _check_units(robot: Robot, label: str, measured: Measured) -> None:
     tested = np.isfinite(scales).sum()
     whose = "the torques" if len(wrong) == tested else f"the torques of {_named(tuple(wrong))}"
     scale = float(np.median(scales[wrong]))
+    if scale > 200.0:
+        unit = "are they mN m, or mA for A?"
+    elif scale > _HIGH:
+        unit = "are they of another unit, or currents with gains that are too large?"
+    elif scale < 1.0 / 30.0:
+        unit = (
+            f"are they those of the motors, before gears of a ratio of about {1.0 / scale:.0f}, or "
+            "currents?"
+        )
+    else:
+        unit = "are they of another unit, or currents with gains that are too small?"
     raise DataError(
-        f"{label}: {whose} are {scale:.3g} times what the inertias of {robot.name} need; "
-        f"{_unit(scale)}",
+        f"{label}: {whose} are {scale:.3g} times what the inertias of {robot.name} need; {unit}",
         culprits=[f"{label}, tau{index + 1}_nm" for index in wrong],
         next_step="Torques are those of the joints, behind the gears, in N m. Currents belong into "
         "current1_a ... [A], and --gains turns them into torques.",
     )
-
-
-def _unit(scale: float) -> str:
-    """The likely unit of torques with that scale, as a question."""
-    if scale > 200.0:
-        return "are they mN m, or mA for A?"
-    if scale > _HIGH:
-        return "are they of another unit, or currents with gains that are too large?"
-    if scale < 1.0 / 30.0:
-        return (
-            f"are they those of the motors, before gears of a ratio of about {1.0 / scale:.0f}, or "
-            "currents?"
-        )
-    return "are they of another unit, or currents with gains that are too small?"

@@ -197,22 +197,18 @@ class Objective:
         position, by_q = _hinge(q - allowed.middle, less * allowed.half)
         speed, by_dq = _hinge(dq, less * allowed.speed)
         acceleration, by_ddq = _hinge(ddq, less * allowed.acceleration)
-        distance, by_q_distance = self._distance_penalty(q)
-        return position + speed + acceleration + distance, [by_q + by_q_distance, by_dq, by_ddq]
-
-    def _distance_penalty(self, q: FloatArray) -> tuple[float, FloatArray]:
-        """Sum of squared shortfalls of the distances, with its gradient (m, n)."""
-        value, gradient = 0.0, np.zeros_like(q)
+        distance = 0.0
         for row, posture in enumerate(q):
             short = self._shortfall(posture)
             if not short.any():
                 continue
-            value += float(short @ short)
+            distance += float(short @ short)
             for joint in range(len(posture)):
                 moved = posture.copy()
                 moved[joint] += _STEP_CLEAR
-                gradient[row, joint] = 2.0 * short @ (self._shortfall(moved) - short) / _STEP_CLEAR
-        return value, gradient
+                slope = 2.0 * short @ (self._shortfall(moved) - short) / _STEP_CLEAR
+                by_q[row, joint] += slope
+        return position + speed + acceleration + distance, [by_q, by_dq, by_ddq]
 
     def _shortfall(self, posture: FloatArray) -> FloatArray:
         """(k,) shortfall of each pair's distance, over its scale; zero for those far apart."""

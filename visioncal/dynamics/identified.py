@@ -131,11 +131,6 @@ class Identified:
         return np.asarray(np.sqrt(np.diag(self.covariance)[: self.base.rank]))
 
     @property
-    def fitted_rms_nm(self) -> FloatArray:
-        """(n,) root mean square of the residuals, of the worst stream [N m]."""
-        return np.asarray(np.max([stream.rms_nm for stream in self.streams], axis=0))
-
-    @property
     def determined(self) -> tuple[str, ...]:
         """Class of each base parameter's relative sigma: `2 %`, `10 %`, `poorly`, `not at all`."""
         shares = self.sigmas / np.maximum(np.abs(self.values), 1e-300)

@@ -106,7 +106,23 @@ def identify(
         fit.covariance,
         humps,
         consistent,
-        stream_statistics(streams, fit),
+        tuple(
+            StreamStatistics(
+                label=stream.label,
+                samples=stream.count,
+                left_out=int(np.sum(~block.used)),
+                band_hz=stream.band_hz,
+                cutoff_hz=stream.cutoff_hz,
+                rate_hz=stream.rate_hz,
+                noise_nm=sigma,
+                rms_nm=rms_of(residuals, block.used),
+                torque_nm=std_of(block.y, block.used),
+                notes=stream.notes,
+            )
+            for stream, block, residuals, sigma in zip(
+                streams, fit.blocks, fit.residuals, fit.sigmas, strict=True
+            )
+        ),
     )
     return Identification(identified, tuple(streams), fit)
 
@@ -115,29 +131,6 @@ def block_of(base: BaseModel, stream: Conditioned) -> NoiseBlock:
     """Filtered regressor and torques of a stream."""
     x = stream.filtered(base.regressor)
     return NoiseBlock(x, stream.torques_nm, stream.used, stream.correlation)
-
-
-def stream_statistics(
-    streams: Sequence[Conditioned], fit: Regression
-) -> tuple[StreamStatistics, ...]:
-    """Statistics of each stream."""
-    return tuple(
-        StreamStatistics(
-            label=stream.label,
-            samples=stream.count,
-            left_out=int(np.sum(~block.used)),
-            band_hz=stream.band_hz,
-            cutoff_hz=stream.cutoff_hz,
-            rate_hz=stream.rate_hz,
-            noise_nm=sigma,
-            rms_nm=rms_of(residuals, block.used),
-            torque_nm=std_of(block.y, block.used),
-            notes=stream.notes,
-        )
-        for stream, block, residuals, sigma in zip(
-            streams, fit.blocks, fit.residuals, fit.sigmas, strict=True
-        )
-    )
 
 
 def find_lag(robot: Robot, streams: Sequence[Conditioned], terms: FrictionTerms) -> Lag | None:
@@ -274,9 +267,3 @@ def friction_at(identified: Identified, dq: FloatArray) -> FloatArray:
     motion = JointMotion(np.zeros(len(dq)), still, dq, still)
     own = model.terms.columns(motion) @ values[10 * model.robot.joint_count :]
     return np.asarray(own + identified.stribeck.torques(motion))
-
-
-def measured_friction(identified: Identified, prediction: Prediction) -> FloatArray:
-    """Measured torques less all predicted ones but friction's: (k, n) [N m]."""
-    error = prediction.measured_nm - prediction.predicted_nm
-    return np.asarray(friction_at(identified, prediction.dq) + error)

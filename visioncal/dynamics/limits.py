@@ -136,7 +136,24 @@ def motion_limits(
             (robot.rates.acceleration, missing.acceleration_rad_s2),
         )
     ]
-    _check_stated(robot, np.minimum(-lower, upper), *rates)
+    for values, what, keys, option in (
+        (np.minimum(-lower, upper), "positions", "lower_deg and upper_deg", "--range-deg"),
+        (rates[0], "speed", "velocity_rad_s", "--speed-deg"),
+        (rates[1], "acceleration", "acceleration_rad_s2", "--acceleration-deg"),
+    ):
+        unlimited = [
+            name
+            for name, value in zip(robot.joint_names, values, strict=True)
+            if not np.isfinite(value)
+        ]
+        if unlimited:
+            raise DataError(
+                f"robot {robot.name}: its description states no limits of {what} for "
+                f"{some_of(unlimited)}; a motion is planned within limits only.",
+                culprits=unlimited,
+                next_step=f"Write {keys} into its description (a <limit> into a URDF), or give "
+                f"{option}.",
+            )
     allowed = MotionLimits(
         robot,
         lower + share.margin_rad,
@@ -164,29 +181,6 @@ def motion_limits(
     values = allowed.inertias.values.copy()
     values[-1] += parameter_transform(robot.chain.placements[-1]) @ payload
     return replace(allowed, inertias=Inertias(values))
-
-
-def _check_stated(
-    robot: Robot, reach: FloatArray, speed: FloatArray, acceleration: FloatArray
-) -> None:
-    for values, what, keys, option in (
-        (reach, "positions", "lower_deg and upper_deg", "--range-deg"),
-        (speed, "speed", "velocity_rad_s", "--speed-deg"),
-        (acceleration, "acceleration", "acceleration_rad_s2", "--acceleration-deg"),
-    ):
-        unlimited = [
-            name
-            for name, value in zip(robot.joint_names, values, strict=True)
-            if not np.isfinite(value)
-        ]
-        if unlimited:
-            raise DataError(
-                f"robot {robot.name}: its description states no limits of {what} for "
-                f"{some_of(unlimited)}; a motion is planned within limits only.",
-                culprits=unlimited,
-                next_step=f"Write {keys} into its description (a <limit> into a URDF), or give "
-                f"{option}.",
-            )
 
 
 @dataclass(frozen=True, eq=False)

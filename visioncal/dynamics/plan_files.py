@@ -74,36 +74,31 @@ def motion_document(plan: MotionPlan) -> dict[str, Any]:
             "seed": request.seed,
         },
     }
-    if plan.sweeps is not None:
-        document["sweeps"] = _sweeps(plan.sweeps)
+    if (sweeps := plan.sweeps) is not None:
+        begins = sweeps.begins_s.tolist()
+        document["sweeps"] = {
+            "duration_s": begins[-1],
+            "home_rad": sweeps.home.tolist(),
+            "kept": _kept(sweeps.extremes),
+            "strokes": [
+                {
+                    "joint": stroke.joint + 1,
+                    "begin_s": begin,
+                    "from_rad": stroke.begin,
+                    "to_rad": stroke.end,
+                    "speed_rad_s": stroke.speed,
+                    "ramp_s": stroke.ramp_s,
+                    "duration_s": stroke.duration_s,
+                }
+                for stroke, begin in zip(sweeps.strokes, begins[:-1], strict=True)
+                if stroke.sweeps
+            ],
+        }
+        if sweeps.left_out:
+            document["sweeps"]["left_out"] = list(sweeps.left_out)
     if unchecked := plan.allowed.unchecked:
         document["not_checked"] = list(unchecked)
     return document | {"robot": dict(plan.allowed.robot.document)}
-
-
-def _sweeps(sweeps: Sweeps) -> dict[str, Any]:
-    begins = sweeps.begins_s.tolist()
-    document: dict[str, Any] = {
-        "duration_s": begins[-1],
-        "home_rad": sweeps.home.tolist(),
-        "kept": _kept(sweeps.extremes),
-        "strokes": [
-            {
-                "joint": stroke.joint + 1,
-                "begin_s": begin,
-                "from_rad": stroke.begin,
-                "to_rad": stroke.end,
-                "speed_rad_s": stroke.speed,
-                "ramp_s": stroke.ramp_s,
-                "duration_s": stroke.duration_s,
-            }
-            for stroke, begin in zip(sweeps.strokes, begins[:-1], strict=True)
-            if stroke.sweeps
-        ],
-    }
-    if sweeps.left_out:
-        document["left_out"] = list(sweeps.left_out)
-    return document
 
 
 def _kept(kept: MotionExtremes) -> dict[str, Any]:

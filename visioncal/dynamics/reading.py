@@ -93,7 +93,16 @@ def read_recorded(
             culprits=[f"{label}, {name}" for name in missing],
             next_step=_HOW,
         )
-    gains = _gains(label, count, gains_nm_a) if of_currents else np.ones(count)
+    gains = np.asarray(gains_nm_a if of_currents else np.ones(count), dtype=float)
+    if gains.shape != (count,) or not (np.isfinite(gains) & (gains > 0.0)).all():
+        raise DataError(
+            f"{label} holds currents and no torques; {count} gains above 0 [N m/A] are needed to "
+            f"turn them into torques, not {list(gains_nm_a)}.",
+            culprits=[label],
+            next_step="Give them with --gains K1,K2,...: the motor's torque constant times the "
+            "gear's ratio. From motion alone gains and masses cannot be separated; visioncal "
+            "dynamics gains finds them by a known body on the flange.",
+        )
     with_dq = all(present["dq"])
     columns = [*names["q"], *names[drive], *(names["dq"] if with_dq else [])]
     times_s, values = stream.group(columns)
@@ -109,20 +118,6 @@ def read_recorded(
         raise too_far_apart(label, usual_s, _SLOWEST_S)
     q, torques, dq = (values[:, at * count : (at + 1) * count] for at in range(3))
     return RecordedSamples(label, times_s, q, dq if with_dq else None, gains * torques, of_currents)
-
-
-def _gains(label: str, count: int, gains_nm_a: Sequence[float]) -> FloatArray:
-    gains = np.asarray(gains_nm_a, dtype=float)
-    if gains.shape == (count,) and np.isfinite(gains).all() and (gains > 0.0).all():
-        return gains
-    raise DataError(
-        f"{label} holds currents and no torques; {count} gains above 0 [N m/A] are needed to turn "
-        f"them into torques, not {list(gains_nm_a)}.",
-        culprits=[label],
-        next_step="Give them with --gains K1,K2,...: the motor's torque constant times the gear's "
-        "ratio. From motion alone gains and masses cannot be separated; visioncal dynamics gains "
-        "finds them by a known body on the flange.",
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -134,24 +134,15 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
     return Run(session, identified, identification, predicted, fitted)
 
 
-def validate_session(
-    session: Session, identified: Identified, request: IdentificationRequest
-) -> list[Prediction]:
-    """Predicts the torques of a session's streams by earlier identified dynamics.
-
-    Raises:
-        DataError: The robot is another one, there is no such stream, or a stream is wrong.
-    """
-    return [
-        predict(identified, stream) for stream in conditioned_streams(session, identified, request)
-    ]
-
-
 @on_one_blas_thread
 def conditioned_streams(
     session: Session, identified: Identified, request: IdentificationRequest
 ) -> list[Conditioned]:
-    """Reads a session's streams, filtered like those of an identification; raises DataError."""
+    """Reads a session's streams, filtered like those of an identification.
+
+    Raises:
+        DataError: The robot is another one, there is no such stream, or a stream is wrong.
+    """
     robot, session = identified.robot, select_arm(session, request.robot)
     names = _torque_streams(session, request.streams)
     recorded = [_read(session, robot, name, request) for name in names]

@@ -134,10 +134,19 @@ def plan_sweeps(allowed: MotionLimits, request: SweepRequest) -> Sweeps:
     breaches: tuple[str, ...] = ("everywhere something is too near",)
     # The best are planned in full.
     for row in order[:20].tolist():
-        sweeps = _in_posture(allowed, request, clear[row], ranges[row])
-        if sweeps.strokes and not sweeps.extremes.breaches:
-            return sweeps
-        breaches = sweeps.extremes.breaches or ("no joint has room",)
+        home, strokes, left_out = clear[row], list[Stroke](), list[str]()
+        for joint, name in enumerate(allowed.robot.joint_names):
+            low, high = _checked_range(allowed, home, joint, *ranges[row, joint].tolist())
+            # Least range of a joint that is swept [rad].
+            if high - low < 0.2:
+                left_out.append(name)
+                continue
+            strokes += _joint_strokes(allowed, request, joint, float(home[joint]), low, high)
+        # For torques alone: paths are checked in full, ramps and speeds are exact.
+        kept = motion_extremes(allowed, _sampled(home, tuple(strokes), 200.0))
+        if strokes and not kept.breaches:
+            return Sweeps(home, tuple(strokes), kept, tuple(left_out))
+        breaches = kept.breaches or ("no joint has room",)
     raise DegenerateError(
         f"robot {allowed.robot.name}: no posture was found from which its joints could sweep; of "
         f"the last one tried, {breaches[0]}.",
@@ -147,32 +156,12 @@ def plan_sweeps(allowed: MotionLimits, request: SweepRequest) -> Sweeps:
     )
 
 
-def _in_posture(
-    allowed: MotionLimits, request: SweepRequest, home: FloatArray, ranges: FloatArray
-) -> Sweeps:
-    strokes: list[Stroke] = []
-    left_out = []
-    for joint, name in enumerate(allowed.robot.joint_names):
-        low, high = _checked_range(allowed, home, joint, *ranges[joint].tolist())
-        # Least range of a joint that is swept [rad].
-        if high - low < 0.2:
-            left_out.append(name)
-            continue
-        strokes += _joint_strokes(allowed, request, joint, float(home[joint]), low, high)
-    # For torques alone: paths are checked in full, ramps and speeds are exact.
-    kept = motion_extremes(allowed, _sampled(home, tuple(strokes), 200.0))
-    return Sweeps(home, tuple(strokes), kept, tuple(left_out))
-
-
 def _joint_strokes(
     allowed: MotionLimits, request: SweepRequest, joint: int, home: float, low: float, high: float
 ) -> Iterator[Stroke]:
     """Strokes there and back at every speed, about the centre of the joint's free range."""
-    acceleration, middle, free_range = (
-        float(allowed.acceleration[joint]),
-        0.5 * (low + high),
-        high - low,
-    )
+    acceleration, middle = float(allowed.acceleration[joint]), 0.5 * (low + high)
+    free_range = high - low
     # The fastest speed with time to hold it; a ramp takes 1.5 times speed over acceleration.
     least = _SHORTEST_RAMP_S + _SHORTEST_HOLD_S
     fastest = (np.sqrt(least**2 + 6.0 * free_range / acceleration) - least) * acceleration / 3.0

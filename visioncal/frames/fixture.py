@@ -18,7 +18,6 @@ from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m, worst_of
 from visioncal.estimation.pointfit import (
     FEATURE_KINDS,
-    DrawingFit,
     FeatureKind,
     PointPairs,
     fit_features,
@@ -368,27 +367,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
     several = f"{len(measured)} touches of " if count < len(measured) else ""
     used = len({name for name, ok in zip(pairs.labels, fitted.agrees, strict=True) if ok})
     share = "" if used == count else f"{used} of "
-    return fitted.frame(
-        f"best fit of {several}{share}{count} points to {drawing.source}",
-        tuple(_drawing_findings(fit, fitted, measured, pairs, used, setting)),
-        {
-            "scale": {"value": fit.scale.value, "sigma": fit.scale.sigma},
-            "coplanar": fit.is_flat,
-            **_worst_details(fitted),
-        },
-        setting,
-    )
-
-
-def _drawing_findings(
-    fit: DrawingFit,
-    fitted: PointsFit,
-    measured: MeasuredPoints,
-    pairs: PointPairs,
-    used: int,
-    setting: FitSettings,
-) -> Iterator[Finding]:
-    deviation = abs(fit.scale.value - 1.0)
+    deviation, more = abs(fit.scale.value - 1.0), list[Finding]()
     if fit.scale.differs:
         # The frame does not absorb scale.
         extent_m = float(np.linalg.norm(np.ptp(pairs.nominal, axis=0)))
@@ -398,13 +377,12 @@ def _drawing_findings(
             if deviation < _WARM
             else "is it the drawing of this part, in this issue and unit, at full scale?"
         )
-        yield Finding(
-            "scale",
+        words = (
             f"The part is {fit.scale.value:.5f} times as large as drawn (sigma "
             f"{fit.scale.sigma:.5f}), {figure(1e3 * deviation * extent_m)} mm over its "
-            f"{figure(1e3 * extent_m)} mm, which the frame does not take in: {cause}",
-            is_fatal=deviation > _WARM * 10,
+            f"{figure(1e3 * extent_m)} mm, which the frame does not take in: {cause}"
         )
+        more.append(Finding("scale", words, is_fatal=deviation > _WARM * 10))
     if fit.is_flat:
         normal = spreads(pairs.nominal[fitted.agrees])[1][2]
         cosines = measured.outward[fitted.agrees] @ fitted.edge.matrix[:3, 2]
@@ -415,19 +393,26 @@ def _drawing_findings(
                 "and the fixture's z axis points away from the side that the tool came from: a "
                 "mirrored drawing looks like this."
             )
-            yield _mirrored(words, "Check that z of the drawing points into the part.")
-        elif not side > _ASIDE:
-            yield _mirrored(
-                "and a mirrored drawing would fit them as well, turned to the other side.",
-                "Check to which side its axes point, or measure a point beside the plane.",
-            )
+            step = "Check that z of the drawing points into the part."
+        else:
+            words = "and a mirrored drawing would fit them as well, turned to the other side."
+            step = "Check to which side its axes point, or measure a point beside the plane."
+        if not side > _ASIDE:
+            words = f"The points lie in one plane, {words}"
+            more.append(Finding("mirrored", words, Remedy(step)))
     if used < setting.fewest:
-        yield Finding(
-            "few_points",
+        words = (
             f"Only {used} points are used: with {setting.fewest} or more a wrong one can "
-            f"be found.{assumed_words(fitted.noise_m, setting.touch_noise_m)}",
+            f"be found.{assumed_words(fitted.noise_m, setting.touch_noise_m)}"
         )
-
-
-def _mirrored(words: str, step: str) -> Finding:
-    return Finding("mirrored", f"The points lie in one plane, {words}", Remedy(step))
+        more.append(Finding("few_points", words))
+    return fitted.frame(
+        f"best fit of {several}{share}{count} points to {drawing.source}",
+        more,
+        {
+            "scale": {"value": fit.scale.value, "sigma": fit.scale.sigma},
+            "coplanar": fit.is_flat,
+            **_worst_details(fitted),
+        },
+        setting,
+    )

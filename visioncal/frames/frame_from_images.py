@@ -19,13 +19,12 @@ from visioncal.frames.camera_chain import CalibratedCamera, checked_point
 from visioncal.frames.fixture import sigma_findings
 from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.frames.session_observations import (
-    SessionImages,
     detect_session_target,
     no_usable_image,
     without_label,
 )
-from visioncal.frames.target_in_image import PoseCandidates, target_pose_candidates
-from visioncal.frames.target_pose import Sight, TargetPose, needs_robot, place_target
+from visioncal.frames.target_in_image import target_pose_candidates
+from visioncal.frames.target_pose import TargetPose, needs_robot, place_target
 from visioncal.results import HELD_BACK, Calibration, Frame, Observation, select_matching
 from visioncal.session import Session, View
 from visioncal.session.selecting import EYE, Choice
@@ -97,7 +96,21 @@ def seen_frame(
     lost |= {view.number: HELD_BACK for view in session.views if view.holdout}
     seen = place_target(eye, sights, looks, parent).at(point)
     worst = worst_of(seen.matrix, seen.covariance, kind, parent)
-    _check_parent(eye, kind, shown, seen, sights, looks)
+    other: FrameKind = "fixture" if kind == "tool" else "tool"
+    elsewhere = PARENTS[other]
+    has_poses = all(sight.base_from_flange is not None for sight in sights)
+    # So much wilder than the noise: it may be fixed to the other parent, and calm against that.
+    if seen.scatter >= 10.0 and (has_poses or not needs_robot(eye, elsewhere)):
+        alternative = place_target(eye, sights, looks, elsewhere)
+        if alternative.rms_mm < 0.1 * seen.rms_mm:
+            raise DataError(
+                f"session {shown.source!r}: target {shown.target.name} moves by "
+                f"{figure(seen.rms_mm)} mm against the {parent}, and stands still to "
+                f"{figure(alternative.rms_mm)} mm against the {elsewhere}: it is on a {other}, not "
+                f"on a {kind}.",
+                culprits=[shown.source],
+                next_step=f"Say visioncal {_COMMANDS[other]} for it.",
+            )
     own, common = (float(np.trace(array[3:, 3:])) for array in (seen.independent, seen.common))
     advice = (
         "Take more images, from nearer and from other sides."
@@ -152,33 +165,6 @@ def seen_frame(
             "note": _COUNTED_TWICE,
         },
     )
-
-
-def _check_parent(
-    eye: CalibratedCamera,
-    kind: FrameKind,
-    shown: SessionImages,
-    seen: TargetPose,
-    sights: Sequence[Sight],
-    looks: Sequence[PoseCandidates],
-) -> None:
-    """Raises an error where the target is fixed to the other parent."""
-    other: FrameKind = "fixture" if kind == "tool" else "tool"
-    parent = PARENTS[other]
-    has_poses = all(sight.base_from_flange is not None for sight in sights)
-    # So much wilder than the noise, and calm against the other parent.
-    if seen.scatter < 10.0 or (needs_robot(eye, parent) and not has_poses):
-        return
-    alternative = place_target(eye, sights, looks, parent)
-    if alternative.rms_mm < 0.1 * seen.rms_mm:
-        raise DataError(
-            f"session {shown.source!r}: target {shown.target.name} moves by "
-            f"{figure(seen.rms_mm)} mm against the {PARENTS[kind]}, and stands still to "
-            f"{figure(alternative.rms_mm)} mm against the {parent}: it is on a {other}, not on a "
-            f"{kind}.",
-            culprits=[shown.source],
-            next_step=f"Say visioncal {_COMMANDS[other]} for it.",
-        )
 
 
 def _observations(

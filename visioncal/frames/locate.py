@@ -117,19 +117,12 @@ def locate(
     eye = CalibratedCamera.of(calibration.chosen(Choice(camera, robot), EYE))
     noise_px, cam_pose = eye.noise_px(sigma_px), eye.at(base_from_flange, joints_rad)
     px = np.atleast_2d(np.asarray(px, dtype=float))
-    rays = _rays(eye, px)
-    return tuple(
-        _on_plane(eye, cam_pose, plane, ray, at, noise_px) for ray, at in zip(rays, px, strict=True)
-    )
-
-
-def _rays(eye: CalibratedCamera, px: FloatArray) -> FloatArray:
-    """(n, 3) points at unit depth in the camera's frame."""
     if px.shape[1:] != (2,):
         raise DataError(f"locate: pixels have the shape {px.shape}; (n, 2) is needed.")
     size = np.array(eye.camera.resolution)
     inside = np.all((px >= -0.5) & (px <= size - 0.5), axis=1)
-    plane = normalise(
+    # Points at unit depth.
+    unit = normalise(
         eye.camera, eye.lens.in_model(np.where(inside[:, None], px, eye.camera.matrix[2:]))
     )
     for at, (u, v) in enumerate(px.tolist()):
@@ -140,13 +133,16 @@ def _rays(eye: CalibratedCamera, px: FloatArray) -> FloatArray:
                 culprits=[f"pixel {at}"],
                 next_step="Give pixels of the full image, as the camera took it.",
             )
-        if not np.isfinite(plane[at]).all():
+        if not np.isfinite(unit[at]).all():
             raise DataError(
                 f"locate: the lens's distortion cannot be inverted at pixel ({u:.1f}, {v:.1f}).",
                 culprits=[f"pixel {at}"],
                 next_step="Calibrate with corners up to the image's edge.",
             )
-    return np.concatenate([plane, np.ones((len(px), 1))], axis=1)
+    return tuple(
+        _on_plane(eye, cam_pose, plane, np.append(ray, 1.0), at, noise_px)
+        for ray, at in zip(unit, px, strict=True)
+    )
 
 
 def _depth(cam_pose: CameraPose, plane: Plane, ray: FloatArray, label: str) -> float:

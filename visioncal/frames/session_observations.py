@@ -86,7 +86,13 @@ def detect_session_target(
         )
     target = session.target
     wanted = session.views if among is None else tuple(among)
-    poses, lost = _poses(session, calibration, parent, wanted)
+    lost = {view.number: _NO_IMAGE for view in wanted if not (view.image or view.has_corners)}
+    if needs_robot(CalibratedCamera.of(calibration), parent):
+        reported = _flange(session, calibration, wanted)
+        poses: Mapping[int, FloatArray] = reported.base_from_flange
+        lost = {rejection.view: rejection.reason for rejection in reported.rejections} | lost
+    else:
+        poses = reported_matrices(wanted)
     detected = detect(session, progress=progress, among=_usable(session, wanted, target, lost))
     lost |= {rejection.view: rejection.reason for rejection in detected.rejections}
     check_resolution(session, calibration, detected.resolution)
@@ -145,18 +151,6 @@ def no_usable_image(shown: SessionImages, lost: Mapping[int, str]) -> DataError:
         culprits=culprits,
         next_step=f"First: {culprits[0]}.",
     )
-
-
-def _poses(
-    session: Session, calibration: Calibration, parent: Parent, wanted: tuple[View, ...]
-) -> tuple[Mapping[int, FloatArray], dict[int, str]]:
-    """The robot's poses by view, and why views without pose or image are unusable."""
-    lost = {view.number: _NO_IMAGE for view in wanted if not (view.image or view.has_corners)}
-    if needs_robot(CalibratedCamera.of(calibration), parent):
-        reported = _flange(session, calibration, wanted)
-        lost = {rejection.view: rejection.reason for rejection in reported.rejections} | lost
-        return reported.base_from_flange, lost
-    return reported_matrices(wanted), lost
 
 
 def _flange(session: Session, calibration: Calibration, wanted: tuple[View, ...]) -> RobotReport:

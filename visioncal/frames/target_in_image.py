@@ -79,16 +79,25 @@ def target_pose_candidates(
     with one_blas_thread():
         in_model = replace(corners, px=eye.lens.in_model(corners.px))
         poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
-        stack = CornerStack.of({kept.view: kept}, corner_positions(target))
+        stack = CornerStack.of({kept.view: kept}, positions)
         # Mean depth of the corners.
         distance_m = float(depths_m(stack, poses.cam_from_target[:1])[0])
         if eye.lens.field is not None and eye.lens.field.breathing > 0.0:
             in_model = replace(corners, px=eye.lens.in_model(corners.px, distance_m))
             poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
-        fits = [
-            _with_jacobians(eye, poses, at, kept, target, noise_px, distance_m)
-            for at in range(len(poses.turns))
-        ]
+        # Each candidate refined, with its Jacobians and corners numbered by its symmetry.
+        fits = []
+        for at, turn in enumerate(poses.turns):
+            # With the rotation p applied, corner i lies where corner p[i] was: that id becomes i.
+            ids = np.argsort(rotations(target)[turn])[kept.ids]
+            turned = replace(kept, ids=ids).take(np.argsort(ids))
+            stack = _stack(eye, turned, positions, noise_px)
+            compressed = _compressed(eye.camera, stack, target, poses.cam_from_target[at : at + 1])
+            by_pose = reproject(stack, eye.camera, compressed.cam_from_target, lens=False).by_pose
+            by_field = eye.lens.displacements(stack.px, distance_m)
+            stack.weigh(by_field)
+            cross = stack.products_by_view(by_pose, by_field)
+            fits.append((compressed, -(covariance_from(compressed.information) @ cross)[0]))
     freedom = 2 * len(kept.ids) - 6
     warnings: tuple[str, ...] = ()
     scatter_px = float(np.sqrt(squared_sum / freedom))
@@ -179,28 +188,6 @@ def _stack(
     if eye.jitter == 0.0:
         return stack
     return replace(stack, zooms=eye.jitter / max(noise_px, 1e-6) * zooms(stack.px, eye.camera))
-
-
-def _with_jacobians(
-    eye: CalibratedCamera,
-    poses: ViewPoses,
-    at: int,
-    corners: Corners,
-    target: Target,
-    noise_px: float,
-    distance_m: float,
-) -> tuple[Compressed, FloatArray]:
-    """One refined candidate with its Jacobians, with corners numbered by its symmetry."""
-    # With the rotation p applied, corner i lies where corner p[i] was: that id becomes i.
-    ids = np.argsort(rotations(target)[poses.turns[at]])[corners.ids]
-    turned = replace(corners, ids=ids).take(np.argsort(ids))
-    stack = _stack(eye, turned, corner_positions(target), noise_px)
-    compressed = _compressed(eye.camera, stack, target, poses.cam_from_target[at : at + 1])
-    by_pose = reproject(stack, eye.camera, compressed.cam_from_target, lens=False).by_pose
-    by_field = eye.lens.displacements(stack.px, distance_m)
-    stack.weigh(by_field)
-    cross = stack.products_by_view(by_pose, by_field)
-    return compressed, -(covariance_from(compressed.information) @ cross)[0]
 
 
 def _compressed(

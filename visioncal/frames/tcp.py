@@ -16,7 +16,6 @@ from visioncal.frames.fixture import FitSettings, PointsFit
 from visioncal.frames.touches import (
     TouchRows,
     flange_poses,
-    nominal_pose_findings,
     refuse_copies,
     robot_noise,
 )
@@ -78,9 +77,17 @@ def touched_tool(
         fit.worst,
         fit.oriented,
     )
+    doubts: tuple[Finding, ...] = ()
+    is_calibrated = calibration is not None and calibration.arm_is_calibrated
+    if is_calibrated and (rows.joints_rad is None or not np.isfinite(rows.joints_rad).all()):
+        words = (
+            "The calibration is of a calibrated arm, but touches come without joint angles: their "
+            "poses are the nominal arm's, off by as much as its errors."
+        )
+        doubts = (Finding("nominal_poses", words, Remedy("Write down q1_rad ... too.")),)
     setting = FitSettings(
         touch_noise_m,
-        tuple(nominal_pose_findings(rows, calibration)),
+        doubts,
         options=options or ToolLimits(),
         noisy="Touch again with a sharp tip; an arm that was never calibrated is off by a "
         "millimetre from posture to posture, and poses that are read wrongly (--robot-form, "

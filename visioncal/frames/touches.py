@@ -1,6 +1,6 @@
 """Touches: flange poses at which the tool's tip touched a point of the cell."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,6 @@ from visioncal.core.limits import FAR_M, WIDE_RAD
 from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.transforms import invert, rotation_angle, skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.pointfit import PointPairs
 from visioncal.estimation.problem_parts import Noise
 from visioncal.results import Calibration, Edge, Frame, Verdict
@@ -130,20 +129,6 @@ def flange_poses(
     if calibrated and calibration is not None and rows.joints_rad is not None:
         poses[modelled] = calibration.standing(rows.joints_rad[modelled])
     return np.where(use_model[:, None, None], poses, rows.base_from_flange)
-
-
-def nominal_pose_findings(rows: TouchRows, calibration: Calibration | None) -> Iterator[Finding]:
-    """Finding on touches of a calibrated arm that have no joint angles."""
-    if calibration is None or not calibration.arm_is_calibrated:
-        return
-    joints = rows.joints_rad
-    if joints is None or not np.isfinite(joints).all():
-        yield Finding(
-            "nominal_poses",
-            "The calibration is of a calibrated arm, but touches come without joint angles: their "
-            "poses are the nominal arm's, off by as much as its errors.",
-            Remedy("Write down q1_rad ... too."),
-        )
 
 
 def check_lengths(rows: TouchRows) -> None:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from visioncal.core.number_format import matched, significant
 from visioncal.dynamics import Identified
 from visioncal.dynamics.identified import judge, stribeck_rows
-from visioncal.dynamics.identify import Prediction, friction_at, measured_friction
+from visioncal.dynamics.identify import Prediction, friction_at
 from visioncal.dynamics.run import Run
 from visioncal.present import facts
 from visioncal.present.report.plotting import (
@@ -117,12 +117,15 @@ def friction(
     figure.subplots_adjust(wspace=0.22, hspace=0.3)
     for axes in grid.flat[joints:]:
         axes.set_visible(False)
+    # Measured torques less all predicted ones but friction's.
+    measured_nm = [
+        friction_at(identified, each.dq) + each.measured_nm - each.predicted_nm
+        for each in predictions
+    ]
     for joint, axes in enumerate(grid.flat[:joints]):
         shown = (
-            np.column_stack(
-                [prediction.dq[:, joint], measured_friction(identified, prediction)[:, joint]]
-            )[prediction.used[:, joint]]
-            for prediction in predictions
+            np.column_stack([each.dq[:, joint], torque_nm[:, joint]])[each.used[:, joint]]
+            for each, torque_nm in zip(predictions, measured_nm, strict=True)
         )
         samples = np.concatenate([*shown])
         samples = samples[:: max(len(samples) // 600, 1)]
