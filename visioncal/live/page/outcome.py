@@ -73,7 +73,7 @@ def ask_command(words: Sequence[str], folder: Path | None, views: tuple[View, ..
             if is_trial and hasattr(os, "setpriority"):
                 # Pictures and requests come first.
                 with suppress(OSError):
-                    os.setpriority(os.PRIO_PROCESS, process.pid, 5)
+                    os.setpriority(os.PRIO_PROCESS, process.pid, 19)
             answer, complaint = process.communicate()
     try:
         document = json.loads(answer)

@@ -108,7 +108,7 @@ class _Page:
         self._table = ViewTable(station, self._visitor, self._understand)
         self._history = ui.column().classes("w-full")
         self._refresh()
-        ui.timer(0.1, self._refresh)
+        ui.timer(0.05, self._refresh)
 
     def _begin(self) -> None:
         chosen = {name: str(field.value or "") for name, field in self._inputs.items()}
