@@ -95,7 +95,7 @@ def main() -> None:
                 timed("undo", undo.click, lambda: last.wait_for(state="detached"))
                 page.wait_for_timeout(1000 * (number % 3))
     text = (
-        f"{VIEWS - 1} views were pasted in {pasted:.2f} s; then {ROUNDS} rounds, each time from the "
+        f"{VIEWS - 1} views were pasted in {pasted:.2f} s; then {ROUNDS} rounds, each from the "
         "click until the browser shows the answer, Playwright's own time included.\n\n"
         "| what | trial | times | median [s] | longest [s] |\n| --- | --- | ---: | ---: | ---: |\n"
     )

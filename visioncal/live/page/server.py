@@ -52,8 +52,10 @@ def serve(
         return Response(outcome.report.read_bytes(), media_type="text/html")
 
     def picture_of(number: int) -> Response:
+        # Its address names the version, too: what was shown once is not drawn again.
+        headers = {"Cache-Control": "private, max-age=86400, immutable"}
         picture = station.picture(number)
-        return Response(picture, media_type="image/jpeg") if picture else Response("", 404)
+        return Response(picture, 200, headers, "image/jpeg") if picture else Response("", 404)
 
     site = FastAPI(openapi_url=None)
     site.get(_PICTURE)(live_picture)

@@ -12,6 +12,11 @@ from visioncal.live.page.station import Row, Snapshot, Station, Visitor
 VIEWS = "/view"
 
 
+def picture_of(row: Row) -> str:
+    """Address of a view's picture."""
+    return f"{VIEWS}/{row.number}?{row.version}"
+
+
 def read_as(pose: PendantPose) -> str:
     """Says how a pose was understood."""
     return f"Read as {pose.words}: {pose_words(pose.pose)}"
@@ -30,7 +35,7 @@ class ViewTable:
         self, station: Station, visitor: Visitor, understand: Callable[[str], PendantPose | str]
     ) -> None:
         self._station, self._visitor, self._understand = station, visitor, understand
-        self._rows: dict[int, tuple[Row, bool, ui.row]] = {}
+        self._rows: dict[int, _Line] = {}
         with ui.column().classes("w-full gap-0").props("role=table aria-label=views") as self._all:
             pass
         with ui.dialog() as self._dialog, ui.card().classes("w-full").style("max-width: 720px"):
@@ -65,9 +70,10 @@ class ViewTable:
         ask = lambda: request(self._visitor, self._number, *more)  # noqa: E731
         ui.button(words, on_click=ask).props("flat")
 
-    def _open(self, row: Row) -> None:
+    def _open(self, number: int) -> None:
+        row = self._rows[number].row
         self._number, self._title.text = row.number, f"View {row.number}  {row.picture}"
-        self._picture.set_source(f"{VIEWS}/{row.number}?{row.version}")
+        self._picture.set_source(picture_of(row))
         self._line.value, self._refused.text, self._other.value = row.pose, "", None
         self._line.visible = self._read_as.visible = self._replaces.visible = row.is_typed
         self._other.set_options([number for number in self._rows if number != row.number])
@@ -89,39 +95,47 @@ class ViewTable:
             self._dialog.close()
 
     def show(self, now: Snapshot) -> None:
-        """Draws the rows that have changed."""
+        """Draws what has changed in the rows."""
         there = {row.number: row for row in now.views}
         for number in self._rows.keys() - there.keys():
-            self._rows.pop(number)[2].delete()
+            self._rows.pop(number).line.delete()
         for number, row in there.items():
-            again = number == now.again
-            before = self._rows.get(number)
-            if before is None:
+            if number not in self._rows:
                 with self._all:
-                    line = ui.row().classes(
-                        "w-full items-center no-wrap gap-3 py-1 border-b border-gray-300"
-                    )
-                line.props("role=row").props["aria-label"] = f"view {number}"
-                line.move(target_index=0)
-            elif before[:2] == (row, again):
-                continue
-            else:
-                line = before[2]
-                line.clear()
-            self._rows[number] = row, again, line
-            with line:
-                self._draw(row, again=again)
+                    self._rows[number] = _Line(row, self._open)
+            self._rows[number].show(row, again=number == now.again)
 
-    def _draw(self, row: Row, *, again: bool) -> None:
-        ui.label(f"{row.number}").classes("w-8 shrink-0 text-right text-lg").props("role=rowheader")
-        thumbnail = ui.image(f"{VIEWS}/{row.number}?{row.version}").classes("w-20 shrink-0")
-        thumbnail.props("no-spinner alt=picture")
-        with ui.column().classes("w-44 shrink-0 gap-0 text-sm").props("role=cell"):
-            ui.label(row.picture).classes("w-full truncate font-bold")
-            ui.label("to be taken again" if again else row.state)
-        pose = ui.label(row.pose).classes("grow font-mono text-sm min-w-0").props("role=cell")
-        pose.style("overflow-wrap: anywhere")
-        residual = ui.label(row.residual).classes("w-32 shrink-0 text-right").props("role=cell")
-        residual.classes("text-red-700" if row.is_odd else "")
-        change = ui.button("Change", on_click=lambda: self._open(row)).props("flat dense")
-        change.props["aria-label"] = f"change view {row.number}"
+
+class _Line:
+    """The line of a view, above all others; it stays, so that no click meets one that is gone."""
+
+    def __init__(self, row: Row, change: Callable[[int], None]) -> None:
+        number, self.row = row.number, row
+        with ui.row() as self.line:
+            name = ui.label(f"{number}").classes("w-8 shrink-0 text-right text-lg")
+            name.props("role=rowheader")
+            self._picture = ui.image(picture_of(row)).classes("w-20 shrink-0")
+            self._picture.props("no-spinner alt=picture")
+            with ui.column().classes("w-44 shrink-0 gap-0 text-sm").props("role=cell"):
+                self._name = ui.label("").classes("w-full truncate font-bold")
+                self._state = ui.label("")
+            self._pose = ui.label("").classes("grow font-mono text-sm min-w-0").props("role=cell")
+            self._pose.style("overflow-wrap: anywhere")
+            self._residual = ui.label("").classes("w-32 shrink-0 text-right").props("role=cell")
+            button = ui.button("Change", on_click=lambda: change(number)).props("flat dense")
+            button.props["aria-label"] = f"change view {number}"
+        self.line.classes("w-full items-center no-wrap gap-3 py-1 border-b border-gray-300")
+        self.line.props("role=row").props["aria-label"] = f"view {number}"
+        self.line.move(target_index=0)
+
+    def show(self, row: Row, *, again: bool) -> None:
+        """Shows the row as it is now."""
+        self.row = row
+        if self._picture.source != picture_of(row):
+            self._picture.set_source(picture_of(row))
+        self._name.text, self._pose.text = row.picture, row.pose
+        self._state.text = "to be taken again" if again else row.state
+        self._residual.text = row.residual
+        self._residual.classes(
+            add="text-red-700" if row.is_odd else "", remove="" if row.is_odd else "text-red-700"
+        )
