@@ -18,7 +18,7 @@ from visioncal import calibrate
 from visioncal.calibration.stages.motion import motion_of
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import pose_difference
-from visioncal.interchange.formats import ImportOptions, PoseImportOptions, convert, lerobot
+from visioncal.interchange.formats import ImportOptions, PoseImportOptions, bags, convert, lerobot
 from visioncal.interchange.formats.lerobot import FrameImages
 from visioncal.session import Session
 
@@ -68,6 +68,62 @@ def test_a_bag_is_the_session_that_it_was_made_of(form, options, source, rendere
         away = pose_difference(pose, meant.base_from_flange().as_matrix())
         # Written stamps have a tenth of a microsecond, and quaternions sixteen digits.
         assert max(away) < 1e-6
+
+
+@pytest.mark.parametrize(("kind", "ending"), [("png", ".png"), ("jpeg", ".jpg")])
+def test_compressed_images_are_kept_byte_by_byte(kind, ending, source, rendered, tmp_path):
+    path = bag(tmp_path / "b", source, rendered, is_compressed=True, image_kind=kind)
+    session = convert(path, tmp_path / "out", requested=BOARD)
+    for view, meant in zip(session.views, source.views, strict=True):
+        assert view.image.endswith(ending)
+        data = source.images.read(meant.image)
+        if kind == "jpeg":
+            data = cv2.imencode(".jpg", pixels(source.images, meant.image))[1].tobytes()
+        assert session.images.read(view.image) == data
+
+
+@pytest.mark.parametrize("period_s", [0.2, 0.3])
+def test_stops_are_found_at_any_rate_of_the_robot(period_s, source, rendered, tmp_path):
+    path = bag(tmp_path / "b", source, rendered, period_s=period_s, frames_s=0.1)
+    session = convert(path, tmp_path / "out", requested=BOARD)
+    assert len(session.views) == len(source.views)
+    assert any("one a stop of the robot" in note for note in session.warnings)
+    motion = motion_of(session, None, "robot")
+    for view, meant in zip(session.views, source.views, strict=True):
+        (pose,) = motion.flange.at(np.array([view.stamp_s]))
+        # Written stamps have a tenth of a microsecond, and quaternions sixteen digits.
+        assert max(pose_difference(pose, meant.base_from_flange().as_matrix())) < 1e-6
+    result = calibrate(tmp_path / "out")
+    assert result.clock.method == "rest"
+    assert [view.used for view in result.views].count(True) == len(source.views)
+
+
+def test_depth_is_no_picture(source, rendered, tmp_path):
+    change = setting("Image", "encoding", "16UC1")
+    path = bag(tmp_path / "b", source, rendered, change=change)
+    raised(DataError, "no topic has images", convert, path, tmp_path / "out", requested=BOARD)
+    change = setting("CompressedImage", "format", "16UC1; png compressed ")
+    path = bag(tmp_path / "c", source, rendered, change=change, is_compressed=True)
+    raised(DataError, "no topic has images", convert, path, tmp_path / "out", requested=BOARD)
+
+
+PACKED = [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "MESSAGE"), ("mcap", "STORAGE")]
+
+
+@pytest.mark.parametrize(("form", "compression"), PACKED)
+def test_few_bytes_do_not_fill_the_memory(
+    form, compression, source, rendered, tmp_path, monkeypatch
+):
+    data = np.zeros(3_000_000, np.uint8)
+    change = setting("Image", "data", data, lambda at: at == 3)
+    options, ending = {"form": form, "compression": compression}, ".bag" * (form == "ros1")
+    sound = bag(tmp_path / f"a{ending}", source, rendered, **options)
+    assert len(convert(sound, tmp_path / "a-out", requested=BOARD).views) == len(source.views)
+    path = bag(tmp_path / f"b{ending}", source, rendered, change=change, **options)
+    monkeypatch.setattr(bags, "MOST_IMAGE_BYTES", 2_000_000)
+    words = "over 2 MB, decompressed"
+    raised(DataError, words, convert, path, tmp_path / "out", requested=BOARD)
+    assert not (tmp_path / "out").exists()
 
 
 def test_cameras_of_a_bag_are_a_whole_cell(source, rendered, tmp_path):
@@ -233,6 +289,30 @@ def test_no_more_rows_of_a_data_set_are_read_than_fit(source, rendered, tmp_path
     # As of a file of some hundred kB that holds as many equal rows as a memory does not.
     monkeypatch.setattr(lerobot, "MAX_VALUES", 10)
     raised(DataError, "more than 200 values", convert, path, tmp_path / "out", requested=BOARD)
+
+
+def test_a_repeated_value_of_a_data_set_does_not_fill_the_memory(
+    source, rendered, tmp_path, monkeypatch
+):
+    path = write_dataset(tmp_path / "set", source, rendered, "v3.0", "ur10e")
+    about = path / "meta" / "info.json"
+    info = json.loads(about.read_text())
+    info["features"][KEY]["dtype"] = "image"
+    about.write_text(json.dumps(info))
+    (file,) = (path / "data").rglob("*.parquet")
+    table = pq.read_table(file)
+    # A hundred kB that stand for as many large images as there are rows.
+    large = pa.array([b"\x89PNG" + bytes(3_000_000)])
+    same = pa.DictionaryArray.from_arrays(pa.array([0] * len(table), pa.int32()), large)
+    cells = pa.StructArray.from_arrays([same, pa.array([""] * len(table))], ["bytes", "path"])
+    pq.write_table(table.append_column(KEY, cells), file)
+    assert file.stat().st_size < 300_000
+    monkeypatch.setattr(lerobot, "_MOST_BYTES", 10_000_000)
+    raised(DataError, "images are over 10 MB", convert, path, tmp_path / "out", requested=BOARD)
+    text = pa.DictionaryArray.from_arrays(same.indices, pa.array([3_000_000 * "1"]))
+    at = table.schema.get_field_index("timestamp")
+    pq.write_table(table.set_column(at, "timestamp", text), file)
+    raised(DataError, "has texts, not num", convert, path, tmp_path / "out", requested=BOARD)
 
 
 def setting(kind, path, value, which=lambda _: True):

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import RigidTransform
@@ -33,22 +33,28 @@ class BagOptions:
     without: tuple[str, ...] = ()  # Topics that are missing.
     poses: str = "tf"  # or `pose`: a topic of PoseStamped.
     frames_s: float = 0.2
+    period_s: float = 0.02  # Of the robot's poses, whose times err by up to a fifth of it.
+    compression: str = ""  # A format of ROS 1, or a mode of ROS 2, that packs with zstd.
+    image_kind: str = "png"  # What compressed images are.
     names: tuple[str, ...] = ("",)  # Namespaces of the cameras, all of which see the same.
     # Changes a message in place, by its type and its number among those of the topic.
     change: Callable[[str, int, Any], object] = lambda *_: None
 
 
-def motion(session: Session) -> tuple[np.ndarray, np.ndarray]:
-    """(m,) times and (m, 4, 4) poses at 50 Hz: from view to view, with a rest at each."""
+def motion(session: Session, period_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """(m,) times and (m, 4, 4) poses: from view to view, with a rest at each."""
     stops = [np.asarray(view.base_from_flange().as_matrix()) for view in session.views]
-    poses, period_s = [], 0.02
+    poses = []
     for at, (here, there) in enumerate(zip(stops, [*stops[1:], stops[-1]], strict=True)):
         poses += [here] * round(REST_S / period_s)
         way = log(invert(here) @ there)
         shares = np.linspace(0.0, 1.0, round(WAY_S / period_s))
         if at + 1 < len(stops):
             poses += [here @ exp(way * (0.5 - 0.5 * np.cos(np.pi * share))) for share in shares]
-    return 1e9 + period_s * np.arange(len(poses)), np.array(poses)
+    stamps_s = 1e9 + period_s * np.arange(len(poses))
+    if period_s > 0.02:
+        stamps_s += np.random.default_rng(1).uniform(-0.2, 0.2, len(poses)) * period_s
+    return stamps_s, np.array(poses)
 
 
 class _Bag:
@@ -107,8 +113,10 @@ class _Bag:
         header = self.header(at_s + self.options.camera_late_s, frame)
         if self.options.is_compressed:
             data = np.frombuffer(file.read_bytes(), np.uint8)
+            if self.options.image_kind == "jpeg":
+                data = cv2.imencode(".jpg", pixels)[1].ravel()
             kind, topic = "CompressedImage", f"{space}/image_raw/compressed"
-            message = self.of[kind](header, "png", data)
+            message = self.of[kind](header, self.options.image_kind, data)
         else:
             height, width = pixels.shape
             kind, topic = "Image", f"{space}/image_raw"
@@ -135,6 +143,11 @@ class _Bag:
             if self.is_first
             else Writer2(path, version=9, storage_plugin=FORMS[self.options.form])
         )
+        if packed := self.options.compression:
+            writer.set_compression(
+                *([Writer1.CompressionFormat[packed]] if self.is_first
+                  else [CompressionMode[packed], CompressionFormat.ZSTD])
+            )  # fmt: skip
         pack = self.types.serialize_ros1 if self.is_first else self.types.serialize_cdr
         with writer:
             connections = {}
@@ -146,7 +159,7 @@ class _Bag:
 
 def write_bag(path: Path, session: Session, folder: Path, options: BagOptions) -> Path:
     """Writes a bag of the session's views, and returns its path."""
-    bag, (stamps_s, poses) = _Bag(options), motion(session)
+    bag, (stamps_s, poses) = _Bag(options), motion(session, options.period_s)
     bag.add_motion(stamps_s, poses)
     eye = "wrist_3_link" if session.mount == "eye-in-hand" else "base_link"
     optical = [(eye, f"{name}optical") for name in options.names]

@@ -1,6 +1,7 @@
 """Choices and default values of files and options, importable without numpy for quick help."""
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -51,10 +52,9 @@ class PoseForm:
     unit: str  # Length unit.
     rotation: str  # Rotation form, a name among `conventions.ROTATION_FORMS`.
     names: str  # Names of the rotation's numbers, in lower case.
-    models: str = ""  # Pattern of the beginning of its robots' names; empty for a library.
-    # Whether the names alone suggest it, and not another form that has them, too.
-    likely: bool = True
-    also: str = ""  # Other names of the rotation's numbers, which suggest it.
+    models: str  # Pattern of the beginning of its robots' names; empty for a library.
+    likely: bool  # Whether the names alone suggest it, and not another form that has them, too.
+    also: str  # Other names of the rotation's numbers, which suggest it.
 
 
 # Universal Robots, "Script manual": p[x, y, z, rx, ry, rz]. KUKA, "System variables": FRAME X, Y,
@@ -67,65 +67,32 @@ class PoseForm:
 # intrinsic, given as rx, ry, rz [m, rad]. Techman, tmr_ros1, tm_ros_topic.cpp: Rx, Ry, Rz as fixed
 # roll, pitch, yaw. Franka, libfranka, RobotState::O_T_EE: 4x4, column-major. URDF specification:
 # roll, pitch, yaw about fixed x, y, z.
-_RX, _RPY = "rx ry rz", "roll pitch yaw"
+_FORMS = r"""
+ur         Universal Robots p[...]                m   rotation-vector    rx ry rz  ur\d
+kuka       KUKA X, Y, Z, A, B, C                  mm  euler-ZYX-deg      a b c  kuka|kr\d|lbr|iiwa
+fanuc  FANUC X, Y, Z, W, P, R  mm  euler-xyz-deg  w p r  fanuc|lrmate|crx|m\d+i
+yaskawa  Yaskawa X, Y, Z, Rx, Ry, Rz  mm  euler-xyz-deg  rx ry rz  yaskawa|motoman|gp\d|hc\d
+abb  ABB X, Y, Z, q1, q2, q3, q4  mm  quaternion-wxyz  q1 q2 q3 q4  abb|irb|gofa|yumi
+staubli  Staubli X, Y, Z, Rx, Ry, Rz  mm  euler-XYZ-deg  rx ry rz  staubli|tx2?\d|ts2
+doosan     Doosan X, Y, Z, A, B, C                mm  euler-ZYZ-deg      a b c  doosan|[ahm]\d{4}
+xarm  UFACTORY X, Y, Z, roll, pitch, yaw  mm  euler-xyz-deg  roll pitch yaw  xarm|uf850|lite6
+mecademic  Mecademic X, Y, Z, alpha, beta, gamma  mm  euler-XYZ-deg      alpha beta gamma  meca
+kawasaki   Kawasaki X, Y, Z, O, A, T              mm  euler-ZYZ-deg      o a t  kawasaki|rs\d{3}
+comau      Comau X, Y, Z, A, E, R                 mm  euler-ZYZ-deg      a e r  comau|racer
+realman    RealMan X, Y, Z, rx, ry, rz            m   euler-xyz-rad      rx ry rz  realman|rml?\d{2}
+techman    Techman X, Y, Z, Rx, Ry, Rz            mm  euler-xyz-deg      rx ry rz  techman|tm\d
+franka  Franka O_T_EE, by columns  m  matrix-transposed  r11 r21 r31 r12 r22 r32 r13 r23 r33
+rpy        URDF xyz and rpy                       m   euler-xyz-rad      rx ry rz
+rpy-deg    xyz and rpy in degrees                 m   euler-xyz-deg      rx ry rz
+ros        ROS position and orientation           m   quaternion-xyzw    qx qy qz qw
+"""
+# Names that suggest another form than these, and other names that suggest these.
+_UNLIKELY, _ALSO = ("doosan", "realman", "rpy", "rpy-deg"), ("rpy", "rpy-deg")
 POSE_FORMS: Mapping[str, PoseForm] = {
-    form.name: form
-    for form in (
-        PoseForm("ur", "Universal Robots p[...]", "m", "rotation-vector", _RX, r"ur\d"),
-        PoseForm(
-            *("kuka", "KUKA X, Y, Z, A, B, C", "mm", "euler-ZYX-deg", "a b c"),
-            r"kuka|kr\d|lbr|iiwa",
-        ),
-        PoseForm(
-            *("fanuc", "FANUC X, Y, Z, W, P, R", "mm", "euler-xyz-deg", "w p r"),
-            r"fanuc|lrmate|crx|m\d+i",
-        ),
-        PoseForm(
-            *("yaskawa", "Yaskawa X, Y, Z, Rx, Ry, Rz", "mm", "euler-xyz-deg", _RX),
-            r"yaskawa|motoman|gp\d|hc\d",
-        ),
-        PoseForm(
-            *("abb", "ABB X, Y, Z, q1, q2, q3, q4", "mm", "quaternion-wxyz", "q1 q2 q3 q4"),
-            r"abb|irb|gofa|yumi",
-        ),
-        PoseForm(
-            *("staubli", "Staubli X, Y, Z, Rx, Ry, Rz", "mm", "euler-XYZ-deg", _RX),
-            r"staubli|tx2?\d|ts2",
-        ),
-        PoseForm(
-            *("doosan", "Doosan X, Y, Z, A, B, C", "mm", "euler-ZYZ-deg", "a b c"),
-            *(r"doosan|[ahm]\d{4}", False),
-        ),
-        PoseForm(
-            *("xarm", "UFACTORY X, Y, Z, roll, pitch, yaw", "mm", "euler-xyz-deg", _RPY),
-            r"xarm|uf850|lite6",
-        ),
-        PoseForm(
-            *("mecademic", "Mecademic X, Y, Z, alpha, beta, gamma", "mm", "euler-XYZ-deg"),
-            *("alpha beta gamma", r"meca"),
-        ),
-        PoseForm(
-            *("kawasaki", "Kawasaki X, Y, Z, O, A, T", "mm", "euler-ZYZ-deg", "o a t"),
-            r"kawasaki|rs\d{3}",
-        ),
-        PoseForm(
-            *("comau", "Comau X, Y, Z, A, E, R", "mm", "euler-ZYZ-deg", "a e r"), r"comau|racer"
-        ),
-        PoseForm(
-            *("realman", "RealMan X, Y, Z, rx, ry, rz", "m", "euler-xyz-rad", _RX),
-            *(r"realman|rml?\d{2}", False),
-        ),
-        PoseForm(
-            *("techman", "Techman X, Y, Z, Rx, Ry, Rz", "mm", "euler-xyz-deg", _RX), r"techman|tm\d"
-        ),
-        PoseForm(
-            *("franka", "Franka O_T_EE, by columns", "m", "matrix-transposed"),
-            "r11 r21 r31 r12 r22 r32 r13 r23 r33",
-        ),
-        PoseForm("rpy", "URDF xyz and rpy", "m", "euler-xyz-rad", _RX, likely=False, also=_RPY),
-        PoseForm(
-            "rpy-deg", "xyz and rpy in degrees", "m", "euler-xyz-deg", _RX, likely=False, also=_RPY
-        ),
-        PoseForm("ros", "ROS position and orientation", "m", "quaternion-xyzw", "qx qy qz qw"),
+    name: PoseForm(
+        *(name, words, unit, rotation, names, "".join(models)),
+        *(name not in _UNLIKELY, "roll pitch yaw" if name in _ALSO else ""),
     )
+    for line in _FORMS.strip().splitlines()
+    for name, words, unit, rotation, names, *models in [re.split(r" {2,}", line)]
 }

@@ -3,7 +3,8 @@
 Between two samples a pose follows the cubic through these and one on either side, in the
 exponential coordinates of the first of them: its error is of fourth order in the sampling interval.
 Where a neighbour is missing, the order is lower, down to linear. There is no interpolation across
-gaps, and no extrapolation.
+gaps, and no extrapolation. Between samples of the same pose the frame was at rest: there is no gap
+then, and neighbours do not count.
 """
 
 from dataclasses import dataclass
@@ -12,12 +13,15 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.transforms import exp, invert, log
+from visioncal.core.transforms import exp, invert, log, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.robot.model import REPEATABILITY
 
 # A gap is an interval over this multiple of the usual one, and over this time [s]; and any over the
 # longest, in which a robot can go anywhere.
 GAP_RATIO, SHORT_GAP_S, LONGEST_GAP_S = 2.5, 0.02, 0.25
+# No arm leaves a stop and is back at it within this time [s].
+_AWAY_S = 2.0
 # Least time over which velocities are averaged, to limit the noise of reported poses [s].
 _SPEED_S = 0.04
 # Samples of the cubic, relative to the one before a time.
@@ -38,15 +42,24 @@ class Samples:
     def covers(self, at_s: FloatArray, margin_s: float = 0.0) -> Mask:
         """Mask of the times (...,) that lie between samples without a gap, including a margin."""
         low, high = at_s - margin_s, at_s + margin_s
-        inside = (low >= self.stamps_s[0]) & (high <= self.stamps_s[-1])
+        inside = self.spans(low) & self.spans(high)
         breaks = np.concatenate([[0], np.cumsum(~self._joined)])
-        first, last = self._before(low), self._before(high)
+        first, last = self.before(low), self.before(high)
         # No gap from the sample before the first moment to the one behind the last.
         return np.asarray(inside & (breaks[first] == breaks[last + 1]))
 
+    def spans(self, at_s: FloatArray) -> Mask:
+        """Mask of the times (...,) between the first and the last sample."""
+        return np.asarray((at_s >= self.stamps_s[0]) & (at_s <= self.stamps_s[-1]))
+
+    def before(self, at_s: FloatArray) -> IntArray:
+        """(...,) the samples at or before some times that have a successor."""
+        before = np.searchsorted(self.stamps_s, at_s, side="right") - 1
+        return np.clip(before, 0, len(self.stamps_s) - 2)
+
     def blend(self, values: FloatArray, at_s: FloatArray) -> FloatArray:
         """(m, k) values interpolated at (m,) covered times, from (n, k) at the samples."""
-        before, last = self._before(at_s), len(self.stamps_s) - 1
+        before, last = self.before(at_s), len(self.stamps_s) - 1
         neighbours = values[np.clip(before[:, None] + _NODES, 0, last)]
         return np.asarray(np.einsum("mi,mik->mk", self._weights(before, at_s), neighbours))
 
@@ -55,19 +68,21 @@ class Samples:
         """(n - 1,) mask of the intervals without a gap."""
         steps = np.diff(self.stamps_s)
         limit_s = max(GAP_RATIO * self.step_s, SHORT_GAP_S)
-        return np.asarray((steps <= limit_s) & (steps < LONGEST_GAP_S))
+        joined = (steps <= limit_s) & (steps < LONGEST_GAP_S)
+        return np.asarray(joined | (self._unmoved & (steps < _AWAY_S)))
 
-    def _before(self, at_s: FloatArray) -> IntArray:
-        """(...,) the samples at or before some times that have a successor."""
-        before = np.searchsorted(self.stamps_s, at_s, side="right") - 1
-        return np.clip(before, 0, len(self.stamps_s) - 2)
+    @cached_property
+    def _unmoved(self) -> Mask:
+        """(n - 1,) mask of the intervals over which nothing is known to have moved."""
+        return np.zeros(len(self.stamps_s) - 1, dtype=bool)
 
     def _weights(self, before: IntArray, at_s: FloatArray) -> FloatArray:
         """(m, 4) Lagrange weights of the samples around some times; zero for missing ones."""
         joined, last = self._joined, len(self.stamps_s) - 1
         present = np.ones((len(at_s), 4), dtype=bool)
-        present[:, 0] = (before > 0) & joined[np.maximum(before - 1, 0)]
-        present[:, 3] = (before + 2 <= last) & joined[np.minimum(before + 1, last - 1)]
+        moved = ~self._unmoved[before]
+        present[:, 0] = moved & (before > 0) & joined[np.maximum(before - 1, 0)]
+        present[:, 3] = moved & (before + 2 <= last) & joined[np.minimum(before + 1, last - 1)]
         nodes_s = self.stamps_s[np.clip(before[:, None] + _NODES, 0, last)]
         counted = present[:, :, None] & present[:, None, :] & ~np.eye(4, dtype=bool)
         spans = np.where(counted, nodes_s[:, :, None] - nodes_s[:, None, :], 1.0)
@@ -86,9 +101,17 @@ class Trajectory(Samples):
         """Time over which velocities are averaged [s]."""
         return max(2.0 * self.step_s, _SPEED_S)
 
+    @cached_property
+    def _unmoved(self) -> Mask:
+        return is_repeated(invert(self.poses[:-1]) @ self.poses[1:])
+
+    def rests(self, at_s: FloatArray) -> Mask:
+        """(m,) mask of the times (m,) between samples of the same pose."""
+        return self._unmoved[self.before(at_s)]
+
     def at(self, at_s: FloatArray) -> FloatArray:
         """(m, 4, 4) poses at (m,) covered times [s]."""
-        before = self._before(at_s)
+        before = self.before(at_s)
         start, last = self.poses[before], len(self.poses) - 1
         twists = np.zeros((len(at_s), 6))
         for node, weight in zip(_NODES, self._weights(before, at_s).T, strict=True):
@@ -99,7 +122,7 @@ class Trajectory(Samples):
 
     def rotations(self, at_s: FloatArray) -> tuple[FloatArray, Mask]:
         """(..., 4) quaternions about linear between samples, and a mask of the covered times."""
-        before, covered = self._before(at_s), self.covers(at_s)
+        before, covered = self.before(at_s), self.covers(at_s)
         share = (
             np.where(covered, at_s - self.stamps_s[before], 0.0) / np.diff(self.stamps_s)[before]
         )
@@ -125,3 +148,12 @@ class Trajectory(Samples):
         middle = invert(self.at(at_s))
         twists = log(middle @ self.at(late)) - log(middle @ self.at(early))
         return np.asarray(twists / (late - early)[:, None])
+
+
+def is_repeated(moved: FloatArray) -> Mask:
+    """(m,) mask of motions (m, 4, 4) [m] within what arms repeat to."""
+    off_mm, off_deg = (
+        1e3 * np.linalg.norm(moved[:, :3, 3], axis=1),
+        np.rad2deg(rotation_angle(moved)),
+    )
+    return np.asarray((off_mm < REPEATABILITY[0]) & (off_deg < REPEATABILITY[1]))

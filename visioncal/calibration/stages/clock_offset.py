@@ -156,8 +156,8 @@ def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
     )
 
 
-def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
-    """Why the motion does not determine the offset, in words."""
+def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match], span_s: float) -> str:
+    """Why the motion of a recording of some length [s] does not determine the offset, in words."""
     if not matches:
         return "camera and robot are not seen to turn together for long enough"
     if matches[0].correlation < LEAST_CORRELATION:
@@ -171,6 +171,8 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
             "camera and robot turn alike, but move alike at no offset: are these the times of the "
             "images, and are the poses read as they are meant (visioncal convert --guess)?"
         )
+    if fits[0].sigma_s > span_s:
+        return "the motion says nothing of it, as it is too even, or too slow"
     if fits[0].sigma_s > LARGEST_SIGMA_S:
         return (
             "the motion is too even: it determines the offset to "

@@ -224,7 +224,8 @@ def _clocked(sweep: _Sweep, change: Finding | None = None) -> ClockedViews:
         doubts = (*offset_doubts(clock), *([] if change is None else [change]))
         clocked = _at_offset(sweep, clock, doubts, notes)
         return _with_shutter(sweep, clocked, fit) if is_rolling else clocked
-    return _undetermined(sweep, clock, why_undetermined(fits, matches))
+    span_s = float(np.ptp(flange.stamps_s))
+    return _undetermined(sweep, clock, why_undetermined(fits, matches, span_s))
 
 
 def _undetermined(sweep: _Sweep, clock: ClockResult, why: str) -> ClockedViews:

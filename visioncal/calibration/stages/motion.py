@@ -9,9 +9,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.trajectory import Samples, Trajectory
+from visioncal.estimation.trajectory import Samples, Trajectory, is_repeated
 from visioncal.robot import Robot
-from visioncal.robot.model import REPEATABILITY
 from visioncal.session import Session, View
 from visioncal.session.columns import POSE
 
@@ -46,7 +45,8 @@ class RobotMotion:
             rows = [dict(zip(POSE, row, strict=True)) for row in values.tolist()]
         if self.joints is not None:
             samples, q = self.joints
-            covered = samples.covers(at_s)
+            # An arm at rest has the same joint angles on both sides of a gap.
+            covered = samples.covers(at_s) | (samples.spans(at_s) & self.flange.rests(at_s))
             angles = samples.blend(q, at_s)
             for row, is_covered, values in zip(rows, covered, angles.tolist(), strict=True):
                 if is_covered:
@@ -98,14 +98,17 @@ def motion_of(session: Session, robot: Robot | None, name: str) -> RobotMotion:
 
 
 def is_standing_still(flange: Trajectory, at_s: FloatArray) -> Mask:
-    """Whether the flange was standing still for a while before and after each time."""
+    """Whether the flange was standing still for a while before and after each time.
+
+    Samples are compared, and not what lies between them, so that the stream's rate does not count.
+    """
     resting = flange.covers(at_s, _REST_S)
-    pose = flange.at(at_s[resting])
+    pose = flange.poses[flange.before(at_s[resting])]
     still = np.ones(len(pose), dtype=bool)
-    for offset_s in (-_REST_S, -0.5 * _REST_S, 0.5 * _REST_S, _REST_S):
-        moved = invert(pose) @ flange.at(at_s[resting] + offset_s)
-        still &= 1e3 * np.linalg.norm(moved[:, :3, 3], axis=1) < REPEATABILITY[0]
-        still &= np.rad2deg(rotation_angle(moved)) < REPEATABILITY[1]
+    for offset_s in (-_REST_S, -0.5 * _REST_S, 0.0, 0.5 * _REST_S, _REST_S):
+        # The sample on the far side.
+        other = flange.before(at_s[resting] + offset_s) + (offset_s >= 0.0)
+        still &= is_repeated(invert(pose) @ flange.poses[other])
     resting[resting] = still
     return resting
 

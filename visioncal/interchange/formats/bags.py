@@ -7,7 +7,8 @@ memory does not grow with the bag.
 """
 
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from bz2 import BZ2Decompressor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,6 +16,7 @@ from itertools import pairwise, takewhile
 from math import hypot
 from pathlib import Path
 from threading import Lock
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 from weakref import finalize
 
@@ -26,6 +28,7 @@ from visioncal.calibration.stages.motion import is_standing_still
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.extras import client_library
+from visioncal.core.files import MOST_IMAGE_BYTES
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray, Mount
@@ -51,7 +54,7 @@ _BASES = ("base_link", "base", "panda_link0", "fr3_link0", "link_base", "link_0"
 _TIPS = ("tool0", "flange", "panda_link8", "fr3_link8", "link_eef", "ee_link", "tcp")
 # Conversions of raw images to what an image file holds, by encoding.
 _COLOURS: Mapping[str, int | None] = {
-    **dict.fromkeys(("mono8", "8UC1", "mono16", "16UC1", "bgr8", "8UC3"), None),
+    **dict.fromkeys(("mono8", "8UC1", "mono16", "bgr8", "8UC3"), None),
     "rgb8": cv2.COLOR_RGB2BGR,
     "rgba8": cv2.COLOR_RGBA2BGR,
     "bgra8": cv2.COLOR_BGRA2BGR,
@@ -62,13 +65,15 @@ _COLOURS: Mapping[str, int | None] = {
     "yuv422": cv2.COLOR_YUV2BGR_UYVY,
     "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2,
 }
+# Encodings of depth, which is no picture.
+_DEPTHS = ("16UC1", "32FC1")
 
 
 @dataclass(frozen=True, eq=False)
 class _Images:
     """The images of one topic."""
 
-    is_compressed: bool
+    ending: str  # Of their files: that of a compressed image, which is one, or png.
     frame: str  # The camera's frame in TF.
     size: tuple[int, int]  # (width, height) [px].
     stamps_s: "array[float]" = field(default_factory=lambda: array("d"))
@@ -105,8 +110,8 @@ class _Contents:
 
 
 @dataclass(frozen=True, eq=False)
-class BagImages(ListedImages[tuple[str, bool, int]]):
-    """Images in a bag: topic, whether it is compressed, and time of receipt [ns], by path."""
+class BagImages(ListedImages[tuple[str, int]]):
+    """Images in a bag: topic and time of receipt [ns], by path."""
 
     source: Path
     _lock: Lock = field(default_factory=Lock, repr=False)  # A reader is of one thread at a time.
@@ -117,29 +122,54 @@ class BagImages(ListedImages[tuple[str, bool, int]]):
         finalize(self, stack.close)
         return stack.enter_context(_opened(self.source))
 
-    def load(self, place: tuple[str, bool, int]) -> bytes:
+    def load(self, place: tuple[str, int]) -> bytes:
         """Reads one image: as it was compressed, or as a PNG."""
-        topic, is_compressed, at_ns = place
+        topic, at_ns = place
         with self._lock, _bag_errors(self.source):
             reader = self._reader
             connections = [each for each in reader.connections if each.topic == topic]
             rows = reader.messages(connections=connections, start=at_ns, stop=at_ns + 1)
             connection, _, raw = next(iter(rows))
             message = reader.deserialize(raw, connection.msgtype)
-            return bytes(message.data) if is_compressed else _png(message, topic)
+            return _png(message, topic) if hasattr(message, "encoding") else bytes(message.data)
 
 
 @contextmanager
 def _opened(source: Path) -> Iterator[Reader]:
     """An open reader of a bag of any form; raises DataError."""
-    names = ("rosbags.highlevel", "rosbags.typesys")
-    highlevel, typesys = (client_library(name, "ros") for name in names)
+    libraries = (
+        *("rosbags.highlevel", "rosbags.typesys", "lz4.frame"),
+        *("rosbags.rosbag1.reader", "rosbags.rosbag2.reader", "rosbags.rosbag2.storage_mcap"),
+    )
+    highlevel, typesys, lz4, first, second, mcap = (
+        client_library(name, "ros") for name in libraries
+    )
     paths = sorted(source.glob("*.bag")) if source.is_dir() else [source]
+    # rosbags sets no limit: some letters may stand for more than there is memory.
+    zstd: Any = vars(mcap)["zstd"]
+    of = {"bz2": BZ2Decompressor, "lz4": lz4.LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
+    for table in (first.decompressors, mcap.DECOMPRESSORS):
+        table |= {name: _limited(of[name]) for name in of if name in table}
+    vars(second)["zstd"] = SimpleNamespace(open=zstd.open, decompress=_limited(of["zstd"]))
     with _bag_errors(source):
         # Bags of old versions of ROS 2 do not hold the definitions of their messages.
         types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         with highlevel.AnyReader(paths or [source], default_typestore=types) as reader:
             yield reader
+
+
+def _limited(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
+    """Decompresses to as much as the largest image at most; raises DataError."""
+
+    def decompress(data: bytes, *_: int) -> bytes:
+        stream = decompressor()
+        found: bytes = stream.decompress(data, max_length=MOST_IMAGE_BYTES)
+        if not stream.eof:
+            words = f"A part of the bag is damaged, or over {MOST_IMAGE_BYTES / 1e6:g} MB"
+            raise DataError(f"{words}, decompressed.", next_step="Record it in smaller chunks.")
+        return found
+
+    return decompress
 
 
 @contextmanager
@@ -167,7 +197,7 @@ def _png(message: Message, topic: str) -> bytes:
             culprits=[topic],
             next_step="Record the topic of its rectified or compressed images.",
         )
-    is_wide, data = message.encoding in ("mono16", "16UC1"), bytes(message.data)
+    is_wide, data = message.encoding == "mono16", bytes(message.data)
     if not 0 < message.width <= message.step or len(data) != message.height * message.step:
         raise DataError(
             f"topic {topic}: an image of {message.width} x {message.height} px with rows of "
@@ -204,7 +234,7 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     stream, words, tip, robot = _motion(contents, requested)
     at_s, poses = stream.stamps_s, stream.poses.poses()
     flange = Trajectory(at_s[np.isfinite(poses[:, 0, 0])], poses[np.isfinite(poses[:, 0, 0])])
-    rows, places = list[tuple[str, float, str]](), dict[str, tuple[str, bool, int]]()
+    rows, places = list[tuple[str, float, str]](), dict[str, tuple[str, int]]()
     how = "--robot-key BASE,TIP or a topic names another."
     notes = [f"The robot's motion: {words}. {how}{_refused(contents)}"]
     for topic, camera in cameras.items():
@@ -212,9 +242,8 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
         chosen, how = _chosen(np.array(images.stamps_s), flange)
         notes.append(f"{topic}: {how}")
         for at in chosen.tolist():
-            ending = "jpg" if images.is_compressed else "png"
-            path = f"images/{camera}{'_' if camera else ''}{at:06d}.{ending}"
-            places[path] = topic, images.is_compressed, images.received_ns[at]
+            path = f"images/{camera}{'_' if camera else ''}{at:06d}.{images.ending}"
+            places[path] = topic, images.received_ns[at]
             rows.append((camera, images.stamps_s[at], path))
     rows.sort(key=lambda row: row[1])
     lenses = {camera: _lens(contents, topic, notes) for topic, camera in cameras.items()}
@@ -273,15 +302,18 @@ def _seven(
 def _add_image(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
     images = contents.images.get(topic)
     if images is None:
-        is_compressed = not hasattr(message, "encoding")
-        # Depth is no picture.
-        if "depth" in topic.lower() or getattr(message, "encoding", "") == "32FC1":
+        is_raw = hasattr(message, "encoding")
+        if "depth" in topic.lower() or (
+            (message.encoding if is_raw else message.format).startswith(_DEPTHS)
+        ):
             return
-        size = image_size(bytes(message.data)) if is_compressed else (message.width, message.height)
+        data = b"" if is_raw else bytes(message.data)
+        size = (message.width, message.height) if is_raw else image_size(data)
         if size is None:
             return
+        ending = "jpg" if data[:2] == b"\xff\xd8" else "png"
         frame = message.header.frame_id.strip("/")
-        images = contents.images[topic] = _Images(is_compressed, frame, size)
+        images = contents.images[topic] = _Images(ending, frame, size)
     images.stamps_s.append(_stamp_s(message, received_ns))
     images.received_ns.append(received_ns)
 
@@ -352,7 +384,7 @@ def _cameras(contents: _Contents, requested: ImportOptions) -> dict[str, str]:
                 raise _no_topic(name, topics, "--image-key")
         topics = asked
     # Of one camera, raw images come before compressed ones, and unrectified before rectified ones.
-    topics.sort(key=lambda name: (contents.images[name].is_compressed, "rect" in name))
+    topics.sort(key=lambda name: ("compressed" in name, "rect" in name))
     first = {_namespace(topic): topic for topic in reversed(topics)}
     if len(first) == 1:
         return dict.fromkeys(first.values(), "")
@@ -494,37 +526,30 @@ def _between(contents: _Contents, base: str, tip: str) -> tuple[FloatArray, Floa
         if name not in known:
             raise _no_topic(name, sorted(known), "--robot-key BASE,TIP")
     up, down = contents.chain(base), contents.chain(tip)
-    common = next((name for name in up if name in down), None)
-    edges = [
-        (parent, child, is_up)
-        for chain, is_up in ((up, True), (down, False))
-        for child, parent in pairwise(chain)
-        if common is not None and common not in chain[: chain.index(child) + 1]
-    ]
-    moving = {(parent, child) for parent, child, _ in edges} & contents.moving.keys()
-    if common is None or not moving:
+    common = next((name for name in up if name in down), "")
+    sides = [chain[: chain.index(common) + 1] if common else [] for chain in (up, down)]
+    links = {(parent, child) for side in sides for child, parent in pairwise(side)}
+    moving = links & contents.moving.keys()
+    if not moving:
         raise DataError(
             f"TF does not move {tip} in {base}{'' if common else ': nothing joins them'}.",
             culprits=[base, tip],
             next_step="Name the base and the tip of the arm: --robot-key base_link,tool0",
         )
-    tracks = {edge: Trajectory(*_rows(contents.moving[edge])) for edge in moving}
+    tracks = {link: Trajectory(*_rows(contents.moving[link])) for link in moving}
     # Timestamps of the least frequent transform; the others are interpolated.
     at_s = min((track.stamps_s for track in tracks.values()), key=len)
     at_s = at_s[np.all([track.covers(at_s) for track in tracks.values()], axis=0)]
-
-    def poses(parent: str, child: str) -> FloatArray:
-        if (parent, child) in tracks:
-            return tracks[parent, child].at(at_s)
-        return _rows(contents.still[parent, child])[1]
-
-    base_from_common, common_from_tip = np.eye(4)[None], np.eye(4)[None]
-    for parent, child, is_up in edges:
-        if is_up:
-            base_from_common = base_from_common @ invert(poses(parent, child))
-        else:
-            common_from_tip = poses(parent, child) @ common_from_tip
-    return at_s, np.broadcast_to(base_from_common @ common_from_tip, (len(at_s), 4, 4))
+    from_common = []
+    for side in sides:
+        pose = np.eye(4)[None]
+        for child, parent in pairwise(side):
+            track = tracks.get((parent, child))
+            rows = contents.still.get((parent, child), array("d"))
+            pose = (_rows(rows)[1] if track is None else track.at(at_s)) @ pose
+        from_common.append(pose)
+    poses = invert(from_common[0]) @ from_common[1]
+    return at_s, np.broadcast_to(poses, (len(at_s), 4, 4))
 
 
 def _joint_rows(

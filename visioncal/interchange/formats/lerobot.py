@@ -37,8 +37,8 @@ _STATE, _IMAGES = "observation.state", "observation.image"
 _ARMS = {"so100": "so101", "so-100": "so101", "franka": "panda"}
 # Names of what is on the flange, and of cameras there.
 _GRIPPERS, _WRISTS = ("gripper", "finger", "hand"), ("wrist", "hand", "gripper", "eef")
-# Frames a second of no camera.
-_MOST_FPS = 1e5
+# Frames a second of no camera; size of all images that are held.
+_MOST_FPS, _MOST_BYTES = 1e5, 4 * MOST_IMAGE_BYTES
 # A stop: joints stay within the first for the time before and after [rad, s]; those of another
 # stop differ by more than the second.
 _STILL_RAD, _STILL_S, _MOVED_RAD = float(np.deg2rad(0.6)), 0.3, float(np.deg2rad(3.0))
@@ -70,25 +70,36 @@ def _info(path: Path) -> Path:
 
 
 def _parquet(path: Path, columns: list[str], rows: IntArray | None = None) -> dict[str, list[Any]]:
-    """The columns of a parquet file, of some rows or of all."""
+    """The columns of a parquet file: images of some rows, or all numbers.
+
+    Some letters of a file may stand for any number of values, and of large ones.
+    """
     parquet = client_library("pyarrow.parquet", "lerobot")
     try:
         facts = parquet.read_metadata(path)
         groups = map(facts.row_group, range(facts.num_row_groups))
         parts = (group.column(at) for group in groups for at in range(facts.num_columns))
-        names = tuple(columns)
-        values = sum(part.num_values for part in parts if part.path_in_schema.startswith(names))
-        # Some letters of a file may stand for any number of values.
-        if values > (most := 20 * MAX_VALUES):
+        found = [part for part in parts if part.path_in_schema.startswith(tuple(columns))]
+        if sum(part.num_values for part in found) > (most := 20 * MAX_VALUES):
             raise too_many(str(path), most)
-        table = parquet.read_table(path, columns=columns)
-        if rows is not None:
-            table = table.take(rows)
-        columns_read: dict[str, list[Any]] = table.to_pydict()
+        texts = {part.path_in_schema for part in found if "BYTE_ARRAY" in part.physical_type}
+        if rows is None and texts:
+            raise _refusal(f"{path}: {some_of(sorted(texts))} has texts, not numbers", str(path))
+        # Each value is held once, however often it is repeated.
+        table = parquet.read_table(path, columns=columns, read_dictionary=sorted(texts))
+        if rows is None:
+            return dict(table.to_pydict())
+        cells, size = list[Any](), 0
+        for cell in table.take(rows)[columns[0]]:
+            cells.append(cell.as_py())
+            size += len(dict(cells[-1] or {}).get("bytes") or b"")
+            if size > _MOST_BYTES:
+                words = f"{path}: {len(cells)} images are over {_MOST_BYTES / 1e6:g} MB"
+                raise _refusal(words, str(path))
+        return {columns[0]: cells}
     # Errors of pyarrow are among these.
     except (OSError, ValueError, LookupError, RuntimeError, TypeError) as error:
         raise _refusal(f"{path} cannot be read as parquet: {error}", str(path)) from error
-    return columns_read
 
 
 def _refusal(words: str, culprit: str) -> DataError:
