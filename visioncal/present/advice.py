@@ -82,13 +82,6 @@ def named(view: ViewResult) -> str:
     return f"{view.view} ({of})" if of else str(view.view)
 
 
-def mark_of(view: ViewResult) -> str:
-    """Status of a view: `used`, `left-out` for contradicting others, or `rejected`."""
-    if view.used:
-        return "used"
-    return "left-out" if contradicts(view) else "rejected"
-
-
 def _outlying(views: Sequence[ViewResult]) -> dict[int, str]:
     """Words for the used views whose residual exceeds a multiple of the median, by view."""
     words: dict[int, list[str]] = {}

@@ -31,25 +31,19 @@ def coverage_charts(calibration: Calibration, evidence: Sequence[ViewEvidence]) 
         return []
     used = {view.view for view in calibration.views if view.used}
     corners = {view.view: view.corners.px for view in evidence if view.corners is not None}
-    charts = [
-        corners_chart(calibration.camera.camera.resolution, corners)
-        if corners and calibration.camera is not None
-        else None,
-        None if calibration.mount == "instrument" else directions_chart(evidence),
-        rotation_axes_chart([view for view in evidence if view.view in used]),
-    ]
+    charts: list[PointChart | None] = []
+    if corners and calibration.camera is not None:
+        width, height = calibration.camera.camera.resolution
+        # Pixel centres are at integers, so the image begins half a pixel before the first one.
+        x = np.linspace(0, width, _CELLS[0] + 1) - 0.5
+        y = np.linspace(0, height, _CELLS[1] + 1) - 0.5
+        lines = [np.array([[value, y[0]], [value, y[-1]]]) for value in x]
+        lines += [np.array([[x[0], value], [x[-1], value]]) for value in y]
+        charts.append(PointChart("image", corners, lines, []))
+    if calibration.mount != "instrument":
+        charts.append(directions_chart(evidence))
+    charts.append(rotation_axes_chart([view for view in evidence if view.view in used]))
     return [chart for chart in charts if chart is not None]
-
-
-def corners_chart(resolution: tuple[int, int], points: Mapping[int, FloatArray]) -> PointChart:
-    """Corners (k, 2) by view in one image [px]."""
-    width, height = resolution
-    # Pixel centres are at integers, so the image begins half a pixel before the first one.
-    x = np.linspace(0, width, _CELLS[0] + 1) - 0.5
-    y = np.linspace(0, height, _CELLS[1] + 1) - 0.5
-    lines = [np.array([[value, y[0]], [value, y[-1]]]) for value in x]
-    lines += [np.array([[x[0], value], [x[-1], value]]) for value in y]
-    return PointChart("image", points, lines, [])
 
 
 def directions_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:

@@ -1,6 +1,7 @@
 """Facts and tables about a result, for pages and recordings."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
@@ -8,10 +9,10 @@ import numpy as np
 from visioncal.core.number_format import decimals_for, matched, significant
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Target
-from visioncal.present.seen_pairs import pairs
 from visioncal.present.tables import Fact, Table, TableRow
-from visioncal.results import Calibration, CellResult, Rms
+from visioncal.results import Calibration, CellResult, Rms, ViewResult
 from visioncal.results.sections import BoardResult, UncertaintyResult
+from visioncal.results.views import left_out_rms, rms_of
 
 PLUS_MINUS, DEGREE = "\N{PLUS-MINUS SIGN}", "\N{DEGREE SIGN}"
 # Suffixes of names on disk, and the units shown.
@@ -117,6 +118,33 @@ def residual_table(calibration: Calibration) -> Table:
 
 def _rms_cells(rms: Rms) -> Iterator[str]:
     return map(significant, (rms.mm, rms.deg, rms.px))
+
+
+@dataclass(frozen=True)
+class SeenPair:
+    """All observations of one frame by another."""
+
+    seer: str  # Observing frame.
+    seen: str  # Observed frame.
+    used: int  # Number of observations that the fit used.
+    left_out: int  # Number of observations that it did not use.
+    rms: Rms | None  # Residuals of the used ones; None if there are none.
+    # Their residuals by fits without their stops (cross-validation); None where unknown.
+    unseen: Rms | None
+
+
+def pairs(views: Iterable[ViewResult]) -> tuple[SeenPair, ...]:
+    """Observations grouped by observing and observed frame, with their residuals."""
+    rows: dict[tuple[str, str], list[ViewResult]] = {}
+    for view in views:
+        rows.setdefault((view.seer, view.seen), []).append(view)
+    summaries = []
+    for (seer, seen), group in rows.items():
+        used = sum(view.used for view in group)
+        unseen = any(view.used and view.left_out_mm is not None for view in group)
+        rms = (rms_of(group) if used else None, left_out_rms(group) if unseen else None)
+        summaries.append(SeenPair(seer, seen, used, len(group) - used, *rms))
+    return tuple(summaries)
 
 
 def pair_table(calibration: Calibration) -> Table | None:

@@ -44,13 +44,14 @@ class Overlay:
         used = frozenset(view.view for view in views if view.used)
         shown = [seen_view for view, seen_view in evidence.items() if view in used]
         active = any(view.corners is not None for view in evidence.values())
-        return cls(
-            magnification(shown, width),
-            used,
-            float(width),
-            image_frames(session, calibration),
-            active,
-        )
+        # Image frame of each view, by row.
+        frames = dict.fromkeys(range(len(session.views)), paths.IMAGE_FRAME)
+        if calibration is not None and calibration.cell is not None:
+            seers = {seen.view.number: seen.seer for seen in session.observations}
+            by_row = {row: seers.get(view.number, "") for row, view in enumerate(session.views)}
+            lenses = calibration.cell.lenses
+            frames = {row: paths.image_frame(at) for row, at in by_row.items() if at in lenses}
+        return cls(magnification(shown, width), used, float(width), frames, active)
 
     def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
         """Logs corners and residuals of all views, in the order of the session."""
@@ -97,16 +98,6 @@ class Overlay:
         send_rows(
             stream, entity, range(len(parts)), columns.partition([len(part) for part in parts])
         )
-
-
-def image_frames(session: Session, calibration: Calibration | None) -> dict[int, str]:
-    """Image frame of each view, by row."""
-    cell = None if calibration is None else calibration.cell
-    if cell is None:
-        return dict.fromkeys(range(len(session.views)), paths.IMAGE_FRAME)
-    seers = {observation.view.number: observation.seer for observation in session.observations}
-    seen_by = {row: seers.get(view.number, "") for row, view in enumerate(session.views)}
-    return {row: paths.image_frame(name) for row, name in seen_by.items() if name in cell.lenses}
 
 
 def log_image_frames(stream: rr.RecordingStream, entity: str, frames: Mapping[int, str]) -> None:

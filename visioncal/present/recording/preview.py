@@ -67,17 +67,10 @@ class Preview(Seen):
 
 
 def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None) -> None:
-    """Writes the preview of a plan as a recording.
+    """Writes the preview of a plan as a recording, whole or not at all; raises DataError.
 
-    It has two timelines: one step per stop, and the arm's path in small steps.
-
-    Args:
-        path: The `.rrd` to write; it appears whole or not at all.
-        preview: The plan.
-        blueprint: Viewer layout of the recording.
-
-    Raises:
-        DataError: The file cannot be written.
+    It has two timelines: one step per stop, and the arm's path in small steps. The blueprint is the
+    viewer's layout of it.
     """
     path_q, reached = _path(preview)
     states = states_of(preview.robot, path_q)
@@ -170,16 +163,7 @@ class MotionPreview:
 def write_motion_preview(
     path: Path, preview: MotionPreview, blueprint: BlueprintLike | None
 ) -> None:
-    """Writes the preview of motions as a recording, on a timeline of seconds.
-
-    Args:
-        path: The `.rrd` to write; it appears whole or not at all.
-        preview: The motions.
-        blueprint: Viewer layout of the recording.
-
-    Raises:
-        DataError: The file cannot be written.
-    """
+    """Writes the preview of motions on a timeline of seconds; see `write_preview`."""
     places_m, robot, start_s = preview.places_m, preview.robot, 0.0
     size_m = float(np.median(np.linalg.norm(places_m[1:], axis=1)))
     with replacing_file(path) as aside, Recorder(aside) as recorder:

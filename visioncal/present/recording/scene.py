@@ -6,15 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
+from visioncal.core.number_format import significant
 from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.present import result_parts
 from visioncal.present.cell_poses import CellPoses, RobotState
+from visioncal.present.facts import DEGREE, pairs
 from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.recorder import Row, send_rows
 from visioncal.present.result_parts import FrameHierarchy
-from visioncal.present.seen_pairs import pairs, sigma_words
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
@@ -144,10 +145,21 @@ class Scene(CellPoses):
         """Draws the robots in some views, each at its place on a timeline."""
         for flange, name in self.frames.robots.items():
             states = [self.states[flange].get(view) for view in rows]
-            poses = [None if state is None else state.pose for state in states]
-            _log_poses(
-                stream, self.frames.parents[flange], flange, poses, [*rows.values()], timeline
-            )
+            placed_at = zip(rows.values(), states, strict=True)
+            poses = {row: state.pose for row, state in placed_at if state is not None}
+            # An unknown pose clears that of the view before.
+            for row in (row for row in rows.values() if row not in poses):
+                stream.set_time(paths.TIMELINE, sequence=int(row))
+                stream.log(paths.entity_of(flange), rr.Clear(recursive=False))
+            if poses:
+                matrices, count = np.array(list(poses.values())), len(poses)
+                columns = rr.Transform3D.columns(
+                    translation=matrices[:, :3, 3],
+                    mat3x3=matrices[:, :3, :3],
+                    parent_frame=[self.frames.parents[flange]] * count,
+                    child_frame=[flange] * count,
+                )
+                send_rows(stream, paths.entity_of(flange), poses, columns, timeline)
             robot, entity = self.models.get(name), paths.named(paths.ROBOT, name)
             arms = [None if state is None else state.link_frames(robot) for state in states]
             log_arms(stream, arms, rows.values(), entity, timeline)
@@ -168,7 +180,14 @@ class Scene(CellPoses):
         nodes = [paths.CELL_FRAME, *(frame for frame in tree.last if frame != paths.CELL_FRAME)]
         captions = {flange: f"robot {robot}" for flange, robot in tree.flanges.items()}
         captions[paths.CELL_FRAME] = f"the frame of {tree.reference}"
-        labels = [f"{node}\n{captions.get(node) or sigma_words(tree, node)}" for node in nodes]
+        labels = []
+        for node in nodes:
+            words = captions.get(node, "the reference")
+            if node not in captions and node != tree.reference:
+                edge = tree.edge_of(node)
+                turned = f", {significant(edge.sigma_deg)}{DEGREE}" if edge.oriented else ""
+                words = f"{significant(edge.sigma_mm)} mm{turned}"
+            labels.append(f"{node}\n{words}")
         seen = [(pair.seer, pair.seen) for pair in pairs(calibration.views) if pair.used]
         hangs = [(tree.parents[node], node) for node in nodes if node != paths.CELL_FRAME]
         colour = [colours.LINK if node in captions else colours.USED for node in nodes]
@@ -209,31 +228,6 @@ class Scene(CellPoses):
         _send_strips(
             stream, entity, strips, [*strips.values()], more=rr.LineStrips3D.columns(colors=colour)
         )
-
-
-def _log_poses(
-    stream: rr.RecordingStream,
-    parent: str,
-    frame: str,
-    poses: Sequence[FloatArray | None],
-    rows: Sequence[Row],
-    timeline: str,
-) -> None:
-    """Places a frame on its parent in each view; an unknown pose clears that of the view before."""
-    entity = paths.entity_of(frame)
-    known = {row: pose for row, pose in zip(rows, poses, strict=True) if pose is not None}
-    for row in (row for row in rows if row not in known):
-        stream.set_time(paths.TIMELINE, sequence=int(row))
-        stream.log(entity, rr.Clear(recursive=False))
-    if known:
-        matrices, count = np.array(list(known.values())), len(known)
-        columns = rr.Transform3D.columns(
-            translation=matrices[:, :3, 3],
-            mat3x3=matrices[:, :3, :3],
-            parent_frame=[parent] * count,
-            child_frame=[frame] * count,
-        )
-        send_rows(stream, entity, known, columns, timeline)
 
 
 def _send_strips(

@@ -67,10 +67,26 @@ def write_recording(
             "not have.",
             culprits=culprits,
         )
+    rows = {view.number: row for row, view in enumerate(session.views)}
+    seen = [seen_of.get(view, ViewEvidence(view)) for view in rows]
     with recording(path, session, blueprint, images, searches or {}) as recorder:
-        _draw(recorder.stream, session, calibration, seen_of)
+        stream, scene = recorder.stream, Scene.of(session, calibration, seen_of)
+        scene.log_static(stream)
+        scene.log_stops(stream)
+        scene.log_views(stream, rows)
+        overlay = Overlay.of(session, calibration, seen_of)
+        overlay.log_views(stream, seen)
+        if calibration is not None:
+            if calibration.cell is not None:
+                scene.log_network(stream, calibration)
+                log_image_frames(stream, paths.IMAGE, overlay.frames)
+            scene.log_seen_targets(stream, session, calibration, seen)
+            notes.log_static(stream, calibration)
+            shown = {rows[view.view]: view for view in calibration.views if view.view in rows}
+            unposed = {row: scene.unposed(view) for view, row in rows.items()}
+            notes.log_views(stream, shown, dict(enumerate(session.views)), unposed)
         text = "" if calibration is None else calibration.text
-        codec.log_record(recorder.stream, paths.CALIBRATION, codec.result_record(text, evidence))
+        codec.log_record(stream, paths.CALIBRATION, codec.result_record(text, evidence))
 
 
 @contextmanager
@@ -144,30 +160,3 @@ def _log_image(
         media_type = _MEDIA_TYPES.get(PurePosixPath(name).suffix.lower())
         stream.log(paths.IMAGE, rr.EncodedImage(contents=shown, media_type=media_type))
     return digest
-
-
-def _draw(
-    stream: rr.RecordingStream,
-    session: Session,
-    calibration: Calibration | None,
-    evidence: Mapping[int, ViewEvidence],
-) -> None:
-    """Draws a session and its result."""
-    rows = {view.number: row for row, view in enumerate(session.views)}
-    seen = [evidence.get(view, ViewEvidence(view)) for view in rows]
-    scene = Scene.of(session, calibration, evidence)
-    scene.log_static(stream)
-    scene.log_stops(stream)
-    scene.log_views(stream, rows)
-    overlay = Overlay.of(session, calibration, evidence)
-    overlay.log_views(stream, seen)
-    if calibration is None:
-        return
-    if calibration.cell is not None:
-        scene.log_network(stream, calibration)
-        log_image_frames(stream, paths.IMAGE, overlay.frames)
-    scene.log_seen_targets(stream, session, calibration, seen)
-    notes.log_static(stream, calibration)
-    shown = {rows[view.view]: view for view in calibration.views if view.view in rows}
-    unposed = {row: scene.unposed(view) for view, row in rows.items()}
-    notes.log_views(stream, shown, dict(enumerate(session.views)), unposed)

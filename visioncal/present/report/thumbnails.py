@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from visioncal.core.types import FloatArray, Image
+from visioncal.core.types import Image
 from visioncal.results.evidence import ViewEvidence
 
 
@@ -48,7 +48,12 @@ def thumbnail(
         height, width = pixels.shape[:2]
         return Thumbnail(view, caption, _jpeg_uri(pixels), -0.5, -0.5, width, height)
     px, predicted_px = corners.px, evidence.predicted_px
-    left, top, right, bottom = _around(px, pixels.shape[1], pixels.shape[0])
+    # The crop has the image's proportions.
+    full, low, high = np.array(pixels.shape[1::-1]), px.min(axis=0), px.max(axis=0)
+    share = min(1.0, 1.25 * float(np.max((high - low) / full)) + 0.05)
+    size = np.maximum(np.round(share * full), 1.0)
+    start = np.clip(np.round(0.5 * (low + high - size)), 0.0, full - size)
+    left, top, right, bottom = np.concatenate([start, start + size]).astype(int).tolist()
     tips = np.zeros((0, 2)) if predicted_px is None else px + magnify * (predicted_px - px)
     arrows = np.hstack([px[: len(tips)], tips])
     corner_rows, arrow_rows = (tuple(map(tuple, xy.round(2).tolist())) for xy in (px, arrows))
@@ -64,16 +69,6 @@ def thumbnail(
         corner_rows,
         arrow_rows,
     )
-
-
-def _around(px: FloatArray, width: int, height: int) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of a crop around the corners, with the image's proportions [px]."""
-    low, high = px.min(axis=0), px.max(axis=0)
-    share = min(1.0, 1.25 * float(np.max((high - low) / (width, height))) + 0.05)
-    size = np.maximum(np.round(share * np.array([width, height])), 1.0)
-    start = np.clip(np.round(0.5 * (low + high - size)), 0.0, (width, height) - size)
-    left, top = (int(value) for value in start)
-    return left, top, left + int(size[0]), top + int(size[1])
 
 
 def _jpeg_uri(image: Image) -> str:
