@@ -97,12 +97,6 @@ class Entry:
             return set().union(*(entry.keys for entry in entries(forms[0] if forms else inner)))
         return set() if REST in self.marks else {self.key}
 
-    def is_absent(self, value: object) -> bool:
-        """Whether a value is omitted."""
-        is_empty = isinstance(value, tuple | Mapping) or DROPPED in self.marks
-        can_be = not self.required and KEPT not in self.marks
-        return value is None or (can_be and is_empty and not value)
-
 
 @cache
 def entries(cls: type) -> tuple[Entry, ...]:
@@ -130,7 +124,9 @@ def write(cls: type, value: object) -> dict[str, Any]:
     document: dict[str, Any] = {}
     for entry in entries(cls):
         field_value = getattr(value, entry.name)
-        if not entry.is_absent(field_value):
+        may_be_empty = isinstance(field_value, tuple | Mapping) or DROPPED in entry.marks
+        can_be_absent = may_be_empty and not entry.required and KEPT not in entry.marks
+        if field_value is not None and not (can_be_absent and not field_value):
             written = _written(entry.kind, field_value)
             is_inline = INLINE in entry.marks or REST in entry.marks
             document |= written if is_inline else {entry.key: written}

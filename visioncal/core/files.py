@@ -566,8 +566,14 @@ def write_generation(
         with temporary(folder, is_folder=True) as (aside, is_locked):
             new = aside / _NEW
             new.mkdir()
-            with _final_paths_in_errors(new, folder):
+            try:
                 write(new)
+            except DataError as error:
+                message, *culprits = (
+                    name.replace(str(new), str(folder)) for name in (error.message, *error.culprits)
+                )
+                step = error.next_step
+                raise DataError(message, culprits=culprits, next_step=step) from error.__cause__
             written = [name for name in names if (new / name).exists()]
             if is_locked:
                 with _switch(folder, aside) as switch:
@@ -583,18 +589,6 @@ def write_generation(
             else "Choose another folder, or one that may be written.",
         ) from error
     return tuple(folder / name for name in reversed(written))
-
-
-@contextmanager
-def _final_paths_in_errors(new: Path, folder: Path) -> Iterator[None]:
-    """Replaces temporary paths in errors by the final ones."""
-    try:
-        yield
-    except DataError as error:
-        message, *culprits = (
-            name.replace(str(new), str(folder)) for name in (error.message, *error.culprits)
-        )
-        raise DataError(message, culprits=culprits, next_step=error.next_step) from error.__cause__
 
 
 @contextmanager
