@@ -1,23 +1,27 @@
 """Targets: their files, corners and turns; AprilGrids, circles and dots as by their makers."""
 
 import re
+import tomllib
 from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import tomli_w
 from support.boards import any_page, aprilgrid, charuco, checkerboard, circles, printed
 from support.commands import visioncal
+from support.following import follow
 from support.marks import slow
 from support.refusals import raised
 from support.rendered import Shot, photograph
 
-from visioncal.calibration.run import run
+from visioncal.calibration.run import calibrate, run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.interchange.formats.intrinsics import read_target_description
 from visioncal.present.recording.board import picture
+from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
@@ -379,6 +383,43 @@ def test_a_cell_is_calibrated_with_it(tmp_path, board, mount):
         errors.append(error @ np.linalg.solve(result.joint_covariance, error))
     # Twelve values, to one case in a thousand.
     assert min(errors) < 32.9
+
+
+def test_circles_of_another_diameter_are_named_until_it_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    true = BOARDS["circles"]
+    cell = simulate(CellOptions(target=true, views=12, mount="eye-to-hand", seed=5))
+    write_session(cell, tmp_path / "s")
+    sound = calibrate(tmp_path / "s")
+    assert not any(finding.kind == "print_size" for finding in sound.verdict.findings)
+    board = tmp_path / "s" / "target.toml"
+    described = target_document(true) | {"kind": "circles"}
+    board.write_text(tomli_w.dumps(described | {"diameter_m": 15 / 16 * true.diameter_m}))
+    toml = tmp_path / "s" / "session.toml"
+    toml.write_text(toml.read_text().replace(f'"{true.name}"', '"target.toml"'))
+    followed = follow("calibrate", "s", "-o", "out")
+    first = followed.runs[0].out
+    assert "mm as stated. Their centres were fitted so; write diameter_m = 0.0" in first
+    assert "blurred" not in first
+    assert "mm as stated" not in followed.last.out
+    written = tomllib.loads(board.read_text())["diameter_m"]
+    # Pixels take a share of their edges.
+    assert written == pytest.approx(true.diameter_m, rel=0.02)
+    # It is a remark: the result is as good, and a recording says the same.
+    found = Calibration.load(tmp_path / "out")
+    assert found.verdict.status == sound.verdict.status
+    assert sum(view.used for view in found.views) == sum(view.used for view in sound.views)
+
+
+def test_a_public_set_of_circles_is_sharp(real_data):
+    result = calibrate(real_data / "field/sets/ji1024")
+    assert [view.used for view in result.views].count(True) == len(result.views) == 16
+    words = " ".join(finding.words for finding in result.verdict.findings)
+    assert "blurred" not in words
+    assert "another one" not in words
+    # Of 20 mm between rows; by eye 16 to 17.5 mm.
+    (stated,) = re.findall(r"write diameter_m = ([\d.]+) in", words)
+    assert 0.016 < float(stated) < 0.0175
 
 
 @pytest.fixture(scope="module")

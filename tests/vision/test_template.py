@@ -5,20 +5,22 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from support.boards import charuco, checkerboard
+from support.boards import charuco, checkerboard, circles
 from support.marks import slow
 from support.rendered import Shot, photograph
 
+from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.types import Target
 from visioncal.simulation import BOARDS, CellOptions, simulate
 from visioncal.simulation.optics import CAMERAS, project
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target, kind_of
 from visioncal.vision.boards.maps import OpticalAxis, maps_about
-from visioncal.vision.boards.template import refine_tags
+from visioncal.vision.boards.template import Refined, refine_tags
 from visioncal.vision.dense import find_densely
 
 # Columns and rows differ by an odd number: the checkerboard has one numbering.
 CHECKERBOARD, CHARUCO = checkerboard(6, 5), charuco(6, 5)
+CIRCLES = circles(4, 7, asymmetric=True, diameter_m=0.014)
 SMALL = Shot(square_px=20, noise=2)
 
 
@@ -111,6 +113,38 @@ def test_a_corner_at_the_edge_of_the_image_is_exact_or_left_to_the_detector():
         assert fitted.sum() >= 29
         assert fitted.all() == (inside > 4)
         assert np.abs(refined.px + np.array([left, 0]) - truth)[fitted].max() < 0.02
+
+
+@pytest.mark.parametrize("stated", [0.75, 0.94, 1.25])
+@pytest.mark.parametrize("square_px", [20, 80])
+def test_circles_of_another_diameter_are_as_exact_and_no_blur(square_px, stated):
+    image, truth = photograph(CIRCLES, replace(SMALL, square_px=square_px), 1)
+    target = replace(CIRCLES, diameter_m=stated * CIRCLES.diameter_m)
+    found, sound = (find_target(image, each) for each in (target, CIRCLES))
+    assert rms(found.px - truth) < 1.1 * rms(sound.px - truth) < 0.02
+    assert found.blur_px == pytest.approx(sound.blur_px, abs=0.05)
+    # Pixels take a share of the edge of circles of 14 px.
+    assert found.drawn_m == pytest.approx(CIRCLES.diameter_m, rel=0.015)
+
+
+@pytest.mark.parametrize("stated", [0.85, 1.0, 1.15])
+def test_blurred_circles_are_blurred_whatever_their_stated_diameter(stated):
+    image, _ = photograph(CIRCLES, replace(SMALL, square_px=60), 1)
+    target = replace(CIRCLES, diameter_m=stated * CIRCLES.diameter_m)
+    assert find_target(cv2.GaussianBlur(image, (0, 0), 6.0), target).blur_px > MAX_BLUR_PX
+    # A motion of 21 px has the standard deviation of a uniform distribution, in one direction.
+    smeared = cv2.filter2D(image, -1, np.full((1, 21), 1 / 21, np.float32))
+    assert find_target(smeared, target).blur_px == pytest.approx(21 / 12**0.5, rel=0.2)
+
+
+def test_a_misfit_of_the_template_is_no_blur_where_edges_are_sharp(monkeypatch):
+    image, truth = photograph(CIRCLES, replace(SMALL, square_px=60), 1)
+    board = type(kind_of(CIRCLES))
+    wide = Refined(truth, np.full(len(truth), 0.1), np.full(2, 9.0))
+    monkeypatch.setattr(board, "refine", lambda *_: wide)
+    assert find_target(image, CIRCLES).blur_px < 2.0
+    blurred = cv2.GaussianBlur(image, (0, 0), 6.0)
+    assert find_target(blurred, CIRCLES).blur_px > MAX_BLUR_PX
 
 
 def test_too_few_corners_stay_where_they_are():

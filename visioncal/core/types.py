@@ -141,6 +141,7 @@ class Corners:
     # Stated standard deviation of a typical corner's coordinate [px]; None if it is to be
     # estimated.
     stated_px: float | None = None
+    drawn_m: float | None = None  # Diameter of circles in the image, by their distances [m].
 
     def take(self, rows: IntArray | Mask) -> "Corners":
         """The corners of (m,) rows or of an (n,) mask."""

@@ -190,7 +190,7 @@ def corners_in(image: Image, target: Target, view: int = 0) -> Corners | NotFoun
     if isinstance(seen, NotFound):
         return seen
     blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
-    return Corners(view, seen.ids, seen.px, blur, seen.weights)
+    return Corners(view, seen.ids, seen.px, blur, seen.weights, drawn_m=seen.drawn_m)
 
 
 def find_corners(

@@ -10,6 +10,7 @@ from visioncal.calibration.stages.distance_scale import distance_scale
 from visioncal.calibration.stages.image_checks import board_correction
 from visioncal.calibration.suspects.lens import has_changed
 from visioncal.calibration.suspects.suspect import Suspect
+from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import invert
@@ -27,6 +28,8 @@ from visioncal.vision.boards import kind_of
 
 # Manufacturing accuracy of rigs, as a share of their size.
 _SAME_SIZE = 5e-4
+# Share by which ink and light widen printed circles, and fewest images that show them wider.
+_INK, _FEWEST_DRAWN = 0.03, 3
 # Accuracy of printed boards [m].
 _LEAST_BEND_M = 1e-5
 
@@ -63,6 +66,30 @@ def _found(run: RunState) -> Iterator[Finding]:
             own = (run.session, scene.names[board])
             yield scale_finding(called, target, measured, written, own)
         yield from _shape_findings(fitted, board, called)
+
+
+def _of_prints(run: RunState) -> Iterator[Finding]:
+    """Circles of another diameter than stated, which is a remark: their centres are the same."""
+    session = run.session
+    for name, target in session.boards.items():
+        views = [view.number for view in session.views if session.board_of(view) == name]
+        seen = [run.corners[view] for view in views if view in run.corners]
+        sizes = np.array([one.drawn_m for one in seen if one.drawn_m is not None])
+        if len(sizes) < _FEWEST_DRAWN or not target.diameter_m:
+            continue
+        size = float(np.median(sizes))
+        sigma = float(1.4826 * np.median(np.abs(sizes - size)) / len(sizes) ** 0.5)
+        off = abs(size - target.diameter_m)
+        if off > max(CONTRADICTION * sigma, _INK * target.diameter_m):
+            figures = f"diameter_m = {size:.4g}"
+            write, command = board_correction(session, name, figures)
+            yield Finding(
+                "print_size",
+                f"The circles of {f'the board {name}'.strip()} are {1e3 * size:.4g} mm wide in the "
+                f"images, by the distance of rows (sigma {figure(1e3 * sigma)} mm), not "
+                f"{1e3 * target.diameter_m:g} mm as stated. Their centres were fitted so; {write}.",
+                Remedy(f"{write[0].upper()}{write[1:]}.", command),
+            )
 
 
 def _of_measured_poses(run: RunState) -> Iterator[Finding]:
@@ -171,5 +198,6 @@ def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
         )
 
 
+PRINT = Suspect("print_size", _of_prints, is_doubt=False)
 SIZE = Suspect("board_size", _found, 2.7e-3, True)
 SHAPE = Suspect("board_shape", None, 1e-4, True)

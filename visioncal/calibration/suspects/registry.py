@@ -82,6 +82,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     lens.LENS,
     board.SIZE,
     board.SHAPE,
+    board.PRINT,
     *growing.GROWING,
     mirrored_cell.MIRRORED_CELL,
     Suspect("carried_away", is_doubt=False),

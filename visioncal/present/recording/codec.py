@@ -129,7 +129,7 @@ def session_record(
 def _found(found: Corners | Rejection) -> object:
     if isinstance(found, Rejection):
         return found.reason
-    return found.ids, found.px, found.blur_px, found.weights
+    return found.ids, found.px, found.blur_px, found.weights, None, found.drawn_m
 
 
 def session_of(record: Record, images: ImageStore) -> Session:

@@ -6,8 +6,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.types import FloatArray, Image, IntArray, Target
-from visioncal.vision.boards.imaging import shrunk
+from visioncal.vision.boards.imaging import blur_at_corners, shrunk
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
 from visioncal.vision.boards.template import Print, Refined, refine
 
@@ -66,6 +67,14 @@ class Board(BoardKind):
         fitted = refined.fitted
         if fitted.sum() < max(min(6, len(fitted)), 0.5 * len(fitted)):
             return replace(seen, weights=np.full(len(fitted), DETECTED_WEIGHT))
-        return DetectedCorners(
-            seen.ids[fitted], refined.px[fitted], blur_px=float(refined.blur_px.max())
-        )
+        px, blur_px = refined.px[fitted], float(refined.blur_px.max())
+        if refined.blur_px.min() > MAX_BLUR_PX:
+            # A print of another size passes for blur; motion widens one direction only.
+            sharp_px = blur_at_corners(image, px, reaches=0.5)
+            blur_px = sharp_px if sharp_px < 0.5 * blur_px else blur_px
+        drawn_m = self.drawn_m(target, refined.grown)
+        return DetectedCorners(seen.ids[fitted], px, blur_px=blur_px, drawn_m=drawn_m)
+
+    def drawn_m(self, target: Target, grown: float) -> float | None:  # noqa: ARG002
+        """Size in an image of what grew by so many units; None where nothing does [m]."""
+        return None

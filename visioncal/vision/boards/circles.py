@@ -134,6 +134,10 @@ class CircleGrid(Board):
         radii = np.full(len(ids), target.diameter_m / target.square_m / 2)
         return Print(np.ones(len(ids)), np.inf, half, radii)
 
+    def drawn_m(self, target: Target, grown: float) -> float:
+        """Diameter of its circles in an image [m]."""
+        return target.diameter_m + 2.0 * grown * target.square_m
+
     def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
         """Refines (n, 2) detected centres [px] with these (n,) ids by the template."""
         if len(px) >= MIN_CORNERS:
@@ -145,7 +149,8 @@ class CircleGrid(Board):
             if scale * target.diameter_m > 40.0:
                 # Half of the size has edges of enough pixels.
                 half = self.refine(shrunk(image, 2), target, ids, (px - 0.5) / 2)
-                return Refined(2 * half.px + 0.5, 2 * half.sigma_px, 2 * half.blur_px)
+                half_px = (2 * half.px + 0.5, 2 * half.sigma_px, 2 * half.blur_px)
+                return Refined(*half_px, half.grown)
         return super().refine(image, target, ids, px)
 
     def search(

@@ -144,8 +144,10 @@ def _is_cut_short(data: bytes) -> bool:
     return data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
 
 
-def blur_at_corners(image: Image, px: FloatArray) -> float:
+def blur_at_corners(image: Image, px: FloatArray, reaches: float = 0.0) -> float:
     """Median edge width (sigma) at a sample of (n, 2) chessboard corners, n >= 1 [px].
+
+    With `reaches`, windows go so many distances of corners far, as to the rims of circles.
 
     A step edge blurred by a Gaussian of sigma s has a steepest central difference of 2 Phi(1 / s) -
     1 times half the step; solved for s, this holds down to half a pixel.
@@ -153,7 +155,7 @@ def blur_at_corners(image: Image, px: FloatArray) -> float:
     # Their median is stable to some percent.
     chosen = px[:: max(1, len(px) // 12)]
     spacing = np.linalg.norm(np.diff(px, axis=0), axis=1).min(initial=4 * _REACH_PX[1])
-    reach = int(np.clip(0.3 * spacing, *_REACH_PX))
+    reach = int(max(np.clip(0.3 * spacing, *_REACH_PX), reaches * spacing))
     offsets = np.arange(-reach, reach + 1)
     centre = np.round(chosen).astype(int)
     rows = np.clip(centre[:, 1, None] + offsets, 0, image.shape[0] - 1)

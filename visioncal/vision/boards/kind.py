@@ -49,6 +49,7 @@ class DetectedCorners:
     # Edge width as a Gaussian's sigma, in the direction of the wider edges [px]; None if not
     # measured.
     blur_px: float | None = None
+    drawn_m: float | None = None  # Diameter of circles in the image, by their distances.
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,8 @@ _SLANT = 1.5
 # Nodes per axis of the polynomial that interpolates a map over a window. With cubics, a fisheye's
 # slanted circles would err by up to 0.35 px.
 _NODES = 6
+# Radii of circles in images over those stated from which fits begin; from within 6 % they converge.
+_RATIOS = 1.1 ** np.arange(-4, 5)
 # Up to this number of corners, images are processed one at a time: numpy releases the interpreter
 # lock at each of about a thousand operations, and switching threads takes longer than these.
 _FEW, _ONE_IMAGE = 100, Lock()
@@ -93,6 +95,7 @@ class Refined:
     # (2,) edge widths between neighbours along x and along y, as sigmas; NaN if no corner was
     # fitted [px].
     blur_px: FloatArray
+    grown: float = 0.0  # Radius of circles in the image less that of the print [squares].
 
     @property
     def fitted(self) -> Mask:
@@ -368,9 +371,16 @@ def _refine_corners(
     indices, all_corners = np.arange(len(px)), np.ones(len(px), bool)
     sample = indices[:: -(-len(px) // 30)]
     windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
-    blur_px, grown = _estimate_blur(windows.at(sample), pattern.at(sample))
+    grown = 0.0
     if pattern.radii is not None:
-        pattern = replace(pattern, radii=pattern.radii + grown)
+        # A fit that begins at another radius takes the difference for blur.
+        grown = _roughly_grown(windows.at(sample), pattern, pattern.radii, sample)
+        pattern = replace(pattern, radii=np.maximum(pattern.radii + grown, 0.3 * pattern.radii))
+        windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
+    blur_px, more = _estimate_blur(windows.at(sample), pattern.at(sample))
+    grown += more
+    if pattern.radii is not None:
+        pattern = replace(pattern, radii=pattern.radii + more)
         windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
     is_lone = pattern.lone is not None
     tolerances_px, last_px = (
@@ -406,7 +416,19 @@ def _refine_corners(
         np.where(good[:, None], refined_px, px),
         np.where(good, sigma_px, np.nan),
         np.sqrt(np.maximum(blur_px**2 - _SMOOTH_PX**2, 0.0)) if good.any() else np.full(2, np.nan),
+        grown,
     )
+
+
+def _roughly_grown(windows: _Windows, pattern: Print, radii: FloatArray, sample: IntArray) -> float:
+    """Growth [squares] of circles of (n,) radii in an image, to 5 % of the radius."""
+    growths = np.median(radii) * (_RATIOS - 1.0)
+    shift, blur_px, residuals = np.zeros((len(sample), 2)), np.full(2, 1.5), []
+    for growth in growths:
+        tried = replace(pattern, radii=np.maximum(radii + growth, 0.3 * radii)).at(sample)
+        step = _step(windows, tried, shift, blur_px)
+        residuals.append(_median(step.misfit * np.abs(step.levels[:, 1])))
+    return float(growths[np.argmin(np.nan_to_num(residuals, nan=np.inf))])
 
 
 def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float]:
