@@ -185,7 +185,17 @@ def choose_stops(worlds: Sequence[World], count: int) -> Design:
         state = _Selection.of(worlds)
         for _ in range(count):
             state = state.with_best()
-        state = _exchanged(state)
+        # Stops are exchanged while that gains; their number stays.
+        for _ in state.rows:
+            if not state.left:
+                break
+            enough = (1.0 - 1e-4) * state.variances[0]
+            exchanged = state.with_best().without_least()
+            if not exchanged.variances[0] < enough:
+                exchanged = state.without_least().with_best()
+            if not exchanged.variances[0] < enough:
+                break
+            state = exchanged
         rows = np.array(state.rows, dtype=np.int64)
         ranking = _Selection.of([world.of_candidates(rows) for world in worlds])
         history = [ranking.accuracy]
@@ -196,18 +206,3 @@ def choose_stops(worlds: Sequence[World], count: int) -> Design:
     sigma_mm = 1e3 * float(np.sqrt(state.variances[0]))
     rows = rows[list(ranking.rows)]
     return Design(rows, sigma_mm, tuple(history), best)
-
-
-def _exchanged(state: _Selection) -> _Selection:
-    """Exchanges stops while that gains; their number stays."""
-    for _ in state.rows:
-        if not state.left:
-            break
-        enough = (1.0 - 1e-4) * state.variances[0]
-        exchanged = state.with_best().without_least()
-        if not exchanged.variances[0] < enough:
-            exchanged = state.without_least().with_best()
-        if not exchanged.variances[0] < enough:
-            break
-        state = exchanged
-    return state

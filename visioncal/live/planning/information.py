@@ -71,11 +71,6 @@ class RecordedStops:
         """(k, k) information on what the views share, from corners and priors."""
         return _effect_information(self.problem)
 
-    def edges_in(self, cell: PlanCell) -> FloatArray:
-        """Edges of the guessed cell; further boards keep their pose relative to the planned one."""
-        boards = cell.z @ invert(self.edges[1]) @ self.edges[1:]
-        return np.concatenate([cell.x[None], boards])
-
 
 @dataclass(frozen=True, eq=False)
 class World:
@@ -199,10 +194,7 @@ def stated(cell: PlanCell) -> LensBoardParameters:
 
 
 def _world(
-    cell: PlanCell,
-    purpose: Purpose,
-    q: FloatArray,
-    recorded: RecordedStops | None,
+    cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: RecordedStops | None
 ) -> World:
     shared = stated(cell).information if recorded is None else recorded.shared
     factors = stop_factors(cell, purpose, q, recorded)
@@ -217,14 +209,31 @@ def _world(
     recorded_information = np.zeros((all_columns, all_columns))
     if recorded is not None:
         recorded_information = _recorded_information(cell, purpose, recorded)
+    middle = corner_positions(cell.target).mean(axis=0)
     if purpose.judged == "sight":
-        weights = _sight_weights(cell, arm, q)
+        # Half the camera's position, half the points that it observes. An observed point is off by
+        # the error of the offset and by that of the rotation times the point's distance, at any
+        # posture of the arm.
+        observed = cell.cam_from_target(q) @ [*middle, 1.0]
+        position, rotation, point = (np.zeros((len(q), 3, 12 + arm)) for _ in range(3))
+        position[:, :, 3:6] = point[:, :, 3:6] = rotation[:, :, :3] = np.eye(3)
+        point[:, :, :3] = -skew(observed[:, :3])
     else:
-        weights = _workspace_weights(cell, purpose)
+        # The pose of what the arm carries, relative to what is fixed in the base.
+        q = postures(cell.robot)
+        flange = cell.robot.base_from_flange(q)
+        problem = chain(cell.mount, flange[:1], cell.cam_from_target(q[:1]))
+        start = State(np.stack([cell.x, cell.z]), np.zeros(0))
+        pair = ArmPair.of(problem, start, problem.robots[0])
+        # (w, 4, 4) poses of the camera-board pair, and their Jacobian (w, 6, 12 + a).
+        poses, jacobian = pair.jacobian(flange, _arm_model(cell.robot, purpose).basis(q))
+        position = point = pair.place_jacobian(poses, jacobian, middle)
+        rotation = jacobian[:, :3]
     # Zeros for lens and board follow the edges.
     at = np.full(shared_count, 12)
-    counted, place, turn = (
-        np.insert(np.insert(square, at, 0.0, axis=0), at, 0.0, axis=1) for square in weights
+    place, turn, spot = (
+        np.insert(np.insert(_mean_square(part), at, 0.0, axis=0), at, 0.0, axis=1)
+        for part in (position, rotation, point)
     )
     misfit, gradient = factors[:, :, size:], recorded_information[:size, size:]
     if recorded is not None and not purpose.blocks:
@@ -239,7 +248,7 @@ def _world(
         factors[:, :, :size],
         prior,
         recorded_information[:size, :size],
-        counted,
+        (place + spot) / 2,
         place,
         turn,
         misfit,
@@ -259,7 +268,9 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
     stops = len(next(iter(recorded.problem.poses.values())))
     joints = np.zeros((stops, cell.robot.joint_count)) if q is None else q
     problem = _with_arm_errors(cell, purpose, recorded.problem, joints, recorded.arm)
-    state = State(recorded.edges_in(cell), problem.start_values)
+    # Further boards keep their pose relative to the planned one.
+    boards = cell.z @ invert(recorded.edges[1]) @ recorded.edges[1:]
+    state = State(np.concatenate([cell.x[None], boards]), problem.start_values)
     information = fisher_information(problem, state, recorded.noise)
     edges = 6 * len(problem.unknown)
     information[edges:, edges:] -= _effect_information(problem)
@@ -343,36 +354,6 @@ def _predicted_corners(
         px[shows][view, corner],
     )
     return stack, shows
-
-
-def _sight_weights(
-    cell: PlanCell, arm: int, q: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Weights for x: half the camera's position, half the points that it observes."""
-    # An observed point is off by the error of the offset and by that of the rotation times the
-    # point's distance, at any posture of the arm.
-    middle = corner_positions(cell.target).mean(axis=0)
-    observed = cell.cam_from_target(q) @ [*middle, 1.0]
-    position, rotation, point = (np.zeros((len(q), 3, 12 + arm)) for _ in range(3))
-    position[:, :, 3:6] = point[:, :, 3:6] = rotation[:, :, :3] = np.eye(3)
-    point[:, :, :3] = -skew(observed[:, :3])
-    of_position = _mean_square(position)
-    return (of_position + _mean_square(point)) / 2, of_position, _mean_square(rotation)
-
-
-def _workspace_weights(
-    cell: PlanCell, purpose: Purpose
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Weights for the pose of what the arm carries, relative to what is fixed in the base."""
-    q = postures(cell.robot)
-    flange = cell.robot.base_from_flange(q)
-    problem = chain(cell.mount, flange[:1], cell.cam_from_target(q[:1]))
-    pair = ArmPair.of(problem, State(np.stack([cell.x, cell.z]), np.zeros(0)), problem.robots[0])
-    # (w, 4, 4) poses of the camera-board pair, and their Jacobian (w, 6, 12 + a).
-    poses, jacobian = pair.jacobian(flange, _arm_model(cell.robot, purpose).basis(q))
-    middle = corner_positions(cell.target).mean(axis=0)
-    position = _mean_square(pair.place_jacobian(poses, jacobian, middle))
-    return position, position, _mean_square(jacobian[:, :3])
 
 
 def _mean_square(jacobian: FloatArray) -> FloatArray:

@@ -39,8 +39,19 @@ class Picking:
         q = self.q[np.linspace(0, len(self.q) - 1, min(40, len(self.q))).astype(np.int64)]
         chances = []
         for cell, world in zip(self.cells, self.worlds, strict=True):
+            # Covariances of picks at the target are in the axes of what carries the camera: the
+            # flange, or the base. That of the camera's pose is of a right perturbation.
             noise = np.repeat(cell.noise.robots[0], 3) ** 2
-            covariances = _pick_covariances(cell, world.covariance(rows)[:6, :6], noise, q)
+            middle = corner_positions(cell.target).mean(axis=0)
+            points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
+            turn = cell.x[:3, :3]
+            # Poses at points move with the frame that these are in.
+            jacobian = block_diag(turn, turn) @ adjoint(compose(np.eye(3), -points))
+            covariances = jacobian @ world.covariance(rows)[:6, :6] @ np.swapaxes(jacobian, 1, 2)
+            covariances = covariances + np.diag(noise)
+            if cell.mount == "eye-in-hand":
+                by_flange = adjoint(compose(np.eye(3), -(points @ turn.T + cell.x[:3, 3])))
+                covariances += (by_flange * noise) @ np.swapaxes(by_flange, 1, 2)
             chances.append(chance_within(covariances, turn_rad, shift_m))
         return float(np.mean(chances))
 
@@ -119,23 +130,3 @@ def check_need(need: Need, judged: str) -> None:
             culprits=["need"],
             next_step="Plan for hand-eye, or leave the need out.",
         )
-
-
-def _pick_covariances(
-    cell: PlanCell, covariance: FloatArray, noise: FloatArray, q: FloatArray
-) -> FloatArray:
-    """Covariances (k, 6, 6) of picks at the target, from (k, n) postures [rad].
-
-    All are in the axes of what carries the camera: the flange, or the base. The covariance (6, 6)
-    is that of the camera's pose, a right perturbation; the noise (6,) is variances of the flange.
-    """
-    middle = corner_positions(cell.target).mean(axis=0)
-    points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
-    turn = cell.x[:3, :3]
-    # Poses at points move with the frame that these are in.
-    jacobian = block_diag(turn, turn) @ adjoint(compose(np.eye(3), -points))
-    covariances = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2) + np.diag(noise)
-    if cell.mount == "eye-in-hand":
-        by_flange = adjoint(compose(np.eye(3), -(points @ turn.T + cell.x[:3, 3])))
-        covariances = covariances + (by_flange * noise) @ np.swapaxes(by_flange, 1, 2)
-    return np.asarray(covariances)

@@ -141,12 +141,8 @@ def make_plan(
         stops = Candidates(postures, cell.cam_from_target(postures), np.ones(len(postures)), {})
     progress("information", 0, 1)
     cells = (cell, *cell.guesses(WORLDS - 1, request.seed))
-    worlds = predict_worlds(
-        cells,
-        request.purpose,
-        stops.q,
-        recorded=None if begun is None else begun.recorded,
-    )
+    recorded = None if begun is None else begun.recorded
+    worlds = predict_worlds(cells, request.purpose, stops.q, recorded=recorded)
     progress("choice", 0, 1)
     planning = _Planning(cells, request, stops, worlds, begun)
     design, route, in_the_way = planning.drivable_design(progress)
@@ -248,29 +244,28 @@ class _Planning:
         segments = route.segments
         if len(segments) < len(route.order):
             segments = (np.zeros((0, q.shape[1])), *segments)
-        return tuple(
-            PlannedStop(
-                int(numbers[row]),
-                q[row],
-                via,
-                _contribution(*design.history[row : row + 2]),
-                flange[row],
-                found.cam_from_target[design.rows[row]],
-                float(found.seen[design.rows[row]]),
-                row + 1,
-                design.history[row],
-                design.history[row + 1],
+        stops = []
+        for row, via in zip(route.order, segments, strict=True):
+            before, after = design.history[row : row + 2]
+            words = "a beginning; not all is determined yet"
+            if before.is_open and not after.is_open:
+                words = f"determines what was open; the error is now {figure(after.mm)} mm"
+            elif not after.is_open:
+                less = 100.0 * (1.0 - after.mm / before.mm)
+                words = f"takes {f'{less:.0f} %' if less >= 1.0 else 'little'} off the error "
+                words += f"({figure(before.mm)} -> {figure(after.mm)} mm)"
+            stops.append(
+                PlannedStop(
+                    int(numbers[row]),
+                    q[row],
+                    via,
+                    words,
+                    flange[row],
+                    found.cam_from_target[design.rows[row]],
+                    float(found.seen[design.rows[row]]),
+                    row + 1,
+                    before,
+                    after,
+                )
             )
-            for row, via in zip(route.order, segments, strict=True)
-        )
-
-
-def _contribution(before: Accuracy, after: Accuracy) -> str:
-    """States what a stop contributes, by the accuracy without it and with it."""
-    if after.is_open:
-        return "a beginning; not all is determined yet"
-    if before.is_open:
-        return f"determines what was open; the error is now {figure(after.mm)} mm"
-    figures = f"({figure(before.mm)} -> {figure(after.mm)} mm)"
-    less = 100.0 * (1.0 - after.mm / before.mm)
-    return f"takes {f'{less:.0f} %' if less >= 1.0 else 'little'} off the error {figures}"
+        return tuple(stops)

@@ -4,7 +4,7 @@ import numpy as np
 
 from visioncal.dynamics.plan_files import MotionPlan
 from visioncal.live.planning.messages import plan_words, summary_of
-from visioncal.live.planning.plan import Plan, PlannedStop
+from visioncal.live.planning.plan import Plan
 from visioncal.present.recording.preview import MotionPreview, Preview, PreviewStop
 
 
@@ -25,6 +25,18 @@ def preview_of(plan: Plan, name: str) -> Preview:
     ]
     ranked = sorted(plan.stops, key=lambda stop: stop.rank)
     lines += [f"- **view {stop.view}** ({stop.after.words}): {stop.words}" for stop in ranked]
+    stops = []
+    for stop in plan.stops:
+        degrees = ", ".join(f"{value:.1f}" for value in np.rad2deg(stop.q))
+        x, y, z = 1e3 * stop.base_from_flange[:3, 3]
+        distance = 1e3 * float(np.linalg.norm(stop.cam_from_target[:3, 3]))
+        note = (
+            f"**View {stop.view}** (number {stop.rank} by information): {stop.words}\n\n"
+            f"Joints ({degrees}) deg; flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm; board's origin at "
+            f"{distance:.0f} mm from the camera. The whole board is in the image in "
+            f"{100 * stop.seen:.0f} % of what the cell may be."
+        )
+        stops.append(PreviewStop(stop.view, stop.q, stop.via, note))
     return Preview(
         cell.mount,
         cell.target,
@@ -33,24 +45,10 @@ def preview_of(plan: Plan, name: str) -> Preview:
         cell.z,
         name,
         cell.robot,
-        tuple(PreviewStop(stop.view, stop.q, stop.via, _note(stop)) for stop in plan.stops),
+        tuple(stops),
         tuple(box.body for box in cell.boxes),
         cell.limits.floor_m,
         "\n".join(lines),
-    )
-
-
-def _note(stop: PlannedStop) -> str:
-    degrees = ", ".join(f"{value:.1f}" for value in np.rad2deg(stop.q))
-    x, y, z = 1e3 * stop.base_from_flange[:3, 3]
-    distance = 1e3 * float(np.linalg.norm(stop.cam_from_target[:3, 3]))
-    return "\n\n".join(
-        [
-            f"**View {stop.view}** (number {stop.rank} by information): {stop.words}",
-            f"Joints ({degrees}) deg; flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm; board's origin at "
-            f"{distance:.0f} mm from the camera. The whole board is in the image in "
-            f"{100 * stop.seen:.0f} % of what the cell may be.",
-        ]
     )
 
 

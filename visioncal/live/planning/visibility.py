@@ -92,16 +92,10 @@ class BoardViews:
         shares = np.arange(_SIDE_POINTS)[:, None, None] / _SIDE_POINTS
         points = knots + shares * (np.roll(knots, -1, axis=0) - knots)
         self.outline = points.reshape(-1, 3)
-        self.distance_m = cell.limits.distance_m or self._filling_m(float(np.nanmin(tangents)))
-
-    def _filling_m(self, half: float) -> tuple[float, float]:
-        """Distances at which the board fills the image of that half width, or has been observed.
-
-        It stays in the image if the guesses are off [m].
-        """
-        # At a distance d the board is off by the errors of both positions, by d times the error of
-        # the camera's rotation, and by half its own size times the error of its own rotation.
-        cell, radius = self._cell, 0.5 * board_size_m(self._cell.target)
+        # Distances at which the board fills the image, and stays in it if the guesses are off: at a
+        # distance d by the errors of both positions, by d times the error of the camera's rotation,
+        # and by half the board's size times the error of its own rotation.
+        half, radius = float(np.nanmin(tangents)), 0.5 * board_size_m(cell.target)
         full = radius / half
         near, far = _NEAREST * full, 6.0 * full
         for d in np.linspace(full, far, 60):
@@ -110,10 +104,10 @@ class BoardViews:
             if half * d > radius + 2.2 * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
                 far = max(_FARTHEST * full, 1.15 * float(d))
                 break
-        if cell.observed_distances_m is None:
-            return near, far
-        least, most = cell.observed_distances_m
-        return min(near, least / _WIDER), max(far, _WIDER * most)
+        # The board stays in view where it has been observed.
+        least, most = cell.observed_distances_m or (np.inf, 0.0)
+        reach = min(near, least / _WIDER), max(far, _WIDER * most)
+        self.distance_m: tuple[float, float] = cell.limits.distance_m or reach
 
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draws views of the board.
@@ -227,7 +221,14 @@ class Occlusion:
 
     def _behind(self, bodies: Iterable[Body], frames: FloatArray) -> Mask:
         """Whether one of some bodies hides part of the print (k,) at frames of the links."""
-        starts, ends = self._sight_lines(frames[:, -1])
+        cell, base_from_flange = self.cell, frames[:, -1]
+        in_hand = cell.mount == "eye-in-hand"
+        base_from_cam = base_from_flange @ cell.x if in_hand else cell.x[None]
+        base_from_target = cell.z[None] if in_hand else base_from_flange @ cell.z
+        # Starts (k or 1, 1, 3) and ends (k or 1, p, 3) of the lines of sight, in the base [m].
+        starts = base_from_cam[:, None, :3, 3]
+        ends = self.points @ np.swapaxes(base_from_target[:, :3, :3], 1, 2)
+        ends = ends + base_from_target[:, None, :3, 3]
         hidden = np.zeros(len(frames), dtype=bool)
         for body in bodies:
             place = body.link_from_body[None]
@@ -236,15 +237,6 @@ class Occlusion:
             blocks = _box_blocks if body.shape == "box" else _capsule_blocks
             hidden |= blocks(starts, ends, place, body.size_m)
         return hidden
-
-    def _sight_lines(self, base_from_flange: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Starts (k or 1, 1, 3) and ends (k or 1, p, 3) of the lines of sight, in the base [m]."""
-        cell = self.cell
-        in_hand = cell.mount == "eye-in-hand"
-        base_from_cam = base_from_flange @ cell.x if in_hand else cell.x[None]
-        base_from_target = cell.z[None] if in_hand else base_from_flange @ cell.z
-        ends = self.points @ np.swapaxes(base_from_target[:, :3, :3], 1, 2)
-        return base_from_cam[:, None, :3, 3], ends + base_from_target[:, None, :3, 3]
 
 
 def _box_blocks(
