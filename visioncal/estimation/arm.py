@@ -122,11 +122,7 @@ def pose_basis(base_from_flange: FloatArray) -> FloatArray:
     return np.concatenate([of_flange, of_base, *varying], axis=2)
 
 
-def find_arm_errors(
-    likelihood: RobotLikelihood,
-    robot: int,
-    basis: FloatArray,
-) -> ArmErrors | None:
+def find_arm_errors(likelihood: RobotLikelihood, robot: int, basis: FloatArray) -> ArmErrors | None:
     """Estimates the size of the errors of one robot's links; None for too few stops.
 
     Significant errors have the size of maximum likelihood. Every arm has link errors, and stops

@@ -233,11 +233,7 @@ class WithoutPoses:
 
     @classmethod
     def of(
-        cls,
-        stack: CornerStack,
-        by_pose: FloatArray,
-        columns: FloatArray,
-        shares: FloatArray | None,
+        cls, stack: CornerStack, by_pose: FloatArray, columns: FloatArray, shares: FloatArray | None
     ) -> "WithoutPoses":
         """Eliminates the poses from (n, 2, c) columns in units of the corner noise.
 

@@ -115,11 +115,7 @@ def distances(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
 
 
 def breathing_columns(
-    stack: CornerStack,
-    px: FloatArray,
-    camera: Camera,
-    cam_from_target: FloatArray,
-    size: float,
+    stack: CornerStack, px: FloatArray, camera: Camera, cam_from_target: FloatArray, size: float
 ) -> FloatArray:
     """(n, 2, 1) displacement by breathing of some size; (n, 2, 0) for size zero.
 

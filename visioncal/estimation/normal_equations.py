@@ -178,12 +178,7 @@ def fisher_information(problem: Problem, state: State, noise: Noise) -> FloatArr
 
 
 def normal_equations(
-    problem: Problem,
-    state: State,
-    noise: Noise,
-    *,
-    ideal: bool = False,
-    among: Mask | None = None,
+    problem: Problem, state: State, noise: Noise, *, ideal: bool = False, among: Mask | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Information (p, p) and gradient (p,) of half the whitened squared error.
 

@@ -52,10 +52,7 @@ def chance_within(
 
 
 def radius_within(
-    spreads: FloatArray,
-    share: float,
-    freedom: float = np.inf,
-    offsets: FloatArray | None = None,
+    spreads: FloatArray, share: float, freedom: float = np.inf, offsets: FloatArray | None = None
 ) -> float:
     """The least radius within which a share of the position errors stays [m].
 

@@ -152,8 +152,5 @@ class Trajectory(Samples):
 
 def is_repeated(moved: FloatArray) -> Mask:
     """(m,) mask of motions (m, 4, 4) [m] within what arms repeat to."""
-    off_mm, off_deg = (
-        1e3 * np.linalg.norm(moved[:, :3, 3], axis=1),
-        np.rad2deg(rotation_angle(moved)),
-    )
-    return np.asarray((off_mm < REPEATABILITY[0]) & (off_deg < REPEATABILITY[1]))
+    is_near = 1e3 * np.linalg.norm(moved[:, :3, 3], axis=1) < REPEATABILITY[0]
+    return np.asarray(is_near & (np.rad2deg(rotation_angle(moved)) < REPEATABILITY[1]))

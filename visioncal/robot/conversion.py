@@ -83,12 +83,7 @@ def convert_table(table: DHTable, convention: Convention) -> DHTable:
     return _with_rows(replace(table, convention=convention, parallel=parallel), rows)
 
 
-def table_of(
-    robot: Robot,
-    convention: Convention,
-    *,
-    like: DHTable | None = None,
-) -> DHTable:
+def table_of(robot: Robot, convention: Convention, *, like: DHTable | None = None) -> DHTable:
     """Converts any robot to a joint table.
 
     The rows follow from the joints' axes alone; the constants `base` before the first axis and

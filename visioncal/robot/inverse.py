@@ -162,12 +162,7 @@ class Inverse:
         return np.asarray(centre + rng.uniform(-1.0, 1.0, (count, len(half))) * half)
 
     def _descend(
-        self,
-        goal: "pin.SE3",
-        start: FloatArray,
-        wanted: FloatArray,
-        *,
-        settle: float = _SEARCH,
+        self, goal: "pin.SE3", start: FloatArray, wanted: FloatArray, *, settle: float = _SEARCH
     ) -> Posture:
         """Searches from a start; the result is turned by whole turns towards `wanted`."""
         bounds, underactuated = self._bounds, len(start) < 6

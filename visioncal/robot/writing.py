@@ -124,11 +124,7 @@ def comment_texts(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
 
 
 def ur_kinematics_yaml(
-    robot: Robot,
-    *,
-    calibration_hash: str,
-    like: DHTable | None = None,
-    notes: Sequence[str] = (),
+    robot: Robot, *, calibration_hash: str, like: DHTable | None = None, notes: Sequence[str] = ()
 ) -> str:
     """Writes the `kinematics` file that ur_description takes as `kinematics_params_file`.
 

@@ -45,11 +45,7 @@ class ArmReport:
     doubts: tuple[Finding, ...] = ()  # Findings against the arm.
 
 
-def report_of(
-    arm: ArmData,
-    levels: SelectedArmLevel,
-    convention: Convention | None,
-) -> ArmReport:
+def report_of(arm: ArmData, levels: SelectedArmLevel, convention: Convention | None) -> ArmReport:
     """Reports a calibrated arm.
 
     Args:

@@ -13,11 +13,9 @@ def distance_scale(
 ) -> Finding | None:
     """Estimates the scale error of measured distances.
 
-    parent_from_flange * flange_from_seer * cam_from_target is the same for all views. Its position
-    over the scale is linear in the inverse of the scale, and in both unknown positions over the
-    scale. Thus the misfit is one of the camera, which errs more than the robot, and a robot that
-    only turns, as a pan-tilt head, determines no scale: the inverse regression would take zero,
-    which makes all positions the same.
+    parent_from_flange * flange_from_seer * cam_from_target is the same for all views; its position
+    over the scale is linear in the inverse of the scale. A regression on the scale itself would
+    give zero for a robot that only turns, as a pan-tilt head: this makes all positions the same.
 
     Args:
         parent_from_flange: (m, 4, 4) the robot's poses; their inverses for a static camera.

@@ -105,9 +105,7 @@ def _beside_arms(
 
 
 def with_sizes(
-    cell_fit: CellFit,
-    fitted: ConvergedFit,
-    posture: Mapping[str, ArmErrors] = MappingProxyType({}),
+    cell_fit: CellFit, fitted: ConvergedFit, posture: Mapping[str, ArmErrors] = MappingProxyType({})
 ) -> tuple[ConvergedFit, Mapping[str, ArmErrors]]:
     """The fit with estimated sizes of the errors of lenses and boards; itself if that diverges.
 

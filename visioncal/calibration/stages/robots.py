@@ -222,11 +222,7 @@ def _contradicted_joints(
 
 
 def _misread(
-    observed: Observed,
-    reported: RobotReport,
-    matched: MatchedJoints,
-    guess: JointGuess,
-    seen: str,
+    observed: Observed, reported: RobotReport, matched: MatchedJoints, guess: JointGuess, seen: str
 ) -> DataError:
     """The error for joint angles that only another reading makes fit what is seen."""
     of_robot = (view for view in observed.session.views if view.number in reported.base_from_flange)

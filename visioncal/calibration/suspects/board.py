@@ -70,19 +70,17 @@ def _found(run: RunState) -> Iterator[Finding]:
 
 def _of_prints(run: RunState) -> Iterator[Finding]:
     """Circles of another diameter than stated, which is a remark: their centres are the same."""
-    session = run.session
-    for name, target in session.boards.items():
-        views = [view.number for view in session.views if session.board_of(view) == name]
+    for name, target in run.session.boards.items():
+        views = [view.number for view in run.session.views if run.session.board_of(view) == name]
         seen = [run.corners[view] for view in views if view in run.corners]
-        sizes = np.array([one.drawn_m for one in seen if one.drawn_m is not None])
-        if len(sizes) < _FEWEST_DRAWN or not target.diameter_m:
+        sizes = np.array([one.drawn_m or np.nan for one in seen])
+        if len(sizes) < _FEWEST_DRAWN or not np.isfinite(sizes).all():
             continue
         size = float(np.median(sizes))
         sigma = float(1.4826 * np.median(np.abs(sizes - size)) / len(sizes) ** 0.5)
         off = abs(size - target.diameter_m)
         if off > max(CONTRADICTION * sigma, _INK * target.diameter_m):
-            figures = f"diameter_m = {size:.4g}"
-            write, command = board_correction(session, name, figures)
+            write, command = board_correction(run.session, name, f"diameter_m = {size:.4g}")
             yield Finding(
                 "print_size",
                 f"The circles of {f'the board {name}'.strip()} are {1e3 * size:.4g} mm wide in the "

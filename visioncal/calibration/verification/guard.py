@@ -266,10 +266,7 @@ class Guard:
         passed = np.cumsum(by_time) / by_time.sum()
         first, last = np.searchsorted(passed, [0.025, 0.975])
         last = min(int(last), len(born) - 1)
-        return {
-            "causes": tuple(causes),
-            "changed_s": (float(born[first, 1]), float(born[last, 2])),
-        }
+        return {"causes": tuple(causes), "changed_s": (float(born[first, 1]), float(born[last, 2]))}
 
     def acknowledge(self) -> None:
         """Ends an alarm: the change that was found is as it should be, and the guard goes on."""

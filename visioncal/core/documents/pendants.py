@@ -55,8 +55,7 @@ _MARKED = (
 _NAMED_ROTATIONS = dict.fromkeys(
     tuple(names.split())
     for form in POSE_FORMS.values()
-    for names in (form.names, form.also)
-    if names
+    for names in filter(None, (form.names, form.also))
 )
 # Forms by the count of bare numbers; seven are the columns of views.csv.
 _BARE_FORMS: Mapping[int, tuple[str, ...]] = {
@@ -248,16 +247,16 @@ def _named(line: str) -> _PendantNumbers | None:
         length, angle = (next(iter(found), "") for found in (lengths, angles))
         words = [cells[name][0] for name in needed]
         values = _values(words)
+        found = _PendantNumbers(values or (), likely, length, angle, names=names)
         if values is None:
-            doubt = "it has decimal commas and decimal points"
-            return _PendantNumbers((), likely, doubt=doubt, names=names)
+            return replace(found, doubt="it has decimal commas and decimal points")
         with_commas = [word for word in words if "," in word]
         # No angle has thousands.
         grouped = [word for word in words[:3] if _THOUSANDS.fullmatch(word)]
         if with_commas and with_commas == grouped:
             doubt = f"the comma of {with_commas[0]} may be decimal, or group thousands"
-            return _PendantNumbers((), likely, doubt=doubt, names=names)
-        return _PendantNumbers(values, likely, length, angle, names=names)
+            return replace(found, doubt=doubt)
+        return found
     return None
 
 

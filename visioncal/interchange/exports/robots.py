@@ -9,10 +9,10 @@ import re
 from collections.abc import Iterable, Mapping
 from functools import partial
 
-from visioncal.core.conventions import POSE_FORMS, write_pose
+from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import fixed
-from visioncal.interchange.exports.content import Content, ExportFormat, Holds, comments
+from visioncal.interchange.exports.content import Content, ExportFormat, comments
 
 # A nanometre and 2e-10 rad, which is a nanometre at five metres.
 _DECIMALS = {"m": 9, "mm": 6}
@@ -116,59 +116,30 @@ def _warn_of_load(content: Content) -> Iterable[str]:
 # has robhold, tframe and tload; `wobjdata` robhold, ufprog, ufmec, uframe and oframe: a fixed user
 # frame, with the object frame at its origin. KUKA, system variables: an entry of $CONFIG.DAT, or
 # the active frame.
-_POSES = {
-    "ur": "Universal Robots: p[x, y, z, rx, ry, rz] [m, rotation vector in rad]",
-    "kuka": "KUKA KRL: {X ..,Y ..,Z ..,A ..,B ..,C ..} [mm, deg]",
-    "fanuc": "FANUC: X, Y, Z, W, P, R as in an .LS program [mm, deg]",
-    "abb": "ABB RAPID pose: [[x,y,z],[q1,q2,q3,q4]] [mm, quaternion w first]",
-    "staubli": "Staubli VAL 3 trsf: {x, y, z, rx, ry, rz} [mm, deg]",
-    "doosan": "Doosan DRL: posx(x, y, z, a, b, c) [mm, deg about z, y, z]",
-}
-_POSES |= {
-    form.name: f"{form.words} [{form.unit}, {form.rotation[-3:]}]"
-    for form in POSE_FORMS.values()
-    if form.models and form.name not in _POSES
-}
-_FRAMES: tuple[tuple[str, Holds, str, str], ...] = (
-    (
-        "ur-tcp",
-        "tool",
-        "set_tcp({pose})",
-        "a tool for Universal Robots: set_tcp(p[...]) [m, rotation vector in rad]",
-    ),
-    (
-        "ur-feature",
-        "fixture",
-        "global {child} = {pose}",
-        "a fixture for Universal Robots: a pose in a variable [m, rotation vector in rad]",
-    ),
-    (
-        "abb-tooldata",
-        "tool",
-        "PERS tooldata {child}:=[TRUE,{pose},{load}];",
-        "a tool for ABB: PERS tooldata, with --mass-kg and --cog-mm [mm, quaternion w first]",
-    ),
-    (
-        "abb-wobjdata",
-        "fixture",
-        'PERS wobjdata {child}:=[FALSE,TRUE,"",{pose},[[0,0,0],[1,0,0,0]]];',
-        "a fixture for ABB: PERS wobjdata [mm, quaternion w first]",
-    ),
-    (
-        "kuka-tool",
-        "tool",
-        "{active}TOOL{number}={pose}",
-        "a tool for KUKA: $TOOL, or TOOL_DATA[n] with --number n [mm, deg]",
-    ),
-    (
-        "kuka-base",
-        "fixture",
-        "{active}BASE{number}={pose}",
-        "a fixture for KUKA: $BASE, or BASE_DATA[n] with --number n [mm, deg]",
-    ),
-)
+_FRAMES = """
+ur-tcp  tool  set_tcp({pose})
+    a tool for Universal Robots: set_tcp(p[...]) [m, rotation vector in rad]
+ur-feature  fixture  global {child} = {pose}
+    a fixture for Universal Robots: a pose in a variable [m, rotation vector in rad]
+abb-tooldata  tool  PERS tooldata {child}:=[TRUE,{pose},{load}];
+    a tool for ABB: PERS tooldata, with --mass-kg and --cog-mm [mm, quaternion w first]
+abb-wobjdata  fixture  PERS wobjdata {child}:=[FALSE,TRUE,"",{pose},[[0,0,0],[1,0,0,0]]];
+    a fixture for ABB: PERS wobjdata [mm, quaternion w first]
+kuka-tool  tool  {active}TOOL{number}={pose}
+    a tool for KUKA: $TOOL, or TOOL_DATA[n] with --number n [mm, deg]
+kuka-base  fixture  {active}BASE{number}={pose}
+    a fixture for KUKA: $BASE, or BASE_DATA[n] with --number n [mm, deg]
+"""
 ROBOTS = (
-    *(ExportFormat(name, words, partial(_write, name, "{pose}")) for name, words in _POSES.items()),
+    *(
+        ExportFormat(
+            form.name,
+            f"{form.words} [{form.unit}, {ROTATION_FORMS[form.rotation].words}]",
+            partial(_write, form.name, "{pose}"),
+        )
+        for form in POSE_FORMS.values()
+        if form.models
+    ),
     *(
         ExportFormat(
             name,
@@ -176,8 +147,10 @@ ROBOTS = (
             partial(_write, name.partition("-")[0], statement),
             takes=frozenset(mark for mark in ("number", "load") if f"{{{mark}}}" in statement),
             warn=_warn_of_load if "{load}" in statement else lambda _: (),
-            holds=holds,
+            holds="tool" if holds == "tool" else "fixture",
         )
-        for name, holds, statement, words in _FRAMES
+        for name, holds, statement, words in (
+            re.split(r"\s{2,}", entry) for entry in re.split(r"\n(?! )", _FRAMES.strip())
+        )
     ),
 )

@@ -134,12 +134,7 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[row.get(name, "") for name in names] for row in rows]
     session = Session.assemble(
-        document,
-        names,
-        cells,
-        store,
-        target_document=target,
-        robot_document=robot,
+        document, names, cells, store, target_document=target, robot_document=robot
     )
     stream = foreign.stream
     if stream is not None:

@@ -11,7 +11,7 @@ from bz2 import BZ2Decompressor
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise, takewhile
 from math import hypot
 from pathlib import Path
@@ -149,8 +149,8 @@ def _opened(source: Path) -> Iterator[Reader]:
     zstd: Any = vars(mcap)["zstd"]
     of = {"bz2": BZ2Decompressor, "lz4": lz4.LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
     for table in (first.decompressors, mcap.DECOMPRESSORS):
-        table |= {name: _limited(of[name]) for name in of if name in table}
-    vars(second)["zstd"] = SimpleNamespace(open=zstd.open, decompress=_limited(of["zstd"]))
+        table |= {name: partial(_limited, of[name]) for name in of if name in table}
+    vars(second)["zstd"] = SimpleNamespace(open=zstd.open, decompress=partial(_limited, of["zstd"]))
     with _bag_errors(source):
         # Bags of old versions of ROS 2 do not hold the definitions of their messages.
         types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -158,18 +158,14 @@ def _opened(source: Path) -> Iterator[Reader]:
             yield reader
 
 
-def _limited(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
+def _limited(decompressor: Callable[[], Any], data: bytes, *_: int) -> bytes:
     """Decompresses to as much as the largest image at most; raises DataError."""
-
-    def decompress(data: bytes, *_: int) -> bytes:
-        stream = decompressor()
-        found: bytes = stream.decompress(data, max_length=MOST_IMAGE_BYTES)
-        if not stream.eof:
-            words = f"A part of the bag is damaged, or over {MOST_IMAGE_BYTES / 1e6:g} MB"
-            raise DataError(f"{words}, decompressed.", next_step="Record it in smaller chunks.")
-        return found
-
-    return decompress
+    stream = decompressor()
+    found: bytes = stream.decompress(data, max_length=MOST_IMAGE_BYTES)
+    if not stream.eof:
+        words = f"A part of the bag is damaged, or over {MOST_IMAGE_BYTES / 1e6:g} MB"
+        raise DataError(f"{words}, decompressed.", next_step="Record it in smaller chunks.")
+    return found
 
 
 @contextmanager
@@ -286,12 +282,10 @@ def _stamp_s(message: Message, received_ns: int) -> float:
     return (stamp.sec + 1e-9 * stamp.nanosec) or 1e-9 * received_ns
 
 
-def _seven(
-    contents: _Contents, name: str, position: Message, rotation: Message
-) -> tuple[float, ...]:
+def _seven(contents: _Contents, name: str, place: Message, rotation: Message) -> tuple[float, ...]:
     """The numbers of a pose; none where it is no pose, by the tolerance of tf2."""
     turn = rotation.x, rotation.y, rotation.z, rotation.w
-    seven = (position.x, position.y, position.z, *turn)
+    seven = (place.x, place.y, place.z, *turn)
     # No map is as large, nor are numbers that are none.
     if all(abs(number) < 1e9 for number in seven) and abs(hypot(*turn) - 1.0) <= 0.005:
         return seven
@@ -303,13 +297,9 @@ def _add_image(contents: _Contents, topic: str, message: Message, received_ns: i
     images = contents.images.get(topic)
     if images is None:
         is_raw = hasattr(message, "encoding")
-        if "depth" in topic.lower() or (
-            (message.encoding if is_raw else message.format).startswith(_DEPTHS)
-        ):
-            return
-        data = b"" if is_raw else bytes(message.data)
+        data, kind = (b"", message.encoding) if is_raw else (bytes(message.data), message.format)
         size = (message.width, message.height) if is_raw else image_size(data)
-        if size is None:
+        if "depth" in topic.lower() or kind.startswith(_DEPTHS) or size is None:
             return
         ending = "jpg" if data[:2] == b"\xff\xd8" else "png"
         frame = message.header.frame_id.strip("/")
@@ -484,28 +474,27 @@ def _ends(contents: _Contents) -> tuple[str, str]:
     def moves(link: tuple[str, str]) -> bool:
         return link[::-1] in contents.moving
 
-    links = {
-        # A frame and those above it, as long as each moves in the next.
-        child: [child, *(above for _, above in takewhile(moves, pairwise(contents.chain(child))))]
+    # Frames and those above them, as long as each moves in the next.
+    chains = [
+        [child, *(above for _, above in takewhile(moves, pairwise(contents.chain(child))))]
         for _, child in contents.moving
         if not any(parent == child for parent, _ in contents.moving)
-    }
-    if not links:
+    ]
+    if not chains:
         raise DataError(
             f"The moving frames of TF go round: {some_of([*contents.parents], 6)}.",
             culprits=[*contents.parents],
             next_step="Name the base and the tip of the arm: --robot-key base_link,tool0",
         )
-    longest = max(map(len, links.values()))
-    ends = [child for child, above in links.items() if len(above) == longest]
-    if len(ends) > 1:
-        pairs = [f"{links[end][-1]},{end}" for end in ends]
+    longest = max(map(len, chains))
+    pairs = [f"{chain[-1]},{chain[0]}" for chain in chains if len(chain) == longest]
+    if len(pairs) > 1:
         raise DataError(
             f"TF has several moving chains of {longest - 1} joints: {some_of(pairs, 6)}.",
-            culprits=ends,
+            culprits=[pair.partition(",")[2] for pair in pairs],
             next_step=f"Say which is the robot's: --robot-key {pairs[0]}",
         )
-    base, tip = links[ends[0]][-1], ends[0]
+    tip, *_, base = max(chains, key=len)
     below = [name for name in contents.parents if tip in contents.chain(name)]
     above = contents.chain(base)
     return (
@@ -560,20 +549,18 @@ def _joint_rows(
     if not contents.descriptions or requested.robot_model is not None:
         return none
     document = {"schema": 1, "name": "robot", "urdf": contents.descriptions[0]}
-    tip = requested.tip or tip
     robot: Robot | None = None
-    for end in (tip, *_TIPS) if tip else _TIPS:
+    for end in filter(None, (requested.tip or tip, *_TIPS)):
         with suppress(VisioncalError):
             robot = Robot.from_document(document | {"tip": end})
             break
-    for topic, by_names in contents.joints.items() if robot is not None else ():
-        if requested.joints and topic not in requested.joints:
-            continue
-        for names, values in by_names.items():
-            if robot is not None and {*robot.joint_names} <= {*names}:
-                table = _table(values, 1 + len(names))
-                order = [1 + names.index(name) for name in robot.joint_names]
-                return table[:, 0], table[:, order], robot
+    topics = requested.joints or tuple(contents.joints)
+    tables = [rows for topic in topics for rows in contents.joints.get(topic, {}).items()]
+    for names, values in tables:
+        if robot is not None and {*robot.joint_names} <= {*names}:
+            table = _table(values, 1 + len(names))
+            order = [1 + names.index(name) for name in robot.joint_names]
+            return table[:, 0], table[:, order], robot
     return none
 
 

@@ -197,17 +197,10 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     episodes, frames, stamps_s = (_numbers(rows[name], name).ravel() for name in columns[:0:-1])
     reach, count = max(round(_STILL_S * info.fps), 1), len(joints)
     at = np.arange(count)
-    sides = [np.clip(at + side, 0, count - 1) for side in (-reach, reach)]
-    is_still = np.all(
-        [
-            (np.abs(joints[side] - joints).max(axis=1) < _STILL_RAD)
-            & (episodes[side] == episodes)
-            & (np.abs(side - at) == reach)
-            for side in sides
-        ],
-        axis=0,
-    )
-    still = np.flatnonzero(is_still)
+    sides = np.clip(at + np.array([[-reach], [reach]]), 0, count - 1)
+    is_near = np.abs(joints[sides] - joints).max(axis=2) < _STILL_RAD
+    is_near &= (episodes[sides] == episodes) & (np.abs(sides - at) == reach)
+    still = np.flatnonzero(is_near.all(axis=0))
     moved = np.abs(np.diff(joints[still], axis=0)).max(axis=1, initial=0.0) > _MOVED_RAD
     chosen, how = frames_to_take(at, still, moved, 60)
     paths = tuple(Path(f"images/{at:06d}.png") for at in chosen.tolist())

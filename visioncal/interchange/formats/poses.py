@@ -262,9 +262,10 @@ def poses_from(
 
 def _by_rows(requested: PoseImportOptions, count: int) -> PoseImportOptions:
     """Options of matrices: whether 16 numbers are by rows or by columns is known."""
+    form = POSE_FORMS.get(requested.form or "")
     if count == 12 or not requested.rotation.startswith("matrix"):
         return requested
-    return replace(requested, form=None, unit=requested.reading(Reading()).unit)
+    return replace(requested, form=None, unit=requested.unit or (form.unit if form else None))
 
 
 def _usual_form(names: Sequence[str], usual: str | None) -> str | None:

@@ -72,9 +72,6 @@ class Board(BoardKind):
             # A print of another size passes for blur; motion widens one direction only.
             sharp_px = blur_at_corners(image, px, reaches=0.5)
             blur_px = sharp_px if sharp_px < 0.5 * blur_px else blur_px
-        drawn_m = self.drawn_m(target, refined.grown)
-        return DetectedCorners(seen.ids[fitted], px, blur_px=blur_px, drawn_m=drawn_m)
-
-    def drawn_m(self, target: Target, grown: float) -> float | None:  # noqa: ARG002
-        """Size in an image of what grew by so many units; None where nothing does [m]."""
-        return None
+        drawn_m = target.diameter_m + 2.0 * refined.grown * self.unit_m(target)
+        drawn = drawn_m if target.diameter_m else None
+        return DetectedCorners(seen.ids[fitted], px, blur_px=blur_px, drawn_m=drawn)

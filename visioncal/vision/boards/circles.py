@@ -134,10 +134,6 @@ class CircleGrid(Board):
         radii = np.full(len(ids), target.diameter_m / target.square_m / 2)
         return Print(np.ones(len(ids)), np.inf, half, radii)
 
-    def drawn_m(self, target: Target, grown: float) -> float:
-        """Diameter of its circles in an image [m]."""
-        return target.diameter_m + 2.0 * grown * target.square_m
-
     def refine(self, image: Image, target: Target, ids: IntArray, px: FloatArray) -> Refined:
         """Refines (n, 2) detected centres [px] with these (n,) ids by the template."""
         if len(px) >= MIN_CORNERS:

@@ -370,17 +370,12 @@ def _refine_corners(
     smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
     indices, all_corners = np.arange(len(px)), np.ones(len(px), bool)
     sample = indices[:: -(-len(px) // 30)]
-    windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
-    grown = 0.0
+    # Wide, as circles may be larger than stated.
+    wide = pattern if pattern.radii is None else replace(pattern, radii=1.4 * pattern.radii)
+    windows = _Windows.cut(smooth, board, px, all_corners, indices, wide, axis)
+    blur_px, grown = _estimate_blur(windows.at(sample), pattern.at(sample))
     if pattern.radii is not None:
-        # A fit that begins at another radius takes the difference for blur.
-        grown = _roughly_grown(windows.at(sample), pattern, pattern.radii, sample)
-        pattern = replace(pattern, radii=np.maximum(pattern.radii + grown, 0.3 * pattern.radii))
-        windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
-    blur_px, more = _estimate_blur(windows.at(sample), pattern.at(sample))
-    grown += more
-    if pattern.radii is not None:
-        pattern = replace(pattern, radii=pattern.radii + more)
+        pattern = replace(pattern, radii=pattern.radii + grown)
         windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
     is_lone = pattern.lone is not None
     tolerances_px, last_px = (
@@ -392,7 +387,7 @@ def _refine_corners(
     # The edges of a lone corner are on one side of it, so that it depends on the maps' directions:
     # these are updated until corners stay [px].
     for _ in range(4 if is_lone else 1):
-        first = _step(windows, pattern, no_shift, blur_px)
+        (first,) = _steps(windows, pattern, no_shift, blur_px, (None,))
         shift, step = _fit_positions(windows, pattern, blur_px, None, first, tolerances_px[0])
         refined_px = windows.shifted(shift)
         good = _accepted(windows, step, refined_px - px, last_px[0])
@@ -420,17 +415,6 @@ def _refine_corners(
     )
 
 
-def _roughly_grown(windows: _Windows, pattern: Print, radii: FloatArray, sample: IntArray) -> float:
-    """Growth [squares] of circles of (n,) radii in an image, to 5 % of the radius."""
-    growths = np.median(radii) * (_RATIOS - 1.0)
-    shift, blur_px, residuals = np.zeros((len(sample), 2)), np.full(2, 1.5), []
-    for growth in growths:
-        tried = replace(pattern, radii=np.maximum(radii + growth, 0.3 * radii)).at(sample)
-        step = _step(windows, tried, shift, blur_px)
-        residuals.append(_median(step.misfit * np.abs(step.levels[:, 1])))
-    return float(growths[np.argmin(np.nan_to_num(residuals, nan=np.inf))])
-
-
 def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float]:
     """(2,) median edge widths of the smoothed image [px], and the growth of circles' radii.
 
@@ -440,8 +424,16 @@ def _estimate_blur(windows: _Windows, pattern: Print) -> tuple[FloatArray, float
     # A larger start would exclude all white around a lone corner.
     blur_px = np.full(2, min(1.5, 0.2 * min(pattern.outside, 1.0) * side_px))
     shift, total = np.zeros((len(windows.px), 2)), 0.0
+    if pattern.radii is not None:
+        # A fit that begins at another radius takes the difference for blur.
+        growths = (_RATIOS - 1.0) * pattern.radii.min()
+        printed = [replace(pattern, radii=pattern.radii + growth) for growth in growths]
+        steps = [_steps(windows, each, shift, blur_px, (None,))[0] for each in printed]
+        residuals = [_median(step.misfit * np.abs(step.levels[:, 1])) for step in steps]
+        best = int(np.argmin(np.nan_to_num(residuals, nan=np.inf)))
+        pattern, total = printed[best], float(growths[best])
     for _ in range(8):
-        step = _step(windows, pattern, shift, blur_px, blurs=True)
+        (step,) = _steps(windows, pattern, shift, blur_px, (None,), blurs=True)
         shift = shift + _limited(step.shift)
         medians = np.array([_median(column) for column in step.blur.T])
         changes = np.clip(np.nan_to_num(medians), -0.5, 0.5)
@@ -476,8 +468,8 @@ def _fit_positions(
         moving = moving[~converged]
         if not moving.size:
             break
-        moving_slopes = None if slopes is None else slopes[moving]
-        step = _step(windows.at(moving), pattern.at(moving), shift[moving], blur_px, moving_slopes)
+        lights = (None if slopes is None else slopes[moving],)
+        (step,) = _steps(windows.at(moving), pattern.at(moving), shift[moving], blur_px, lights)
         latest.replace(moving, step)
     return shift, latest
 
@@ -489,19 +481,6 @@ def _limited(shift: FloatArray) -> FloatArray:
     return np.where(np.isfinite(length), bounded, 0.0)
 
 
-def _step(
-    windows: _Windows,
-    pattern: Print,
-    shift: FloatArray,
-    blur_px: FloatArray,
-    slopes: FloatArray | None = None,
-    *,
-    blurs: bool = False,
-) -> _GaussNewtonStep:
-    """A Gauss-Newton step; `slopes` (n, 2, 2) are gradients of offset and contrast by x and y."""
-    return _steps(windows, pattern, shift, blur_px, (slopes,), blurs=blurs)[0]
-
-
 def _steps(
     windows: _Windows,
     pattern: Print,
@@ -511,7 +490,10 @@ def _steps(
     *,
     blurs: bool = False,
 ) -> list[_GaussNewtonStep]:
-    """Gauss-Newton steps for several gradients of illumination; None for even illumination."""
+    """Gauss-Newton steps for several gradients (n, 2, 2) of offset and contrast by x and y.
+
+    None stands for even illumination.
+    """
     count = len(shift)
     sx, sy, dx, dy, signs = (
         np.asarray(column, np.float32)[:, None, None]
