@@ -289,11 +289,10 @@ def test_a_board_too_blurred_for_its_markers_is_no_other_board():
     assert "sharp, near enough and not mirrored" in found.do.words
 
 
-def test_a_board_without_markers_has_to_be_stated():
+def test_a_board_of_another_kind_is_named():
     found = first_of_blurred(circles(4, 7, asymmetric=True), 0.0)
-    assert "no view shows the target" in found.words
-    assert 'kind = "circles", columns' in str(found.do)
-    assert 'target = "board.toml" in session.toml' in str(found.do)
+    assert "another board than declared: asymmetric grid of 4 x 7 circles" in found.words
+    assert 'write target = "seen.toml"' in found.do.words
 
 
 @pytest.mark.parametrize("name", NAMED)
@@ -322,7 +321,7 @@ def test_what_cannot_be_read_is_refused_with_what_to_type(tmp_path, name):
 def test_a_board_that_is_not_declared_is_named_by_calibrate(tmp_path):
     folder = broken_session(tmp_path / "session", BROKEN["another size of board"])
     caught = raised(DataError, "ChArUco board of 9 x 6 squares", visioncal.calibrate, folder)
-    assert "target check SESSION/images" in caught.next_step
+    assert "Write columns = 9 and rows = 6 in the board's .toml" in caught.next_step
 
 
 @pytest.mark.slow

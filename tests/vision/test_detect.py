@@ -19,6 +19,7 @@ from support.marks import slow
 from support.refusals import raised
 
 from visioncal.calibration.stages.detect import detect
+from visioncal.cli.target import to_toml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
 from visioncal.core.types import Camera, Target
@@ -27,7 +28,7 @@ from visioncal.simulation import BOARDS, CellOptions, prepare_scene, project, re
 from visioncal.simulation.render import light_on
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target, kind_of
 from visioncal.vision.boards.charuco import charuco_board
-from visioncal.vision.boards.identify import identify, to_toml
+from visioncal.vision.boards.identify import identify
 from visioncal.vision.boards.imaging import blur_at_corners, decode_image
 from visioncal.vision.targets import (
     corner_positions,
@@ -157,13 +158,22 @@ def test_too_few_corners_and_corners_on_one_line(charuco, monkeypatch):
     assert list(refused.corners) == [1]
 
 
-@pytest.mark.parametrize("declared", [{"legacy": True}, {"columns": 6, "rows": 9}])
-def test_another_layout_than_declared_is_named(charuco, declared):
+@pytest.mark.parametrize(
+    ("declared", "correction"),
+    [
+        ({"legacy": True}, "Write legacy = false in"),
+        ({"columns": 6, "rows": 9}, "Write columns = 9 and rows = 6 in"),
+        ({"marker_id": 17}, "Write first_id = 0 in"),
+        ({"dictionary": "DICT_4X4_100"}, 'Write dictionary = "DICT_5X5_50" in'),
+    ],
+)
+def test_another_layout_than_declared_is_named(charuco, declared, correction):
     cell, images = charuco
     files = {f"{at}.png": encoded(image) for at, image in enumerate(images)}
-    with pytest.raises(DataError, match="another board") as refused:
-        detect(session_of(files, replace(cell.options.target, **declared)))
-    assert "correct columns, rows, and legacy" in refused.value.next_step
+    session = session_of(files, replace(cell.options.target, **declared))
+    words = "another board than declared: ChArUco board of 9 x 6"
+    caught = raised(DataError, words, detect, session)
+    assert caught.next_step.startswith(correction)
 
 
 def seen_by_a_fisheye(target, turn, depth_m, resolution, *matrix):
@@ -327,14 +337,17 @@ def test_an_image_without_a_board_is_refused(sigma_px):
     if sigma_px:
         noise = cv2.GaussianBlur(noise, (0, 0), sigma_px)
     image = np.clip(128 + 60 * noise / noise.std(), 0, 255).astype(np.uint8)
-    raised(DataError, "No marker is read", identify, image)
+    raised(DataError, "No board is seen", identify, image)
 
 
 @pytest.mark.parametrize("target", [checkerboard_of(9, 6), circles(5, 9, asymmetric=True)])
-def test_a_board_without_markers_has_to_be_stated(target):
-    caught = raised(DataError, "they must be stated", identify, printed(target, 100))
-    assert f'kind = "{target.kind}", columns' in caught.next_step
-    assert 'target = "board.toml" in session.toml' in caught.next_step
+def test_a_board_without_markers_is_named_by_its_counts(target):
+    identity = identify(printed(target, 100))
+    assert_named(identity, target)
+    assert identity.board.asymmetric == target.asymmetric
+    described = identity.target("again", target.square_m)
+    # A pixel of a print at 4 pixels a millimetre.
+    assert described.diameter_m == pytest.approx(target.diameter_m, abs=2.5e-4)
 
 
 @pytest.mark.parametrize("name", MARKED)

@@ -34,7 +34,7 @@ from visioncal.simulation import (
 )
 from visioncal.simulation.textures import draw_sheet
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target
-from visioncal.vision.boards.charuco import CHARUCO, charuco_board
+from visioncal.vision.boards.charuco import Charuco, charuco_board
 from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA, BoardRequest
 from visioncal.vision.printing.page import pages_named
 from visioncal.vision.printing.pattern import draw_pattern
@@ -175,7 +175,7 @@ def test_two_copies_of_a_charuco_board_in_an_image_are_named():
     target = charuco(9, 6, square_m=0.025, marker_m=0.018)
     drawn = cv2.resize(picture(target), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
     page = np.pad(drawn, 60, constant_values=255)
-    seen = CHARUCO.search(np.hstack([page, page]), target)
+    seen = Charuco().search(np.hstack([page, page]), target)
     assert isinstance(seen, NotFound)
     assert (
         seen.reason == "markers are seen twice: another board with the same markers is in the image"

@@ -129,7 +129,7 @@ class BoardOptions:
     """Options that describe a board."""
 
     kind: str | None = option(
-        "What to print.", metavar="charuco|checkerboard|aprilgrid|circles|dots|marker"
+        "What to print.", metavar="charuco|checkerboard|aprilgrid|gridboard|circles|dots|marker"
     )
     columns: int | None = option("Squares along x; inner corners of a checkerboard, tags, circles.")
     rows: int | None = option("The same along y.")
@@ -139,9 +139,9 @@ class BoardOptions:
     marker_mm: float | None = option("Side of the markers of a ChArUco board.")
     dictionary: str = option("As DICT_5X5_100, DICT_APRILTAG_36h11.", default="")
     legacy: bool = flag("The ChArUco layout from before OpenCV 4.6.")
-    marker_id: int | None = option("Id of a single marker; an AprilGrid's first.", "--id")
+    marker_id: int | None = option("Id of a single marker; the first of a board.", "--id")
     size_mm: float | None = option("Side of a single marker or a tag; left out: the largest.")
-    spacing: float | None = option("White between an AprilGrid's tags, in their sides: 0.3.")
+    spacing: float | None = option("White between the markers of a grid, in their sides: 0.3.")
     border: int | None = option("Dark modules around their bits: 2, as Kalibr has it.")
     diameter_mm: float | None = option("Diameter of circles.")
     asymmetric: bool = flag("Every second row of circles is shifted by half.")
@@ -168,13 +168,13 @@ class TargetMakeOptions(BoardOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class TargetCheckOptions:
-    """Name the board in a photograph without further options, and print its description.
+    """Name the board in photographs without further options, and print its description.
 
     Only the size of its squares cannot be seen. Exit status 0: it is named; 2: no board is seen.
     """
 
-    image: Path = argument("A photograph of the board: png, jpg, tif, bmp or webp.")
-    square_mm: float | None = option("Measured side of a square, or of a tag.")
+    images: list[Path] = argument("Photographs of the board: png, jpg, tif, bmp or webp.")
+    square_mm: float | None = option("Measured side of a square, or of a tag; circles' rows.")
     out: Path | None = option("Write the description here.", "-o", "--out")
     as_json: bool = json_flag()
     force: bool = flag("Replace a description that is there.")

@@ -2,16 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import fields
+from typing import Any
 
+import tomli_w
 import typer
 
 from visioncal.cli.console import answer, print_json, say
 from visioncal.cli.session_options import BoardOptions, TargetCheckOptions, TargetMakeOptions
 from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, write_atomically
+from visioncal.core.files import check_free, one_line, write_atomically
 from visioncal.core.number_format import known_name
-from visioncal.vision.boards import KINDS
-from visioncal.vision.boards.identify import describe, identify, to_document, to_toml
+from visioncal.vision.boards import KINDS, kind_of
+from visioncal.vision.boards.identify import Identity, describe, identify
 from visioncal.vision.boards.imaging import read_image
 from visioncal.vision.boards.kind import BoardRequest, side_metres
 from visioncal.vision.printing.files import write_board
@@ -87,12 +89,12 @@ def target_check_command(options: TargetCheckOptions) -> None:
         )
     if options.out is not None:
         check_free(options.out, force=options.force)
-    identity = identify(read_image(options.image))
+    identity = identify([read_image(path) for path in options.images])
     if square_m is not None:
         # Refuses what no session could load, such as a size in millimetres taken as metres.
-        target = identity.target(options.image.stem, square_m)
+        target = identity.target(options.images[0].stem, square_m)
         target_from_document(target_document(target), target.name)
-    description = "" if square_m is None else to_toml(identity, square_m, options.image.name)
+    description = "" if square_m is None else to_toml(identity, square_m, options.images[0].name)
     if options.out is not None:
         write_atomically(options.out, description)
     if options.as_json:
@@ -105,3 +107,38 @@ def target_check_command(options: TargetCheckOptions) -> None:
             say(note)
     if options.out is not None:
         say(f"wrote {options.out}")
+
+
+def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
+    """An identity as the content of a JSON document.
+
+    With a measured side of a square, or of a single marker [m], it has the target's description
+    too.
+    """
+    kind, board = kind_of(identity.board), identity.board
+    described = kind.document(board)
+    sizes = {kind.size_key, "square_sigma_m", "marker_m", "diameter_m"}
+    document: dict[str, Any] = {
+        "kind": board.kind,
+        **{key: value for key, value in described.items() if key not in sizes},
+        "corners_seen": identity.corners_seen,
+        "corners": identity.corners,
+        "same_markers": list(identity.larger),
+        "marker_ids": list(identity.marker_ids),
+        "mirrored": identity.is_mirrored,
+        "notes": list(identity.notes),
+    }
+    if board.marker_m:
+        document["marker_over_square"] = board.marker_m
+    if square_m is not None:
+        document["target"] = target_document(identity.target("board", square_m))
+    return document
+
+
+def to_toml(identity: Identity, square_m: float, source: str) -> str:
+    """A target's description, with its measured side [m]; `source` names the image."""
+    lines = [f"# Seen in {one_line(source)}: {describe(identity)}."]
+    lines += [f"# {note}" for note in identity.notes]
+    lines.append("# square_sigma_m is 0.1 %, as of printers: replace it by how well you measured.")
+    target = identity.target("board", square_m)
+    return "\n".join([*lines, tomli_w.dumps(target_document(target))])

@@ -91,9 +91,9 @@ class Target:
     # ArUco dictionary by OpenCV's name, as `DICT_5X5_100`; empty without markers.
     dictionary: str = ""
     legacy: bool = False  # Whether a ChArUco board has the layout that OpenCV printed before 4.6.
-    # The id of a single marker, and the least one of an AprilGrid; -1 elsewhere.
+    # The id of a single marker, and the first one of a board of markers; -1 for 0 of a ChArUco board.
     marker_id: int = -1
-    # White between the tags of an AprilGrid, as a share of a tag's side; 0 elsewhere.
+    # White between the markers of a grid, as a share of a tag's side; 0 elsewhere.
     spacing: float = 0.0
     border: int = 1  # Dark modules around the bits of an AprilGrid's tags; 1 elsewhere.
     diameter_m: float = 0.0  # Diameter of the circles of a grid [m]; 0 elsewhere.

@@ -29,7 +29,9 @@ _BOX = np.array(
     ]
 )
 # Keys of target descriptions.
-KEYS = {"kind", "points"}.union(*(kind.keys.split() for kind in KINDS.values()))
+KEYS = {"kind", "points", "spacing_m"}.union(*(kind.keys.split() for kind in KINDS.values()))
+# What is to be written for a grid of ArUco markers.
+_GRID = ("gridboard", 'Write kind = "gridboard" with columns, rows, size_m, spacing, dictionary.')
 
 
 def _shipped() -> dict[str, Path]:
@@ -100,7 +102,8 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     Args:
         document: kind, columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy; for a
             single marker kind, id, size_m, dictionary; for an AprilGrid kind, columns, rows,
-            size_m, spacing and, unless Kalibr's, id, dictionary, border; for circles kind, columns,
+            size_m, spacing and, unless Kalibr's, first_id, dictionary, border; for a grid of
+            markers the same, with its dictionary; for circles kind, columns,
             rows, square_m, diameter_m, asymmetric; for a rig kind and points, the columns of its
             table as lists.
         name: Name of the target.
@@ -110,6 +113,9 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     """
     try:
         table = DocumentTable(document, f"target {name}")
+        kind = str(document.get("kind"))
+        if kind not in KINDS and "aruco" in kind and document.keys() & {"columns", "markers_x"}:
+            raise table.refuse("kind", kind, *_GRID)
         return KINDS[table.choice("kind", tuple(KINDS))].read(table, name)
     except DataError as error:
         hint = error.next_step or " ".join(misspelt_keys(document))

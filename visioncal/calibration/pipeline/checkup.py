@@ -13,6 +13,7 @@ from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
+from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
@@ -101,7 +102,9 @@ def _run_stages(run: RunState) -> tuple[RunState, VisioncalError | None]:
 
 
 def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
-    cause = unseen_cause(run) if error is not None or run.reasons else None
+    cause = error.finding if isinstance(error, OtherBoardError) else None
+    if cause is None and (error is not None or run.reasons):
+        cause = unseen_cause(run)
     read = [] if error is not None else [*misreadings(run)]
     hint = " ".join(finding.words for finding in read)
     if error is None and not read:

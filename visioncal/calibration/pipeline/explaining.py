@@ -3,6 +3,7 @@
 from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.image_checks import unseen_cause
+from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.misread_poses import with_misreading
 from visioncal.calibration.suspects.ranking import add_views_remedy
 from visioncal.core.errors import DegenerateError, VisioncalError
@@ -12,6 +13,8 @@ def explained(
     error: VisioncalError, state: RunState, stage: str, *, are_located: bool
 ) -> VisioncalError:
     """An error of a stage with its likeliest cause, where known, or the command for more views."""
+    if isinstance(error, OtherBoardError):
+        return error
     # Lost views are often why the remaining ones do not suffice.
     error = error.with_culprits([view for view in state.lost_views if view not in error.culprits])
     cause = unseen_cause(state) or (poor_motion(state) if stage == "intrinsics" else None)

@@ -5,14 +5,16 @@ Corners that another detector found (corners.csv) are used as they are.
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import cv2
 
 from visioncal.calibration.stages.corner_numbers import lack_of_corners, usable_corners
+from visioncal.calibration.stages.other_board import OtherBoardError, other_board, spread
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.threads import SharedSetting
@@ -62,6 +64,7 @@ def detect(
         The corners and the rejected views.
 
     Raises:
+        OtherBoardError: The first images that are looked at show another board, or are mirrored.
         DataError: No view shows the target, more images have some other size than the camera's,
             the size of the images is unknown, or the printed board has another layout than the
             declared one.
@@ -77,7 +80,11 @@ def detect(
         return _search(session, view, picture=pictures)
 
     with ONE_OPENCV_THREAD.held(), ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
-        for view, searched in zip(views, pool.map(search, views), strict=True):
+        first = _looked_at_first(session, views, lambda some: [*pool.map(search, some)])
+        rest = [view for view in views if view.number not in first]
+        searches = chain(first.values(), pool.map(search, rest))
+        order = [view for view in views if view.number in first] + rest
+        for view, searched in zip(order, searches, strict=True):
             found[view.number] = searched
             if progress is not None:
                 progress("detect", len(found), len(views))
@@ -95,6 +102,25 @@ def detect(
         resolution,
         found,
     )
+
+
+def _looked_at_first(
+    session: Session, views: Sequence[View], search: Callable[[Sequence[View]], list[Searched]]
+) -> dict[int, Searched]:
+    """Searches a few images of each board, and refuses where they show another one."""
+    first = dict[int, Searched]()
+    for name in session.boards:
+        some = spread([view for view in views if session.board_of(view) == name])
+        seen = {view.number: searched for view, searched in zip(some, search(some), strict=True)}
+        first |= seen
+        if any(isinstance(searched.found, Corners) for searched in seen.values()):
+            continue
+        present = [view for view in some if session.images.exists(view.image)]
+        images = [(view, image_of(session, view)) for view in present]
+        shown = [(view, image) for view, image in images if not isinstance(image, Rejection)]
+        if shown and (finding := other_board(session, name, shown)):
+            raise OtherBoardError.of(finding)
+    return {view.number: first[view.number] for view in views if view.number in first}
 
 
 def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Searched]) -> Size:

@@ -18,7 +18,6 @@ from visioncal.results import HELD_BACK, CameraResult
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.document import CameraTable
-from visioncal.vision.boards.identify import DESCRIBE_IT
 
 if TYPE_CHECKING:
     from visioncal.vision.dense import DenseCorners
@@ -202,5 +201,6 @@ def nothing_seen(observed: Observed) -> DataError:
         f"session {observed.session.name!r}: no view shows the target, or enough of it{why}.",
         culprits=observed.lost_views,
         next_step=f"Look at {image}: is the whole board in it, sharp, near enough and not "
-        f"mirrored, and is it the one that the session declares? {DESCRIBE_IT}",
+        "mirrored, and is it the one that the session declares? visioncal target check IMAGE says "
+        "what it shows.",
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.distance_scale import distance_scale
-from visioncal.calibration.stages.image_checks import board_correction
+from visioncal.calibration.stages.other_board import board_correction
 from visioncal.calibration.suspects.lens import has_changed
 from visioncal.calibration.suspects.suspect import Suspect
 from visioncal.core.limits import CONTRADICTION

@@ -59,7 +59,7 @@ def _unconnected(run: RunState) -> Iterator[Finding]:
 
 def _unseen(run: RunState) -> Iterator[Finding]:
     cause = unseen_cause(run) if run.reasons else None
-    if cause is not None and cause.kind == "other_board":
+    if cause is not None and cause.kind in ("other_board", "mirrored_images"):
         yield cause
 
 

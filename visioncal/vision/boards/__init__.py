@@ -6,10 +6,11 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.aprilgrid import AprilGrid
-from visioncal.vision.boards.charuco import CHARUCO
+from visioncal.vision.boards.charuco import Charuco
 from visioncal.vision.boards.checkerboard import Checkerboard
 from visioncal.vision.boards.circles import CircleGrid
 from visioncal.vision.boards.dots import Dots
+from visioncal.vision.boards.gridboard import GridBoard
 from visioncal.vision.boards.imaging import blur_at_corners
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
 from visioncal.vision.boards.marker import MarkerKind
@@ -19,7 +20,10 @@ __all__ = ["KINDS", "DetectedCorners", "NotFound", "blur_of", "find_target", "ki
 
 KINDS: Mapping[str, BoardKind] = {
     kind.name: kind
-    for kind in (CHARUCO, Checkerboard(), AprilGrid(), CircleGrid(), MarkerKind(), Rig(), Dots())
+    for kind in (
+        *(Charuco(), Checkerboard(), AprilGrid(), GridBoard()),
+        *(CircleGrid(), MarkerKind(), Rig(), Dots()),
+    )
 }
 
 

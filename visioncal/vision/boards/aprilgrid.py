@@ -1,99 +1,40 @@
 """AprilGrids: Kalibr's grids of tags with small dark squares at their corners."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Iterator, Sequence
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
-from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.boards.board import Board
-from visioncal.vision.boards.kind import (
-    COUNTS,
-    MM,
-    BoardRequest,
-    Cells,
-    DetectedCorners,
-    NotFound,
-    counts_of,
-    dictionary_size,
-    marker_cells,
-    sigma_of,
-    size_of,
-)
-from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit, read_markers
+from visioncal.vision.boards.gridboard import GridBoard, marker_grid
+from visioncal.vision.boards.kind import COUNTS, MM, Cells, DetectedCorners, NotFound, marker_cells
+from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit, once, read_markers
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
-from visioncal.vision.boards.template import SQUARE, Print
+from visioncal.vision.boards.template import Print
 
-# Kalibr's pages have tags with borders of two modules, and usually gaps of this share of a side.
-_MOST_BORDER, _USUAL_SPACING = 2, 0.3
 # OpenCV detects only tags surrounded by white, but squares touch a tag's corners. The image is grey
 # where two dark corners meet: it counts as white if dark has to be darker than its surroundings by
 # this many levels, and if the enlarged image has enough grey pixels. The last copy also suits
 # images of little contrast.
-_DARKER, _LITTLE, _ENLARGED = 25.0, 7.0, 2
+DARKER, _LITTLE, ENLARGED = 25.0, 7.0, 2.0
 # Half-widths of the windows of corner refinement, as a share of the gap between tags, and bounds
 # [px].
 _WINDOW, _WINDOWS_PX = 0.35, (2, 6)
 _ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-2)
 
 
-class AprilGrid(Board):
+class AprilGrid(Board, GridBoard):
     """An AprilGrid. Its origin is the outer corner of the tag at the upper left."""
 
     name: ClassVar[str] = "aprilgrid"
     noun = "AprilGrid"
-    options = "--columns --rows --size-mm --spacing --border --dictionary --id --name"
     in_a_word = rf"{COUNTS}_(?P<size_m>{MM})mm_(?P<spacing>0\.[0-9]{{1,9}}|1)"
-    keys = "columns rows size_m square_sigma_m spacing dictionary id border"
-    size_key = "size_m"
     side, sides = "side of a tag", "tags"
-    unit = "side"
-    is_seen_in_part = True
-
-    def read(self, table: DocumentTable, name: str) -> Target:
-        """Reads columns, rows, size_m, square_sigma_m, spacing, dictionary, id and border."""
-        columns, rows = counts_of(table, 1)
-        size_m = size_of(table, "size_m")
-        sigma_m = sigma_of(table, size_m)
-        spacing = table.number("spacing", positive=True)
-        # Kalibr's pages have gaps of at most a tag's side.
-        if spacing > 1.0:
-            raise table.refuse("spacing", spacing, "a share of size_m, such as 0.3,")
-        dictionary = table.text("dictionary", APRILGRID_DICTIONARY)
-        markers = dictionary_size(table, dictionary)
-        first = table.integer("id", 0, markers - 1, 0)
-        if first + columns * rows > markers:
-            raise DataError(
-                f"{table.label}: dictionary {dictionary} has {markers} tags; {columns} x {rows} "
-                f"tags from id {first} on need {first + columns * rows}.",
-                culprits=[f"{table.label}: columns"],
-            )
-        border = table.integer("border", 1, _MOST_BORDER, _MOST_BORDER)
-        return Target(
-            name,
-            self.name,
-            columns,
-            rows,
-            size_m,
-            sigma_m,
-            dictionary=dictionary,
-            marker_id=first,
-            spacing=spacing,
-            border=border,
-        )
-
-    def corners(self, target: Target) -> FloatArray:
-        """(n, 3) corners [m], clockwise on the page, tag by tag in the order of their ids."""
-        places = _tag_corners(target, np.arange(target.columns * target.rows)).reshape(-1, 2)
-        return np.asarray(target.square_m * np.pad(places, ((0, 0), (0, 1))))
-
-    def words(self, target: Target, size: str) -> str:
-        """The board in a few words."""
-        return f"AprilGrid of {size} tags, {target.dictionary} from id {target.marker_id}"
+    usual_dictionary = APRILGRID_DICTIONARY
+    usual_place, usual_border = " at the lower left", 2  # Of Kalibr's pages.
+    has_lone_tags = False
 
     def extent_m(self, target: Target) -> tuple[FloatArray, FloatArray]:
         """Low and high x, y of the print, with small squares around the outermost tags, too."""
@@ -111,30 +52,16 @@ class AprilGrid(Board):
         squares = (side + gap) * np.stack([x, y], axis=-1).reshape(-1, 2) - gap
         return (*grids, *(Cells(square, gap, np.ones((1, 1), bool)) for square in squares))
 
-    def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it."""
-        side_mm, sides = (
-            1e3 * target.square_m,
-            target.columns + (target.columns - 1) * target.spacing,
-        )
-        return (
-            f"AprilGrid, {target.columns} x {target.rows} tags of {side_mm:g} mm, "
-            f"{target.spacing * side_mm:g} mm apart, {target.dictionary} from id "
-            f"{target.marker_id} at the lower left",
-            "the upper left corner of the tag at the top left",
-            f"Measure over all {target.columns} columns of tags, meant to be "
-            f"{sides * side_mm:g} mm; divide by {sides:g} and write the result into size_m, in "
-            "metres.",
-        )
+    def page_places(self, target: Target, numbers: IntArray) -> FloatArray:
+        """(t, 2) columns and rows of tags on the page; those outside the grid continue its rows."""
+        columns, rows = marker_grid(numbers, target.columns).T
+        return np.stack([columns, target.rows - 1 - rows], axis=1)
 
-    def requested(self, request: BoardRequest, square_mm: float) -> dict[str, Any]:
-        """The description of a requested board; Kalibr's where it says nothing."""
-        optional = {"id": request.marker_id, "border": request.border}
-        return super().requested(request, square_mm) | {
-            "dictionary": request.dictionary or APRILGRID_DICTIONARY,
-            "spacing": _USUAL_SPACING if request.spacing is None else request.spacing,
-            **{key: value for key, value in optional.items() if value is not None},
-        }
+    def marker_places(self, numbers: IntArray, columns: int) -> Sequence[FloatArray]:
+        """Row by row from the lower left, by tags that are upside down or turned otherwise."""
+        places = marker_grid(numbers, columns) * np.array([-1.0, 1.0])
+        across = places[:, ::-1] * np.array([1.0, -1.0])
+        return [places, -places, across, -across]
 
     def unit_m(self, target: Target) -> float:
         """The gap between tags, within which are a corner's own lines and the next ones."""
@@ -164,29 +91,35 @@ class AprilGrid(Board):
         if own.sum() <= 0.5 * len(own):
             others = ", ".join(map(str, ids[~own][:5].tolist()))
             return NotFound(f"most tags seen ({others}) are none of the target's", misfit=True)
-        px, misfit = _ordered_tags(target, numbers, px, own)
+        px, misfit = self._ordered(target, numbers, px, own)
         if misfit > LAYOUT_MISFIT:
             return NotFound("the tags do not lie as the target describes them", misfit=True)
         size = f"the target's {target.columns} x {target.rows}"
-        if not own.all() and layout_misfit(_tag_corners(target, numbers), px) <= LAYOUT_MISFIT:
+        if not own.all() and layout_misfit(self.tag_corners(target, numbers), px) <= LAYOUT_MISFIT:
             return NotFound(f"the grid has tag {ids[~own][0]} besides {size}", misfit=True)
         numbers, px = numbers[own], px[own]
+        refined = _refined_tags(image, px, target.spacing)
+        if why := self.other_spacing(target, self.page_places(target, numbers), refined):
+            return NotFound(why, misfit=True)
         if not _has_squares(image, px, target.spacing):
             return NotFound(
-                "the tags lack the small dark squares at their corners that an AprilGrid has "
-                "(they are a target of kind points)",
+                "the tags lack the small dark squares at their corners that an AprilGrid has",
                 misfit=True,
             )
-        px = _refined_tags(image, px, target.spacing)
-        spacing = _measured_spacing(target, numbers, px)
-        # Shares of a side.
-        if abs(spacing - target.spacing) > 0.02:
-            return NotFound(
-                f"the tags are {spacing:.2f} of their side apart, and the target says spacing = "
-                f"{target.spacing:g}",
-                misfit=True,
-            )
-        return DetectedCorners((4 * numbers[:, None] + np.arange(4)).ravel(), px.reshape(-1, 2))
+        ids = (4 * numbers[:, None] + np.arange(4)).ravel()
+        return DetectedCorners(ids, refined.reshape(-1, 2))
+
+    def _ordered(
+        self, target: Target, numbers: IntArray, px: FloatArray, own: Mask
+    ) -> tuple[FloatArray, float]:
+        """Orders the corners (t, 4, 2) of tags as on the page, and measures the layout's misfit."""
+        # Kalibr's pages have the tags upside down; other orientations are recognised by the layout.
+        rotated = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
+        if own.sum() < 2:
+            return rotated[0], 0.0
+        places = self.tag_corners(target, numbers[own])
+        misfits = [layout_misfit(places, array[own]) for array in rotated]
+        return rotated[int(np.argmin(misfits))], min(misfits)
 
 
 def _grid_tags(
@@ -194,19 +127,9 @@ def _grid_tags(
 ) -> tuple[IntArray, FloatArray]:
     """Ids (t,), ascending, and corners (t, 4, 2) [px] of tags whose corners touch dark squares."""
     corners: dict[int, FloatArray] = {}
-    for copy in _copies(image):
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.markerBorderBits = border
-        parameters.adaptiveThreshConstant = copy.darker
-        found_ids, px = read_markers(copy.image, dictionary, parameters)
-        # From pixel centres of the copy to those of the image.
-        quads = (px + 0.5) / copy.scale - 0.5
-        unique = {
-            index: quad
-            for index, quad in zip(found_ids, quads, strict=True)
-            if found_ids.count(index) == 1
-        }
-        corners = unique | corners
+    for copy, scale, darker in _copies(image):
+        found = read_markers(copy, dictionary, border, darker=darker, scale=scale)
+        corners = once(*found) | corners
         if len(corners) >= enough:
             break
     numbers = sorted(corners)
@@ -214,34 +137,11 @@ def _grid_tags(
     return np.array(numbers, dtype=np.int64), found_px
 
 
-@dataclass(frozen=True, eq=False)
-class _Copy:
-    """A processed copy of an image, its scale, and the threshold below its surroundings."""
-
-    image: Image
-    scale: float
-    darker: float
-
-
-def _copies(image: Image) -> Iterator[_Copy]:
+def _copies(image: Image) -> Iterator[tuple[Image, float, float]]:
     """Copies: enlarged; smoothed, against motion; dilated, against spreading ink."""
-    large = cv2.resize(image, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)
-    yield _Copy(np.asarray(large, np.uint8), _ENLARGED, _DARKER)
-    yield _Copy(np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.uint8), 1.0, _DARKER)
-    yield _Copy(np.asarray(cv2.dilate(image, np.ones((3, 3), np.uint8)), np.uint8), 1.0, _LITTLE)
-
-
-def _ordered_tags(
-    target: Target, numbers: IntArray, px: FloatArray, own: Mask
-) -> tuple[FloatArray, float]:
-    """Orders the corners (t, 4, 2) of tags as on the page, and measures the layout's misfit."""
-    # Kalibr's pages have the tags upside down; other orientations are recognised by the layout.
-    rotated = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
-    if own.sum() < 2:
-        return rotated[0], 0.0
-    places = _tag_corners(target, numbers[own])
-    misfits = [layout_misfit(places, array[own]) for array in rotated]
-    return rotated[int(np.argmin(misfits))], min(misfits)
+    yield image, ENLARGED, DARKER
+    yield np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.uint8), 1.0, DARKER
+    yield np.asarray(cv2.dilate(image, np.ones((3, 3), np.uint8)), np.uint8), 1.0, _LITTLE
 
 
 def _has_squares(image: Image, px: FloatArray, spacing: float) -> bool:
@@ -261,13 +161,6 @@ def _has_squares(image: Image, px: FloatArray, spacing: float) -> bool:
     return squares < (dark + white) / 2
 
 
-def _tag_corners(target: Target, numbers: IntArray) -> FloatArray:
-    """(t, 4, 2) corners of tags [sides]; numbers outside the grid continue its rows."""
-    rows, columns = np.divmod(numbers, target.columns)
-    first = np.stack([columns, target.rows - 1 - rows], axis=1) * (1.0 + target.spacing)
-    return np.asarray(first[:, None] + SQUARE)
-
-
 def _refined_tags(image: Image, px: FloatArray, spacing: float) -> FloatArray:
     """Refines the (t, 4, 2) corners of tags [px], each a saddle point between two dark squares."""
     sides = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2)
@@ -277,33 +170,3 @@ def _refined_tags(image: Image, px: FloatArray, spacing: float) -> FloatArray:
     # Without a saddle point the refinement diverges.
     strays = np.linalg.norm(refined - start, axis=2, keepdims=True) > 2 * window
     return np.where(strays, start, refined).reshape(px.shape).astype(float)
-
-
-def _measured_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float:
-    """Measured gap between tags [sides]; the stated one if too few tags are adjacent.
-
-    Four corners of two collinear tags lie at 0, 1, 1 + s and 2 + s. Their cross-ratio (AC BD) / (BC
-    AD) = (1 + s)^2 / (s (2 + s)) is invariant under projection, and almost under lens distortion.
-    """
-    index = {number: place for place, number in enumerate(numbers.tolist())}
-    lines: list[FloatArray] = []
-    for number, place in index.items():
-        right = number + 1 if (number + 1) % target.columns else -1
-        for neighbour, sides in (
-            (right, [[0, 1], [3, 2]]),
-            (number + target.columns, [[3, 0], [2, 1]]),
-        ):
-            if neighbour in index:
-                lines += [
-                    np.concatenate([px[place][side], px[index[neighbour]][side]]) for side in sides
-                ]
-    if len(lines) < 4:
-        return target.spacing
-    a, b, c, d = np.moveaxis(np.array(lines), 1, 0)
-    far, near = (
-        np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
-        for first, second in ((c - a, d - b), (c - b, d - a))
-    )
-    quarter, middle, last = np.percentile(np.sqrt(far / np.maximum(far - near, 1e-9)), [25, 50, 75])
-    # Scattered corners, as in blurred images, are inconclusive.
-    return target.spacing if last - quarter > 0.05 else float(middle) - 1.0

@@ -3,22 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import product
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 
-from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
-from visioncal.core.number_format import listed
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.checkerboard import measure_squares, square_corners
-from visioncal.vision.boards.identity import LEAST_MARKERS, Identity, Marker, holding
 from visioncal.vision.boards.kind import (
     COUNTS,
-    DEFAULT_RELATIVE_SIGMA,
     MM,
     BoardRequest,
     Cells,
@@ -26,7 +21,7 @@ from visioncal.vision.boards.kind import (
     NotFound,
     aruco_dictionary,
     counts_of,
-    dictionary_size,
+    first_id,
     marker_cells,
     side_metres,
     sigma_of,
@@ -37,14 +32,7 @@ from visioncal.vision.boards.template import Print
 
 # A homography has eight unknowns and a marker gives eight equations: three are a check.
 _LAYOUT_MARKERS = 3
-
-
 _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
-# Steps between markers up to this length, and this close to whole squares, are counted [squares].
-_NEAR, _OFF = 2.5, 0.3
-_SHARES = (0.25, 0.98)
-# A marker's corners around its centre [sides].
-_AROUND = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 
 
 class Charuco(Board):
@@ -52,7 +40,7 @@ class Charuco(Board):
 
     name: ClassVar[str] = "charuco"
     noun = "ChArUco board"
-    options = "--columns --rows --square-mm --marker-mm --dictionary --legacy --name"
+    options = "--columns --rows --square-mm --marker-mm --dictionary --id --legacy --name"
     in_a_word = (
         rf"{COUNTS}_(?P<square_m>{MM})mm_(?P<marker_m>{MM})mm_(?P<dictionary>DICT_\w+?)"
         "(?P<legacy>_legacy)?"
@@ -61,7 +49,7 @@ class Charuco(Board):
     is_seen_in_part = is_dense = has_quick_search = True
 
     def read(self, table: DocumentTable, name: str) -> Target:
-        """Reads columns, rows, square_m, square_sigma_m, marker_m, dictionary and legacy."""
+        """Reads columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy, first_id."""
         columns, rows = counts_of(table)
         square_m = size_of(table, "square_m")
         sigma_m = sigma_of(table, square_m)
@@ -72,17 +60,18 @@ class Charuco(Board):
             allowed = f"less than square_m = {square_m!r}, above {low_m:g}, in the same unit,"
             raise table.refuse("marker_m", marker_m, allowed)
         dictionary = table.text("dictionary")
-        markers, needed = dictionary_size(table, dictionary), columns * rows // 2
-        if markers < needed:
-            raise DataError(
-                f"{table.label}: dictionary {dictionary} has {markers} markers; a board of "
-                f"{columns} x {rows} squares needs {needed}.",
-                culprits=[f"{table.label}: dictionary"],
-            )
+        size = f"{columns} x {rows} squares"
+        first = first_id(table, columns * rows // 2, size, dictionary)
         legacy = table.flag("legacy", default=False)
-        return Target(
+        board = Target(
             name, self.name, columns, rows, square_m, sigma_m, marker_m, dictionary, legacy
         )
+        return replace(board, marker_id=first) if first else board
+
+    def document(self, target: Target) -> dict[str, Any]:
+        """The target as the content of a `.toml`; first_id only where it is another than 0."""
+        first = {"first_id": target.marker_id} if target.marker_id > 0 else {}
+        return super().document(target) | first
 
     def corners(self, target: Target) -> FloatArray:
         """(n, 3) inner corners [m], row by row."""
@@ -91,7 +80,8 @@ class Charuco(Board):
     def words(self, target: Target, size: str) -> str:
         """The board in a few words."""
         layout = ", legacy layout" if target.legacy else ""
-        return f"ChArUco board of {size} squares, {target.dictionary}{layout}"
+        first = f" from id {target.marker_id}" if target.marker_id > 0 else ""
+        return f"ChArUco board of {size} squares, {target.dictionary}{first}{layout}"
 
     def extent_m(self, target: Target) -> tuple[FloatArray, FloatArray]:
         """Low and high x, y of the print [m]."""
@@ -104,7 +94,7 @@ class Charuco(Board):
         dark[light[:, 1], light[:, 0]] = False
         grids = [Cells(np.zeros(2), target.square_m, dark)]
         inset = (target.square_m - target.marker_m) / 2
-        for marker_id, square in enumerate(light):
+        for marker_id, square in enumerate(light, max(target.marker_id, 0)):
             cells = marker_cells(target.dictionary, marker_id)
             corner_m = target.square_m * square + inset
             grids.append(Cells(corner_m, target.marker_m / len(cells), cells))
@@ -130,17 +120,20 @@ class Charuco(Board):
             # too small for that: rounded to a nanometre.
             marker_mm = round(0.75 * square_mm, 6)
             marker_mm = float(int(marker_mm)) if square_mm >= 10 else marker_mm
-        needed = (request.columns or 0) * (request.rows or 0) // 2
+        first = {"first_id": request.marker_id} if request.marker_id else {}
+        needed = (request.columns or 0) * (request.rows or 0) // 2 + (request.marker_id or 0)
         large = (name for name in _USUAL if len(aruco_dictionary(name).bytesList) >= needed)
         return document | {
             "marker_m": side_metres("--marker-mm", marker_mm),
             "dictionary": request.dictionary or next(large, _USUAL[-1]),
             "legacy": request.legacy,
+            **first,
         }
 
     def file_name(self, target: Target, side: str) -> str:
         """Name of a target with sides of `side`."""
-        return super().file_name(target, side) + ("_legacy" if target.legacy else "")
+        first = f"_id{target.marker_id}" if target.marker_id > 0 else ""
+        return super().file_name(target, side) + first + ("_legacy" if target.legacy else "")
 
     def around(self, target: Target, ids: IntArray, squares: FloatArray) -> Print:
         """The print around corners, without the markers."""
@@ -190,17 +183,9 @@ class Charuco(Board):
         detected = px.reshape(-1, 2)[order].astype(np.float64)
         return DetectedCorners(ids.ravel()[order].astype(np.int64), detected)
 
-    def identify(self, image: Image, markers: Sequence[Marker]) -> list[Identity]:
-        """Boards by the markers of each family."""
-        families = sorted({marker.family for marker in markers})
-        boards = (
-            _identified(image, [marker for marker in markers if marker.family == family])
-            for family in families
-        )
-        return [board for board in boards if board is not None]
-
-
-CHARUCO = Charuco()
+    def marker_places(self, numbers: IntArray, columns: int) -> Sequence[FloatArray]:
+        """Row by row in the light squares, from the upper left; the legacy layout is the second."""
+        return [_places(numbers, columns, legacy=legacy) for legacy in (False, True)]
 
 
 def marked_squares(target: Target) -> IntArray:
@@ -219,62 +204,10 @@ def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
         target.square_m,
         target.marker_m,
         aruco_dictionary(target.dictionary),
+        np.arange(target.columns * target.rows // 2, dtype=np.int32) + max(target.marker_id, 0),
     )
     board.setLegacyPattern(target.legacy)
     return board
-
-
-def _identified(image: Image, markers: Sequence[Marker]) -> Identity | None:
-    """Identifies a ChArUco board from the markers of one family, with false positives.
-
-    The ids count the white squares row by row: columns and layout predict the step from each marker
-    to its neighbours. Steps are measured in the frame of the marker itself, where perspective and
-    lens hardly count. Where too few rows are seen to determine the columns, several layouts predict
-    them; corners decide, or a note names the others.
-    """
-    if len(markers) < LEAST_MARKERS:
-        return None
-    ids = np.array([marker.number for marker in markers])
-    px = np.array([marker.px for marker in markers])
-    centres = np.array([marker.centre for marker in markers])
-    sides = np.stack(
-        [px[:, 1] + px[:, 2] - px[:, 0] - px[:, 3], px[:, 2:].sum(1) - px[:, :2].sum(1)]
-    )
-    own_from_px = 2.0 * np.linalg.pinv(np.moveaxis(sides, 0, -1))
-    # (n, n, 2) steps [marker sides].
-    steps = np.einsum("iab,ijb->ija", own_from_px, centres - centres[:, None])
-    lengths = np.abs(steps).max(axis=2) + np.diag(np.full(len(ids), np.inf))
-    sides_away = max(float(np.median(lengths.min(axis=1))), 1e-9)
-    agreeing = {}
-    # The nearest marker is one square away along both axes, or two where some are not read.
-    for share in (1.0 / sides_away, 2.0 / sides_away):
-        whole = np.rint(share * steps)
-        near = whole.any(axis=2) & (share * lengths < _NEAR)
-        near &= (np.abs(share * steps - whole) < _OFF).all(axis=2)
-        # Printable boards have fewer columns.
-        for columns, legacy in product(range(3, 41), (False, True)):
-            places = _places(ids, columns, legacy=legacy)
-            pairs = near & (places - places[:, None] == whole).all(axis=2)
-            agreeing[share, columns, legacy] = pairs
-    most = max(int(pairs.sum()) for pairs in agreeing.values())
-    tied = [layout for layout, pairs in agreeing.items() if pairs.sum() == most]
-    boards = []
-    for share, columns, legacy in tied[:4]:
-        fits = agreeing[share, columns, legacy].any(axis=1)
-        # At most half of the markers may be false positives.
-        if fits.sum() >= max(LEAST_MARKERS, len(ids) / 2):
-            fitting = [markers[index] for index in np.flatnonzero(fits).tolist()]
-            boards.append(_charuco_of(image, fitting, columns, share, legacy=legacy))
-    found = sorted(filter(None, boards), key=lambda board: -board.corners_seen)
-    rivals = [board for board in found[1:] if board.corners_seen == found[0].corners_seen]
-    if not rivals:
-        return next(iter(found), None)
-    layouts = ", ".join(
-        f"{rival.columns} x {rival.rows}{' in the legacy layout' if rival.legacy else ''}"
-        for rival in (identity.board for identity in rivals)
-    )
-    note = f"What is seen of it fits {layouts} as well: show more of the board."
-    return replace(found[0], notes=(note, *found[0].notes))
 
 
 def _places(ids: IntArray, columns: int, *, legacy: bool) -> FloatArray:
@@ -287,42 +220,3 @@ def _places(ids: IntArray, columns: int, *, legacy: bool) -> FloatArray:
     # In the upper row of a pair the markers are in the odd columns, or the even ones if legacy.
     start = np.where(lower == legacy, 1, 0)
     return np.stack([2 * place + start, 2 * pair + lower], axis=1).astype(float)
-
-
-def _charuco_of(
-    image: Image, markers: Sequence[Marker], columns: int, share: float, *, legacy: bool
-) -> Identity | None:
-    """The board of a layout that markers fit, with the corners of its detector; None without."""
-    ids = np.array([marker.number for marker in markers])
-    squares = _places(ids, columns, legacy=legacy)
-    rows = int(squares[:, 1].max()) + 1
-    quads = np.array([marker.px for marker in markers])
-    for _ in range(3):
-        places = (squares + 0.5)[:, None] + share * _AROUND
-        fit = cv2.findHomography(places.reshape(-1, 2), quads.reshape(-1, 2))[0]
-        px_from_board = np.asarray(fit, dtype=float)
-        if px_from_board.shape != (3, 3) or np.linalg.matrix_rank(px_from_board) < 3:
-            return None
-        seen_places = cv2.perspectiveTransform(quads, np.linalg.inv(px_from_board))
-        areas = [cv2.contourArea(quad.astype(np.float32)) for quad in seen_places]
-        share = float(np.sqrt(np.median(areas)))
-    if legacy and rows % 2:
-        # A legacy board with an odd number of rows does not start with a marker.
-        rows += 1
-    names = holding(markers[0].family, max(columns * rows // 2, int(ids.max()) + 1))
-    if not _SHARES[0] < share < _SHARES[1] or not names:
-        return None
-    notes = ["The markers' side is by the image, to about 3 %: measure it to be sure."]
-    if len(names) > 1:
-        notes.append(f"{listed(names[1:])} hold the same markers: any of them finds this board.")
-    sigma, share = DEFAULT_RELATIVE_SIGMA, round(share, 5)
-    board = Target("board", "charuco", columns, rows, 1.0, sigma, share, names[0], legacy)
-    seen = CHARUCO.search(image, board)
-    found = len(seen.ids) if isinstance(seen, DetectedCorners) else 0
-    # So many markers in place prove a board without its corners.
-    if not found and len(markers) < 8:
-        return None
-    if isinstance(seen, NotFound):
-        notes.insert(0, f"Its corners are not found in this image: {seen.reason}.")
-    corners, numbers = (columns - 1) * (rows - 1), tuple(sorted(set(ids.tolist())))
-    return Identity(board, found, corners, names[1:], numbers, tuple(notes))

@@ -1,6 +1,5 @@
 """Checkerboards: inner corners of plain squares."""
 
-from dataclasses import replace
 from typing import ClassVar, Literal
 
 import cv2
@@ -11,7 +10,7 @@ from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.kind import (
     COUNTS,
-    FEWEST_SQUARES,
+    DEFAULT_RELATIVE_SIGMA,
     MM,
     Cells,
     DetectedCorners,
@@ -30,6 +29,13 @@ _FLAGS = (
     cv2.CALIB_CB_ACCURACY,
     cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
 )
+# The search for any count, and counts that it begins at: a smaller one finds more small boards, and
+# more parts of larger ones.
+_ANY = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+_FEWEST = ((4, 4), (3, 3))
+# Shares of a square at which its grey levels are compared, and their range in units of contrast
+# from which on it is not plain: light and noise leave a tenth.
+_INSIDE, _MARKS = (0.25, 0.4, 0.6, 0.75), 0.4
 
 
 class Checkerboard(Board):
@@ -122,17 +128,19 @@ class Checkerboard(Board):
             f"no board: no checkerboard of {target.columns} x {target.rows} inner corners is seen"
         )
 
-    def miscounted(self, image: Image, target: Target) -> Target | None:
-        """The board of one row and column less or more than stated, by a quick search.
-
-        Squares are easily counted in the place of inner corners.
-        """
-        for more in (-1, 1):
-            other = replace(target, columns=target.columns + more, rows=target.rows + more)
-            if min(other.columns, other.rows) >= FEWEST_SQUARES and isinstance(
-                self.search(image, other, quick=True), DetectedCorners
-            ):
-                return other
+    def seen_in(self, image: Image) -> Target | None:
+        """The checkerboard of any count that a (h, w) grey image shows whole, the wider way."""
+        for size in _FEWEST:
+            found, _, grid = cv2.findChessboardCornersSBWithMeta(image, size, flags=_ANY)
+            columns, rows = sorted(grid.shape, reverse=True) if found else (0, 0)
+            board = Target("board", self.name, columns, rows, 1.0, DEFAULT_RELATIVE_SIGMA)
+            # A second look, as this search takes parts of some boards for the whole.
+            seen = self.search(image, board, quick=True)
+            if isinstance(seen, DetectedCorners):
+                px = seen.px.reshape(rows, columns, 2)
+                outside = _extended(px).reshape(-1, 2)
+                is_whole = (outside > -0.5).all() and (outside < image.shape[::-1]).all()
+                return board if is_whole and not _has_marks(image, px) else None
         return None
 
 
@@ -156,15 +164,7 @@ def _is_checkered(image: Image, grid: FloatArray) -> bool:
 
     For small boards OpenCV sometimes skips a row and takes the board's edge as the last one.
     """
-    extended = grid
-    for axis in (0, 1):
-        first, last = np.take(extended, [0], axis), np.take(extended, [-1], axis)
-        before, after = (
-            2 * first - np.take(extended, [1], axis),
-            2 * last - np.take(extended, [-2], axis),
-        )
-        extended = np.concatenate([before, extended, after], axis=axis)
-    levels = _levels(image, extended)
+    levels = _levels(image, _extended(grid))
     diagonal = np.stack([levels[:-1, :-1], levels[1:, 1:]])
     antidiagonal = np.stack([levels[:-1, 1:], levels[1:, :-1]])
     gap = np.maximum(
@@ -175,6 +175,30 @@ def _is_checkered(image: Image, grid: FloatArray) -> bool:
     meet = gap > 0.25 * np.ptp(np.concatenate([diagonal, antidiagonal]), axis=0)
     # Glare hides some.
     return all(bool(np.all(meet.mean(axis=axis) >= 0.5)) for axis in (0, 1))
+
+
+def _extended(grid: FloatArray) -> FloatArray:
+    """A (rows, columns, 2) grid with the outer corners of its outermost squares."""
+    for axis in (0, 1):
+        first, last = np.take(grid, [0], axis), np.take(grid, [-1], axis)
+        before, after = 2 * first - np.take(grid, [1], axis), 2 * last - np.take(grid, [-2], axis)
+        grid = np.concatenate([before, grid, after], axis=axis)
+    return grid
+
+
+def _has_marks(image: Image, grid: FloatArray) -> bool:
+    """Whether the squares of a (rows, columns, 2) grid are no plain ones, as those of markers."""
+    corners = grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
+    shares = [(x, y) for x in _INSIDE for y in _INSIDE]
+    places = [
+        (1 - x) * (1 - y) * corners[0] + x * (1 - y) * corners[1] + (1 - x) * y * corners[2]
+        + x * y * corners[3]
+        for x, y in shares
+    ]  # fmt: skip
+    levels = np.stack([_at(image, place) for place in places])
+    ranges = np.ptp(levels, axis=0) / max(np.ptp(np.median(levels, axis=0)), 1.0)
+    odd = np.indices(ranges.shape).sum(axis=0) % 2 == 1
+    return max(float(np.median(ranges[odd])), float(np.median(ranges[~odd]))) > _MARKS
 
 
 def _dark_corner_first(image: Image, grid: FloatArray) -> FloatArray:
@@ -192,6 +216,10 @@ def _dark_corner_first(image: Image, grid: FloatArray) -> FloatArray:
 
 def _levels(image: Image, grid: FloatArray) -> FloatArray:
     """Grey levels (rows - 1, columns - 1) at the centres of a grid's squares."""
-    centres = (grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4
-    pixels = np.clip(np.round(centres).astype(int), 0, np.array(image.shape[::-1]) - 1)
+    return _at(image, (grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4)
+
+
+def _at(image: Image, places: FloatArray) -> FloatArray:
+    """Grey levels at (..., 2) places [px]."""
+    pixels = np.clip(np.round(places).astype(int), 0, np.array(image.shape[::-1]) - 1)
     return np.asarray(image[pixels[..., 1], pixels[..., 0]], float)

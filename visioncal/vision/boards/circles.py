@@ -1,7 +1,7 @@
 """Grids of circles: blobs on a lattice."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, ClassVar, Literal, Self
 
@@ -24,9 +24,9 @@ from visioncal.vision.boards.kind import (
 )
 from visioncal.vision.boards.template import MIN_CORNERS, Print, Refined
 
-# Largest diameter over spacing of circles, so that their edges remain separate; that of requested
-# ones, as much dark as white between them.
-_WIDEST, _USUAL_DIAMETER = 0.85, 0.5
+# Largest diameter over spacing of circles, so that their edges remain separate; that of those named
+# without being declared; that of requested ones, as much dark as white between them.
+_WIDEST, _NAMED, _USUAL_DIAMETER = 0.85, 0.75, 0.5
 # Threshold: window as a share of the image's shorter side, and grey levels below its mean. Blobs
 # have a minimum area [px] and fill the ellipse of their moments: squares fill 0.955, circles of few
 # pixels a little less than all of it; the median separates them.
@@ -165,6 +165,27 @@ class CircleGrid(Board):
         size = f"{target.columns} x {target.rows}"
         return NotFound(f"no board: no {self.words(target, size)} is seen")
 
+    def seen_in(self, image: Image) -> Target | None:
+        """The grid of circles of any count that a (h, w) grey image shows whole."""
+        for picture in (image, 255 - image):
+            blobs, lattice, members = _circles(picture)
+            px, grids = blobs.px[members], list[tuple[float, Target]]()
+            for turn, asymmetric in product(_BASES if len(members) else (), (False, True)):
+                places = lattice @ (turn @ _STAGGER if asymmetric else turn)
+                across, down = (np.ptp(places, axis=0) + 1).tolist()
+                columns, rows = (across // 2 if asymmetric else across), down
+                board = Target("board", self.name, columns, rows, 1.0, 0.001, asymmetric=asymmetric)
+                order = _order(places, px, board) if min(columns, rows) >= 3 else None
+                if order is not None:
+                    share = _diameter(blobs.at(members[order]), self.corners(board)[:, :2])
+                    # Blurred squares of a checkerboard are wider.
+                    if share < _NAMED * (1.4 if asymmetric else 1.0):
+                        board = replace(board, diameter_m=share)
+                        grids.append((_turn_rad(px[order], columns), board))
+            if grids:
+                return min(grids, key=lambda grid: grid[0])[1]
+        return None
+
 
 def circle_places(columns: int, rows: int, *, asymmetric: bool) -> IntArray:
     """(n, 2) columns and rows of circles, row by row; for an asymmetric grid in half columns."""
@@ -174,21 +195,35 @@ def circle_places(columns: int, rows: int, *, asymmetric: bool) -> IntArray:
 
 def _centres(image: Image, target: Target) -> FloatArray | None:
     """(n, 2) centres of a grid's dark circles in a grey image [px]; None where none is seen."""
-    blobs = find_blobs(image)
-    if len(blobs.px) < _LEAST:
-        return None
-    lattice, members = _lattice(blobs)
-    if len(members) < _LEAST or np.median(blobs.fill[members]) < _ROUND:
-        return None
+    blobs, lattice, members = _circles(image)
     px, turns = blobs.px[members], _BASES @ _STAGGER if target.asymmetric else _BASES
-    orders = (_order(lattice @ turn, px, target) for turn in turns)
+    orders = [_order(lattice @ turn, px, target) for turn in turns] if len(members) else []
     grids = [px[order] for order in orders if order is not None]
+    return min(grids, key=lambda grid: _turn_rad(grid, target.columns), default=None)
 
-    def turn_rad(grid: FloatArray) -> float:
-        first_row = grid[target.columns - 1] - grid[0]
-        return abs(float(np.arctan2(first_row[1], first_row[0])))
 
-    return min(grids, key=turn_rad, default=None)
+def _turn_rad(grid: FloatArray, columns: int) -> float:
+    """Angle of the first row of a grid of (n, 2) points [px] in the image."""
+    along = grid[columns - 1] - grid[0]
+    return abs(float(np.arctan2(along[1], along[0])))
+
+
+def _circles(image: Image) -> tuple["Blobs", IntArray, IntArray]:
+    """Dark blobs of a grey image, and the lattice and indices of those that are circles."""
+    blobs = find_blobs(image)
+    lattice, members = _lattice(blobs) if len(blobs.px) >= _LEAST else (np.zeros((0, 2), int),) * 2
+    if len(members) < _LEAST or np.median(blobs.fill[members]) < _ROUND:
+        return blobs, np.zeros((0, 2), int), np.zeros(0, int)
+    return blobs, lattice, members
+
+
+def _diameter(circles: "Blobs", places: FloatArray) -> float:
+    """Diameter of circles at (n, 2) places, in the unit of these."""
+    flat = np.asarray(cv2.findHomography(places, circles.px)[0], float)
+    ends = [cv2.perspectiveTransform((places + step)[None], flat)[0] for step in 0.5 * np.eye(2)]
+    steps = np.stack(ends, axis=-1) - cv2.perspectiveTransform(places[None], flat)[0][..., None]
+    scales = 2.0 * np.sqrt(np.abs(np.linalg.det(steps)))
+    return round(float(np.median(circles.diameters / scales)), 5)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -15,9 +15,6 @@ from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.boards.template import Refined, unrefined
-
-if TYPE_CHECKING:
-    from visioncal.vision.boards.identity import Identity, Marker
 
 # Relative sigma of a square by default: the scale error of office printers.
 DEFAULT_RELATIVE_SIGMA = 1e-3
@@ -34,7 +31,7 @@ FEWEST_SQUARES, MOST_SQUARES = 3, 100
 COUNTS = "(?P<columns>[0-9]{1,3})x(?P<rows>[0-9]{1,3})"
 MM = r"[0-9]{1,5}(?:\.[0-9]{1,9})?"
 # Fields of targets with other names than their keys.
-_FIELDS = {"id": "marker_id", "size_m": "square_m"}
+_FIELDS = {"id": "marker_id", "first_id": "marker_id", "size_m": "square_m"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +82,7 @@ class BoardRequest:
     marker_mm: float | None = None  # Side of the markers in a ChArUco board [mm].
     dictionary: str = ""  # ArUco dictionary by OpenCV's name.
     legacy: bool = False  # Whether a ChArUco board has OpenCV's layout before 4.6.
-    marker_id: int | None = None  # Id of a single marker; the smallest one of an AprilGrid.
+    marker_id: int | None = None  # Id of a single marker; the first one of a board of markers.
     name: str = ""  # Name of the target.
     spacing: float | None = None  # Gap between the tags of an AprilGrid, as a share of their side.
     border: int | None = None  # Number of dark modules around their bits.
@@ -201,14 +198,18 @@ class BoardKind(ABC):
         """Name of a target with sides of `side`."""
         return f"{self.name}_{target.columns}x{target.rows}_{side}"
 
-    def identify(self, image: Image, markers: Sequence["Marker"]) -> list["Identity"]:
-        """Boards of this kind in an image with these markers, without their size."""
-        del image, markers
-        return []
+    def marker_places(self, numbers: IntArray, columns: int) -> Sequence[FloatArray]:
+        """(n, 2) places of markers in steps of their grid, by variant of the layout.
 
-    def miscounted(self, image: Image, target: Target) -> Target | None:
-        """The board whose squares were counted wrongly, where it is seen in an image."""
-        del image, target
+        x and y are those of the markers themselves; `numbers` count from the first marker on, and
+        may continue before it. Empty where a kind has no such grid.
+        """
+        del numbers, columns
+        return ()
+
+    def seen_in(self, image: Image) -> Target | None:
+        """The board without markers that a (h, w) grey image shows whole, with sides of 1 m."""
+        del image
         return None
 
 
@@ -251,6 +252,19 @@ def dictionary_size(table: DocumentTable, name: str) -> int:
             or "The names look like DICT_5X5_100 or DICT_APRILTAG_36h11.",
         )
     return len(aruco_dictionary(name).bytesList)
+
+
+def first_id(table: DocumentTable, count: int, board: str, dictionary: str) -> int:
+    """Reads the id of the first of a board's `count` markers, or raises DataError."""
+    markers = dictionary_size(table, dictionary)
+    first = table.integer("id" if "id" in table.content else "first_id", 0, markers - 1, 0)
+    if first + count > markers:
+        raise DataError(
+            f"{table.label}: dictionary {dictionary} has {markers} markers; a board of {board}"
+            f"{f' from id {first} on' if first else ''} needs {first + count}.",
+            culprits=[f"{table.label}: dictionary"],
+        )
+    return first
 
 
 def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:

@@ -1,18 +1,13 @@
 """Single ArUco or AprilTag markers."""
 
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 
 from visioncal.core.files import DocumentTable
-from visioncal.core.number_format import listed, some_of
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.boards.board import DETECTED_WEIGHT
-from visioncal.vision.boards.identity import Identity, Marker, holding, modules
 from visioncal.vision.boards.kind import (
-    DEFAULT_RELATIVE_SIGMA,
     MM,
     BoardKind,
     BoardRequest,
@@ -53,7 +48,9 @@ class MarkerKind(BoardKind):
         sigma_m = sigma_of(table, size_m)
         dictionary = table.text("dictionary")
         number = table.integer("id", 0, dictionary_size(table, dictionary) - 1)
-        return _target(name, size_m, sigma_m, dictionary, number)
+        return Target(
+            name, self.name, 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=number
+        )
 
     def corners(self, target: Target) -> FloatArray:
         """(4, 3) corners [m], clockwise from its upper left."""
@@ -97,9 +94,7 @@ class MarkerKind(BoardKind):
         by the template of `refine_tags`; a corner that it does not fit remains OpenCV's, with less
         weight.
         """
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        ids, px = read_markers(image, target.dictionary, parameters)
+        ids, px = read_markers(image, target.dictionary, refined=True)
         if target.marker_id not in ids:
             seen = f"; seen instead: {', '.join(map(str, ids[:5]))}" if ids else ""
             return NotFound(f"no marker {target.marker_id} of {target.dictionary} is seen{seen}")
@@ -116,50 +111,3 @@ class MarkerKind(BoardKind):
         return DetectedCorners(
             np.arange(4), np.where(fitted[:, None], refined.px, corners), weights
         )
-
-
-def _target(name: str, size_m: float, sigma_m: float, dictionary: str, number: int) -> Target:
-    return Target(name, "marker", 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=number)
-
-
-def genuine(markers: Sequence[Marker]) -> list[Marker]:
-    """Markers that resemble their ideal; of several at one position, the most similar."""
-    kept: list[Marker] = []
-    for marker in sorted(markers, key=lambda candidate: -candidate.likeness):
-        apart = all(
-            np.linalg.norm(marker.centre - other.centre) > max(marker.side_px, other.side_px) / 2
-            for other in kept
-        )
-        short = modules(marker.family) <= 6
-        # Strong lens distortion lowers the likeness to 0.55. Codes of sixteen bits occur by chance
-        # in other markers' squares, with up to 0.8; longer codes do not.
-        if marker.likeness > (0.83 if short else 0.5) and apart:
-            kept.append(marker)
-    return kept
-
-
-def single_marker(markers: Sequence[Marker]) -> Identity | None:
-    """The largest marker of the family with the most markers, the most similar first; or None."""
-    if not markers:
-        return None
-    by_family: dict[str, list[Marker]] = {}
-    for marker in markers:
-        by_family.setdefault(marker.family, []).append(marker)
-    # The family of the most similar marker wins ties.
-    members = max(by_family.values(), key=len)
-    largest = max(members, key=lambda member: member.side_px)
-    others = tuple(sorted(member.number for member in members if member is not largest))
-    ids = (largest.number, *others)
-    names = holding(largest.family, max(ids) + 1)
-    notes = []
-    if others:
-        notes.append(
-            f"Also seen: {some_of([*map(str, others)], 12)}. A target is one marker, and the "
-            "largest is taken; where they are a board's, show more of it, or describe it if it is "
-            'an AprilGrid (kind = "aprilgrid"); where they lie freely, describe them by a table of '
-            'their corners (kind = "points").'
-        )
-    if len(names) > 1:
-        notes.append(f"{listed(names[1:])} hold the same markers: any of them finds this one.")
-    board = _target("board", 1.0, DEFAULT_RELATIVE_SIGMA, names[0], ids[0])
-    return Identity(board, 4, 4, names[1:], ids, tuple(notes))

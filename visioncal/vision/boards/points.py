@@ -22,9 +22,8 @@ from visioncal.vision.boards.kind import (
     dictionary_size,
     marker_cells,
 )
-from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit, read_markers
+from visioncal.vision.boards.layout import find_tags
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
-from visioncal.vision.boards.template import refine_tags
 
 # Columns of a rig's table; sigma_m is optional, and so are tag and corner together.
 _RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
@@ -176,40 +175,7 @@ class Rig(PointsKind):
                 f"target {target.name} is a rig of points, which no image is searched for: "
                 "corners.csv has no rows of this view"
             )
-        numbers, found_px = read_markers(image, target.dictionary)
-        corner_ids = tag_corners(target)
-        quads = {
-            number: px
-            for number, px in zip(numbers, found_px, strict=True)
-            if number in corner_ids and numbers.count(number) == 1
-        }
-        if not quads:
-            seen = f"; seen instead: {', '.join(map(str, numbers[:5]))}" if numbers else ""
-            return NotFound(
-                f"no tag of the target's, of {target.dictionary}, is seen{seen}",
-                misfit=bool(numbers),
-            )
-        places = self.corners(target)
-        points = np.array([corner_ids[quad] for quad in quads])
-        quads_px = np.array([*quads.values()])
-        count = len(marker_cells(target.dictionary, 0))
-        # Two complete tags or more in the plane z = 0.
-        if len(quads) > 1 and points.min() >= 0 and not np.ptp(places[:, 2]):
-            flat = places[points, :2]
-            side = float(np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1).mean())
-            if layout_misfit(flat / side, quads_px) > LAYOUT_MISFIT:
-                return NotFound("the tags do not lie as the target describes them", misfit=True)
-            parts = [refine_tags(image, count, quads_px, flat)]
-        else:
-            parts = [refine_tags(image, count, quad[None]) for quad in quads_px]
-        points = points.ravel()
-        fitted = np.concatenate([part.fitted for part in parts]) & (points >= 0)
-        if not fitted.any():
-            return NotFound("no corner of the tags seen is like the print")
-        px = np.concatenate([part.px for part in parts])[fitted]
-        order = np.argsort(points[fitted])
-        blur_px = float(np.nanmedian([part.blur_px.max() for part in parts]))
-        return DetectedCorners(points[fitted][order], px[order], blur_px=blur_px)
+        return find_tags(image, target.dictionary, 1, tag_corners(target), self.corners(target))
 
 
 def points_of(

@@ -1,0 +1,139 @@
+"""Boards that name themselves: random photographs, first ids, grids of markers, field cases."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.commands import visioncal as command
+from support.following import follow
+from support.marks import slow
+from support.photographed import KINDS, dictionary_of, is_named, photographs, print_of
+
+from visioncal.core.types import Target
+from visioncal.vision.boards import DetectedCorners, find_target
+from visioncal.vision.boards.identify import identify
+from visioncal.vision.targets import (
+    board_words,
+    corner_positions,
+    target_document,
+    target_from_document,
+)
+
+CASES = Path(__file__).parents[3] / "shared/data/field/cases"
+MARKED = ("charuco", "aprilgrid", "gridboard", "marker")
+
+
+@pytest.mark.parametrize("seed", [0, 5, *(slow(at) for at in (*range(1, 5), *range(6, 20)))])
+def test_a_random_board_is_named_from_three_photographs(seed):
+    rng = np.random.default_rng([69, seed])
+    board = print_of(KINDS[seed % len(KINDS)], rng)
+    images = photographs(board, rng)
+    # No image of a plain board shows that it is a mirror image.
+    mirrored = board.said["kind"] in MARKED and bool(rng.integers(2))
+    images = [np.ascontiguousarray(image[:, ::-1]) for image in images] if mirrored else images
+    identity = identify(images)
+    assert is_named(board, identity)
+    assert identity.is_mirrored == mirrored
+
+
+GRID = Target("grid", "gridboard", 4, 3, 0.04, 4e-5, dictionary="DICT_5X5_250", spacing=0.2)
+GRID = replace(GRID, marker_id=7)
+
+
+def test_a_grid_of_markers_has_the_corners_of_opencv():
+    ids = np.arange(7, 19, dtype=np.int32)
+    board = cv2.aruco.GridBoard((4, 3), 0.04, 0.008, dictionary_of("DICT_5X5_250"), ids)
+    drawn = np.pad(board.generateImage((800, 592)), 60, constant_values=255)
+    seen = find_target(drawn, GRID)
+    assert isinstance(seen, DetectedCorners)
+    assert len(seen.ids) == 48
+    corners, numbers, _ = cv2.aruco.ArucoDetector(board.getDictionary()).detectMarkers(drawn)
+    places, px = board.matchImagePoints(corners, numbers)
+    ours = corner_positions(GRID)
+    # Ours are refined; OpenCV's err by up to a pixel of the drawing.
+    for place, at in zip(places.reshape(-1, 3), px.reshape(-1, 2), strict=True):
+        nearest = int(np.argmin(np.linalg.norm(ours - place, axis=1)))
+        assert np.linalg.norm(ours[nearest] - place) < 1e-6
+        assert np.linalg.norm(seen.px[list(seen.ids).index(nearest)] - at) < 1.5
+    # Edges of pixels: the first marker's outer corner is at the drawing's, half a pixel before it.
+    assert np.abs(seen.px[0] - 59.5).max() < 0.2
+
+
+@pytest.mark.parametrize("first", [0, 17])
+def test_a_charuco_board_may_begin_at_any_id(first):
+    ids = np.arange(first, first + 24, dtype=np.int32)
+    board = cv2.aruco.CharucoBoard((8, 6), 0.03, 0.022, dictionary_of("DICT_5X5_100"), ids)
+    drawn = np.pad(board.generateImage((960, 720)), 60, constant_values=255)
+    described = {"kind": "charuco", "columns": 8, "rows": 6, "square_m": 0.03, "marker_m": 0.022}
+    described |= {"dictionary": "DICT_5X5_100", "first_id": first}
+    target = target_from_document(described, "board")
+    seen = find_target(drawn, target)
+    assert isinstance(seen, DetectedCorners)
+    assert len(seen.ids) == 35
+    exact = 60 - 0.5 + 120 * corner_positions(target)[:, :2] / 0.03
+    assert np.abs(seen.px - exact[seen.ids]).max() < 0.1
+    assert target_from_document(target_document(target), "board") == target
+    assert ("from id 17" in board_words(target)) == (first == 17)
+    other = identify(drawn, replace(target, marker_id=-1 if first else 17))
+    assert max(other.board.marker_id, 0) == first
+
+
+def test_a_gap_in_metres_is_read_by_its_own_key():
+    document = target_document(GRID)
+    spacing = document.pop("spacing")
+    again = target_from_document(document | {"spacing_m": spacing * 0.04}, "grid")
+    assert again.spacing == pytest.approx(0.2)
+
+
+def case(name, folder):
+    """A copy of a case's session."""
+    if not (CASES / name).is_dir():
+        pytest.skip("no field cases here")
+    shutil.copytree(CASES / name / "session", folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "written"),
+    [
+        ("aprilgrid-spacing-metres", "looks like metres", "spacing = 0.3"),
+        ("charuco-legacy", "8 x 6 squares, DICT_4X4_50, legacy layout", "legacy = true"),
+    ],
+)
+def test_a_board_of_a_field_case_is_named_and_mended(tmp_path, monkeypatch, name, said, written):
+    monkeypatch.chdir(tmp_path)
+    folder = case(name, tmp_path / "cell")
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert said in followed.runs[0].refused().said
+    assert written in (folder / "board.toml").read_text("utf-8")
+    assert len(followed.done) == 1
+    assert (tmp_path / "out/calibration.json").is_file()
+
+
+def test_a_grid_of_aruco_markers_is_named_and_written_with_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = case("aruco-grid-board", tmp_path / "cell")
+    refused = command("calibrate", "cell", "-o", "out").refused()
+    assert 'kind = "gridboard"' in refused.said
+    text = (folder / "board.toml").read_text("utf-8")
+    (folder / "board.toml").write_text(text.replace("aruco_grid", "gridboard"), "utf-8")
+    assert command("calibrate", "cell", "-o", "out").status == 0
+    images = sorted((folder / "images").iterdir())[:3]
+    said = command("target", "check", *images).good().said
+    assert "grid of 4 x 3 markers" in said
+    assert "0.20 of their side apart" in said
+
+
+def test_a_checkerboard_of_another_count_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = CASES / "checkerboard-miscounted"
+    if not source.is_dir():
+        pytest.skip("no field cases here")
+    words = ("--target", "checkerboard_9x6_35mm", "--mount", "eye-in-hand")
+    command("convert", source, "cell", *words).good()
+    said = command("calibrate", "cell", "-o", "out").refused().said
+    assert "checkerboard of 11 x 8 inner corners" in said
+    assert "Write columns = 11 and rows = 8" in said

@@ -1,0 +1,202 @@
+"""The board that images show, where it is another than declared or the images are mirrored."""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import Image, Target
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy
+from visioncal.session import Session, View
+from visioncal.session.images import FolderImages
+from visioncal.session.kinds import declared_targets
+from visioncal.vision.boards import kind_of
+from visioncal.vision.boards.identify import Identity, describe, identify
+from visioncal.vision.targets import board_words, target_names
+
+# Images that are searched for any board.
+LOOKED_AT = 3
+# Least share of a board's corners in an image that identifies it.
+_LEAST_CORNERS = 0.2
+# Gaps between markers that differ by less are the same [sides].
+_SAME_SPACING = 0.05
+# Command that writes a copy with the images as they should be, and calibrates it.
+MEND_IMAGES = (
+    f"visioncal convert SESSION FIXED --mend-images && {CALIBRATE.replace('SESSION', 'FIXED')}"
+)
+
+
+class OtherBoardError(DataError):
+    """The images show another board than declared, or mirror images of it."""
+
+    finding: Finding | None = None
+
+    @classmethod
+    def of(cls, finding: Finding) -> "OtherBoardError":
+        """The error of a finding."""
+        error = cls(finding.words, next_step=str(finding.do or ""))
+        error.finding = finding
+        return error
+
+
+def spread(views: Sequence[View]) -> Sequence[View]:
+    """A few views from all over a session."""
+    return views[:: max(len(views) // LOOKED_AT, 1)][:LOOKED_AT]
+
+
+def other_board(
+    session: Session, name: str, looked: Sequence[tuple[View, Image]]
+) -> Finding | None:
+    """Identifies the board in images in which the declared one is not found.
+
+    Args:
+        session: The session.
+        name: The board's name in the session's `boards`.
+        looked: Views of it and their (h, w) grey images.
+
+    Returns:
+        The finding; None where the images may show the declared board.
+    """
+    declared = session.boards[name]
+    try:
+        identity = identify([image for _, image in looked], declared)
+    except DataError:
+        return None
+    found = _differences(declared, identity)
+    # One image of several may show something else, or a part.
+    is_sure = identity.shown >= min(2, len(looked))
+    if identity.board.kind == "checkerboard" == declared.kind and _is_part(identity, declared):
+        is_sure = identity.shown == len(looked)
+    if not is_sure or identity.corners_seen < _LEAST_CORNERS * identity.corners:
+        return None
+    numbers = tuple(view.number for view, _ in looked)
+    if identity.is_mirrored:
+        return Finding(
+            "mirrored_images",
+            f"The images are mirrored: a {describe(identity)} (view {numbers[0]}), is seen only "
+            "where they are mirrored back.",
+            Remedy(
+                "Write a copy of the session with its images mirrored back, and calibrate it; "
+                "then turn the flip off in the camera's driver.",
+                MEND_IMAGES,
+            ),
+            numbers,
+        )
+    if not found:
+        return None
+    stated = board_words(declared)
+    if "spacing" in found:
+        stated += f" with spacing = {declared.spacing:g}"
+        metres = identity.board.spacing * declared.square_m
+        if abs(declared.spacing - metres) < 0.2 * metres:
+            stated += ", which looks like metres: spacing is a share of the side"
+    return Finding(
+        "other_board",
+        f"The images show another board than declared: {describe(identity)} (view {numbers[0]}), "
+        f"and {declared.name} is {stated}.",
+        _remedy(session, name, identity, found, looked),
+        numbers,
+    )
+
+
+def _is_part(identity: Identity, declared: Target) -> bool:
+    """Whether a checkerboard has no more rows and columns than declared."""
+    seen, stated = (sorted((one.columns, one.rows)) for one in (identity.board, declared))
+    return all(few <= many for few, many in zip(seen, stated, strict=True))
+
+
+def _remedy(
+    session: Session,
+    name: str,
+    identity: Identity,
+    found: dict[str, object],
+    looked: Sequence[tuple[View, Image]],
+) -> Remedy:
+    """What to write into the description of a board, or the command that describes the one seen."""
+    declared, board = session.boards[name], identity.board
+    share = declared.marker_m / declared.square_m
+    if "kind" not in found and abs(board.marker_m - share) < 0.06:
+        figures = [f"{key} = {_toml(value)}" for key, value in found.items()]
+        words, command = board_correction(session, name, " and ".join(figures))
+        return Remedy(f"{words[0].upper()}{words[1:]}, or name another target.", command)
+    side, mm = kind_of(board).side, f"{1e3 * declared.square_m:g}"
+    images = " ".join(f"SESSION/{shlex.quote(view.image)}" for view, _ in looked)
+    key = f"in [targets], {name}" if name else "target"
+    return Remedy(
+        f"Measure the {side}, and where it is not {mm} mm as declared, change the figure in the "
+        f'command. In session.toml, write {key} = "seen.toml", which it makes.',
+        f"visioncal target check {images} --square-mm {mm} -o SESSION/seen.toml",
+    )
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, str):
+        return f'"{value}"'
+    return str(value).lower()
+
+
+def board_correction(session: Session | None, board: str, figures: str) -> tuple[str, str]:
+    """How figures such as `square_m = 0.03` are written into the description of a board.
+
+    Returns:
+        A part of a sentence, and the command that it takes: one for a board that ships with
+        visioncal, of which a session's folder has no file.
+    """
+    named = ""
+    if session is not None and isinstance(session.images, FolderImages):
+        named = declared_targets(session.declaration).get(board, "")
+    if named not in target_names():
+        return f"write {figures} in the board's .toml", ""
+    return (
+        f'write target = "{named}.toml" in session.toml, and {figures} in that file, which the '
+        "command makes",
+        f"visioncal target make {named} -o SESSION",
+    )
+
+
+def _differences(declared: Target, identity: Identity) -> dict[str, object]:
+    """What an identified board has otherwise than a declared target, by the description's keys.
+
+    Empty where the images may show the declared target: a part of it, or one that is not clear.
+    """
+    board = identity.board
+    counts: dict[str, object] = {"columns": board.columns, "rows": board.rows}
+    names = {board.dictionary, *identity.larger}
+    if identity.is_single and declared.columns * declared.rows > 1 and declared.dictionary in names:
+        # A single marker is no evidence against a board of several: its finder says what it lacks.
+        return {}
+    if board.kind != declared.kind:
+        if {tag for tag, _ in declared.point_tags} & {*identity.marker_ids}:
+            return {}
+        # Where markers cannot be read, a ChArUco board is a checkerboard.
+        inner = replace(declared, columns=declared.columns - 1, rows=declared.rows - 1)
+        if (board.kind, declared.kind) == ("checkerboard", "charuco") and _is_part(identity, inner):
+            return {}
+        return {"kind": board.kind, **counts}
+    if board.kind in ("checkerboard", "circles"):
+        seen = {**counts, "asymmetric": board.asymmetric}
+        same = sorted((board.columns, board.rows)) == sorted((declared.columns, declared.rows))
+        if same and board.asymmetric == declared.asymmetric:
+            return {}
+        return seen if board.kind == "circles" else counts
+    return _other_markers(declared, identity)
+
+
+def _other_markers(declared: Target, identity: Identity) -> dict[str, object]:
+    board, found = identity.board, dict[str, object]()
+    keys = kind_of(board).keys.split()
+    if board.columns != declared.columns or board.rows > declared.rows:
+        found |= {"columns": board.columns, "rows": board.rows}
+    if declared.dictionary not in {board.dictionary, *identity.larger}:
+        found["dictionary"] = board.dictionary
+    first = max(board.marker_id, 0)
+    if first != max(declared.marker_id, 0):
+        found["id" if "id" in keys else "first_id"] = first
+    # With an odd number of rows there is one layout.
+    if (board.legacy and board.rows % 2 == 0) != (declared.legacy and declared.rows % 2 == 0):
+        found["legacy"] = board.legacy
+    if abs(board.spacing - declared.spacing) > _SAME_SPACING:
+        found["spacing"] = round(board.spacing, 2)
+    if "border" in keys and board.border != declared.border:
+        found["border"] = board.border
+    return found
