@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.commands import visioncal as command
 from support.following import follow
+from support.fuzz.broken_sessions import sound_session
 from support.marks import slow
 from support.photographed import KINDS, dictionary_of, is_named, photographs, print_of
 
@@ -137,3 +138,52 @@ def test_a_checkerboard_of_another_count_is_named(tmp_path, monkeypatch):
     said = command("calibrate", "cell", "-o", "out").refused().said
     assert "checkerboard of 11 x 8 inner corners" in said
     assert "Write columns = 11 and rows = 8" in said
+
+
+def changed_images(folder, change, every=1):
+    """Changes each of so many images of a session."""
+    for path in sorted((folder / "images").iterdir())[::every]:
+        cv2.imwrite(str(path), change(cv2.imread(str(path))))
+
+
+@pytest.mark.parametrize(
+    ("change", "every", "said"),
+    [
+        (lambda it: it[:, ::-1], 1, "The images are mirrored"),
+        slow(lambda it: cv2.rotate(it, cv2.ROTATE_90_COUNTERCLOCKWISE), 3, "turned or scaled"),
+        slow(
+            lambda it: cv2.resize(it, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA),
+            2,
+            "turned or scaled",
+        ),
+    ],
+    ids=["mirrored", "quarter turns", "half size"],
+)
+def test_images_that_were_changed_are_mended_as_is_printed(
+    tmp_path, monkeypatch, change, every, said
+):
+    monkeypatch.chdir(tmp_path)
+    folder = sound_session(tmp_path / "cell")
+    changed_images(folder, change, every)
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert said in followed.runs[0].said
+    assert "cell-fixed" in followed.words
+    assert followed.last.good().said.startswith("good")
+
+
+def test_images_upside_down_are_found_by_the_robot(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = sound_session(tmp_path / "cell")
+    changed_images(folder, lambda it: it[::-1, ::-1], 4)
+    command("convert", "cell", "mended", "--mend-images").good()
+    text = (tmp_path / "mended/session.toml").read_text("utf-8")
+    assert "turned by a half" in text
+    for name in sorted(path.stem for path in (folder / "images").iterdir())[::4]:
+        mended = cv2.imread(str(tmp_path / f"mended/images/{name}.png"))
+        assert (mended == cv2.imread(str(folder / f"images/{name}.png"))[::-1, ::-1]).all()
+
+
+def test_sound_images_are_not_mended(tmp_path):
+    folder = sound_session(tmp_path / "cell")
+    said = command("convert", folder, tmp_path / "mended", "--mend-images").refused().said
+    assert "no image is mirrored" in said

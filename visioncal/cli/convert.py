@@ -43,6 +43,7 @@ def convert_command(options: ConvertOptions) -> None:
             choose=choose,
             mirrors_poses=options.mirror_poses,
             exchange=options.exchange,
+            mends_images=options.mend_images,
         )
     for warning in session.warnings:
         say(f"note: {warning}")

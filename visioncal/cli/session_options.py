@@ -359,6 +359,9 @@ class ConvertOptions(RobotPoseOptions):
     exchange: tuple[int, int] | None = _doubt(
         "Two views whose images are exchanged: 8,17.", parse=pair_in
     )
+    mend_images: bool = _doubt(
+        "Mirror, turn and scale images back.", "--mend-images", default=False
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

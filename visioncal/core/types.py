@@ -91,7 +91,7 @@ class Target:
     # ArUco dictionary by OpenCV's name, as `DICT_5X5_100`; empty without markers.
     dictionary: str = ""
     legacy: bool = False  # Whether a ChArUco board has the layout that OpenCV printed before 4.6.
-    # The id of a single marker, and the first one of a board of markers; -1 for 0 of a ChArUco board.
+    # The id of a single marker, or the first of a board's; -1 elsewhere, and for ChArUco's 0.
     marker_id: int = -1
     # White between the markers of a grid, as a share of a tag's side; 0 elsewhere.
     spacing: float = 0.0

@@ -14,11 +14,18 @@ from itertools import chain
 import cv2
 
 from visioncal.calibration.stages.corner_numbers import lack_of_corners, usable_corners
-from visioncal.calibration.stages.other_board import OtherBoardError, other_board, spread
+from visioncal.calibration.stages.other_board import (
+    MEND_IMAGES,
+    OtherBoardError,
+    other_board,
+    spread,
+)
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
+from visioncal.core.number_format import ranges
 from visioncal.core.threads import SharedSetting
 from visioncal.core.types import Corners, Image, Progress, Rejection, Searched, Target
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
 from visioncal.vision.boards import NotFound, find_target, kind_of
@@ -162,6 +169,31 @@ def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Sea
         culprits=culprits,
         next_step=f"In session.toml, write resolution = [{usual[0]}, {usual[1]}]{lens}.",
     )
+
+
+def other_sizes(detections: Detections) -> Iterator[Finding]:
+    """The finding on images that are turned by a quarter or scaled, beside those of the camera."""
+    usual = detections.resolution
+    sizes = {view: at.size for view, at in detections.searches.items() if at.size is not None}
+    odd = [
+        view
+        for view, size in sizes.items()
+        if size != usual and (size == usual[::-1] or is_scaled(size, usual))
+    ]
+    if odd:
+        width, height = sizes[odd[0]]
+        yield Finding(
+            "image_sizes",
+            f"{len(odd)} of {len(sizes)} images are turned or scaled: view {ranges(odd)}, such as "
+            f"{width} x {height} px, and the camera's are {usual[0]} x {usual[1]}.",
+            Remedy("Write a copy of the session in which all are alike.", MEND_IMAGES),
+            tuple(odd),
+        )
+
+
+def is_scaled(size: Size, usual: Size) -> bool:
+    """Whether an image is a smaller or larger one of the same view, by its (width, height) [px]."""
+    return abs(size[0] * usual[1] - size[1] * usual[0]) <= max(usual)
 
 
 def _of_size(view: View, searched: Searched, size: Size) -> Searched:

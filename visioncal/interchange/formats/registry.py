@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from visioncal.calibration.guess import Candidate
+from visioncal.calibration.pipeline.mended_images import mend_images
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
@@ -60,6 +61,7 @@ def convert(
     choose: Choose | None = None,
     mirrors_poses: bool = False,
     exchange: tuple[int, int] | None = None,
+    mends_images: bool = False,
 ) -> Session:
     """Writes a session or a foreign recording as a session's folder or as a recording.
 
@@ -75,6 +77,7 @@ def convert(
             reading to apply.
         mirrors_poses: Whether that reading may mirror the robot's poses.
         exchange: Two views whose images, corners and readings are exchanged.
+        mends_images: Whether images are mirrored, turned and scaled back: see `mend_images`.
 
     Returns:
         The session.
@@ -119,6 +122,8 @@ def convert(
         session = reread(doubtful, choose(doubtful), mirrors_poses=mirrors_poses)
     if exchange is not None:
         session = exchange_views(session, *exchange)
+    if mends_images:
+        session = mend_images(session, requested.progress)
     write_session(session, dest)
     return session
 
