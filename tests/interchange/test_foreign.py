@@ -278,7 +278,7 @@ def test_as_many_images_as_poses_are_needed(tmp_path):
 
 def test_without_names_the_fields_are_listed(tmp_path):
     (tmp_path / "log.csv").write_text("alpha,beta\n1,2\n3,4\n")
-    with pytest.raises(DataError, match="it has alpha, beta"):
+    with pytest.raises(DataError, match="numbers alpha, beta"):
         convert(tmp_path / "log.csv", tmp_path / "out", requested=HAND)
 
 
@@ -344,15 +344,22 @@ def test_a_column_that_names_images_pairs_them(tmp_path, table, header, ending):
 @pytest.mark.parametrize(
     ("names", "form"), [("X,Y,Z,A,B,C", "kuka"), ("X,Y,Z,W,P,R", "fanuc"), ("x,y,z,rx,ry,rz", "ur")]
 )
-def test_angles_beyond_a_turn_are_not_taken_for_radians(tmp_path, logged, names, form):
+def test_angles_beyond_a_turn_are_read_as_the_target_s_poses_have_them(
+    tmp_path, logged, names, form
+):
     degrees = np.rad2deg(1) if form == "ur" else 1.0
     poses = written(POSE_FORMS[form]) * [1, 1, 1, degrees, degrees, degrees]
     source = logged(names, poses.tolist())
-    with pytest.raises(DataError, match=r"too large for radians.*kuka.*fanuc.*--guess"):
-        convert(source, tmp_path / "out", requested=HAND)
-    assert not (tmp_path / "out").exists()
+    session = convert(source, tmp_path / "out", requested=HAND)
+    assert any("Found by the poses: With the robot's rot" in note for note in session.warnings)
+    np.testing.assert_allclose(poses_of(session, "base_from_flange"), BASE_FROM_FLANGE, atol=1e-9)
+    # Too few rows to tell.
+    source.write_text("\n".join(source.read_text().splitlines()[:4]))
+    with pytest.raises(DataError, match=r"form of the robot's rotations is not.*--robot-form"):
+        convert(source, tmp_path / "few", requested=HAND)
+    assert not (tmp_path / "few").exists()
     said = PoseImportOptions(form="rotation-vector-deg" if form == "ur" else form)
-    convert(source, tmp_path / "out", requested=replace(HAND, robot=said))
+    convert(source, tmp_path / "few", requested=replace(HAND, robot=said))
 
 
 @pytest.mark.parametrize(
@@ -616,7 +623,7 @@ OUTSIDE = {
 
 @pytest.mark.parametrize("name", OUTSIDE.values(), ids=OUTSIDE.keys())
 def test_names_of_images_that_are_refused(tmp_path, name):
-    raised(DataError, "or leaves the folder", images_named, [name], tmp_path, None)
+    raised(DataError, "or leaves the folder", images_named, [name], tmp_path)
 
 
 def test_links_that_lead_out_are_not_followed(tmp_path, naming):

@@ -122,7 +122,7 @@ def test_pose_pairs_give_what_opencv_gets_of_them(
     real_data, calibrated, tmp_path, source, unit, count, park_mm, scatter
 ):
     result, said = calibrated(real_data / source, "--robot-unit", unit, "--mount", "eye-in-hand")
-    assert "camera's positions are taken for metres" in said
+    assert "Found by the poses: The poses fit as declared" in said
     assert len(result.views) == count
     # Half a unit of the last digit that is written of each.
     x_mm, rms_mm, rms_deg = by_opencv(Session.load(tmp_path / "session"))
@@ -217,7 +217,8 @@ def test_a_ur10_from_its_joints(real_data, calibrated):
 
 
 def test_a_guess_finds_what_was_not_said(real_data, tmp_path):
-    done = convert(real_data / "doosan_a0509_charuco", tmp_path / "s", "--guess", "--yes").good()
+    source = real_data / "doosan_a0509_charuco"
+    done = convert(source, tmp_path / "s", "--robot-unit", "m", "--guess", "--yes").good()
     assert "positions in mm" in done.err
     assert "eye-in-hand" in done.err
     assert visioncal.calibrate(tmp_path / "s").rms.mm < 5

@@ -1,5 +1,6 @@
 """`visioncal convert`."""
 
+import sys
 from dataclasses import replace
 from functools import partial
 
@@ -37,7 +38,7 @@ def convert_command(options: ConvertOptions) -> None:
         session = convert(
             options.source,
             options.dest,
-            requested=replace(requested, progress=progress),
+            requested=replace(requested, progress=progress, command=("visioncal", *sys.argv[1:])),
             form=options.form,
             force=options.force,
             choose=choose,

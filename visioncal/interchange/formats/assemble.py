@@ -162,9 +162,9 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
     """
     notes: list[str] = []
     foreign = _images_or_poses(foreign, notes)
-    points = foreign.columns.get("point", ())
+    readings = map(foreign.columns.get, ("point", "meas_x_m"))
     saw = np.zeros(len(foreign.robot), dtype=bool)
-    for cells in (foreign.images, points):
+    for cells in (foreign.images, *filter(None, readings)):
         saw |= np.array([bool(cell) for cell in cells] or [False])
     if foreign.camera is not None:
         saw |= foreign.camera.present

@@ -1,21 +1,27 @@
 """Tables, JSON and .npz with a row a view; lines of a pendant; a second file of camera poses."""
 
-import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from visioncal.core.conventions import PoseNumbers
+from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Samples
 from visioncal.interchange.formats.file_search import (
-    files_in,
-    images_beside,
+    FileGroup,
+    Pairing,
+    groups_in,
+    image_groups,
     images_named,
+    images_of,
     is_image_name,
+    paired,
 )
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -23,56 +29,69 @@ from visioncal.interchange.formats.foreign import (
     ForeignStream,
     ImportOptions,
     PoseImportOptions,
+    Side,
+    Unstated,
 )
-from visioncal.interchange.formats.poses import joint_names, joints_from, pose_names, poses_from
+from visioncal.interchange.formats.poses import (
+    columns_named,
+    joint_names,
+    joints_from,
+    pose_names,
+    poses_from,
+    without_unit,
+)
 from visioncal.interchange.formats.reading import (
-    ENDINGS,
     Fields,
     named_by,
     read_fields,
     stamp_name,
     unnamed_columns,
 )
+from visioncal.interchange.formats.sources import Source, look, rows_in, unknown
+from visioncal.session.columns import INSTRUMENT_POSITION
 
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
 # Present epochs are about 1e9 s: (larger than, seconds a unit).
 _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 
-def _read_file(path: Path, requested: ImportOptions) -> ForeignRecording:
-    """Reads one file with a row a view, or the only one in a folder of images."""
-    fields = read_fields(_pose_file(path) or path, requested.robot.form)
-    if requested.camera_file is None:
-        return foreign_from(fields, requested, images=path if path.is_dir() else None)
-    return with_camera_file(fields, read_fields(requested.camera_file), requested)
-
-
-def _pose_file(path: Path) -> Path | None:
-    if path.is_file():
-        return path if path.suffix.lower() in ENDINGS else None
-    files = [file for file in files_in(path) if file.suffix.lower() in ENDINGS]
-    # Beside a file of intrinsics or notes, the file's name decides.
-    named = [file for file in files if re.search("pose|robot", file.stem.lower())]
-    return next((group[0] for group in (files, named) if len(group) == 1), None)
+def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
+    """Reads a file or folder of any layout, or one file and another with the camera's poses."""
+    if requested.camera_file is not None:
+        fields = read_fields(path, requested.robot.form)
+        return with_camera_file(fields, read_fields(requested.camera_file), requested)
+    source = look(path, requested.robot.form)
+    if path.is_file() and source.parts[0].fault:
+        raise source.parts[0].fault
+    fields = rows_in(source, requested)
+    images = source.images
+    if path.is_file() and requested.target and not requested.images:
+        images = images_of(path.parent)
+    foreign = foreign_from(fields, requested, images=images, source=source)
+    lens, notes = (None, ()) if requested.intrinsics else source.lens()
+    return replace(foreign, lens=lens, notes=(*foreign.notes, *notes))
 
 
 def foreign_from(
-    fields: Fields, requested: ImportOptions, *, images: Path | None = None
+    fields: Fields,
+    requested: ImportOptions,
+    *,
+    images: Sequence[FileGroup] = (),
+    source: Source | None = None,
 ) -> ForeignRecording:
     """Builds a recording from rows of named values, by their names or the user's options.
 
-    `images` is the folder of the images, where the source is one. Raises DataError.
+    `images` are those of the source, which describes itself where nothing is known. Raises
+    DataError.
     """
     unnamed = unnamed_columns(fields)
-    given = (*requested.robot.names, *requested.camera.names, *requested.joints)
-    used = {fields.find(name) for name in given}
-    robot_names = pose_names(fields, requested.robot.names, unnamed["robot"], "robot", used)
-    used.update(robot_names)
-    camera_names = pose_names(fields, requested.camera.names, unnamed["camera"], "camera", used)
-    used.update(camera_names)
+    names = _pose_fields(fields, requested, unnamed)
+    used = {name for of_side in names.values() for name in of_side}
     joint_fields = requested.joints or joint_names(fields, used)
-    used.update(joint_fields)
-    if not robot_names and not joint_fields:
+    used.update(map(fields.find, joint_fields))
+    if not names["robot"] and not joint_fields:
+        if source is not None:
+            raise unknown(source, requested, [fields])
         word = named_by(fields.places[0])
         raise DataError(
             f"{fields.name}: which of its fields are the robot's poses is not known; it has "
@@ -80,38 +99,101 @@ def foreign_from(
             culprits=[fields.name],
             next_step=f"Name them with --robot-{word}, or the joint angles with --joint-{word}.",
         )
-    notes: tuple[str, ...] = ()
-    robot, camera = PoseNumbers.empty(fields.places), None
-    if robot_names:
-        robot, notes = poses_from(fields, robot_names, requested.robot, "robot")
-    if camera_names:
-        camera, more = poses_from(fields, camera_names, requested.camera, "camera")
-        notes = (*notes, *more)
-    joints = None
-    if joint_fields:
-        joints, more = joints_from(fields, joint_fields, degrees=requested.joints_deg)
-        notes = (*notes, *more)
+    poses: dict[Side, PoseNumbers] = {"robot": PoseNumbers.empty(fields.places)}
+    unstated: dict[Side, Unstated] = {}
+    joints, notes = _joint_angles(fields, joint_fields, requested, bool(names["robot"]))
+    for whose, of_side in names.items():
+        if of_side:
+            asked = requested.robot if whose == "robot" else requested.camera
+            poses[whose], more, unstated[whose] = poses_from(fields, of_side, asked, whose)
+            notes += more
+    if irregular := [name for name in fields.shape_errors if name not in used]:
+        notes.append(f"Left aside, as rows differ in their shape: {some_of(irregular)}.")
+    columns = dict[str, tuple[str, ...]]()
+    if not unstated:
+        columns, more = _readings(fields, used)
+        notes += more
     # Components of a field that is used.
     used |= {text for text in fields.texts if text.rpartition(".")[0] in used}
     stamps = stamp_name(fields, used)
     if stamps and stamps in unnamed["time"]:
-        notes = (*notes, f"Column {stamps} is taken for times, as the source does not say.")
+        notes.append(f"Column {stamps} is taken for times, as the source does not say.")
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
-    paths, image_name, more = _images(fields, requested, images, used)
+    pairing, image_name = _images(fields, requested, images, used)
+    used.add(image_name)
+    columns |= {name: cells for name, cells in fields.texts.items() if name not in used}
+    if len({*columns.get("point", ())}) == len(fields) and "meas_x_m" in columns:
+        # Names of the readings, and not of the points that are read again and again.
+        columns["reading"] = columns.pop("point")
+    if pairing.depths:
+        columns["source_depth"] = tuple(str(file or "") for file in pairing.depths)
     return ForeignRecording(
         name=fields.name,
-        robot=robot,
-        camera=camera,
-        images=paths,
+        robot=poses["robot"],
+        camera=poses.get("camera"),
+        images=pairing.images,
         joints_rad=joints,
         stamps_s=_in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
         form=fields.form,
         views=fields.views or view_numbers(fields),
-        columns={
-            name: cells for name, cells in fields.texts.items() if name not in used | {image_name}
-        },
-        notes=(*notes, *more),
+        columns=columns,
+        notes=(*notes, *pairing.notes),
+        unstated=unstated,
     )
+
+
+def _pose_fields(
+    fields: Fields, requested: ImportOptions, unnamed: Mapping[str, tuple[str, ...]]
+) -> dict[Side, tuple[str, ...]]:
+    """The fields of each side's poses, the robot's first."""
+    used = {fields.find(name) for name in requested.joints}
+    sides: list[tuple[Side, PoseImportOptions]] = [
+        ("robot", requested.robot),
+        ("camera", requested.camera),
+    ]
+    names: dict[Side, tuple[str, ...]] = {"robot": (), "camera": ()}
+    # What the user names of one side is not the other's.
+    for whose, asked in sorted(sides, key=lambda side: not side[1].names):
+        names[whose] = pose_names(fields, asked.names, unnamed[whose], whose, used)
+        used.update(names[whose])
+    return names
+
+
+def _joint_angles(
+    fields: Fields, names: Sequence[str], requested: ImportOptions, has_poses: bool
+) -> tuple[FloatArray | None, list[str]]:
+    """Joint angles [rad] and notes; beside poses, angles that nobody asked for may be faulty."""
+    if not names:
+        return None, []
+    try:
+        joints, notes = joints_from(fields, names, degrees=requested.joints_deg)
+    except DataError as error:
+        if requested.joints or not has_poses:
+            raise
+        return None, [f"The joint angles are left aside: {error.message}"]
+    return joints, [*notes]
+
+
+def _readings(fields: Fields, used: set[str]) -> tuple[dict[str, tuple[str, ...]], tuple[str, ...]]:
+    """Columns of an instrument's readings beside joint angles, and a note; empty without them."""
+    arrays = [
+        (name,)
+        for name, numbers in fields.numbers.items()
+        if numbers.ndim > 1 and numbers[0].size == 3 and name not in used
+    ]
+    names = columns_named(fields, ("x", "y", "z")) or (arrays[0] if len(arrays) == 1 else ())
+    if not names:
+        return {}, ()
+    used.update(names)
+    places = np.hstack([fields.column(name) for name in names])
+    stated = {unit for name in names if (unit := without_unit(name)[1])}
+    is_far = float(np.nanmax(np.abs(places), initial=0.0)) > FAR_M
+    unit = stated.pop() if len(stated) == 1 else "mm" if is_far else "m"
+    cells = [
+        ["" if np.isnan(v) else repr(v) for v in row] for row in (UNITS_M[unit] * places.T).tolist()
+    ]
+    note = f"{', '.join(names)} are taken for an instrument's readings in {unit}."
+    return dict(zip(INSTRUMENT_POSITION, map(tuple, cells), strict=True)), (note,)
 
 
 def view_numbers(fields: Fields) -> tuple[int, ...]:
@@ -122,30 +204,25 @@ def view_numbers(fields: Fields) -> tuple[int, ...]:
 
 
 def _images(
-    fields: Fields, requested: ImportOptions, folder: Path | None, taken: Collection[str]
-) -> tuple[tuple[Path | None, ...], str, tuple[str, ...]]:
-    """Pairs the rows with images: (paths, the field that names them, notes on assumptions)."""
-    beside = requested.images or folder
-    name = fields.find(requested.image) if requested.image else _image_name(fields, beside, taken)
+    fields: Fields, requested: ImportOptions, found: Sequence[FileGroup], taken: Collection[str]
+) -> tuple[Pairing, str]:
+    """Pairs the rows with images, and names the field that names them."""
+    asked = image_groups(requested.images) if requested.images else None
+    groups = found if asked is None else asked
+    name = fields.find(requested.image) if requested.image else _image_name(fields, groups, taken)
     if name in fields.texts:
-        return images_named(fields.texts[name], fields.folder, requested.images), name, ()
-    has_images = beside is not None and any(is_image_name(file.name) for file in files_in(beside))
-    if beside is None or not (requested.images or has_images):
-        return (), "", ()
-    paths, notes = images_beside(beside, fields.views, fields.places)
-    return paths, "", notes
+        return Pairing(images_named(fields.texts[name], fields.folder, found, asked)), name
+    return paired(fields, groups) if groups else Pairing(()), ""
 
 
-def _image_name(fields: Fields, folder: Path | None, taken: Collection[str]) -> str:
+def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[str]) -> str:
     """Finds the field that names images, by its name or its cells; empty where none does."""
     free = {name: cells for name, cells in fields.texts.items() if name not in taken}
     usual = (name for name in _IMAGE_NAMES if any(map(is_image_name, free.get(name, ()))))
     if name := next(usual, ""):
         return name
-    files = [] if folder is None else files_in(folder)
-    image_names = {
-        name for file in files if is_image_name(file.name) for name in (file.name, file.stem)
-    }
+    files = (file for group in groups for file in group.files)
+    image_names = {name for file in files for name in (file.name, file.stem)}
     naming = [
         name
         for name, cells in free.items()
@@ -161,11 +238,23 @@ def _image_name(fields: Fields, folder: Path | None, taken: Collection[str]) -> 
     return next(iter(naming), "")
 
 
+def _recognises(path: Path, *, series: bool) -> bool:
+    data = [group for group in groups_in(path) if group.is_data]
+    is_series = any(len(group.files) > 1 for group in data)
+    return is_series if series else bool(data)
+
+
+VIEWS = ForeignFormat(
+    "views",
+    "a folder with one or more files a view (pose_01.json, .txt, .npz)",
+    partial(_recognises, series=True),
+    _read,
+)
 TABLE = ForeignFormat(
     "table",
     "a table, JSON, YAML or .npz with a row a view, alone or in the folder of its images",
-    lambda path: _pose_file(path) is not None,
-    _read_file,
+    partial(_recognises, series=False),
+    _read,
 )
 
 
@@ -211,7 +300,7 @@ def with_camera_file(
 
 
 def _poses(
-    fields: Fields, requested: PoseImportOptions, whose: str
+    fields: Fields, requested: PoseImportOptions, whose: Side
 ) -> tuple[PoseNumbers, tuple[str, ...], tuple[str, ...]]:
     """Reads the poses of one file: (poses, the fields that hold them, notes on assumptions)."""
     unnamed = unnamed_columns(fields)["robot"]
@@ -227,7 +316,7 @@ def _poses(
             culprits=[fields.name],
             next_step=f"Name them with --{whose}-{named_by(fields.places[0])}.",
         )
-    poses, notes = poses_from(fields, names, requested, whose)
+    poses, notes, _ = poses_from(fields, names, requested, whose)
     return poses, names, notes
 
 

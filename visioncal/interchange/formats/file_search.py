@@ -1,14 +1,30 @@
-"""Finds files: in natural order, by the number in their names, and images by their rows."""
+"""Finds files: those of a source in groups of one kind, and the image of each row."""
 
 import re
-from collections import Counter
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from visioncal.core.errors import DataError
-from visioncal.core.files import is_inside, natural
-from visioncal.interchange.formats.reading import named_by
+from visioncal.core.files import MOST_IMAGE_BYTES, is_inside, natural, read_bytes
+from visioncal.core.number_format import counted, some_of
+from visioncal.interchange.formats.reading import ENDINGS, Fields, named_by
 from visioncal.session.images import IMAGE_ENDINGS
+
+# Folders below a source that are looked through, and the most files in all.
+_DEPTH, _MOST_FILES = 3, 100_000
+# Words of pictures that a program drew: they are no camera's where there are others.
+_DRAWN = re.compile(
+    r"result|overlay|detect|corner|annot|drawn|debug|visual|vis(?![a-z])|axes|axis|mask|plot|"
+    r"preview|thumb|reproj|heat",
+    re.IGNORECASE,
+)
 
 
 def number_in(name: str) -> int | None:
@@ -17,9 +33,150 @@ def number_in(name: str) -> int | None:
     return int(digits[-1]) if digits and len(digits[-1]) < 19 else None
 
 
-def series_name(path: Path) -> str:
-    """A file's name without its last number: equal for files of one series."""
-    return re.sub(r"[0-9]+([^0-9]*)$", r"\1", path.stem).strip("_-. ") + path.suffix.lower()
+def is_image_name(name: str) -> bool:
+    """Whether a name has an image's ending."""
+    return name.lower().endswith(IMAGE_ENDINGS)
+
+
+@dataclass(frozen=True)
+class ImageKind:
+    """What an image file holds."""
+
+    size: tuple[int, int]  # (width, height) [px].
+    words: str  # `8-bit colour`.
+    is_depth: bool  # Whether its numbers are distances: one channel of more than eight bits.
+
+
+def image_kind(path: Path) -> ImageKind | None:
+    """The kind of an image file; None where it cannot be decoded."""
+    try:
+        data = np.frombuffer(read_bytes(path, MOST_IMAGE_BYTES), np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    except (DataError, cv2.error):
+        return None
+    if image is None:
+        return None
+    bits, is_grey = 8 * image.itemsize, image.ndim == 2
+    words = f"{bits}-bit {'grey' if is_grey else 'colour'}"
+    return ImageKind(image.shape[1::-1], words, is_grey and bits > 8)
+
+
+@dataclass(frozen=True)
+class FileGroup:
+    """Files of a source whose paths differ in numbers alone, files of one kind, or one file."""
+
+    label: str  # Their path in the source: `images/img_#.png`.
+    files: tuple[Path, ...]  # In natural order.
+    numbers: tuple[int, ...] = ()  # The number by which they differ; empty without one.
+
+    @property
+    def name(self) -> str:
+        """What the files are called without numbers, else their folder."""
+        parts = reversed(Path(self.label).with_suffix("").parts)
+        return next(filter(None, (part.replace("#", "").strip("_-. ") for part in parts)), "")
+
+    @property
+    def is_images(self) -> bool:
+        """Whether they are images by their names."""
+        return is_image_name(self.label)
+
+    @property
+    def is_data(self) -> bool:
+        """Whether they have the ending of numbers."""
+        return self.label.lower().endswith(ENDINGS)
+
+    @cached_property
+    def image(self) -> ImageKind | None:
+        """The kind of the images, by the first that can be read."""
+        return next(filter(None, map(image_kind, self.files[:3])), None)
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether they are depth pictures."""
+        return self.image is not None and self.image.is_depth
+
+    def listed(self) -> str:
+        """The label and the number of files, for messages."""
+        return self.label if len(self.files) == 1 else f"{self.label} ({len(self.files)} files)"
+
+
+def groups_in(source: Path) -> tuple[FileGroup, ...]:
+    """The files of a source, three folders deep, in groups of one kind; pure."""
+    if not source.is_dir():
+        return (FileGroup(source.name, (source,)),)
+    alike: dict[tuple[str, str], list[Path]] = defaultdict(list)
+    for file in _walked(source, _DEPTH):
+        path = file.relative_to(source)
+        alike[re.sub(r"[0-9]+", "#", _stem(path)), path.suffix.lower()].append(file)
+    groups, single = list[FileGroup](), list[Path]()
+    for (_, ending), files in alike.items():
+        for part in _series(source, files):
+            if len(part) > 1:
+                groups.append(_numbered(source, part, ending))
+            else:
+                single += part
+    # Of any names: images of a folder, and records that are called as images are.
+    stems = {file.stem for group in groups for file in group.files if group.is_images}
+    stems |= {file.stem for file in single if is_image_name(file.name)}
+    kinds: dict[tuple[Path, str], list[Path]] = defaultdict(list)
+    for file in single:
+        kinds[file.parent, file.suffix.lower()].append(file)
+    for (folder, ending), files in kinds.items():
+        named = [file for file in files if is_image_name(file.name) or file.stem in stems]
+        is_series = len(named) > 1
+        if is_series:
+            label = (folder.relative_to(source) / f"*{ending}").as_posix()
+            groups.append(FileGroup(label, tuple(sorted(named, key=natural))))
+        others = (file for file in files if not (is_series and file in named))
+        groups += [FileGroup(file.relative_to(source).as_posix(), (file,)) for file in others]
+    return tuple(sorted(groups, key=lambda group: _in_order(Path(group.label))))
+
+
+def _stem(path: Path) -> str:
+    return path.with_suffix("").as_posix()
+
+
+def _in_order(path: Path) -> tuple[object, ...]:
+    return natural(Path(path.as_posix().replace("/", "|")))
+
+
+def _series(source: Path, files: list[Path]) -> Iterable[list[Path]]:
+    """Splits files that differ in several numbers into series with the same last numbers."""
+    by_rest: dict[str, list[Path]] = defaultdict(list)
+    for file in files:
+        words = _stem(file.relative_to(source))
+        by_rest[re.sub(r"[0-9]+([^0-9]*)$", r"#\1", words)].append(file)
+    last = [{number_in(_last_numbered(file)) for file in part} for part in by_rest.values()]
+    is_split = len(by_rest) > 1 and len(last[0]) > 1 and all(part == last[0] for part in last)
+    return by_rest.values() if is_split else [files]
+
+
+def _last_numbered(file: Path) -> str:
+    """The last part of a path, without its ending, that has a number."""
+    parts = (file.stem, *reversed(file.parent.parts))
+    return next((part for part in parts if re.search("[0-9]", part)), "") + "."
+
+
+def _numbered(source: Path, files: list[Path], ending: str) -> FileGroup:
+    files = sorted(files, key=_in_order)
+    runs = [re.split(r"([0-9]+)", _stem(file.relative_to(source))) for file in files]
+    differing = [at for at in range(1, len(runs[0]), 2) if len({run[at] for run in runs}) > 1]
+    label = "".join("#" if at in differing else part for at, part in enumerate(runs[0]))
+    for at in reversed(differing):
+        numbers = tuple(int(run[at][:18]) for run in runs)
+        if len({*numbers}) == len(numbers):
+            return FileGroup(label + ending, tuple(files), numbers)
+    return FileGroup(label + ending, tuple(files))
+
+
+def _walked(folder: Path, depth: int) -> Iterator[Path]:
+    """Files of a folder and of those in it; of at most `_MOST_FILES`."""
+    yield from files_in(folder)[:_MOST_FILES]
+    if depth > 1:
+        with suppress(OSError):
+            for path in sorted(folder.iterdir()):
+                if path.is_dir() and not path.is_symlink() and not path.name.startswith("."):
+                    yield from _walked(path, depth - 1)
 
 
 def files_in(folder: Path) -> tuple[Path, ...]:
@@ -35,17 +192,6 @@ def files_in(folder: Path) -> tuple[Path, ...]:
     return tuple(sorted(own, key=natural))
 
 
-def _images_in(folder: Path) -> tuple[Path, ...]:
-    """Images of a folder in natural order."""
-    if images := tuple(path for path in files_in(folder) if is_image_name(path.name)):
-        return images
-    raise DataError(
-        f"{folder} has no images (png, jpg, tif, bmp, webp), or is no folder.",
-        culprits=[str(folder)],
-        next_step="Name the folder of the images with --images.",
-    )
-
-
 def head(path: Path) -> str:
     """The beginning of a text file; empty where it is not text."""
     try:
@@ -57,31 +203,58 @@ def head(path: Path) -> str:
     return "" if b"\0" in data else data.decode("utf-8", "ignore")
 
 
+def images_of(source: Path) -> tuple[FileGroup, ...]:
+    """The groups of images in a source."""
+    return tuple(group for group in groups_in(source) if group.is_images)
+
+
+def image_groups(folder: Path) -> tuple[FileGroup, ...]:
+    """The images that a user names: those of a folder, or of the series of one file.
+
+    Raises:
+        DataError: There are none.
+    """
+    found = images_of(folder.parent if folder.is_file() else folder)
+    found = tuple(group for group in found if folder.is_dir() or folder in group.files)
+    if not found:
+        raise DataError(
+            f"{folder} has no images (png, jpg, tif, bmp, webp), or is no folder.",
+            culprits=[str(folder)],
+            next_step="Name the folder of the images with --images.",
+        )
+    return found
+
+
 def images_named(
-    names: Sequence[str | None], base: Path, folder: Path | None
+    names: Sequence[str | None],
+    base: Path,
+    found: Sequence[FileGroup] = (),
+    asked: Sequence[FileGroup] | None = None,
 ) -> tuple[Path | None, ...]:
     """(n,) paths of the images that rows name; of a missing image the one that the source states.
 
-    Names are relative to `base`, or to the folder `images` in it; in `folder`, if given, images are
-    matched by their names, else by the numbers in these. Raises DataError.
+    Names are relative to `base`, or to the folder `images` in it, or of an image `found` in the
+    source; among `asked`, if given, they are matched by their names, else by the numbers in these.
+    Raises DataError.
     """
-    images = () if folder is None else _images_in(folder)
-    by_name = {item.stem: item for item in images} | {item.name: item for item in images}
+    files = [file for group in found if asked is None for file in group.files]
+    files += [file for group in asked or () for file in group.files]
+    by_name = {item.stem: item for item in files} | {item.name: item for item in files}
     numbers = [number_in(name) for name in names if name]
-    is_unique = len(set(numbers)) == len(numbers) and None not in numbers
-    by_number = _unique_numbers(images) if is_unique else {}
+    is_unique = asked is not None and len(set(numbers)) == len(numbers)
+    by_number = _by_number(files, [number_in(file.name) for file in files]) if is_unique else {}
     paths: list[Path | None] = []
     for name in names:
         path: Path | None = None
-        if name and folder is not None:
+        if name:
             plain = name.replace("\\", "/").rsplit("/", 1)[-1]
-            path = by_name.get(plain) or by_number.get(number_in(plain))
-            path = path or path_inside(folder, plain)
-        elif name:
-            path = path_inside(base, name)
-            inner = base / "images" / path.name
-            if not path.exists() and is_inside(inner, base) and inner.exists():
-                path = inner
+            known = by_name.get(plain) or by_number.get(number_in(plain))
+            is_elsewhere = asked is not None or not is_inside(base / name, base)
+            path = known if is_elsewhere else None
+            path = path or path_inside(base, name if asked is None else plain)
+            near = base / "images" / path.name
+            if asked is None and not path.exists():
+                path = near if is_inside(near, base) and near.exists() else known or path
         if path is not None and not is_image_name(path.name):
             raise DataError(
                 f"{base}: an image is named {str(name)[:80]!r}; a png, jpg, tif, bmp or "
@@ -93,45 +266,87 @@ def images_named(
     return tuple(paths)
 
 
-def is_image_name(name: str) -> bool:
-    """Whether a name has an image's ending."""
-    return name.lower().endswith(IMAGE_ENDINGS)
+def _by_number(files: Sequence[Path], numbers: Sequence[int | None]) -> dict[int | None, Path]:
+    """Files by their numbers; empty where two have the same, or one has none."""
+    by_number = dict(zip(numbers, files, strict=True))
+    return {} if None in by_number or len(by_number) < len(files) else by_number
 
 
-def images_beside(
-    folder: Path, views: Sequence[int], labels: Sequence[str]
-) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
-    """Pairs rows with the images of a folder, and notes assumptions; raises DataError.
+@dataclass(frozen=True)
+class Pairing:
+    """The images of n rows."""
 
-    By the rows' numbers in the source's names (`views`), where there are some and the images have
-    them, too; otherwise both are paired in natural order, and their counts must agree.
+    images: tuple[Path | None, ...]  # (n,) the image of each row; None in a row without.
+    depths: tuple[Path | None, ...] = ()  # (n,) its depth picture likewise; empty without any.
+    notes: tuple[str, ...] = ()  # What was paired with what, and what was left out.
+
+
+def _matched(fields: Fields, group: FileGroup) -> tuple[str, tuple[Path | None, ...]] | None:
+    """How a group's files belong to rows, and those of each; None where they do not."""
+    by_stem = {file.stem: file for file in group.files}
+    if fields.stems and {*fields.stems} <= by_stem.keys():
+        return "equal names", tuple(by_stem[stem] for stem in fields.stems)
+    views, numbers, count = fields.views, group.numbers, len(fields)
+    by_number = _by_number(group.files, numbers) if numbers else {}
+    # Numbers that begin one later are of the same rows.
+    shifted = {b - a for a, b in zip(sorted(views), sorted(numbers), strict=False)} - {0}
+    is_shifted = len(views) == len(numbers) == count and len(shifted) == 1
+    if {*views} & by_number.keys() and not (is_shifted and {*views} != {*numbers}):
+        return "equal numbers", tuple(map(by_number.get, views))
+    return ("their order", group.files) if len(group.files) == count else None
+
+
+def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
+    """Pairs rows with one kind of image: by equal names or numbers, else in natural order.
+
+    Depth pictures of the rows are kept beside; raises DataError where nothing fits, or several do.
     """
-    images = _images_in(folder)
-    of_views = [image for image in images if number_in(image.name) in set(views)]
-    by_number = _unique_numbers(of_views)
-    if 0 < len(by_number) == len(of_views):
-        return tuple(by_number.get(view) for view in views), ()
-    first, last = images[0].name, images[-1].name
-    if len(images) != len(labels):
+    matches = [(group, found) for group in groups if (found := _matched(fields, group))]
+    order = ["equal names", "equal numbers", "their order"]
+
+    def rank(item: tuple[FileGroup, tuple[str, tuple[Path | None, ...]]]) -> tuple[object, ...]:
+        group, (how, files) = item
+        drawn = _DRAWN.search(group.label) is not None
+        is_named = re.search("rgb|colou?r", group.label, re.IGNORECASE) is not None
+        # What another program drew, and pictures of some of the rows alone, come last.
+        return group.is_depth, drawn, files.count(None), order.index(how), not is_named
+
+    ranked = sorted(matches, key=rank)
+    if not ranked:
+        largest = max(groups, key=lambda group: len(group.files))
+        first, last = largest.files[0].name, largest.files[-1].name
         raise DataError(
-            f"{folder} has {len(images)} images ({first} ... {last}), but there are {len(labels)} "
-            f"poses ({labels[0]} ... {labels[-1]}); one image a pose is needed.",
-            culprits=[str(folder)],
-            next_step=f"Name each row's image with --image-{named_by(labels[0]).rstrip('s')}, or "
-            "remove what is over. Where that is not known, remove the last, and doctor "
+            f"{largest.files[0].parent} has {counted(len(largest.files), 'image')} ({first} ... "
+            f"{last}), but there are {len(fields)} poses ({fields.places[0]} ... "
+            f"{fields.places[-1]}); one image a pose is needed.",
+            culprits=[str(largest.files[0].parent)],
+            next_step=f"Name each row's image with --image-{named_by(fields.places[0]).rstrip('s')}"
+            ", or remove what is over. Where that is not known, remove the last, and doctor "
             "says from where on rows and images are shifted.",
         )
-    return images, (
-        f"Rows and images are paired in order, {labels[0]} with {first}, {labels[-1]} with {last}; "
-        "--image-column names a column that names each row's image.",
-    )
-
-
-def _unique_numbers(paths: Sequence[Path]) -> dict[int | None, Path]:
-    """Files by the number in their names, where only one has it."""
-    counts = Counter(number_in(path.name) for path in paths)
-    by_number = {number_in(path.name): path for path in paths}
-    return {n: path for n, path in by_number.items() if n is not None and counts[n] == 1}
+    rivals = [group for group, _ in ranked if rank((group, _)) == rank(ranked[0])]
+    if len(rivals) > 1:
+        raise DataError(
+            f"Each row has several images: {some_of([group.listed() for group in rivals])}.",
+            culprits=[group.label for group in rivals],
+            next_step=f"Say --images {rivals[0].files[0]}, or the first file of the others.",
+        )
+    chosen, (how, images) = ranked[0]
+    depth = next((item for item in ranked[1:] if item[0].is_depth), None)
+    both = [(place, file.name) for place, file in zip(fields.places, images, strict=True) if file]
+    ends = ", ".join(f"{place} with {name}" for place, name in dict.fromkeys((both[0], both[-1])))
+    hint = "; --image-column names a column that names each row's image" * (how == order[2])
+    notes = [f"Rows and images are paired by {how}: {ends}{hint}."]
+    left = [group.listed() for group in groups if group is not chosen]
+    if depth is not None:
+        left.remove(depth[0].listed())
+        notes.append(
+            f"The depth pictures {depth[0].listed()} are of the same rows, which name them in "
+            "source_depth; a session holds none, and they stay where they are."
+        )
+    if left:
+        notes.append(f"Left out of the images: {some_of(left)}.")
+    return Pairing(images, () if depth is None else depth[1][1], tuple(notes))
 
 
 def path_inside(base: Path, name: str) -> Path:

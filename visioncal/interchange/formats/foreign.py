@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 
@@ -12,6 +12,11 @@ from visioncal.core.number_format import known_name
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress, chosen_rows
 from visioncal.estimation.clock_correlation import evenly
 from visioncal.session import ImageStore
+
+# What a source does not say of its poses: `rotation`, `angles` (their order and unit), `unit` and
+# `inverse`.
+Unstated: TypeAlias = frozenset[str]
+Side: TypeAlias = Literal["robot", "camera"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,8 @@ class ImportOptions:
     resolution: tuple[int, int] | None = None  # (width, height) [px].
     robot_model: str | None = None  # A built-in robot's name, or the path of a .urdf or a DH .toml.
     tip: str | None = None  # The frame that the poses are of.
+    # The words of the command, which messages repeat with what is to be added.
+    command: tuple[str, ...] = field(default=(), compare=False)
     # Called during long reading.
     progress: Progress | None = field(default=None, compare=False, repr=False)
 
@@ -120,6 +127,8 @@ class ForeignRecording:
     # Further columns of views.csv with their (n,) cells.
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # Assumptions and omissions, in sentences for the user.
+    # What is assumed of the poses of each side.
+    unstated: Mapping[Side, Unstated] = field(default_factory=dict)
 
 
 def frames_to_take(

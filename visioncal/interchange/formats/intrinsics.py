@@ -1,7 +1,8 @@
 """Targets by name, file or description; intrinsics in foreign formats as fields of `[camera]`."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -71,6 +72,7 @@ _DISTORTION_KEYS = (
     *("distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distCoeffs", "distortion"),
     *("dist", "D", "d", "D1"),
 )
+LENS_KEYS = (*_MATRIX_KEYS, *_DISTORTION_KEYS)
 _FOUR = ("fx", "fy", "cx", "cy")
 _SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
@@ -94,6 +96,18 @@ def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
         if root.find("camera") is not None:
             return _visp(root, str(path)), ()
     return intrinsics_from(read_opencv(path), str(path))
+
+
+def lenses_in(document: object, where: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """All intrinsics in a document, at any depth, with where they stand."""
+    if not isinstance(document, Mapping):
+        return
+    if {*_FOUR} <= document.keys() or {*_MATRIX_KEYS, "cam0"} & document.keys():
+        with suppress(DataError):
+            yield where, intrinsics_from(document, where)[0]
+            return
+    for name, value in document.items():
+        yield from lenses_in(value, f"{where}: {name}")
 
 
 def intrinsics_from(

@@ -1,9 +1,10 @@
 """Recognises fields of poses by the words in their names."""
 
 import re
-from collections import Counter, defaultdict
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -13,9 +14,9 @@ from visioncal.core.documents.pendants import forms_named
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.types import FloatArray
-from visioncal.interchange.formats.foreign import PoseImportOptions
-from visioncal.interchange.formats.reading import Fields, named_by
-from visioncal.session.columns import SELECTORS, joint_columns
+from visioncal.interchange.formats.foreign import PoseImportOptions, Side, Unstated
+from visioncal.interchange.formats.reading import Fields, appearance, named_by, split_matrices
+from visioncal.session.columns import joint_columns
 
 # An ordinal indicator is common for the degree sign, too.
 _DEGREES = ("deg", "degrees", "°", "º")
@@ -26,18 +27,34 @@ _UNIT = re.compile(
     rf"|(?<=_)({'|'.join([*UNITS_M, *_ANGLES])}))",
     re.IGNORECASE,
 )
-_POSITION_WORDS = {"translation", "position", "pos", "tvec", "trans", "xyz", "t"}
-_ROTATION_WORDS = {"rotation", "orientation", "quaternion", "quat", "rvec", "rotvec", "rot", "r"}
-_ROTATION_WORDS |= {"rpy", "euler", "vector", "matrix", "xyzw", "wxyz"}
+_POSITION_WORDS = {"translation", "position", "pos", "tvec", "tvecs", "trans", "xyz", "t"}
+_ROTATION_WORDS = {"rotation", "orientation", "quaternion", "quat", "rotvec", "rot", "r", "ori"}
+_ROTATION_WORDS |= {"rvec", "rvecs", "rpy", "euler", "vector", "matrix", "xyzw", "wxyz"}
 _POSE_WORDS = {"pose", "poses", "transform", "transforms", "t", "h", "matrix"}
 # Words of the parent frame and of the child frame, for the robot and for the camera.
 _FRAMES = {
     "robot": ({"base", "world", "root"}, {"gripper", "flange", "ee", "tcp", "tool", "hand", "tip"}),
     "camera": ({"cam", "camera", "eye", "sensor"}, {"target", "board", "marker", "tag", "object"}),
 }
-_SIDE_WORDS = {"robot": {"robot", "arm", "effector"}, "camera": {"charuco", "aruco", "chessboard"}}
+_SIDE_WORDS = {
+    "robot": {"robot", "arm", "effector", "eef", "endeffector", "manipulator"},
+    "camera": {"charuco", "aruco", "chessboard", "checkerboard", "apriltag", "pattern", "cft"},
+}
 # With these words between two frames the child is named first; otherwise second.
 _CHILD_FIRST = {"2", "to", "in", "wrt"}
+# Numbers of poses' sizes that are none, and poses that were not reached but asked for.
+_NO_POSE = re.compile(r"joint|axis|axes|angles|wrench|force|torque|twist|vel|effort|corner|intrins")
+_ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "init", "ref", "guess"}
+# Names of the numbers of a position and of a rotation, the rotations that tell most first.
+_POSITION_NAMES: tuple[tuple[str, ...], ...] = (
+    ("x", "y", "z"),
+    ("tx", "ty", "tz"),
+    ("px", "py", "pz"),
+)
+_ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
+    ("qx", "qy", "qz", "qw"),
+    *dict.fromkeys(tuple(form.names.split()) for form in POSE_FORMS.values()),
+)
 
 
 def without_unit(name: str) -> tuple[str, str]:
@@ -46,132 +63,102 @@ def without_unit(name: str) -> tuple[str, str]:
     return (match[1], (match[2] or match[3]).lower()) if match and match[1] else (name, "")
 
 
-def _fields_by_words(fields: Fields, whose: str, taken: Collection[str]) -> tuple[str, ...]:
-    """Finds the fields of the robot's or the camera's poses by the words of their names."""
-    sizes = {
-        name: numbers.reshape(len(fields), -1).shape[1]
-        for name, numbers in fields.numbers.items()
-        if numbers.ndim > 1 and name not in taken
-    }
-    found: dict[tuple[str, ...], None] = {}
-    positions: dict[tuple[str, ...], str] = {}
-    rotations: dict[tuple[str, ...], list[str]] = defaultdict(list)
-    for name, size in sizes.items():
-        words = [part for part in re.split(r"[\W_]+|(2)", without_unit(name)[0].lower()) if part]
-        is_whole = size == 16 or (size in (6, 7, 12) and (_POSE_WORDS | _CHILD_FIRST) & {*words})
-        # A single matrix without frame words is the robot's.
-        is_plain = [*sizes.values()] == [16] and whose == "robot" and not _sides(words)
-        if is_whole and (is_plain or _is_of(words, whose)):
-            found[(name,)] = None
-        if size in (3, 4, 9) and _ROTATION_WORDS & {*words}:
-            rotations[tuple(word for word in words if word not in _ROTATION_WORDS)].append(name)
+def words_of(name: str) -> list[str]:
+    """The words of a field's name, in small letters and without its unit."""
+    plain = re.sub(r"(?<=[a-z])(?=[A-Z][a-z])", "_", without_unit(name)[0])
+    return [part for part in re.split(r"[\W_]+|(2)", plain.lower()) if part]
+
+
+@dataclass(frozen=True)
+class PoseFields:
+    """Fields that may hold poses: one, or those of a position and of a rotation."""
+
+    names: tuple[str, ...]
+    words: tuple[str, ...]  # What the names say beside `position` and the like.
+
+    @property
+    def sides(self) -> list[str]:
+        """The sides, robot or camera, whose frames the words name."""
+        return [
+            frame
+            for frame in _FRAMES
+            if {*self.words} & (_FRAMES[frame][0] | _FRAMES[frame][1] | _SIDE_WORDS[frame])
+        ]
+
+    def is_reversed(self, whose: str) -> bool:
+        """Whether the words name the frames of a side in the order of the inverse pose."""
+        parent, child = _FRAMES[whose]
+        frames = [word for word in self.words if word in parent | child]
+        if not ({*frames} & parent and {*frames} & child):
+            return False
+        return (frames[0] in child) != bool({*self.words} & _CHILD_FIRST)
+
+
+def possible_poses(fields: Fields, taken: Collection[str] = ()) -> list[PoseFields]:
+    """All fields that may hold poses, by what the numbers look like and what they are called."""
+    found: list[PoseFields] = []
+    positions: dict[tuple[str, ...], tuple[str, ...]] = {}
+    rotations: dict[tuple[str, ...], list[tuple[int, tuple[str, ...]]]] = defaultdict(list)
+    for names, words, size, look in (*_arrays(fields, taken), *_numbers(fields, taken)):
+        rest = tuple(word for word in words if word not in _POSITION_WORDS | _ROTATION_WORDS)
+        is_named = {*words} & (_POSE_WORDS | _CHILD_FIRST) and not _NO_POSE.search(names[0].lower())
+        if look in ("rotation", "quaternion") or (size == 3 and _ROTATION_WORDS & {*words}):
+            rotations[rest].append((size, names))
         elif size == 3 and _POSITION_WORDS & {*words}:
-            positions[tuple(word for word in words if word not in _POSITION_WORDS)] = name
-    # Names of position and rotation share all other words.
-    for rest, position in positions.items():
-        is_plain = not {*rest} - _POSE_WORDS and whose == "robot"
-        if rotations[rest] and (is_plain or _is_of(rest, whose)):
-            # Of several rotations the least ambiguous: a matrix, then a quaternion.
-            found[position, max(rotations[rest], key=lambda index: sizes[index])] = None
-    return next(iter(found)) if len(found) == 1 else ()
+            positions[rest] = names
+        elif look == "pose" or (size in (6, 7, 12, 16) and is_named):
+            found.append(PoseFields(names, words))
+    # Names of position and rotation share all other words; of several rotations the least
+    # ambiguous is taken: a matrix, then a quaternion.
+    both = ((rest, names) for rest, names in positions.items() if rotations[rest])
+    found += [PoseFields((*names, *max(rotations[rest])[1]), rest) for rest, names in both]
+    return found
 
 
-def _is_of(words: Sequence[str], whose: str) -> bool:
-    """Whether words name frames of one side only, in the order of the wanted pose."""
-    parent, child = _FRAMES[whose]
-    if _sides(words) != [whose]:
-        return False
-    frames = [word for word in words if word in parent | child]
-    if {*frames} & parent and {*frames} & child:
-        return (frames[0] in child) == bool({*words} & _CHILD_FIRST)
-    return True
+# Fields with their words, the number of values, and what they look like.
+_Sorted: TypeAlias = tuple[tuple[str, ...], tuple[str, ...], int, str]
 
 
-def _sides(words: Sequence[str]) -> list[str]:
-    """The sides, robot or camera, whose frames the words name."""
-    return [
-        frame
-        for frame in _FRAMES
-        if {*words} & (_FRAMES[frame][0] | _FRAMES[frame][1] | _SIDE_WORDS[frame])
-    ]
+def _arrays(fields: Fields, taken: Collection[str]) -> Iterator[_Sorted]:
+    for name, numbers in fields.numbers.items():
+        if numbers.ndim > 1 and name not in taken and len(numbers):
+            yield (name,), tuple(words_of(name)), numbers[0].size, appearance(numbers)
 
 
-# Common names of pose fields, the most specific first.
-ROBOT_KEYS: tuple[tuple[str, ...], ...] = (
-    ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
-    ("effector_wrt_world",),
-    ("O_T_EE",),
-    ("base_from_flange",),
-    ("base_T_flange",),
-    ("base_T_tool",),
-    ("base_T_ee",),
-    ("T_base_ee",),
-    ("robot_pose",),
-    ("robot_poses",),
-    ("R_gripper2base", "t_gripper2base"),
-    ("x", "y", "z", "qx", "qy", "qz", "qw"),
-    ("tx", "ty", "tz", "qx", "qy", "qz", "qw"),
-    *dict.fromkeys(("x", "y", "z", *form.names.split()) for form in POSE_FORMS.values()),
-    ("pose",),
-    ("robot",),
-    ("robot.rvec", "robot.tvec"),
-    ("matrix",),
-)
-CAMERA_KEYS: tuple[tuple[str, ...], ...] = (
-    ("cft_x_m", "cft_y_m", "cft_z_m", "cft_qx", "cft_qy", "cft_qz", "cft_qw"),
-    ("object_wrt_sensor",),
-    ("cam_from_target",),
-    ("T_cam_target_rvec", "T_cam_target_tvec"),
-    ("T_cam_target",),
-    ("camera_T_target",),
-    ("R_target2cam", "t_target2cam"),
-    ("camera_pose",),
-    ("camera_poses",),
-    ("rvec", "tvec"),
-    ("rvecs", "tvecs"),
-    ("camera",),
-    ("camera.rvec", "camera.tvec"),
-)
-JOINT_KEYS: tuple[str, ...] = ("joint_pose", "joints", "joint_angles", "joint_positions", "q")
-
-_JOINT_NAME = re.compile(
-    r"(?:.*\.)?(joint|axis|j|a|q)[ _]?([1-9])((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*"
-    r"(?:deg|rad|[°º])[a-z]*\W*)?)",
-    re.IGNORECASE,
-)
-
-_ROTATION_NAME = re.compile(r"rvec|rot|quat|orient|rpy|euler|(^|\.)R(_|$)")
-_ANGLES_NAME = re.compile(r"rpy|roll|euler")
+def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Sorted]:
+    """Positions and rotations of a column a number."""
+    for prefix, named in _by_prefix(fields, taken).items():
+        words = words_of(prefix)
+        position, rotation = (
+            next((part for part in known if {*part} <= named.keys()), ())
+            for known in (_POSITION_NAMES, _ROTATION_NAMES)
+        )
+        if {*named} == {*"xyzw"}:
+            position, rotation = (), tuple("xyzw")
+        elif position and not rotation and _ROTATION_WORDS & {*words}:
+            position, rotation = (), position
+        # Five and more of these are joints.
+        if rotation and "q5" not in named:
+            names = tuple(named[each] for each in rotation)
+            yield names, (*words, "rotation"), len(rotation), "rotation"
+        if position:
+            yield tuple(named[each] for each in position), (*words, "position"), 3, ""
 
 
-def known_names(
-    fields: Fields, candidates: Sequence[tuple[str, ...]], taken: Collection[str]
-) -> tuple[str, ...]:
-    """Full names of the first candidate whose fields all exist and are not taken; else empty.
-
-    Case and units are ignored. A text field counts only within a set of several names, so that a
-    wrong cell is reported by its place.
-    """
-    # A single number in a field called `robot` or `camera` is a selector, not a pose.
-    numbers = (
-        name for name, values in fields.numbers.items() if values.ndim > 1 or name not in SELECTORS
-    )
-    numeric = [*numbers, *fields.shape_errors]
-    textual = (name for name, cells in fields.texts.items() if any(cells) and name not in SELECTORS)
-    free_names = [name for name in dict.fromkeys([*numeric, *textual]) if name not in taken]
-    endings = Counter(name.rsplit(".", 1)[-1] for name in free_names)
-    full = {end: name for name in free_names if endings[end := name.rsplit(".", 1)[-1]] == 1}
-    full |= {name: name for name in free_names}
-    # An exact match of a name goes before one in another case or with a unit.
-    plain = {name: without_unit(name)[0].lower() for name in full}
-    counts = Counter(plain.values())
-    without_units = {plain[word]: name for word, name in full.items() if counts[plain[word]] == 1}
-    full = without_units | {word.lower(): name for word, name in full.items()} | full
-    for candidate in candidates:
-        matches = tuple(full.get(name, full.get(name.lower(), "")) for name in candidate)
-        if all(matches) and (len(matches) > 1 or matches[0] in numeric):
-            return matches
-    return ()
+def _by_prefix(fields: Fields, taken: Collection[str]) -> dict[str, dict[str, str]]:
+    """Columns by what their names begin with, and by their last words: `tcp_`, `rx`."""
+    groups: dict[str, dict[str, str]] = defaultdict(dict)
+    columns = {name: None for name, numbers in fields.numbers.items() if numbers.ndim == 1}
+    texts = {name: None for name, cells in fields.texts.items() if any(cells)}
+    # An exact name goes before one in another case or with a unit.
+    for name in sorted({**columns, **texts}, key=lambda name: without_unit(name)[0] != name):
+        plain = without_unit(name)[0]
+        last = re.split("[ _.]", plain)[-1]
+        prefix = plain.removesuffix(last)
+        # The same numbers as an array.
+        if name not in taken and prefix.rstrip(".") not in fields.numbers:
+            groups[prefix].setdefault(last.lower(), name)
+    return groups
 
 
 def pose_names(
@@ -184,80 +171,155 @@ def pose_names(
     """Full names of the fields with the poses of the `robot` or `camera`; empty where none fit.
 
     They are those that the user gives, else the `unnamed` columns of a table without a header, else
-    fields with a known name that are not `taken`. Raises DataError.
+    the only fields that may hold poses and whose words say so: by the frames of that side, first in
+    the right order, and for the robot without any words. Raises DataError.
     """
     if given:
-        return tuple(fields.find(name) for name in given)
+        inner = f".{given[0]}."
+        within = (item.names for item in possible_poses(fields) if inner in f".{item.names[0]}.")
+        # A key that holds a position and a rotation.
+        is_whole = len(given) > 1 or inner[1:-1] in {*fields.numbers, *fields.texts}
+        held = None if is_whole else next(within, None)
+        return held or tuple(fields.find(name) for name in given)
     if unnamed:
         return () if set(unnamed) & set(taken) else unnamed
-    keys = ROBOT_KEYS if whose == "robot" else CAMERA_KEYS
-    return known_names(fields, keys, taken) or _fields_by_words(fields, whose, taken)
+    possible = possible_poses(fields, taken)
+    # OpenCV's names of a board's pose.
+    seen = [item for item in possible if not item.sides and _is_opencv(item)]
+    plain = [item for item in possible if not item.sides and item not in seen]
+    of_side = [item for item in possible if item.sides == [whose]]
+    in_order = [item for item in of_side if not item.is_reversed(whose)]
+    others = [plain, seen] if whose == "robot" else [seen]
+    for group in (in_order, of_side, *others):
+        wanted = [item for item in group if not {*item.words} & _ASKED_FOR] or group
+        if len(wanted) == 1:
+            return wanted[0].names
+        if wanted:
+            return ()
+    # A field whose rows are irregular is refused by its row.
+    ragged = (PoseFields((name,), tuple(words_of(name))) for name in fields.shape_errors)
+    return next(
+        (
+            item.names
+            for item in ragged
+            if item.sides == [whose] and not _NO_POSE.search(item.names[0].lower())
+        ),
+        (),
+    )
+
+
+def _is_opencv(item: PoseFields) -> bool:
+    return any(re.search("[rt]vecs?$", name) for name in item.names)
+
+
+JOINT_KEYS = ("joint_pose", "joints?", "joint_angles", "joint_(?:positions?|values?|states?)", "q")
+
+_JOINT_NAME = re.compile(
+    r"(?:.*\.)?(joint|axis|j|a|q)[ _]?([1-9])((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*"
+    r"(?:deg|rad|[°º])[a-z]*\W*)?)",
+    re.IGNORECASE,
+)
+
+_ROTATION_NAME = re.compile(r"rvec|rot|quat|orient|rpy|euler|(^|\.)R(_|$)")
+_ANGLES_NAME = re.compile(r"rpy|roll|euler")
+
+
+def columns_named(fields: Fields, wanted: Sequence[str]) -> tuple[str, ...]:
+    """The columns of these names, in any case, with a unit or words before; empty without."""
+    groups = {k: group for k, group in _by_prefix(fields, ()).items() if {*wanted} <= group.keys()}
+    group = groups.get("") or (next(iter(groups.values())) if len(groups) == 1 else None)
+    return tuple(group[name] for name in wanted) if group else ()
 
 
 def poses_from(
-    fields: Fields, names: Sequence[str], requested: PoseImportOptions, whose: str
-) -> tuple[PoseNumbers, tuple[str, ...]]:
-    """Reads the poses of the `robot` or `camera` from fields, with notes on assumptions.
+    fields: Fields, names: Sequence[str], requested: PoseImportOptions, whose: Side
+) -> tuple[PoseNumbers, tuple[str, ...], Unstated]:
+    """Reads the poses of the `robot` or `camera` from fields: (poses, notes, what is assumed).
 
     16 numbers are a matrix, by rows or by columns as its last row of 0, 0, 0, 1 shows; 12 are its
     upper three rows, or a position and a rotation by rows, whichever gives rotations; otherwise a
     position of three numbers and a rotation, ordered as names such as rvec and tvec show. Raises
     DataError.
     """
-    if whose == "robot" and requested.form is None:
-        requested = replace(requested, form=_usual_form(names, requested.usual))
-    if whose == "robot" and fields.form:
-        # The rows themselves state the form of their poses.
-        if requested.form not in (None, fields.form):
-            raise DataError(
-                f"{fields.places[0]}: the pose is written as {POSE_FORMS[fields.form].words}, not "
-                f"as {requested.form}.",
-                culprits=["--robot-form"],
-            )
-        requested = replace(requested, form=fields.form)
+    if whose == "robot":
+        requested = _stated_form(fields, names, requested)
     if not requested.names and len(names) == 7 and requested.rotation == "quaternion-wxyz":
         # --form refers to the columns in their order in the file, and these were found by their
         # names.
         order = {name: at for at, name in enumerate(fields.numbers)}
         names = (*names[:3], *sorted(names[3:], key=lambda name: order.get(name, 0)))
     blocks = [fields.column(name) for name in names]
-    sizes = [block.shape[1] for block in blocks]
-    flat, unit, notes = np.hstack(blocks), requested.unit, tuple[str, ...]()
+    sizes, units = [block.shape[1] for block in blocks], {without_unit(name)[1] for name in names}
+    notes, unstated = list[str](), set[str]() if requested.inverse is not None else {"inverse"}
     if sum(sizes) in (12, 16) and 9 not in sizes:
-        positions, rotations = _matrices(flat)
+        positions, rotations = split_matrices(np.hstack(blocks))
         rotation = "matrix"
         requested = _by_rows(requested, sum(sizes))
         unit = requested.unit
     else:
-        positions, rotations, rotation_names = flat[:, :3], flat[:, 3:], tuple(names[3:] or names)
-        if len(blocks) == 2:
-            rotation_first = sizes[1] == 3
-            if sizes[0] == sizes[1]:
-                rotation_first = _ROTATION_NAME.search(names[0]) is not None
-            positions, rotations = blocks[::-1] if rotation_first else blocks
-            rotation_names = (names[0] if rotation_first else names[1],)
-        if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
-            raise DataError(
-                f"{fields.name}: {', '.join(names)} have {sum(sizes)} numbers; a pose has 16 or 12 "
-                "(matrix), 7 (quaternion) or 6 (three angles). There are " + fields.listing() + ".",
-                culprits=list(names),
-                next_step=f"Name the fields of the {whose}'s poses with --{whose}-"
-                f"{named_by(fields.places[0])}.",
-            )
-        units = {without_unit(name)[1] for name in names}
-        rotation, notes = _likely_rotation(
-            rotations.shape[1], rotation_names, requested, whose, degrees=bool(units & {*_DEGREES})
+        positions, rotations, of_rotation = _split(fields, names, blocks, whose)
+        rotation, doubt = _likely_rotation(
+            rotations, of_rotation, requested, whose, degrees=bool(units & {*_DEGREES})
         )
-        lengths = units - {"", *_ANGLES}
-        unit = unit or (lengths.pop() if len(lengths) == 1 else None)
+        notes += [doubt] * bool(doubt)
+        unstated |= {"angles"} if requested.form is None and rotations.shape[1] == 3 else set()
+        unstated |= {"rotation"} if "does not say" in doubt else set()
+    lengths = units - {"", *_ANGLES}
+    unit = requested.unit or (lengths.pop() if len(lengths) == 1 else None)
     if unit is None and requested.form not in POSE_FORMS:
-        notes = (
-            *notes,
-            f"The {whose}'s positions are taken for metres, as the source does not say; "
-            f"--{whose}-unit names another unit.",
+        unstated.add("unit")
+        farthest = float(np.nanmax(np.abs(positions), initial=0.0))
+        # No arm reaches so far, and no camera looks there.
+        unit = "mm" if farthest > FAR_M else None
+        words = f"millimetres, as {farthest:.0f} m is far," if unit else "metres,"
+        notes.append(
+            f"The {whose}'s positions are taken for {words} as the source does not say; "
+            f"--{whose}-unit names another unit."
         )
     reading = replace(requested, unit=unit).reading(Reading(rotation))
-    return PoseNumbers(positions, rotations, reading, fields.places), notes
+    numbers = PoseNumbers(positions, rotations, reading, fields.places)
+    return numbers, tuple(notes), frozenset(unstated)
+
+
+def _stated_form(
+    fields: Fields, names: Sequence[str], requested: PoseImportOptions
+) -> PoseImportOptions:
+    """The robot's options with the form that its own or the rows state; raises DataError."""
+    if requested.form is None:
+        requested = replace(requested, form=_usual_form(names, requested.usual))
+    if fields.form and requested.form not in (None, fields.form):
+        raise DataError(
+            f"{fields.places[0]}: the pose is written as {POSE_FORMS[fields.form].words}, not "
+            f"as {requested.form}.",
+            culprits=["--robot-form"],
+        )
+    return replace(requested, form=fields.form or requested.form)
+
+
+def _split(
+    fields: Fields, names: Sequence[str], blocks: Sequence[FloatArray], whose: Side
+) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Positions, rotations, and the names of the rotations' fields; raises DataError."""
+    flat, sizes = np.hstack(blocks), [block.shape[1] for block in blocks]
+    positions, rotations = flat[:, :3], flat[:, 3:]
+    of_rotation = tuple(names[int(np.searchsorted(np.cumsum(sizes), 3)) + 1 :] or names)
+    if len(blocks) == 2:
+        rotation_first = sizes[1] == 3
+        if sizes[0] == sizes[1]:
+            rotation_first = _ROTATION_NAME.search(names[0]) is not None
+        positions, rotations = blocks[::-1] if rotation_first else blocks
+        of_rotation = (names[0] if rotation_first else names[1],)
+    if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
+        raise DataError(
+            f"{fields.name}: {', '.join(names)} have {sum(sizes)} numbers; a pose has 16 or 12 "
+            "(matrix), 7 (quaternion) or 6 (three angles). There are " + fields.listing() + ".",
+            culprits=list(names),
+            next_step=f"Name the fields of the {whose}'s poses with --{whose}-"
+            f"{named_by(fields.places[0])}.",
+        )
+    # The numbers of a mapping have names of their own.
+    inner = tuple(name for name in fields.numbers if name.startswith(f"{of_rotation[0]}."))
+    return positions, rotations, inner if len(of_rotation) == 1 and inner else of_rotation
 
 
 def _by_rows(requested: PoseImportOptions, count: int) -> PoseImportOptions:
@@ -289,8 +351,13 @@ def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
     """Finds the fields of joint angles: one list, or a field a joint numbered from one."""
     if columns := joint_columns(tuple(fields.numbers)):
         return columns
-    if listed := known_names(fields, [(key,) for key in JOINT_KEYS], taken):
-        return listed
+    lists = [
+        name
+        for name, numbers in fields.numbers.items()
+        if numbers.ndim > 1 and name not in taken and _is_of_joints(name)
+    ]
+    if len(lists) == 1:
+        return (lists[0],)
     counted: dict[tuple[str, ...], dict[int, str]] = defaultdict(dict)
     for name, numbers in fields.numbers.items():
         match = _JOINT_NAME.fullmatch(name)
@@ -302,6 +369,12 @@ def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
         if len(by_number) >= 5 and [*by_number] == [*range(1, len(by_number) + 1)]:
             return tuple(by_number.values())
     return ()
+
+
+def _is_of_joints(name: str) -> bool:
+    return any(
+        re.fullmatch(rf"(?:.*[._])?{key}", without_unit(name)[0].lower()) for key in JOINT_KEYS
+    )
 
 
 def joints_from(
@@ -373,36 +446,18 @@ def check_radians(
     )
 
 
-def _matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Splits (n, 16) or (n, 12) numbers of matrices into (n, 3) positions and (n, 9) rotations."""
-    last = np.array([0.0, 0, 0, 1])
-    if flat.shape[1] == 12:
-        matrices = flat.reshape(-1, 3, 4)
-        after_position = ROTATION_FORMS["matrix"].read(flat[:, 3:])
-        upper_rows = ROTATION_FORMS["matrix"].read(matrices[:, :, :3].reshape(-1, 9))
-        if (
-            np.isfinite(after_position).all(axis=(1, 2)).sum()
-            > np.isfinite(upper_rows).all(axis=(1, 2)).sum()
-        ):
-            return flat[:, :3].copy(), flat[:, 3:].copy()
-    else:
-        square = flat.reshape(-1, 4, 4)
-        by_columns = (square[:, :, 3] == last).all(axis=1) & ~(square[:, 3] == last).all(axis=1)
-        matrices = np.where(by_columns[:, None, None], np.swapaxes(square, 1, 2), square)
-        wrong = np.isfinite(matrices).all(axis=(1, 2)) & (
-            np.abs(matrices[:, 3] - last).max(axis=1) > 1e-6
-        )
-        # A matrix with another last row is no rigid transform: its zeroed rotation is refused
-        # later.
-        matrices = np.where(wrong[:, None, None], 0.0, matrices)
-    return matrices[:, :3, 3].copy(), matrices[:, :3, :3].reshape(-1, 9).copy()
-
-
 def _likely_rotation(
-    size: int, names: Sequence[str], requested: PoseImportOptions, whose: str, *, degrees: bool
-) -> tuple[str, tuple[str, ...]]:
+    rotations: FloatArray,
+    names: Sequence[str],
+    requested: PoseImportOptions,
+    whose: Side,
+    *,
+    degrees: bool,
+) -> tuple[str, str]:
+    """The likely form of (n, k) numbers of rotations, and a note on what is assumed, or none."""
+    size = rotations.shape[1]
     if size == 9:
-        return "matrix", ()
+        return "matrix", ""
     if size == 4:
         ends = (
             names[0][-4:].lower()
@@ -412,21 +467,28 @@ def _likely_rotation(
         # ABB numbers q1 to q4 from the scalar on.
         is_abb = [name[-2:].lower() for name in names] == ["q1", "q2", "q3", "q4"]
         rotation = f"quaternion-{'wxyz' if is_abb or ends == 'wxyz' else 'xyzw'}"
-        if requested.form is not None or is_abb or ends in ("xyzw", "wxyz"):
-            return rotation, ()
+        # Of a mapping, whose numbers were joined by their names.
+        is_mapping = len(names) > 1 and "." in names[0] and {*ends} == {*"xyzw"}
+        if is_mapping or requested.form is not None or is_abb or ends in ("xyzw", "wxyz"):
+            return "quaternion-xyzw" if is_mapping else rotation, ""
         return rotation, (
             f"The {whose}'s quaternions are taken for x, y, z, w, as the source does not say; "
-            f"--{whose}-form quaternion-wxyz names the other order.",
+            f"--{whose}-form quaternion-wxyz names the other order."
         )
     joined = " ".join(names).lower()
+    largest = float(np.nanmax(np.abs(rotations), initial=0.0))
     if _ANGLES_NAME.search(joined):
-        return f"euler-xyz-{'deg' if degrees else 'rad'}", ()
+        is_large = not degrees and largest > 2 * np.pi + 0.01 and requested.form is None
+        note = (
+            f"The {whose}'s angles up to {largest:.0f} are no radians, and are taken for degrees."
+        )
+        return f"euler-xyz-{'deg' if degrees or is_large else 'rad'}", note * is_large
     if degrees:
         # Angle units are checked later, unless the user states them.
-        return "rotation-vector-deg", ()
+        return "rotation-vector-deg", ""
     if requested.form is None and "rvec" not in joined:
         return "rotation-vector", (
             f"The {whose}'s rotations ({', '.join(names)}) are taken for rotation vectors in "
-            f"radians, as the source does not say; --{whose}-form names another form.",
+            f"radians, as the source does not say; --{whose}-form names another form."
         )
-    return "rotation-vector", ()
+    return "rotation-vector", ""

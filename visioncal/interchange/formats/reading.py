@@ -2,14 +2,14 @@
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from visioncal.core.conventions import POSE_FORMS, write_pose
+from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
 from visioncal.core.documents.jsons import read_arrays, read_json
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.documents.structured import read_opencv, read_yaml
@@ -45,6 +45,7 @@ class Fields:
     # (n,) texts by name, of every column of a table and of single numbers.
     texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     views: tuple[int, ...] = ()  # (n,) the rows' numbers, where their files' names have them.
+    stems: tuple[str, ...] = ()  # (n,) names of the rows' files without their ending.
     # Error messages of fields whose rows differ in shape, by name.
     shape_errors: Mapping[str, str] = field(default_factory=dict)
     form: str = ""  # A name among `POSE_FORMS` where the rows state the form of the robot's poses.
@@ -170,21 +171,27 @@ def fields_of_records(
                     "" if np.isnan(each) else str(int(each)) if each % 1 == 0 else repr(each)
                     for each in numbers[key].tolist()
                 )
-    return Fields(name, folder, tuple(places), numbers, texts, views, ragged)
+    return Fields(name, folder, tuple(places), numbers, texts, views, shape_errors=ragged)
+
+
+# Names of numbers in a mapping that are one array.
+_JOINED = ("x y z", "x y z w", "qx qy qz qw", "roll pitch yaw", "rx ry rz")
 
 
 def flattened(record: object, prefix: str = "") -> dict[str, object]:
     """Flattens nested mappings with names joined by points; the parser has bounded the depth.
 
-    Numbers named x, y, z, or x, y, z, w, are also joined into an array.
+    Numbers named as in `_JOINED` are also joined into an array, in that order.
 
     Returns:
         Texts, small arrays, and lists that are no arrays; large arrays and nulls are left out.
     """
     if isinstance(record, Mapping):
         flat: dict[str, object] = {}
-        if prefix and [*record] in (["x", "y", "z"], ["x", "y", "z", "w"], ["w", "x", "y", "z"]):
-            flat |= flattened([record[name] for name in "xyzw"[: len(record)]], prefix)
+        plain = {str(name).lower(): value for name, value in record.items()}
+        joined = next((names for names in map(str.split, _JOINED) if {*names} == {*plain}), None)
+        if prefix and joined:
+            flat |= flattened([plain[name] for name in joined], prefix)
         for name, value in record.items():
             flat |= flattened(value, f"{prefix}{name}.")
         return flat
@@ -196,6 +203,52 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
     except (ValueError, TypeError, OverflowError):
         return {name: record}
     return {name: array} if record is not None and array.size <= _MOST_NUMBERS else {}
+
+
+def appearance(numbers: FloatArray) -> str:
+    """What (n, ...) numbers look like: a `pose`, a `rotation`, a `quaternion`; else empty."""
+    flat = numbers.reshape(len(numbers), -1)
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    size, matrix = flat.shape[1], ROTATION_FORMS["matrix"]
+    if not len(flat) or size not in (4, 7, 9, 12, 16):
+        return ""
+    if size in (4, 7):
+        norms = np.linalg.norm(flat[:, -4:], axis=1)
+        is_unit = bool((np.abs(norms - 1.0) < _NORM_TOLERANCE).all())
+        return ("quaternion" if size == 4 else "pose") * is_unit
+    rotations = flat if size == 9 else split_matrices(flat)[1]
+    is_rotation = bool(np.isfinite(matrix.read(rotations)).all())
+    return ("rotation" if size == 9 else "pose") * is_rotation
+
+
+def holds_pose(fields: Fields) -> bool:
+    """Whether numbers of a row look like a pose or a rotation, whatever they are called."""
+    return any(appearance(numbers) for numbers in fields.numbers.values())
+
+
+def split_matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Splits (n, 16) or (n, 12) numbers of matrices into (n, 3) positions and (n, 9) rotations."""
+    last = np.array([0.0, 0, 0, 1])
+    if flat.shape[1] == 12:
+        matrices = flat.reshape(-1, 3, 4)
+        after_position = ROTATION_FORMS["matrix"].read(flat[:, 3:])
+        upper_rows = ROTATION_FORMS["matrix"].read(matrices[:, :, :3].reshape(-1, 9))
+        if (
+            np.isfinite(after_position).all(axis=(1, 2)).sum()
+            > np.isfinite(upper_rows).all(axis=(1, 2)).sum()
+        ):
+            return flat[:, :3].copy(), flat[:, 3:].copy()
+    else:
+        square = flat.reshape(-1, 4, 4)
+        by_columns = (square[:, :, 3] == last).all(axis=1) & ~(square[:, 3] == last).all(axis=1)
+        matrices = np.where(by_columns[:, None, None], np.swapaxes(square, 1, 2), square)
+        wrong = np.isfinite(matrices).all(axis=(1, 2)) & (
+            np.abs(matrices[:, 3] - last).max(axis=1) > 1e-6
+        )
+        # A matrix with another last row is no rigid transform: its zeroed rotation is refused
+        # later.
+        matrices = np.where(wrong[:, None, None], 0.0, matrices)
+    return matrices[:, :3, 3].copy(), matrices[:, :3, :3].reshape(-1, 9).copy()
 
 
 def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
@@ -249,10 +302,14 @@ def stamp_name(fields: Fields, taken: Collection[str]) -> str:
 
 
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml", ".npz", ".npy")
-ENDINGS = (".csv", ".tsv", ".txt", ".log", *DOCUMENTS)
+# Robots' programs, of which the poses alone are read.
+_PROGRAMS = (".dat", ".src", ".ls", ".mod", ".script")
+ENDINGS = (".csv", ".tsv", ".txt", ".log", *_PROGRAMS, *DOCUMENTS)
 # Field names of a pose by its number of values.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
 _IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
+# What a program declares beside targets.
+_FRAMES = re.compile("tool|wobj|load|base", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//", "!")
 
 
@@ -265,6 +322,8 @@ def read_fields(path: Path, form: str | None = None) -> Fields:
         return fields_of_document(read_document(path), path)
     if lines := _pendant(path, form if form in POSE_FORMS else None):
         return lines
+    if path.suffix.lower() in _PROGRAMS:
+        raise DataError(f"{path} holds no poses of a robot.", culprits=[str(path)])
     table = read_table(path)
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
         raise DataError(
@@ -295,35 +354,69 @@ def read_document(path: Path) -> object:
 
 
 def fields_of_document(document: object, path: Path) -> Fields:
-    """Rows from a list of records, from lists of one length in a mapping, or a mapping of records.
+    """Rows of a document, at any depth: lists of one length, or a mapping of records.
+
+    Of several lengths the first in which a pose is found is taken, lists of records before others.
 
     Raises:
         DataError: It holds no rows.
     """
-    views: tuple[int, ...] = ()
-    # Names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
-    if isinstance(document, Mapping):
-        numbered = _numbered(document)
-        lists = {k: v for k, v in document.items() if isinstance(v, list) and v}
-        lists = {k: v for k, v in lists.items() if isinstance(v[0], Mapping)} or lists
-        if len(numbered) > 1:
-            document, views = list(numbered.values()), tuple(numbered)
-        elif lists:
-            counts = Counter(map(len, lists.values()))
-            count = max(counts, key=lambda length: (counts[length], length))
-            columns = {k: v for k, v in document.items() if isinstance(v, list) and len(v) == count}
-            only = len(columns) == 1 and isinstance(next(iter(columns.values()))[0], Mapping)
-            rows = [{k: v[at] for k, v in columns.items()} for at in range(count)]
-            document = next(iter(columns.values())) if only else rows
-        elif all(isinstance(value, Mapping) for value in document.values()):
-            document = list(document.values())
-    if not isinstance(document, list) or not document:
+    found: dict[int, dict[str, list[object]]] = defaultdict(dict)
+    numbered = _numbered(document) if isinstance(document, Mapping) else {}
+    if len(numbered) > 1:
+        found[len(numbered)][""] = [*numbered.values()]
+    else:
+        for name, rows in _row_lists(document):
+            found[len(rows)][name] = rows
+    if not found:
         raise DataError(
             f"{path} holds no rows; a list with one entry a pose is needed.", culprits=[str(path)]
         )
-    places = [f"{path.name}, entry {at}" for at in views or range(len(document))]
-    records = [flattened(value) for value in document]
-    return fields_of_records(records, places, path.stem, path.parent, views)
+    views = tuple(numbered) if len(numbered) > 1 else ()
+
+    def rank(lists: Mapping[str, list[object]]) -> tuple[bool, int, int]:
+        rows = [*lists.values()]
+        return any(isinstance(each[0], Mapping) for each in rows), len(rows), len(rows[0])
+
+    several = [
+        _fields_of_lists(lists, path, views)
+        for lists in sorted(found.values(), key=rank, reverse=True)
+    ]
+    return next((fields for fields in several if holds_pose(fields)), several[0])
+
+
+def _fields_of_lists(
+    lists: Mapping[str, list[object]], path: Path, views: tuple[int, ...]
+) -> Fields:
+    count = len(next(iter(lists.values())))
+    records = [name for name, rows in lists.items() if isinstance(rows[0], Mapping)]
+    flat: list[dict[str, object]] = [{} for _ in range(count)]
+    for name, rows in lists.items():
+        prefix = "" if not name or records == [name] else f"{name}."
+        for at, row in enumerate(rows):
+            flat[at] |= flattened(row, prefix)
+    places = [f"{path.name}, entry {at}" for at in views or range(count)]
+    return fields_of_records(flat, places, path.stem, path.parent, views)
+
+
+def _row_lists(document: object, name: str = "") -> Iterator[tuple[str, list[object]]]:
+    """All that may be rows in a document: its lists, and mappings of records that are alike."""
+    if isinstance(document, list | np.ndarray) and len(document) > 0:
+        rows = [*document]
+        # A list of one entry is a wrapper, unless there is nothing in it.
+        inner = [*_row_lists(rows[0], name)] if len(rows) == 1 else []
+        yield from inner or [(name, rows)]
+    elif isinstance(document, Mapping):
+        values = [*document.values()]
+        if all(isinstance(value, Mapping) for value in values) and (
+            len(values) > 2 or all(re.search("[0-9]$", str(key)) for key in document)
+        ):
+            shared = set[object].intersection(*({*value} for value in values)) if values else set()
+            if shared:
+                yield name, values
+                return
+        for key, value in document.items():
+            yield from _row_lists(value, f"{name}.{key}" if name else str(key))
 
 
 def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
@@ -345,11 +438,18 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
 
 def _pendant(path: Path, form: str | None) -> Fields | None:
     """Lines with poses in a maker's notation, with names of images; None where there are none."""
+    text = read_plain_text(path)
+    is_program = path.suffix.lower() in _PROGRAMS
+    if is_program:
+        # FANUC writes a pose in several lines.
+        text = re.sub(r"\{[^{}]*\}", lambda block: " ".join(block[0].split()), text)
     lines = [
         (f"{path.name}, line {at}", line)
-        for at, line in enumerate(read_plain_text(path).splitlines(), start=1)
+        for at, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.strip().startswith(_COMMENTS)
     ]
+    if is_program:
+        lines = [each for each in lines if is_marked_pose(each[1]) and not _FRAMES.search(each[1])]
     # The first line may be a header.
     first = next((at for at, (_, line) in enumerate(lines[:2]) if is_marked_pose(line)), None)
     if first is None:

@@ -14,8 +14,7 @@ from visioncal.core.files import check_free
 from visioncal.core.number_format import known_name
 from visioncal.interchange.formats.assemble import assemble, with_user_options
 from visioncal.interchange.formats.bags import BAG
-from visioncal.interchange.formats.columns import TABLE
-from visioncal.interchange.formats.file_search import files_in
+from visioncal.interchange.formats.columns import TABLE, VIEWS
 from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.industrial import EASY_HANDEYE, HAND_EYE, KINEMATICS, MOVEIT
 from visioncal.interchange.formats.lerobot import LEROBOT
@@ -25,8 +24,10 @@ from visioncal.interchange.formats.rereading import (
     exchange_views,
     load_for_rereading,
     reread,
+    settled,
 )
-from visioncal.interchange.formats.views import VIEWS, VISP, ZIVID
+from visioncal.interchange.formats.sources import look, unknown
+from visioncal.interchange.formats.views import VISP, ZIVID
 from visioncal.session import Session
 from visioncal.session.selecting import check_one_of_each
 
@@ -101,11 +102,7 @@ def convert(
         if choose is not None:
             doubtful = DoubtfulSession.of(foreign)
         else:
-            robot = foreign.robot if foreign.stream is None else foreign.stream.poses
-            check_radians(robot, requested.robot, "robot")
-            if foreign.camera is not None:
-                check_radians(foreign.camera, requested.camera, "camera")
-            session = assemble(foreign)
+            session = assemble(_checked(foreign, requested))
     elif requested != _DEFAULTS:
         raise DataError(
             f"{source} is a session already; what describes poses and cameras is for somebody "
@@ -128,6 +125,18 @@ def convert(
     return session
 
 
+def _checked(foreign: ForeignRecording, requested: ImportOptions) -> ForeignRecording:
+    """The recording with what its source does not say; raises DataError."""
+    tested = settled(foreign, requested.progress)
+    robot = foreign.robot if foreign.stream is None else foreign.stream.poses
+    # What was tested is in no doubt.
+    if tested.unstated or not foreign.unstated:
+        check_radians(robot, requested.robot, "robot")
+        if foreign.camera is not None:
+            check_radians(foreign.camera, requested.camera, "camera")
+    return tested
+
+
 def read_foreign(
     source: Path, requested: ImportOptions, form: str | None = None
 ) -> ForeignRecording:
@@ -137,7 +146,9 @@ def read_foreign(
     """
     # With a second file, both are tables, whatever the first looks like.
     form = form or (TABLE.name if requested.camera_file is not None else None)
-    return with_user_options(_foreign_format(source, form).read(source, requested), requested)
+    return with_user_options(
+        _foreign_format(source, form, requested).read(source, requested), requested
+    )
 
 
 def write_session(session: Session, dest: Path) -> None:
@@ -177,7 +188,7 @@ def _is_recording(path: Path) -> bool:
     return path.suffix.lower() == ".rrd"
 
 
-def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
+def _foreign_format(source: Path, form: str | None, requested: ImportOptions) -> ForeignFormat:
     if not (source.is_file() or source.is_dir()):
         raise DataError(
             f"{source} {'is no regular file' if source.exists() else 'does not exist'}; a file or "
@@ -191,11 +202,4 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
     for candidate in FOREIGN_FORMATS:
         if form in (None, candidate.name) and candidate.recognises(source):
             return candidate
-    words = "; ".join(each.words for each in FOREIGN_FORMATS if form in (None, each.name))
-    contents = ", ".join(path.name for path in files_in(source)[:8]) if source.is_dir() else ""
-    raise DataError(
-        f"{source} is no session and in no format that is asked for: {words}."
-        + (f" It holds {contents}." if contents else ""),
-        culprits=[str(source)],
-        next_step="Write the poses into a CSV with a header, a row a view.",
-    )
+    raise unknown(look(source), requested)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from visioncal.calibration.guess import Candidate, Guess
 from visioncal.calibration.guess.readings import Hypothesis
+from visioncal.calibration.guess.search import FEWEST_ROWS
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
@@ -19,11 +21,12 @@ from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
 from visioncal.core.types import MOUNTS, FloatArray, Progress
+from visioncal.estimation.clock_correlation import evenly
 from visioncal.interchange.formats.assemble import assemble, pose_cells, with_observations_only
-from visioncal.interchange.formats.foreign import ForeignRecording
+from visioncal.interchange.formats.foreign import ForeignRecording, rows_of
 from visioncal.session import Session, Stream
 from visioncal.session.columns import (
     INSTRUMENT_POSITION,
@@ -83,6 +86,98 @@ class DoubtfulSession:
         stages = [stage for stage in STAGES if stage.name in names]
         run = run_stages(RunState(self.session, progress), stages)
         return guess_from_camera_poses(run, self.robot, self.camera, knows_mount=self.knows_mount)
+
+
+# Rows by which a reading is tested, evenly spread: few first, more where these cannot tell.
+_TESTED = (12, 36)
+
+
+def settled(foreign: ForeignRecording, progress: Progress | None = None) -> ForeignRecording:
+    """Finds what a source does not say of its poses by what agrees with its images or target poses.
+
+    Raises:
+        DataError: A form of rotations is not said, and nothing tells it.
+    """
+    unstated = frozenset[str]().union(*foreign.unstated.values())
+    if not unstated - {"inverse"} or foreign.mount is None or foreign.stream is not None:
+        return foreign
+    seen = with_observations_only(foreign)
+    here = seen.robot.present
+    if seen.images:
+        here &= np.array([image is not None and image.is_file() for image in seen.images])
+    elif seen.camera is not None:
+        here &= seen.camera.present
+    rows, why = np.flatnonzero(here), "too few rows have a pose and what the camera saw"
+    for least, most in pairwise((FEWEST_ROWS - 1, *_TESTED)):
+        if len(rows) <= least:
+            break
+        try:
+            guess = DoubtfulSession.of(rows_of(seen, rows[evenly(len(rows), most)])).guess(progress)
+        except VisioncalError as error:
+            why = error.message.rstrip(".")
+            continue
+        if guess.stands_out or guess.declared.fit.closes:
+            return _applied(foreign, guess, is_measured=bool(seen.images))
+        why = guess.sentence.rstrip(".")
+    return _untested(foreign, why)
+
+
+def _applied(foreign: ForeignRecording, guess: Guess, *, is_measured: bool) -> ForeignRecording:
+    """The recording as its best reading has it, where that changes only what is not said."""
+    best, declared = guess.best.hypothesis, guess.declared.hypothesis
+    numbers, said = {"robot": foreign.robot, "camera": foreign.camera}, dict[str, Reading]()
+    fits = (best.mount, best.order) == (declared.mount, declared.order)
+    for whose in ("robot", "camera"):
+        found, stated = getattr(best, whose), getattr(declared, whose)
+        if found == stated:
+            continue
+        free = foreign.unstated.get(whose, frozenset())
+        changed = {
+            name for name in ("unit", "inverse") if getattr(found, name) != getattr(stated, name)
+        }
+        changed |= {"rotation"} if found.rotation != stated.rotation else set()
+        may = free | ({"rotation"} if "angles" in free else set())
+        fits &= found.reading is not None and changed <= may
+        if found.reading is not None:
+            said[whose] = found.reading
+    if not fits:
+        return _untested(foreign, guess.sentence.rstrip("."))
+    # One unit of both sides scales the cell, which poses alone do not show.
+    is_open = not is_measured and all("unit" in each for each in foreign.unstated.values())
+    kept = (
+        note
+        for note in foreign.notes
+        if not (note.startswith("The ") and " taken for " in note)
+        or (is_open and "positions" in note)
+    )
+    camera = numbers["camera"]
+    if camera is not None and "camera" in said:
+        camera = camera.read_as(said["camera"])
+    robot = foreign.robot.read_as(said.get("robot", foreign.robot.reading))
+    notes = (f"Found by the {'images' if is_measured else 'poses'}: {guess.sentence}", *guess.notes)
+    return replace(foreign, robot=robot, camera=camera, notes=(*kept, *notes), unstated={})
+
+
+def _untested(foreign: ForeignRecording, why: str) -> ForeignRecording:
+    """Asks for a form of rotations that nothing tells; else notes that nothing was tested."""
+    for whose, free in foreign.unstated.items():
+        if "rotation" in free:
+            numbers = foreign.robot if whose == "robot" else foreign.camera
+            size = 0 if numbers is None else numbers.rotations.shape[1]
+            forms = (
+                "quaternion-xyzw, or quaternion-wxyz"
+                if size == 4
+                else "rotation-vector, euler-xyz-rad, euler-ZYX-deg or another, or whose they are, "
+                "as kuka"
+            )
+            raise DataError(
+                f"{foreign.name}: the form of the {whose}'s rotations is not said, and nothing "
+                f"tells it: {why}.",
+                culprits=[f"--{whose}-form"],
+                next_step=f"Say --{whose}-form {forms}.",
+            )
+    note = f"What the source does not say of its poses was not tested: {why}."
+    return replace(foreign, notes=(*foreign.notes, note))
 
 
 def load_for_rereading(path: Path) -> DoubtfulSession:

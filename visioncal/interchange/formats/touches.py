@@ -15,7 +15,7 @@ from visioncal.interchange.formats.columns import foreign_from, view_numbers
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.poses import (
     check_radians,
-    known_names,
+    columns_named,
     pose_names,
     poses_from,
     without_unit,
@@ -56,7 +56,7 @@ def read_touches(
         poses[:, :3, 3], _ = _coordinates(fields, given.names, unit, "--robot-unit")
     else:
         has_joints = bool(requested.joints or joint_columns(tuple(fields.numbers)))
-        if not named and not has_joints and known_names(fields, [_AXES], ()):
+        if not named and not has_joints and columns_named(fields, _AXES):
             raise DataError(
                 f"{path.name} has positions without rotations, and a tip beside the flange needs "
                 "both.",
@@ -168,7 +168,7 @@ def _coordinates(
     fields: Fields, given: Sequence[str], unit: str | None, option: str
 ) -> tuple[FloatArray, float]:
     """Positions (n, 3) [m], NaN where a cell is empty, and the length of their unit [m]."""
-    names = tuple(map(fields.find, given)) or known_names(fields, [_AXES], ())
+    names = tuple(map(fields.find, given)) or columns_named(fields, _AXES)
     if not names:
         raise DataError(
             f"{fields.name}: columns x_mm, y_mm, z_mm or x_m, y_m, z_m are needed; there are "

@@ -1,27 +1,20 @@
-"""Folders with one file a view, or several kinds of file a view.
-
-Among them ViSP's YAML with a camera XML, and Zivid's YAML with 4 x 4 matrices [mm].
-"""
+"""Folders with one file a view: ViSP's YAML with a camera XML, Zivid's with matrices [mm]."""
 
 import re
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from visioncal.core.documents.structured import read_yaml
-from visioncal.core.documents.tables import is_number, read_table
 from visioncal.core.documents.values import as_numbers, mapping, read_plain_text
-from visioncal.core.files import is_inside
 from visioncal.core.types import MOUNTS
 from visioncal.interchange.formats.columns import foreign_from
 from visioncal.interchange.formats.file_search import (
     files_in,
     head,
-    is_image_name,
+    images_of,
     number_in,
-    series_name,
 )
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -30,14 +23,7 @@ from visioncal.interchange.formats.foreign import (
     PoseImportOptions,
 )
 from visioncal.interchange.formats.intrinsics import read_intrinsics
-from visioncal.interchange.formats.reading import (
-    DOCUMENTS,
-    ENDINGS,
-    Fields,
-    fields_of_records,
-    flattened,
-    read_document,
-)
+from visioncal.interchange.formats.reading import Fields, fields_of_records, flattened
 
 # `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame; `pose_cPo_3.yaml`: the
 # object in the camera.
@@ -74,7 +60,9 @@ def _read_zivid(path: Path, requested: ImportOptions) -> ForeignRecording:
         )
     fields = _fields(path, files, records)
     stated = PoseImportOptions(("matrix",), unit="mm")
-    return foreign_from(fields, requested.with_poses(stated, PoseImportOptions()), images=path)
+    return foreign_from(
+        fields, requested.with_poses(stated, PoseImportOptions()), images=images_of(path)
+    )
 
 
 ZIVID = ForeignFormat("zivid", "Zivid's pos01.yaml ... in millimetres", _is_zivid, _read_zivid)
@@ -97,7 +85,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         PoseImportOptions((name,), "rotation-vector", "m") for name in ("robot", "camera")
     )
     stated = requested.with_poses(robot, camera if cameras else PoseImportOptions())
-    foreign = foreign_from(fields, stated, images=path)
+    foreign = foreign_from(fields, stated, images=images_of(path))
     notes = [*foreign.notes]
     lenses = [file for file in files_in(path) if file.suffix.lower() == ".xml"]
     lens, lens_notes = read_intrinsics(lenses[0]) if lenses else (None, ())
@@ -134,69 +122,4 @@ VISP = ForeignFormat(
     "ViSP's poses (*_pose_rPe_1.yaml) with images and a camera XML, or with pose_cPo_1.yaml",
     lambda path: bool(_named(path, _POSE_NAME)),
     _read,
-)
-
-
-def _families(folder: Path) -> list[tuple[str, dict[int, Path]]]:
-    """Groups a folder's data files by their names without the number, the largest group first."""
-    groups: dict[str, dict[int, Path]] = defaultdict(dict)
-    for file in files_in(folder):
-        number = number_in(file.name)
-        if file.suffix.lower() in ENDINGS and number is not None:
-            groups[series_name(file)].setdefault(number, file)
-    families = [(name.rsplit(".", 1)[0], files) for name, files in groups.items() if len(files) > 1]
-    return sorted(families, key=lambda family: -len(family[1]))
-
-
-def _view_folder(path: Path) -> Path | None:
-    """The folder with one file a view: the named one, or `poses` in it."""
-    if not path.is_dir():
-        return None
-    inner = path / "poses"
-    folders = (path, inner) if is_inside(inner, path) else (path,)
-    return next((folder for folder in folders if _families(folder)), None)
-
-
-def _read_views(path: Path, requested: ImportOptions) -> ForeignRecording:
-    """Reads a folder with one file a view, or several kinds of file a view."""
-    folder = _view_folder(path) or path
-    families = _families(folder)
-    records: dict[int, dict[str, object]] = {}
-    places: dict[int, list[str]] = defaultdict(list)
-    for view in sorted({number for _, files in families for number in files}):
-        records[view] = {}
-        for kind, files in ((kind, files) for kind, files in families if view in files):
-            places[view].append(files[view].name)
-            prefix = f"{kind}." if len(families) > 1 else ""
-            for key, value in _record(files[view]).items():
-                key_name = kind if key == "matrix" else f"{prefix}{key}"
-                records[view][key_name or "matrix"] = value
-    name = (path if folder == path else folder.parent).resolve().name
-    joined = [" and ".join(names) for names in places.values()]
-    fields = fields_of_records([*records.values()], joined, name, folder, tuple(records))
-    folders = (file for file in (folder, path, path / "images") if is_inside(file, path))
-    images = next(
-        (file for file in folders if any(is_image_name(at.name) for at in files_in(file))), None
-    )
-    return foreign_from(fields, requested, images=images)
-
-
-def _record(path: Path) -> dict[str, object]:
-    """Reads one view's file; numbers without a name are its matrix or pose."""
-    if path.suffix.lower() in DOCUMENTS:
-        document = read_document(path)
-    else:
-        table = read_table(path)
-        rows = [[float(cell) if is_number(cell) else cell for cell in row] for row in table.rows]
-        document = rows[0] if len(rows) == 1 else rows
-        if table.has_header and len(rows) == 1:
-            document = dict(zip(table.columns, rows[0], strict=True))
-    return flattened(document if isinstance(document, Mapping) else {"matrix": document})
-
-
-VIEWS = ForeignFormat(
-    "views",
-    "a folder with one or more files a view (pose_01.json, .txt, .npz)",
-    lambda path: _view_folder(path) is not None,
-    _read_views,
 )
