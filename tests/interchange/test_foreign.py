@@ -421,6 +421,20 @@ def test_the_names_of_makers_are_known(logged, form, names):
     np.testing.assert_allclose(found, BASE_FROM_FLANGE, atol=1e-12)
 
 
+@pytest.mark.parametrize("form", ["franka", "matrix-transposed", "matrix", None])
+def test_sixteen_numbers_are_by_columns_where_they_say_so(logged, form):
+    names = tuple(f"m{at}" for at in range(16))
+    by_columns = BASE_FROM_FLANGE.transpose(0, 2, 1).reshape(-1, 16)
+    source = logged(",".join(names), by_columns.tolist())
+    foreign = read_foreign(source, replace(HAND, robot=PoseImportOptions(names, form)))
+    # To rounding.
+    np.testing.assert_allclose(foreign.robot.poses(), BASE_FROM_FLANGE, atol=1e-12)
+    # Franka's are in metres.
+    assert any("robot's positions are taken for metres" in note for note in foreign.notes) == (
+        form != "franka"
+    )
+
+
 @pytest.mark.parametrize(("step", "timed"), [(1, False), (0.5, True)])
 def test_numbers_of_rows_are_no_times(table, step, timed):
     pairs = zip(quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET), strict=True)
