@@ -170,6 +170,33 @@ def _photograph(drawn, rng, size, fill, tilt, blur, noise, turned, hidden):
     return np.clip(light + rng.normal(0.0, noise, light.shape), 0, 255).astype(np.uint8)
 
 
+def described(board: Print) -> dict[str, Any]:
+    """The right description of a board, with sides of 30 mm."""
+    said = {**board.said}
+    kind, family = said["kind"], said.pop("family", "")
+    said |= {"dictionary": f"DICT_{family}_1000"} if family else {}
+    if kind == "charuco":
+        return said | {"square_m": 0.03, "marker_m": 0.021}
+    if kind == "checkerboard":
+        return said | {"square_m": 0.03}
+    if kind == "circles":
+        return said | {"square_m": 0.03, "diameter_m": 0.0165}
+    return {"spacing": 0.3} | said | {"size_m": 0.03}
+
+
+# What makes sound boards hard to find.
+HARD: dict[str, dict[str, Any]] = {
+    "small": {"fill": (0.12, 0.25)},
+    "far": {"fill": (0.06, 0.1)},
+    "hidden in part": {"hidden": 0.3},
+    "blurred": {"blur": (2.5, 5.0)},
+    "very blurred": {"blur": (5.0, 9.0)},
+    "noisy": {"noise": 25.0},
+    "cut off": {"fill": (1.3, 1.7)},
+    "steep": {"tilt": 1.1},
+}
+
+
 def is_named(board: Print, identity) -> bool:
     """Whether an identity says what a board is."""
     found, said = identity.board, board.said

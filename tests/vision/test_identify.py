@@ -11,9 +11,21 @@ from support.commands import visioncal as command
 from support.following import follow
 from support.fuzz.broken_sessions import sound_session
 from support.marks import slow
-from support.photographed import KINDS, dictionary_of, is_named, photographs, print_of
+from support.photographed import (
+    HARD,
+    KINDS,
+    described,
+    dictionary_of,
+    is_named,
+    photographs,
+    print_of,
+)
 
+from visioncal.calibration.stages.detect import detect
+from visioncal.calibration.stages.other_board import OtherBoardError
+from visioncal.core.errors import DataError
 from visioncal.core.types import Target
+from visioncal.session import Session
 from visioncal.vision.boards import DetectedCorners, find_target
 from visioncal.vision.boards.identify import identify
 from visioncal.vision.targets import (
@@ -38,6 +50,24 @@ def test_a_random_board_is_named_from_three_photographs(seed):
     identity = identify(images)
     assert is_named(board, identity)
     assert identity.is_mirrored == mirrored
+
+
+@pytest.mark.parametrize("kind", [KINDS[0], *map(slow, KINDS[1:])])
+@pytest.mark.parametrize("hard", HARD)
+def test_no_sound_board_is_accused(kind, hard):
+    rng = np.random.default_rng([70, KINDS.index(kind), [*HARD].index(hard)])
+    board = print_of(kind, rng)
+    images = photographs(board, rng, **HARD[hard])
+    target = target_from_document(described(board), "board")
+    session = Session.from_arrays(images, np.tile(np.eye(4), (3, 1, 1)), target)
+    # It is found, or not found, but not said to be another one.
+    found: DataError | None = None
+    try:
+        detect(session)
+    except DataError as error:
+        found = error
+    assert not isinstance(found, OtherBoardError)
+    assert "another board" not in str(found)
 
 
 GRID = Target("grid", "gridboard", 4, 3, 0.04, 4e-5, dictionary="DICT_5X5_250", spacing=0.2)
@@ -68,9 +98,9 @@ def test_a_charuco_board_may_begin_at_any_id(first):
     ids = np.arange(first, first + 24, dtype=np.int32)
     board = cv2.aruco.CharucoBoard((8, 6), 0.03, 0.022, dictionary_of("DICT_5X5_100"), ids)
     drawn = np.pad(board.generateImage((960, 720)), 60, constant_values=255)
-    described = {"kind": "charuco", "columns": 8, "rows": 6, "square_m": 0.03, "marker_m": 0.022}
-    described |= {"dictionary": "DICT_5X5_100", "first_id": first}
-    target = target_from_document(described, "board")
+    document = {"kind": "charuco", "columns": 8, "rows": 6, "square_m": 0.03, "marker_m": 0.022}
+    document |= {"dictionary": "DICT_5X5_100", "first_id": first}
+    target = target_from_document(document, "board")
     seen = find_target(drawn, target)
     assert isinstance(seen, DetectedCorners)
     assert len(seen.ids) == 35
@@ -135,9 +165,13 @@ def test_a_checkerboard_of_another_count_is_named(tmp_path, monkeypatch):
         pytest.skip("no field cases here")
     words = ("--target", "checkerboard_9x6_35mm", "--mount", "eye-in-hand")
     command("convert", source, "cell", *words).good()
-    said = command("calibrate", "cell", "-o", "out").refused().said
+    followed = follow("calibrate", "cell", "-o", "out")
+    said = followed.runs[0].refused().said
     assert "checkerboard of 11 x 8 inner corners" in said
     assert "Write columns = 11 and rows = 8" in said
+    # Nothing more is said of the board; how the source writes its rotations is another matter.
+    assert len(followed.done) == 1
+    assert "board" not in followed.last.said.partition("error: ")[2].partition("\n")[0]
 
 
 def changed_images(folder, change, every=1):

@@ -4,20 +4,31 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
+import numpy as np
+
 from visioncal.core.errors import DataError
 from visioncal.core.types import Image, Target
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
 from visioncal.session.kinds import declared_targets
-from visioncal.vision.boards import kind_of
+from visioncal.vision.boards import NotFound, find_target, kind_of
 from visioncal.vision.boards.identify import Identity, describe, identify
-from visioncal.vision.targets import board_words, target_names
+from visioncal.vision.targets import (
+    board_words,
+    corner_positions,
+    extent_m,
+    outline,
+    target_names,
+)
 
 # Images that are searched for any board.
 LOOKED_AT = 3
 # Least share of a board's corners in an image that identifies it.
 _LEAST_CORNERS = 0.2
+# Paper that is looked for beyond the print: less than a square, and up to the next circle.
+_RIM = {"checkerboard": 0.35, "circles": 0.8}
 # Gaps between markers that differ by less are the same [sides].
 _SAME_SPACING = 0.05
 # Command that writes a copy with the images as they should be, and calibrates it.
@@ -65,8 +76,9 @@ def other_board(
     found = _differences(declared, identity)
     # One image of several may show something else, or a part.
     is_sure = identity.shown >= min(2, len(looked))
-    if identity.board.kind == "checkerboard" == declared.kind and _is_part(identity, declared):
-        is_sure = identity.shown == len(looked)
+    if _is_part(identity, declared):
+        # A sound one may be covered in part: its paper ends there.
+        is_sure &= sum(_has_rim(image, identity.board) for _, image in looked) > len(looked) / 2
     if not is_sure or identity.corners_seen < _LEAST_CORNERS * identity.corners:
         return None
     numbers = tuple(view.number for view, _ in looked)
@@ -100,9 +112,37 @@ def other_board(
 
 
 def _is_part(identity: Identity, declared: Target) -> bool:
-    """Whether a checkerboard has no more rows and columns than declared."""
+    """Whether a board without markers has no more rows and columns than declared."""
+    if identity.board.dictionary or identity.board.kind != declared.kind:
+        return False
     seen, stated = (sorted((one.columns, one.rows)) for one in (identity.board, declared))
     return all(few <= many for few, many in zip(seen, stated, strict=True))
+
+
+def _has_rim(image: Image, board: Target) -> bool:
+    """Whether an image shows paper all around a board."""
+    seen = find_target(image, board)
+    if isinstance(seen, NotFound):
+        return False
+    places = corner_positions(board)[seen.ids, :2]
+    flat = np.asarray(cv2.findHomography(places, seen.px)[0], float)
+    if flat.shape != (3, 3):
+        return False
+    low, high = extent_m(board)
+    along = np.linspace(0.0, 1.0, 40)[:, None]
+    # Of sides of 1 m.
+    ends = outline(board)[:, :2] + _RIM[board.kind] * np.sign(
+        outline(board)[:, :2] - (low + high) / 2
+    )
+    sides = [a + along * (b - a) for a, b in zip(ends, np.roll(ends, -1, axis=0), strict=True)]
+    inside = low + np.random.default_rng(0).random((400, 2)) * (high - low)
+    grey = []
+    for points in (*sides, inside):
+        px = np.rint(cv2.perspectiveTransform(points[None], flat)[0]).astype(int)
+        u, v = px[(px >= 0).all(axis=1) & (px < image.shape[::-1]).all(axis=1)].T
+        grey.append(image[v, u])
+    dark, light = np.percentile(grey[-1], [10, 90])
+    return all(len(side) and np.median(side) > (dark + light) / 2 for side in grey[:-1])
 
 
 def _remedy(
@@ -170,7 +210,8 @@ def _differences(declared: Target, identity: Identity) -> dict[str, object]:
             return {}
         # Where markers cannot be read, a ChArUco board is a checkerboard.
         inner = replace(declared, columns=declared.columns - 1, rows=declared.rows - 1)
-        if (board.kind, declared.kind) == ("checkerboard", "charuco") and _is_part(identity, inner):
+        inner = replace(inner, kind="checkerboard")
+        if declared.kind == "charuco" and _is_part(identity, inner):
             return {}
         return {"kind": board.kind, **counts}
     if board.kind in ("checkerboard", "circles"):
