@@ -38,6 +38,7 @@ from visioncal.interchange.formats.poses import (
     joints_from,
     pose_names,
     poses_from,
+    possible_poses,
     without_unit,
 )
 from visioncal.interchange.formats.reading import (
@@ -88,6 +89,8 @@ def foreign_from(
     names = _pose_fields(fields, requested, unnamed)
     used = {name for of_side in names.values() for name in of_side}
     joint_fields = requested.joints or joint_names(fields, used)
+    if joint_fields and not (images or requested.images):
+        names = _seen_by_camera(fields, requested, names)
     used.update(map(fields.find, joint_fields))
     if not names["robot"] and not joint_fields:
         if source is not None:
@@ -121,12 +124,7 @@ def foreign_from(
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
     pairing, image_name = _images(fields, requested, images, used)
     used.add(image_name)
-    columns |= {name: cells for name, cells in fields.texts.items() if name not in used}
-    if len({*columns.get("point", ())}) == len(fields) and "meas_x_m" in columns:
-        # Names of the readings, and not of the points that are read again and again.
-        columns["reading"] = columns.pop("point")
-    if pairing.depths:
-        columns["source_depth"] = tuple(str(file or "") for file in pairing.depths)
+    columns = _further(fields, columns, used, pairing)
     return ForeignRecording(
         name=fields.name,
         robot=poses["robot"],
@@ -157,6 +155,29 @@ def _pose_fields(
         names[whose] = pose_names(fields, asked.names, unnamed[whose], whose, used)
         used.update(names[whose])
     return names
+
+
+def _further(
+    fields: Fields, columns: Mapping[str, tuple[str, ...]], used: Collection[str], pairing: Pairing
+) -> dict[str, tuple[str, ...]]:
+    """All columns of views.csv beside poses, joints and images."""
+    found = {**columns, **{name: cells for name, cells in fields.texts.items() if name not in used}}
+    if len({*found.get("point", ())}) == len(fields) and "meas_x_m" in columns:
+        # Names of the readings, and not of the points that are read again and again.
+        found["reading"] = found.pop("point")
+    if pairing.depths:
+        found["source_depth"] = tuple(str(file or "") for file in pairing.depths)
+    return found
+
+
+def _seen_by_camera(
+    fields: Fields, requested: ImportOptions, names: dict[Side, tuple[str, ...]]
+) -> dict[Side, tuple[str, ...]]:
+    """The fields of poses beside joint angles: the target's where nothing else was seen."""
+    is_said = bool(requested.robot.names) or any(
+        item.names == names["robot"] and item.sides for item in possible_poses(fields)
+    )
+    return names if is_said or names["camera"] else {"robot": (), "camera": names["robot"]}
 
 
 def _joint_angles(

@@ -22,7 +22,7 @@ _DEPTH, _MOST_FILES = 3, 100_000
 # Words of pictures that a program drew: they are no camera's where there are others.
 _DRAWN = re.compile(
     r"result|overlay|detect|corner|annot|drawn|debug|visual|vis(?![a-z])|axes|axis|mask|plot|"
-    r"preview|thumb|reproj|heat",
+    r"preview|thumb|reproj|heat|undist|rectif",
     re.IGNORECASE,
 )
 
@@ -286,7 +286,11 @@ def _matched(fields: Fields, group: FileGroup) -> tuple[str, tuple[Path | None, 
     by_stem = {file.stem: file for file in group.files}
     if fields.stems and {*fields.stems} <= by_stem.keys():
         return "equal names", tuple(by_stem[stem] for stem in fields.stems)
-    views, numbers, count = fields.views, group.numbers, len(fields)
+    numbers, count = group.numbers, len(fields)
+    columns = (each.tolist() for each in fields.numbers.values() if each.shape == (count,))
+    # A column with the numbers of the images.
+    named = (cells for cells in columns if len({*cells}) == count and {*cells} <= {*numbers})
+    views = fields.views or tuple(map(int, next(named, ())))
     by_number = _by_number(group.files, numbers) if numbers else {}
     # Numbers that begin one later are of the same rows.
     shifted = {b - a for a, b in zip(sorted(views), sorted(numbers), strict=False)} - {0}
@@ -309,7 +313,8 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         drawn = _DRAWN.search(group.label) is not None
         is_named = re.search("rgb|colou?r", group.label, re.IGNORECASE) is not None
         # What another program drew, and pictures of some of the rows alone, come last.
-        return group.is_depth, drawn, files.count(None), order.index(how), not is_named
+        extra = order.index(how), not is_named, -len(group.files)
+        return group.is_depth, drawn, files.count(None), *extra
 
     ranked = sorted(matches, key=rank)
     if not ranked:

@@ -112,7 +112,24 @@ def possible_poses(fields: Fields, taken: Collection[str] = ()) -> list[PoseFiel
     # ambiguous is taken: a matrix, then a quaternion.
     both = ((rest, names) for rest, names in positions.items() if rotations[rest])
     found += [PoseFields((*names, *max(rotations[rest])[1]), rest) for rest, names in both]
-    return found
+    return found or [*_by_shape(fields, taken)]
+
+
+def _by_shape(fields: Fields, taken: Collection[str]) -> Iterator[PoseFields]:
+    """Positions and rotations of one mapping by their numbers, in whatever language."""
+    groups: dict[str, list[tuple[int, str]]] = defaultdict(list)
+    for (name,), _, size, look in _arrays(fields, taken):
+        if size == 3 or look in ("rotation", "quaternion"):
+            groups[name.rpartition(".")[0]].append((size, name))
+    for group in groups.values():
+        threes = [name for size, name in group if size == 3]
+        more = [name for size, name in sorted(group) if size > 3]
+        # Of two times three numbers the position comes first, unless the names say otherwise.
+        threes.sort(key=lambda name: _ROTATION_NAME.search(name) is not None)
+        if len(threes) == 1 + (not more):
+            names = (threes[0], *(more[-1:] or threes[1:]))
+            words = dict.fromkeys(word for name in names for word in words_of(name))
+            yield PoseFields(names, tuple(words))
 
 
 # Fields with their words, the number of values, and what they look like.

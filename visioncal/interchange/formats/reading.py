@@ -1,8 +1,10 @@
 """Reads files as rows of named values, not yet interpreted: tables, documents, arrays, lines."""
 
+import ast
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -12,10 +14,11 @@ import numpy as np
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
 from visioncal.core.documents.jsons import read_arrays, read_json
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
-from visioncal.core.documents.structured import read_opencv, read_yaml
+from visioncal.core.documents.structured import parse_yaml, read_opencv, read_yaml
 from visioncal.core.documents.tables import TextTable, is_number, read_table
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
+from visioncal.core.files import check_values
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, chosen_rows
 
@@ -148,6 +151,10 @@ def fields_of_records(
     ragged: dict[str, str] = {}
     for key in dict.fromkeys(name for record in records for name in record):
         values = [record.get(key) for record in records]
+        arrays = sum(isinstance(value, np.ndarray) and value.ndim > 0 for value in values)
+        if 2 * arrays > len(values):
+            # A word where others have numbers says that there were none.
+            values = [None if isinstance(value, str) else value for value in values]
         if any(isinstance(value, str) for value in values):
             cells = texts[key] = tuple("" if value is None else str(value) for value in values)
             if any(cells) and all(not cell or is_number(cell) for cell in cells):
@@ -201,8 +208,26 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
     try:
         array = np.array(record, dtype=float)
     except (ValueError, TypeError, OverflowError):
+        numbers = _in_line(record)
+        # A position and a rotation in lists of their own; or a list of several kinds.
+        if isinstance(record, list) and len(numbers) in (6, 7, 12, 16):
+            return {name: np.array(numbers)}
+        if isinstance(record, list) and any(isinstance(part, list | Mapping) for part in record):
+            flat = {}
+            for at, part in enumerate(record):
+                flat |= flattened(part, f"{prefix}{at}.")
+            # Lists of numbers of any length are irregular, and not several kinds.
+            return flat if any(not isinstance(part, list) for part in record) else {name: record}
         return {name: record}
     return {name: array} if record is not None and array.size <= _MOST_NUMBERS else {}
+
+
+def _in_line(record: object) -> list[float]:
+    """The numbers of nested lists, in order; empty where there is anything else."""
+    if not isinstance(record, list):
+        return [float(record)] if isinstance(record, int | float) else []
+    parts = [_in_line(part) for part in record]
+    return [number for part in parts for number in part] if all(parts) else []
 
 
 def appearance(numbers: FloatArray) -> str:
@@ -304,10 +329,13 @@ def stamp_name(fields: Fields, taken: Collection[str]) -> str:
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml", ".npz", ".npy")
 # Robots' programs, of which the poses alone are read.
 _PROGRAMS = (".dat", ".src", ".ls", ".mod", ".script")
-ENDINGS = (".csv", ".tsv", ".txt", ".log", *_PROGRAMS, *DOCUMENTS)
+ENDINGS = (".csv", ".tsv", ".txt", ".log", ".jsonl", *_PROGRAMS, *DOCUMENTS)
 # Field names of a pose by its number of values.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
 _IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
+# Words of JSON, and the same of Python.
+_NAMES_OF = {"true": "True", "false": "False", "null": "None", "NaN": "None"}
+_PYTHON = re.compile(rf"\b(?:{'|'.join(_NAMES_OF)})\b")
 # What a program declares beside targets.
 _FRAMES = re.compile("tool|wobj|load|base", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//", "!")
@@ -320,6 +348,8 @@ def read_fields(path: Path, form: str | None = None) -> Fields:
     """
     if path.suffix.lower() in DOCUMENTS:
         return fields_of_document(read_document(path), path)
+    if literals := _literals(path):
+        return fields_of_document(literals, path)
     if lines := _pendant(path, form if form in POSE_FORMS else None):
         return lines
     if path.suffix.lower() in _PROGRAMS:
@@ -350,7 +380,12 @@ def read_document(path: Path) -> object:
         return {name: array.tolist() for name, array in arrays.items()}
     if suffix == ".json":
         return read_json(path)
-    return read_opencv(path) if suffix == ".xml" else read_yaml(path)
+    if suffix == ".xml":
+        return read_opencv(path)
+    parts = re.split(r"^---.*$", read_plain_text(path), flags=re.MULTILINE)
+    several = [part for part in parts if part.strip() and not part.startswith("%")]
+    # As programs write that print one message after the other.
+    return [parse_yaml(part, str(path)) for part in several] if several[1:] else read_yaml(path)
 
 
 def fields_of_document(document: object, path: Path) -> Fields:
@@ -403,6 +438,12 @@ def _row_lists(document: object, name: str = "") -> Iterator[tuple[str, list[obj
     """All that may be rows in a document: its lists, and mappings of records that are alike."""
     if isinstance(document, list | np.ndarray) and len(document) > 0:
         rows = [*document]
+        if len(rows) in (3, 4):
+            with suppress(ValueError, TypeError):
+                # One matrix.
+                square = np.array(rows, dtype=float)
+                if square.shape in ((3, 3), (3, 4), (4, 4)) and appearance(square[None]):
+                    return
         # A list of one entry is a wrapper, unless there is nothing in it.
         inner = [*_row_lists(rows[0], name)] if len(rows) == 1 else []
         yield from inner or [(name, rows)]
@@ -434,6 +475,26 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
         if match and (nested or isinstance(value, np.ndarray)):
             rows[int(match[2])][match[1] or "matrix"] = value
     return dict(sorted(rows.items()))
+
+
+def _literals(path: Path) -> list[object]:
+    """Records of JSON or of Python, one a line; empty where a line is none."""
+    lines = [line for line in read_plain_text(path).splitlines() if line.strip()]
+    if not lines or not all(line.lstrip().startswith("{") for line in lines):
+        return []
+    records = list[object]()
+    with suppress(ValueError, SyntaxError, MemoryError, RecursionError):
+        for line in lines:
+            records.append(_listed(ast.literal_eval(_PYTHON.sub(lambda m: _NAMES_OF[m[0]], line))))
+    check_values(records, str(path))
+    return records if len(records) == len(lines) else []
+
+
+def _listed(value: object) -> object:
+    """A value with lists in the place of tuples."""
+    if isinstance(value, Mapping):
+        return {str(key): _listed(part) for key, part in value.items()}
+    return [_listed(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def _pendant(path: Path, form: str | None) -> Fields | None:

@@ -186,7 +186,7 @@ def rows_in(source: Source, requested: ImportOptions) -> Fields:
     chosen = next((group[0] for group in (joined, usable, named) if len(group) == 1), None)
     if chosen is not None:
         return chosen
-    faults = [part.fault for part in source.parts if part.fault]
+    faults = [part.fault for part in source.parts if part.fault and not part.lenses]
     if not joined and len(faults) == 1:
         raise faults[0]
     raise unknown(source, requested, joined)
