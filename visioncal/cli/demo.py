@@ -125,12 +125,9 @@ def demo_command(options: DemoOptions) -> None:
     say(f"Open {result / 'report.html'} in a browser to see it all.")
     agrees = squared <= limit
     report_written(written, status=exit_status(done.calibration.verdict) if agrees else EXIT_BAD)
-    if options.fault is not None:
-        _rehearse(options, result)
-
-
-def _rehearse(options: DemoOptions, result: Path) -> None:
-    """Lets a joint's encoder slip, and recovers the calibration as a user does."""
+    if options.fault is None:
+        return
+    # A joint's encoder slips, and the calibration is recovered as a user does.
     folder = options.out / "recovery"
     shutil.rmtree(folder, ignore_errors=True)
     answer(f"the encoder of joint {_SLIPPED + 1} slips by {_SLIP_DEG:g} deg")

@@ -28,7 +28,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
 from visioncal.core.number_format import figure, matched, significant, some_of
 from visioncal.core.threads import signals_as_interrupts
-from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.identified import CLASSES, UNKNOWN, Identified, judge, to_document
@@ -49,7 +48,7 @@ from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.interchange.outputs import Written, write_dynamics, write_motions
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.planning.messages import plan_warnings, plan_words
+from visioncal.live.planning.messages import plan_words
 from visioncal.present.torques import torque_table
 from visioncal.present.words import said
 from visioncal.robot import load_robot
@@ -72,6 +71,17 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
         flange = arm.chain.placements[-1]
         tip = flange[:3, 3] + flange[:3, 2] * max(length - radius, 0.0)
         bodies.append(capsule("tool", arm.joint_count, flange[:3, 3], tip, radius))
+    payload = None
+    if options.payload is not None:
+        kg, *centre_mm = options.payload
+        if kg < 0.0:
+            raise DataError(
+                f"--payload is of {kg:g} kg; a mass of 0 kg or more is needed.",
+                culprits=["--payload"],
+            )
+        # A point mass, in the flange's frame.
+        centre_m, no_extent = 1e-3 * np.array([centre_mm]), np.zeros((1, 3, 3))
+        payload = np.asarray(Inertias.of_bodies(np.array([kg]), centre_m, no_extent).values[0])
     allowed = motion_limits(
         arm,
         MotionMargins(
@@ -89,7 +99,7 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
             )
         ),
         bodies=tuple(bodies),
-        payload=None if options.payload is None else _payload(*options.payload),
+        payload=payload,
     )
     request = ExcitationRequest(
         options.duration,
@@ -114,7 +124,10 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
     else:
         for words in plan_words(plan):
             answer(words)
-        for words in plan_warnings(plan):
+        warnings = [f"not checked: {name}" for name in allowed.unchecked]
+        if sweeps is not None and sweeps.left_out:
+            warnings.append(f"too little room to sweep {some_of(sweeps.left_out)}")
+        for words in warnings:
             answer(words, "warning: ", "bold yellow")
     report_written(written, quiet=options.as_json)
 
@@ -129,17 +142,6 @@ def _friction_terms(words: str, known: Sequence[str]) -> FrictionTerms:
             culprits=["--friction"],
         )
     return FrictionTerms(*(name in wanted for name in known))
-
-
-def _payload(kg: float, *centre_mm: float) -> FloatArray:
-    """(10,) inertial parameters of a point mass, in the flange's frame."""
-    if kg < 0.0:
-        raise DataError(
-            f"--payload is of {kg:g} kg; a mass of 0 kg or more is needed.", culprits=["--payload"]
-        )
-    centre_m = 1e-3 * np.array([centre_mm])
-    point = Inertias.of_bodies(np.array([kg]), centre_m, np.zeros((1, 3, 3)))
-    return np.asarray(point.values[0])
 
 
 def dynamics_record_command(options: DynamicsRecordOptions) -> None:

@@ -15,7 +15,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import MOST_FOR_NEED, ClearanceOptions, PlanOptions
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
-from visioncal.core.number_format import listed, some_of
+from visioncal.core.number_format import listed, percent, some_of
 from visioncal.core.transforms import compose
 from visioncal.core.types import Camera, FloatArray, Need, Progress
 from visioncal.estimation.problem_parts import Noise
@@ -30,7 +30,8 @@ from visioncal.live.planning.cell import (
     PlanCell,
     cell_of_calibration,
 )
-from visioncal.live.planning.messages import need_words, summary_of
+from visioncal.live.planning.messages import summary_of
+from visioncal.live.planning.pick_probability import words_of
 from visioncal.live.planning.plan import Plan, PlanRequest, make_plan
 from visioncal.live.planning.plan_file import plan_document
 from visioncal.live.planning.purposes import purpose_of
@@ -223,7 +224,8 @@ def _report(plan: Plan) -> None:
     if plan.need is not None and plan.need.limits:
         answer(plan.need.limits, "warning: ", "bold yellow")
     if plan.need is not None and plan.need.met:
-        answer(f"that meets the need, with {len(plan.stops)} stops: {need_words(plan.need)}")
+        met = f"{percent(plan.need.probability)} of picks land within {words_of(plan.need.need)}"
+        answer(f"that meets the need, with {len(plan.stops)} stops: {met}")
     if plan.request.start_q is None:
         answer(
             "the way from where the arm stands to the first stop was not looked at; --start-joints "

@@ -69,8 +69,16 @@ def record_command(options: RecordOptions) -> None:
     taking = taking_of(options, is_driven=drives)
     with signals_as_interrupts(), opened(options, is_moved=drives and not options.dry_run) as cell:
         check_order(cell, is_resumed=options.resume)
-        if driven is not None:
-            _check_resolution(driven.cell.camera.resolution, cell.camera.resolution)
+        if driven is not None and driven.cell.camera.resolution != cell.camera.resolution:
+            sizes = driven.cell.camera.resolution, cell.camera.resolution
+            had, has = (f"{width} x {height}" for width, height in sizes)
+            raise DataError(
+                f"the plan is for pictures of {had} px, and the camera gives {has} px: the board "
+                "might not be in them.",
+                culprits=["--resolution"],
+                next_step=f"Ask for them with --resolution {had.replace(' x ', ',')}, or plan "
+                "anew.",
+            )
         if options.dry_run and driven is not None:
             report_departure(motion_summary(cell, driven, (), taking), cell, taking)
             say("Nothing was moved (--dry-run).")
@@ -139,18 +147,6 @@ def recorded_cell(plan: PlanFile | None, described: RecordOptions) -> RecordedCe
             next_step="Record with a printed board, or write views.csv and corners.csv yourself.",
         )
     return found
-
-
-def _check_resolution(planned: tuple[int, int], given: tuple[int, int]) -> None:
-    """Checks that the camera has the image size of the plan."""
-    if planned != given:
-        had, has = (f"{width} x {height}" for width, height in (planned, given))
-        raise DataError(
-            f"the plan is for pictures of {had} px, and the camera gives {has} px: the board might "
-            "not be in them.",
-            culprits=["--resolution"],
-            next_step=f"Ask for them with --resolution {had.replace(' x ', ',')}, or plan anew.",
-        )
 
 
 def _guided(capture: Capture, views: int) -> list[CaptureEvent]:

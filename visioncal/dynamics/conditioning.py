@@ -342,7 +342,11 @@ def condition(
         speeds_agree &= part_agrees
         inner = slice(window // 2, -(window // 2))
         measured = Measured(motion.chosen(inner), samples.torques_nm[inner])
-        resting = _resting(measured.motion, rate_hz)
+        # A joint stands still at a mean speed of under 1 mrad/s over 0.1 s, for as long: friction
+        # then holds it by any torque up to its bound.
+        least = max(round(0.1 * rate_hz), 1)
+        slow = np.abs(uniform_filter1d(measured.motion.dq, least, axis=0)) < 1e-3
+        resting = binary_opening(slow, np.ones((least, 1), dtype=bool))
         pieces.append(Piece(measured, part.invalid[inner] | resting, part.present[inner], lowpass))
     if not pieces:
         span_s = (len(lowpass.taps) + 2 * window) / rate_hz
@@ -360,14 +364,6 @@ def condition(
     return Conditioned(
         recorded.label, tuple(pieces), band_hz, cutoff, rate_hz, tuple(notes), recorded.of_currents
     )
-
-
-def _resting(motion: JointMotion, rate_hz: float) -> Mask:
-    """(m, n) where a joint stands still: friction then holds it by any torque up to its bound."""
-    # A mean speed of under 1 mrad/s over 0.1 s, for as long.
-    samples = max(round(0.1 * rate_hz), 1)
-    slow = np.abs(uniform_filter1d(motion.dq, samples, axis=0)) < 1e-3
-    return np.asarray(binary_opening(slow, np.ones((samples, 1), dtype=bool)))
 
 
 def _longest_gap(smoothing_hz: float, rate_hz: float, usual_s: float) -> float:

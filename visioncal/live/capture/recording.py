@@ -168,7 +168,17 @@ class Capture:
         covered = self.coach.words()
         self.steps.append(CaptureEvent(number, place, count, result, covered, accuracy, advice))
         self.watch(self.steps[-1])
-        self._check_missed_in_a_row()
+        in_a_row = self.options.missed_in_a_row
+        recent = self.steps[-in_a_row:] if in_a_row else []
+        reasons = [step.found.reason for step in recent if isinstance(step.found, Missed)]
+        if reasons and len(reasons) >= in_a_row:
+            raise DataError(
+                f"no view at {len(recent)} stops in a row "
+                f"({', '.join(f'{step.view}' for step in recent)}): {reasons[-1]}.",
+                culprits=[f"view {step.view}" for step in recent],
+                next_step="Look at the board: does it lie where the plan has it, in the light and "
+                f"unhidden? Is it a {self.target.name}, and the lens in focus?",
+            )
         return self.steps[-1]
 
     def view_at(self, state: ArmState, number: int, place: int, count: int) -> CaptureEvent:
@@ -179,20 +189,6 @@ class Capture:
             return self.view(number, place, count)
         finally:
             self.cell = cell
-
-    def _check_missed_in_a_row(self) -> None:
-        recent = self.steps[-self.options.missed_in_a_row :] if self.options.missed_in_a_row else []
-        reasons = [step.found.reason for step in recent if isinstance(step.found, Missed)]
-        if not reasons or len(reasons) < self.options.missed_in_a_row:
-            return
-        raise DataError(
-            f"no view at {len(recent)} stops in a row "
-            f"({', '.join(f'{step.view}' for step in recent)}): "
-            f"{reasons[-1]}.",
-            culprits=[f"view {step.view}" for step in recent],
-            next_step="Look at the board: does it lie where the plan has it, in the light and "
-            f"unhidden? Is it a {self.target.name}, and the lens in focus?",
-        )
 
     def next_numbers(self) -> tuple[int, int]:
         """Number and place of the next view, where there is no plan."""

@@ -219,8 +219,16 @@ class SocketArm:
         if answer in ("next", "done") and self._stop is not None:
             self._joints = 0 if self._stop.q is None else len(self._stop.q)
         if answer == "done":
-            self._is_done = True
-            self._linger(is_answered=self._link is link)
+            self._is_done, is_answered = True, self._link is link
+            lingering = Stopwatch()
+            # `done` answers whatever comes, until an answered program has closed its link. So long
+            # may a robot take to read it and to close the link [s].
+            while lingering.read() < 3.0 and not (is_answered and self._link is None):
+                if self._next_line() is not None and self._link is not None:
+                    with self._dropped_if_lost(self._link):
+                        self._link.send(b"done")
+                        is_answered = True
+                self._wait()
 
     def close(self) -> None:
         """Closes link and port, by which the robot's program learns that nothing listens."""
@@ -322,17 +330,6 @@ class SocketArm:
         link.close()
         self._waiting = [other for other in self._waiting if other is not link]
         self._link = None if self._link is link else self._link
-
-    def _linger(self, *, is_answered: bool) -> None:
-        """Answers `done` to whatever comes, until an answered program has closed its link."""
-        lingering = Stopwatch()
-        # How long a robot may take to read it and to close the link [s].
-        while lingering.read() < 3.0 and not (is_answered and self._link is None):
-            if self._next_line() is not None and self._link is not None:
-                with self._dropped_if_lost(self._link):
-                    self._link.send(b"done")
-                    is_answered = True
-            self._wait()
 
     def _wait(self) -> None:
         links = [self._link] if self._link else self._waiting

@@ -121,7 +121,13 @@ class StreamingCamera:
                     raise self._error
                 limit_s = max(timeout_s, _INTERVALS * self._interval_s())
                 if waiting.read() > limit_s:
-                    raise self._timeout_error(waiting.read())
+                    why, step = f"stalls: no picture has come for {waiting.read():.1f} s", _STEP
+                    if self._too_old > _INTERVALS:
+                        why = f"gives no fresh pictures: {self._too_old} that came were older than "
+                        why += "the request, or cut short"
+                        step = "It sends more than can be carried or decoded: set a lower rate or "
+                        step += "resolution."
+                    raise camera_error(self.name, why, step)
                 self._news.wait(0.05)
             stamp_s, image = self._answer
         return Frame(image, stamp_s, self._exposure_s or None)
@@ -175,14 +181,6 @@ class StreamingCamera:
         """Mean interval between recent pictures [s]; 0 where it is not known."""
         recent = list(self._arrivals_s)
         return (recent[-1] - recent[0]) / (len(recent) - 1) if len(recent) > 1 else 0.0
-
-    def _timeout_error(self, waited_s: float) -> DriverError:
-        if self._too_old <= _INTERVALS:
-            why = f"stalls: no picture has come for {waited_s:.1f} s"
-            return camera_error(self.name, why, _STEP)
-        why = f"gives no fresh pictures: {self._too_old} that came were older than the request, or "
-        step = "It sends more than can be carried or decoded: set a lower rate or resolution."
-        return camera_error(self.name, f"{why}cut short", step)
 
 
 def camera_error(name: str, why: str, step: str, *culprits: str) -> DriverError:

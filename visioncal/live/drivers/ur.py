@@ -25,7 +25,6 @@ from visioncal.core.types import FloatArray
 from visioncal.live.drivers.protocols import ArmState, Safety, Stopwatch
 from visioncal.live.drivers.ur_net import (
     SCRIPT_PORT,
-    Condition,
     Dashboard,
     check_states_come,
     connect,
@@ -174,11 +173,11 @@ class StateStream:
             "again once the pendant has started.",
         )
 
-    def wait(self) -> float:
+    def wait(self) -> tuple[float, float]:
         """Waits for a state that is sent after the call.
 
         Returns:
-            The controller's timestamp [s].
+            The controller's timestamp, and the same by the monotonic clock [s].
 
         Raises:
             DriverError: None arrives.
@@ -194,14 +193,8 @@ class StateStream:
         # Clocks drift by less than a millisecond in 10 s.
         while self._delays[0][0] < now - 10.0:
             self._delays.popleft()
-        return stamp
-
-    def host_time(self, stamp: float) -> float:
-        """Converts a controller timestamp to the monotonic clock, by the shortest recent delay [s].
-
-        A state may be noticed late, but never early.
-        """
-        return stamp + min(delay for _, delay in self._delays)
+        # The shortest recent delay counts: a state may be noticed late, but never early.
+        return stamp, stamp + min(delay for _, delay in self._delays)
 
     @property
     def safety(self) -> Safety:
@@ -234,7 +227,14 @@ class UrArm:
         receive = client_library("rtde_receive", _EXTRA)
         control = None if watch_only else client_library("rtde_control", _EXTRA)
         self._host = host
-        condition = check_controller(self._host, moves=not watch_only)
+        # By plain connections first, as the library's constructors have no timeout.
+        condition = read_condition(host)
+        if watch_only:
+            condition.check_reports()
+        else:
+            condition.check_moves()
+            connect(host, SCRIPT_PORT, "programs").close()
+        check_states_come(host)
         self.name = f"{condition.model} at {host}"
         # Visioncal's name of the model, such as `ur10e`.
         self.model = condition.model.lower()
@@ -279,7 +279,7 @@ class UrArm:
         self._check_open()
         client = self._states.client
         while True:
-            stamp = self._states.wait()
+            stamp, stamp_s = self._states.wait()
             pose, q, dq = client.getActualTCPPose(), client.getActualQ(), client.getActualQd()
             currents, temperatures = client.getActualCurrent(), client.getJointTemperatures()
             payload_kg, payload_m = None, None
@@ -291,7 +291,7 @@ class UrArm:
             if client.getTimestamp() == stamp:
                 break
         return ArmState(
-            stamp_s=self._states.host_time(stamp),
+            stamp_s=stamp_s,
             base_from_flange=_matrix(pose) @ invert(self._flange_from_tool),
             q=np.array(q),
             dq=np.array(dq),
@@ -447,22 +447,6 @@ class UrArm:
             next_step="Read the pendant's log, and see that no other program or computer drives "
             "the arm.",
         )
-
-
-def check_controller(host: str, *, moves: bool) -> Condition:
-    """Checks a controller by plain connections, as the library's constructors have no timeout.
-
-    Raises:
-        DriverError: It cannot be reached, is no UR, reports nothing, or could not be moved.
-    """
-    condition = read_condition(host)
-    if moves:
-        condition.check_moves()
-        connect(host, SCRIPT_PORT, "programs").close()
-    else:
-        condition.check_reports()
-    check_states_come(host)
-    return condition
 
 
 def keep(client: Any) -> None:  # noqa: ANN401

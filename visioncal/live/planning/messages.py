@@ -1,15 +1,9 @@
 """A plan of stops, or of motions, in words."""
 
-from visioncal.core.number_format import counted, figure, percent, some_of
+from visioncal.core.number_format import counted, figure
 from visioncal.dynamics.limits import MotionExtremes
 from visioncal.dynamics.plan_files import MotionPlan
-from visioncal.live.planning.pick_probability import NeedPlanned, words_of
 from visioncal.live.planning.plan import Plan
-
-
-def need_words(prediction: NeedPlanned) -> str:
-    """States the prediction for picks: `97 % of picks land within 0.3 mm`."""
-    return f"{percent(prediction.probability)} of picks land within {words_of(prediction.need)}"
 
 
 def summary_of(plan: Plan) -> str:
@@ -44,14 +38,6 @@ def plan_words(plan: MotionPlan) -> tuple[str, ...]:
             f"they use {_used(plan.sweeps.extremes)}",
         ]
     return tuple(words)
-
-
-def plan_warnings(plan: MotionPlan) -> tuple[str, ...]:
-    """Warnings to read before the plan is driven."""
-    warnings = [f"not checked: {name}" for name in plan.allowed.unchecked]
-    if plan.sweeps is not None and plan.sweeps.left_out:
-        warnings.append(f"too little room to sweep {some_of(plan.sweeps.left_out)}")
-    return tuple(warnings)
 
 
 def _used(kept: MotionExtremes) -> str:

@@ -114,21 +114,18 @@ def start_from_session(
         boxes,
         covariance,
     )
-    cell = replace(cell, observed_distances_m=_board_distances_m(cell, start.problem))
-    first_corner = int(first_corners(targets)[start.board])
-    recorded = _recorded_stops(run, start, edges, first_corner)
-    return SessionStart(cell, recorded, refusal, start.views)
-
-
-def _board_distances_m(cell: PlanCell, problem: Problem) -> tuple[float, float]:
-    """Least and greatest distance at which stops show the planned board [m]."""
+    # Least and greatest distance at which stops show the planned board.
+    problem = start.problem
     _, board, *_ = problem.unknown
     of_board = np.array(problem.observations.observed) == board
     flange = problem.poses[problem.robots[0]][problem.observations.stops[of_board]]
     low, high = extent_m(cell.target)
     poses, centre = cell.seen_from(flange), np.append(0.5 * (low + high), 0.0)
     distance = np.linalg.norm(poses[:, :3, :3] @ centre + poses[:, :3, 3], axis=1)
-    return float(distance.min()), float(distance.max())
+    cell = replace(cell, observed_distances_m=(float(distance.min()), float(distance.max())))
+    first_corner = int(first_corners(targets)[start.board])
+    recorded = _recorded_stops(run, start, edges, first_corner)
+    return SessionStart(cell, recorded, refusal, start.views)
 
 
 def _recorded_stops(

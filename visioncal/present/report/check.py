@@ -34,6 +34,15 @@ def render_check(check: Check, triggers: Sequence[Trigger], verdict: Verdict) ->
             change_words(check, listed),
         )
         rows.append(TableRow(cells, "left-out" if is_found else "rejected"))
+    sides = {"as calibrated": before} | ({"undone": after} if undone else {})
+    # Positions first, then rotations.
+    residuals = {
+        f"{name} [{unit}]": values[:, column_index]
+        for column_index, unit in enumerate(("mm", "deg"))
+        for name, values in sides.items()
+    }
+    rms = ("rms", *(np.sqrt(np.mean(np.square(column))) for column in residuals.values()))
+    by_stop = [*zip(stops, *residuals.values(), strict=True), rms]
     return template("check.html.j2").render(
         check=check,
         kind="Check of a calibration",
@@ -56,23 +65,9 @@ def render_check(check: Check, triggers: Sequence[Trigger], verdict: Verdict) ->
             TableRow((str(view), "not used", reason), "rejected")
             for view, reason in sorted(check.predicted.observed.reasons.items())
         ),
-        residuals=_residual_table(stops, before, after if undone else None),
-    )
-
-
-def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray | None) -> Table:
-    """Residuals by stop, and their rms: as calibrated, and with the change undone."""
-    sides = {"as calibrated": before} | ({} if after is None else {"undone": after})
-    # Positions first, then rotations.
-    columns = {
-        f"{name} [{unit}]": values[:, column_index]
-        for column_index, unit in enumerate(("mm", "deg"))
-        for name, values in sides.items()
-    }
-    rms = [np.sqrt(np.mean(np.square(column))) for column in columns.values()]
-    rows = [*zip(stops, *columns.values(), strict=True), ("rms", *rms)]
-    return Table.of(
-        ("stop (views)", *columns), [(name, *map(significant, row)) for name, *row in rows]
+        residuals=Table.of(
+            ("stop (views)", *residuals), [(name, *map(significant, row)) for name, *row in by_stop]
+        ),
     )
 
 
