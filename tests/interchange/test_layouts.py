@@ -175,11 +175,82 @@ def rapid(folder):
     write(folder / "calib.mod", "\n".join([*lines, "  PROC main()", "  ENDPROC", "ENDMODULE"]))
 
 
+def other_language(folder):
+    """Names in another language, and a second place without a rotation."""
+    shoot(folder, "bild_{}.png")
+    for at, pose in enumerate(world()[0]):
+        x, y, z, qx, qy, qz, qw = seven(pose)
+        flange = {"Ort_mm": [1e3 * x, 1e3 * y, 1e3 * z], "Quaternion_wxyz": [qw, qx, qy, qz]}
+        document = {"Roboter": {"Flansch": flange, "Greifer": {"Ort_mm": [0, 0, 120.0 + at]}}}
+        write(folder / f"bild_{at}.json", document)
+
+
+def parallel(folder):
+    """Two lists in one mapping, poses as a position and a quaternion."""
+    shoot(folder / "pics", "{}.png")
+    rows = [[seven(pose)[:3], seven(pose)[3:]] for pose in world()[0]]
+    files = [f"pics/{at}.png" for at in range(len(rows))]
+    write(folder / "run.json", {"run": {"files": files, "hand_poses": rows}})
+
+
+def printed(folder):
+    """A dict of Python a line."""
+    shoot(folder, "{}.png")
+    rows = [
+        {"t_mm": tuple((1e3 * pose[:3, 3]).tolist()), "R": pose[:3, :3].tolist(), "force": None}
+        for pose in world()[0]
+    ]
+    write(folder / "log.txt", "\n".join(map(repr, rows)))
+
+
+def messages(folder):
+    """Several documents of YAML in a file, and a lens beside."""
+    shoot(folder, "frame{:04d}.png")
+    text = ""
+    for pose in world()[0]:
+        numbers = seven(pose)
+        place = dict(zip("xyz", map(float, numbers), strict=False))
+        turn = dict(zip("xyzw", map(float, numbers[3:]), strict=True))
+        text += f"transform: {json.dumps({'translation': place, 'rotation': turn})}\n---\n"
+    write(folder / "tf.yaml", text)
+    write(folder / "camera_info.yaml", LENS)
+
+
+LENS = """image_width: 640
+image_height: 400
+camera_matrix: {rows: 3, cols: 3, data: [520.0, 0, 322.5, 0, 521, 198, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0, 0, 0, 0]}
+projection_matrix: {rows: 3, cols: 4, data: [520.0, 0, 322.5, 0, 0, 521, 198, 0, 0, 0, 1, 0]}
+"""
+
+
+def unnamed_angles(folder):
+    """Euler angles ZYZ without a word, a lens beside, and pictures twice."""
+    shoot(folder / "raw", "{}.png")
+    shoot(folder / "undistorted", "{}.png")
+    write(folder / "cam.yaml", LENS)
+    turns = Rotation.from_matrix(world()[0][:, :3, :3]).as_euler("ZYZ")
+    rows = np.hstack([world()[0][:, :3, 3], turns]).tolist()
+    lines = [",".join([f"{at}.png", *map(repr, row)]) for at, row in enumerate(rows)]
+    write(folder / "poses.csv", "\n".join(["image,e1,e2,e3,e4,e5,e6", *lines]))
+
+
+def old_results(folder):
+    """A result and a first guess beside the poses, and a row that failed."""
+    shoot(folder, "{}.png")
+    rows = [{"img": f"{at}.png", "tcp": seven(pose)} for at, pose in enumerate(world()[0])]
+    write(folder / "log.json", rows)
+    write(folder / "result.json", {"X": np.eye(4).tolist(), "guess": np.eye(4).tolist()})
+    np.save(folder / "old.npy", world()[0][0])
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
         stems_with_depth, two_folders, array, sixes, opencv_each, nested, mappings, blanks,
-        inverted, krl, fanuc, rapid,
+        inverted, krl, fanuc, rapid, other_language, parallel, printed, messages, unnamed_angles,
+        old_results,
     )
 }  # fmt: skip
 
@@ -209,7 +280,7 @@ def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
         assert "Left out of the images: rgb/frame_#_corners.png (9 files)" in done.err
     if make in (sixes, blanks, inverted):
         assert "Found by the images: With the robot's" in done.err
-    if make in (nested, array):
+    if make in (nested, array, messages, unnamed_angles):
         assert session.camera is not None
 
 
@@ -243,6 +314,27 @@ def test_a_tracker_s_joints_and_points_in_two_files_are_a_session_of_its(tmp_pat
     view = Session.load(tmp_path / "out").views[3]
     np.testing.assert_allclose(view.joints_rad, np.deg2rad(joints[3]))
     assert view.numbers["meas_y_m"] == pytest.approx(1e-3 * points[3, 1])
+
+
+def test_poses_beside_joints_are_the_target_s_where_nothing_else_was_seen(tmp_path):
+    poses = world()[0]
+    joints = [
+        ";".join(f"{30.0 * at + n:.1f}".replace(".", ",") for n in range(6)) for at in range(9)
+    ]
+    rows = []
+    for pose in poses:
+        x, y, z, qx, qy, qz, qw = map(float, seven(pose))
+        numbers = (1e3 * x, 1e3 * y, 1e3 * z, qw, qx, qy, qz)
+        rows.append(";".join(f"{number:.12f}".replace(".", ",") for number in numbers))
+    write(tmp_path / "in/joints.csv", "\n".join(["J1;J2;J3;J4;J5;J6", *joints]))
+    write(tmp_path / "in/tracker.csv", "\n".join(["X;Y;Z;q0;q1;q2;q3", *rows]))
+    said = ("--mount", "eye-to-hand", "--robot-model", "ur10")
+    visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    views = Session.load(tmp_path / "out").views
+    found = np.array([view.cam_from_target().as_matrix() for view in views])
+    # Twelve decimals of millimetres.
+    np.testing.assert_allclose(found, poses, atol=1e-11)
+    np.testing.assert_allclose(views[2].joints_rad, np.deg2rad(60.0 + np.arange(6)))
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,8 @@ _CHILD_FIRST = {"2", "to", "in", "wrt"}
 # Numbers of poses' sizes that are none, and poses that were not reached but asked for.
 _NO_POSE = re.compile(r"joint|axis|axes|angles|wrench|force|torque|twist|vel|effort|corner|intrins")
 _ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "init", "ref", "guess"}
+# Columns that count or time rows.
+_COUNTED = {"view", "index", "id", "nr", "no", "t", "time", "timestamp", "stamp", "stamp_s"}
 # Names of the numbers of a position and of a rotation, the rotations that tell most first.
 _POSITION_NAMES: tuple[tuple[str, ...], ...] = (
     ("x", "y", "z"),
@@ -53,6 +55,7 @@ _POSITION_NAMES: tuple[tuple[str, ...], ...] = (
 )
 _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
     ("qx", "qy", "qz", "qw"),
+    ("q0", "q1", "q2", "q3"),
     *dict.fromkeys(tuple(form.names.split()) for form in POSE_FORMS.values()),
 )
 
@@ -121,6 +124,14 @@ def _by_shape(fields: Fields, taken: Collection[str]) -> Iterator[PoseFields]:
     for (name,), _, size, look in _arrays(fields, taken):
         if size == 3 or look in ("rotation", "quaternion"):
             groups[name.rpartition(".")[0]].append((size, name))
+    columns = tuple(
+        name
+        for name, numbers in fields.numbers.items()
+        if numbers.ndim == 1 and name not in taken and name.lower() not in _COUNTED
+    )
+    # The only numbers of a table, in the usual order.
+    if len(columns) in (6, 7, 12, 16) and not groups and not joint_names(fields, ()):
+        yield PoseFields(columns, ())
     for group in groups.values():
         threes = [name for size, name in group if size == 3]
         more = [name for size, name in sorted(group) if size > 3]
@@ -481,8 +492,8 @@ def _likely_rotation(
             if len(names) == 1
             else "".join(name[-1].lower() for name in names)
         )
-        # ABB numbers q1 to q4 from the scalar on.
-        is_abb = [name[-2:].lower() for name in names] == ["q1", "q2", "q3", "q4"]
+        # ABB numbers q1 to q4 from the scalar on, trackers q0 to q3.
+        is_abb = "".join(name[-2:].lower() for name in names) in ("q1q2q3q4", "q0q1q2q3")
         rotation = f"quaternion-{'wxyz' if is_abb or ends == 'wxyz' else 'xyzw'}"
         # Of a mapping, whose numbers were joined by their names.
         is_mapping = len(names) > 1 and "." in names[0] and {*ends} == {*"xyzw"}
