@@ -205,7 +205,12 @@ class _Look:
             board = replace(board, border=max(border, 1), spacing=spacing)
         if others:
             notes.append(f"{listed(others)} hold the same markers: any of them finds this board.")
-        seen = kind.find(self.shown(mirrored=mirrored)[order[0]], board)
+        fullest = self.shown(mirrored=mirrored)[order[0]]
+        seen = kind.find(fullest, board)
+        # Blur draws corners inwards, so that gaps look wider.
+        for narrower in (0.03, 0.06) if isinstance(kind, GridBoard) else ():
+            if isinstance(seen, NotFound):
+                seen = kind.find(fullest, replace(board, spacing=board.spacing - narrower))
         if isinstance(seen, NotFound):
             # So many markers in place prove a board without its corners, but for the squares at
             # the tags of an AprilGrid.
