@@ -1,5 +1,6 @@
 """Boards that name themselves: random photographs, first ids, grids of markers, field cases."""
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -7,9 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tomli_w
 from support.commands import visioncal as command
 from support.following import follow
-from support.fuzz.broken_sessions import sound_session
+from support.fuzz.broken_sessions import Mistake, edit, sound_session
 from support.marks import slow
 from support.photographed import (
     HARD,
@@ -26,6 +28,7 @@ from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
 from visioncal.session import Session
+from visioncal.simulation import BOARDS
 from visioncal.vision.boards import DetectedCorners, find_target
 from visioncal.vision.boards.identify import identify
 from visioncal.vision.targets import (
@@ -163,15 +166,15 @@ def test_a_checkerboard_of_another_count_is_named(tmp_path, monkeypatch):
     source = CASES / "checkerboard-miscounted"
     if not source.is_dir():
         pytest.skip("no field cases here")
-    words = ("--target", "checkerboard_9x6_35mm", "--mount", "eye-in-hand")
-    command("convert", source, "cell", *words).good()
+    words = ("--mount", "eye-in-hand", "--robot-form", "rotation-vector", "--target")
+    command("convert", source, "cell", *words, "checkerboard_9x6_35mm").good()
     followed = follow("calibrate", "cell", "-o", "out")
     said = followed.runs[0].refused().said
     assert "checkerboard of 11 x 8 inner corners" in said
     assert "Write columns = 11 and rows = 8" in said
     # Nothing more is said of the board; how the source writes its rotations is another matter.
     assert len(followed.done) == 1
-    assert "board" not in followed.last.said.partition("error: ")[2].partition("\n")[0]
+    assert "checkerboard" not in followed.last.said
 
 
 def changed_images(folder, change, every=1):
@@ -221,3 +224,27 @@ def test_sound_images_are_not_mended(tmp_path):
     folder = sound_session(tmp_path / "cell")
     said = command("convert", folder, tmp_path / "mended", "--mend-images").refused().said
     assert "no image is mirrored" in said
+
+
+@pytest.mark.parametrize(
+    ("drawn", "declared", "said"),
+    [
+        ("charuco", {"kind": "checkerboard", "columns": 8, "rows": 5}, "ChArUco board of 9 x 6"),
+        ("checkerboard", {"kind": "charuco", "columns": 10, "rows": 7}, "checkerboard of 9 x 6"),
+    ],
+)
+def test_a_board_of_another_kind_is_no_circle(tmp_path, monkeypatch, drawn, declared, said):
+    monkeypatch.chdir(tmp_path)
+    folder = sound_session(
+        tmp_path / "cell", Mistake(options=replace(Mistake().options, target=BOARDS[drawn]))
+    )
+    side_m = BOARDS[drawn].square_m
+    more = {"marker_m": 0.7 * side_m, "dictionary": "DICT_5X5_100"}
+    document = declared | {"square_m": side_m} | (more if declared["kind"] == "charuco" else {})
+    (folder / "board.toml").write_text(tomli_w.dumps(document), "utf-8")
+    edit(folder, lambda text: re.sub('target = "[^"]*"', 'target = "board.toml"', text))
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert said in followed.runs[0].refused().said
+    # Whether ChArUco's markers hide beside a checkerboard's corners or not: one step, and a result.
+    assert len(followed.done) == 1
+    assert followed.last.status == 0

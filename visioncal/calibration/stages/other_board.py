@@ -29,6 +29,8 @@ LOOKED_AT = 3
 _LEAST_CORNERS = 0.2
 # Paper that is looked for beyond the print: less than a square, and up to the next circle.
 _RIM = {"checkerboard": 0.35, "circles": 0.8}
+# Contrast of squares over that of paper: markers that blur hides leave half of it.
+_PLAIN = 0.75
 # Gaps between markers that differ by less are the same [sides].
 _SAME_SPACING = 0.05
 # Command that writes a copy with the images as they should be, and calibrates it.
@@ -113,6 +115,10 @@ def other_board(
 
 def _is_part(identity: Identity, declared: Target) -> bool:
     """Whether a board without markers has no more rows and columns than declared."""
+    if declared.kind == "charuco":
+        # Where markers cannot be read, it looks like a checkerboard.
+        inner = (declared.columns - 1, declared.rows - 1)
+        declared = replace(declared, kind="checkerboard", columns=inner[0], rows=inner[1])
     if identity.board.dictionary or identity.board.kind != declared.kind:
         return False
     seen, stated = (sorted((one.columns, one.rows)) for one in (identity.board, declared))
@@ -120,7 +126,7 @@ def _is_part(identity: Identity, declared: Target) -> bool:
 
 
 def _has_rim(image: Image, board: Target) -> bool:
-    """Whether an image shows paper all around a board."""
+    """Whether an image shows paper all around a board, and in the light squares of it."""
     seen = find_target(image, board)
     if isinstance(seen, NotFound):
         return False
@@ -135,14 +141,19 @@ def _has_rim(image: Image, board: Target) -> bool:
         outline(board)[:, :2] - (low + high) / 2
     )
     sides = [a + along * (b - a) for a, b in zip(ends, np.roll(ends, -1, axis=0), strict=True)]
-    inside = low + np.random.default_rng(0).random((400, 2)) * (high - low)
+    # Middles of squares; circles are seen between them too.
+    step = 1.0 if board.kind == "checkerboard" else 0.25
+    steps = [np.arange(start + 0.5, end, step) for start, end in zip(low, high, strict=True)]
+    inside = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
     grey = []
     for points in (*sides, inside):
         px = np.rint(cv2.perspectiveTransform(points[None], flat)[0]).astype(int)
         u, v = px[(px >= 0).all(axis=1) & (px < image.shape[::-1]).all(axis=1)].T
         grey.append(image[v, u])
-    dark, light = np.percentile(grey[-1], [10, 90])
-    return all(len(side) and np.median(side) > (dark + light) / 2 for side in grey[:-1])
+    dark, light = np.percentile(grey[-1], [25, 75])
+    paper = [float(np.median(side)) for side in grey[:-1] if len(side)]
+    is_plain = board.kind == "circles" or light - dark > _PLAIN * (np.median(paper) - dark)
+    return len(paper) == 4 and min(paper) > (dark + light) / 2 and bool(is_plain)
 
 
 def _remedy(
@@ -207,11 +218,6 @@ def _differences(declared: Target, identity: Identity) -> dict[str, object]:
         return {}
     if board.kind != declared.kind:
         if {tag for tag, _ in declared.point_tags} & {*identity.marker_ids}:
-            return {}
-        # Where markers cannot be read, a ChArUco board is a checkerboard.
-        inner = replace(declared, columns=declared.columns - 1, rows=declared.rows - 1)
-        inner = replace(inner, kind="checkerboard")
-        if declared.kind == "charuco" and _is_part(identity, inner):
             return {}
         return {"kind": board.kind, **counts}
     if board.kind in ("checkerboard", "circles"):
