@@ -44,6 +44,8 @@ def convert_command(options: ConvertOptions) -> None:
             choose=choose,
             mirrors_poses=options.mirror_poses,
             exchange=options.exchange,
+            shift=options.shift,
+            turned=options.turned,
             mends_images=options.mend_images,
         )
     for warning in session.warnings:

@@ -53,6 +53,20 @@ def views_in(words: str, option: str) -> tuple[int, ...]:
     return tuple(found)
 
 
+def shift_in(words: str, option: str) -> tuple[tuple[int, ...], int]:
+    """Parses views and the number of rows that they are apart, written as 12-24:2."""
+    views, _, by = words.partition(":")
+    is_right = by.removeprefix("-").isdecimal() and int(by) != 0
+    _check(is_right, words, option, "views and a number of rows are needed, as 12-24:2")
+    return views_in(views, option), int(by)
+
+
+def turn_in(words: str, option: str) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Parses views, and an angle [deg] and a point [mm], written as 3,7:180,80,60."""
+    views, _, turn = words.partition(":")
+    return views_in(views, option), numbers_in(turn, option, "deg,x,y")
+
+
 def serial_in(words: str, option: str) -> tuple[str, str]:
     """Parses what a serial number is of, and the number, written as camera=1234."""
     what, sign, number = words.partition("=")

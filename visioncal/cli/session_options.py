@@ -20,7 +20,7 @@ from visioncal.cli.options import (
     session_argument,
     yes_flag,
 )
-from visioncal.cli.parsing import names_in, pair_in
+from visioncal.cli.parsing import names_in, pair_in, shift_in, turn_in
 from visioncal.core.choices import (
     PLAN_SPEED,
     POSE_FORMS,
@@ -358,6 +358,13 @@ class ConvertOptions(RobotPoseOptions):
     )
     exchange: tuple[int, int] | None = _doubt(
         "Two views whose images are exchanged: 8,17.", parse=pair_in
+    )
+    shift: tuple[tuple[int, ...], int] | None = _doubt(
+        "Views whose poses stand so many rows later: 12-24:2.", parse=shift_in
+    )
+    turned: tuple[tuple[int, ...], tuple[float, ...]] | None = _doubt(
+        "Views whose board is read turned, by degrees about a point in mm: 3,7:180,80,60.",
+        parse=turn_in,
     )
     mend_images: bool = _doubt(
         "Mirror, turn and scale images back.", "--mend-images", default=False

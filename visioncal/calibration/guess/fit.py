@@ -147,7 +147,9 @@ def is_about_one_axis(rotations: FloatArray) -> bool:
     return bool(singular[2] < max(_SECOND_AXIS * singular[0], _LEAST_TURN_RAD))
 
 
-def robust_fits(robot: FloatArray, camera: FloatArray, starts: int = 0) -> list[Fit]:
+def robust_fits(
+    robot: FloatArray, camera: FloatArray, starts: int = 0, share: float = _KEPT_SHARE
+) -> list[Fit]:
     """Solves `robot * x * camera = z` for k readings by the views that agree best.
 
     Least trimmed squares with concentration steps (Rousseeuw and Van Driessen 1999).
@@ -156,9 +158,10 @@ def robust_fits(robot: FloatArray, camera: FloatArray, starts: int = 0) -> list[
         robot: (k, n, 4, 4) the robot's part of the chain.
         camera: (k, n, 4, 4) `cam_from_target`.
         starts: Number of random small subsets to start from, besides all views.
+        share: Share of the views that must agree.
     """
     count = robot.shape[1]
-    kept = _kept_count(count)
+    kept = _kept_count(count, share)
     lever = np.maximum(np.median(np.linalg.norm(camera[..., :3, 3], axis=2), axis=1), 1e-12)
 
     def solved(rows: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
@@ -211,6 +214,6 @@ def distances(
     return Fit(*edges, *_away(robot, camera, edges), lever)
 
 
-def _kept_count(rows: int) -> int:
+def _kept_count(rows: int, share: float = _KEPT_SHARE) -> int:
     """Number of rows that a fit of this many keeps."""
-    return max(int(np.ceil(_KEPT_SHARE * rows)), min(rows, FEWEST_COMPARED))
+    return max(int(np.ceil(share * rows)), min(rows, FEWEST_COMPARED))

@@ -67,7 +67,8 @@ class SideReading(Reading):
         return PoseNumbers.of_poses(self.poses(numbers), numbers.places)
 
 
-def _shifted(by: int, count: int) -> IntArray:
+def shifted(by: int, count: int) -> IntArray:
+    """(count,) rows that many rows later, or earlier where negative; -1 for none."""
     rows = np.arange(count) + by
     return np.where((rows < 0) | (rows >= count), -1, rows)
 
@@ -85,8 +86,8 @@ def _back_from_text(first: int, count: int) -> IntArray:
 # `count` views; -1 for none.
 ROW_ORDERS: Mapping[str, Callable[[int], IntArray]] = {
     "": np.arange,
-    "the robot's pose of a view one row after it": partial(_shifted, 1),
-    "the robot's pose of a view one row before it": partial(_shifted, -1),
+    "the robot's pose of a view one row after it": partial(shifted, 1),
+    "the robot's pose of a view one row before it": partial(shifted, -1),
     "the robot's poses in reverse order": lambda count: np.arange(count)[::-1].copy(),
     "the images sorted as text (10 before 2)": partial(_as_text, 0),
     "the images, counted from 1, sorted as text (10 before 2)": partial(_as_text, 1),

@@ -15,7 +15,7 @@ from visioncal.calibration.suspects.judge import judge
 from visioncal.calibration.suspects.judged import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.calibration.suspects.misread_poses import BY_CHAIN, with_misreading
 from visioncal.calibration.suspects.registry import found_in
-from visioncal.calibration.suspects.suspect import EXCHANGED
+from visioncal.calibration.suspects.suspect import EXCHANGED, UNDONE
 from visioncal.core.conventions import controller_form
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg, some_of
@@ -203,6 +203,7 @@ def _is_outlier(view: ViewResult) -> bool:
 def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
     seers = dict.fromkeys(view.seer for view in views)
     not_needed = run.spared.keys() | run.held_back
+    undone = {at for found in run.warnings if found.kind in UNDONE for at in found.views}
     sensors = []
     for seer in seers:
         mine = [view for view in views if view.seer == seer]
@@ -211,7 +212,7 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
             Sensor(
                 used=sum(view.used for view in mine),
                 lost=[Rejection(view.view, view.reason) for view in unused],
-                outliers=[view.view for view in mine if _is_outlier(view)],
+                outliers=[v.view for v in mine if _is_outlier(v) or v.view in undone],
                 pixel_px=run.cell_fit.residual_px.get(seer),
                 spared=sum(view.view in run.spared for view in mine),
                 name=seer if len(seers) > 1 else "",

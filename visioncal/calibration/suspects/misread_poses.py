@@ -14,6 +14,7 @@ from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
+from visioncal.calibration.suspects.undoing import undone
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy
@@ -55,6 +56,7 @@ def with_misreading(run: RunState) -> RunState:
 
 def with_open_chains(run: RunState) -> RunState:
     """Looks for misread poses before the fit where chains do not close; notes turned boards."""
+    run = undone(run)
     if run.mount is None or not closes(run.base_from_flange, run.poses_of_one_board, run.mount):
         run = with_misreading(run)
     return run if run.misread else run.noting((), turned_boards(run))

@@ -24,6 +24,7 @@ from visioncal.calibration.suspects.suspect import (
     REMARK,
     SOURCES,
     STEPS,
+    UNDONE,
     UNEXPLAINED,
     Suspect,
 )
@@ -66,6 +67,7 @@ def _unseen(run: RunState) -> Iterator[Finding]:
 _ENTRIES: tuple[Suspect, ...] = (
     # Views.
     Suspect(EXCHANGED, _outliers, 1e-6, order=-1),
+    *(Suspect(kind, None, 1e-6, order=-1) for kind in UNDONE),
     Suspect("something_moved", chance=1e-4),
     Suspect("moved_frame", chance=1e-4),
     Suspect("wrong_views", chance=1e-3),

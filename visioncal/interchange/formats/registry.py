@@ -25,6 +25,8 @@ from visioncal.interchange.formats.rereading import (
     load_for_rereading,
     reread,
     settled,
+    shift_views,
+    turn_boards,
 )
 from visioncal.interchange.formats.sources import look, unknown
 from visioncal.interchange.formats.views import VISP, ZIVID
@@ -62,6 +64,8 @@ def convert(
     choose: Choose | None = None,
     mirrors_poses: bool = False,
     exchange: tuple[int, int] | None = None,
+    shift: tuple[tuple[int, ...], int] | None = None,
+    turned: tuple[tuple[int, ...], tuple[float, ...]] | None = None,
     mends_images: bool = False,
 ) -> Session:
     """Writes a session or a foreign recording as a session's folder or as a recording.
@@ -78,6 +82,9 @@ def convert(
             reading to apply.
         mirrors_poses: Whether that reading may mirror the robot's poses.
         exchange: Two views whose images, corners and readings are exchanged.
+        shift: Views whose poses of the robot stand so many rows later (earlier where negative).
+        turned: Views in which the board was read turned in its plane; by which angle [deg], and
+            about which point of the board [mm] (x, y).
         mends_images: Whether images are mirrored, turned and scaled back: see `mend_images`.
 
     Returns:
@@ -117,8 +124,13 @@ def convert(
         check_one_of_each(doubtful.session)
     if choose is not None:
         session = reread(doubtful, choose(doubtful), mirrors_poses=mirrors_poses)
-    if exchange is not None:
-        session = exchange_views(session, *exchange)
+    mends: tuple[tuple[Callable[..., Session], tuple[object, ...] | None], ...] = (
+        (exchange_views, exchange),
+        (shift_views, shift),
+        (turn_boards, turned),
+    )
+    for mend, asked in mends:
+        session = session if asked is None else mend(session, *asked)
     if mends_images:
         session = mend_images(session, requested.progress)
     write_session(session, dest)

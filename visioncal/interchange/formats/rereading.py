@@ -1,12 +1,13 @@
 """Finds another reading of a recording's poses, and applies it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess import Candidate, Guess
 from visioncal.calibration.guess.readings import Hypothesis
@@ -23,6 +24,8 @@ from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
+from visioncal.core.number_format import ranges
+from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import MOUNTS, FloatArray, Progress
 from visioncal.estimation.clock_correlation import evenly
 from visioncal.interchange.formats.assemble import assemble, pose_cells, with_observations_only
@@ -37,10 +40,12 @@ from visioncal.session.columns import (
     QUATERNION,
     ROTATIONS,
     joint_columns,
+    pose_row,
     position_columns,
 )
 from visioncal.session.table import parse_csv
 from visioncal.vision.boards.kind import LARGEST_M
+from visioncal.vision.targets import corner_positions
 
 _IDENTITY = ("0.0", "0.0", "0.0", "1.0")
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
@@ -392,8 +397,85 @@ def exchange_views(session: Session, first: int, second: int) -> Session:
         views = np.where(is_first, second, np.where(is_second, first, corners.views))
         corners = replace(corners, views=views)
     note = f"the images of views {first} and {second} were exchanged"
+    return _with_cells(session, cells.values(), note, corners=corners)
+
+
+def _with_cells(
+    session: Session, cells: Iterable[Mapping[str, str]], note: str, **changes: object
+) -> Session:
+    """The session with other rows, which notes why in `corrected`."""
     return session.with_content(
         document=_noting(session, session.document, [note]),
-        cells=[[row[name] for name in session.columns] for row in cells.values()],
-        corners=corners,
+        cells=[[row[name] for name in session.columns] for row in cells],
+        **changes,
     )
+
+
+def _chosen_views(session: Session, views: Sequence[int], option: str) -> list[int]:
+    """The session's views among some numbers; raises DataError where there are none."""
+    numbers = {view.number for view in session.views}
+    chosen = [view for view in dict.fromkeys(views) if view in numbers]
+    if not chosen:
+        words = f"Session {session.name!r} has none of the views {ranges(views)}."
+        raise DataError(words, culprits=[option], next_step="Name views of its views.csv.")
+    return chosen
+
+
+def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
+    """Gives some views the robot's columns of so many rows later, or earlier where negative.
+
+    Views whose row there is none are dropped, and `corrected` names them. Raises DataError.
+    """
+    moved, rows = set(_chosen_views(session, views, "--shift")), session.views
+    kept = {*_OBSERVED, *_MUST_AGREE, "view", "role"}
+    cells, dropped = list[dict[str, str]](), list[int]()
+    for at, view in enumerate(rows):
+        source = at + by if view.number in moved else at
+        if not 0 <= source < len(rows):
+            dropped.append(view.number)
+            continue
+        cells.append(
+            {name: (view if name in kept else rows[source]).cell(name) for name in session.columns}
+        )
+    lost = f"; {ranges(dropped)} had none there and were dropped" if dropped else ""
+    note = f"views {ranges(moved)} have the robot's poses of the row {by:+d}{lost}"
+    corners = session.corner_table
+    if corners is not None:
+        corners = corners.of_views([view.number for view in rows if view.number not in dropped])
+    return _with_cells(session, cells, note, corners=corners)
+
+
+def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -> Session:
+    """Turns the board back that was read turned in some views.
+
+    Args:
+        session: A session of measured poses or corners.
+        views: Their numbers.
+        turn: Angle in the board's plane [deg], and the point about which it turns [mm].
+
+    Raises:
+        DataError: There are no such views, or corners are none of the board's once turned.
+    """
+    chosen = _chosen_views(session, views, "--turned")
+    degrees, *centre = turn
+    rotation = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    middle = 1e-3 * np.array([*centre, 0.0])
+    right_from_read = compose(rotation, middle - rotation @ middle)
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    numbers = numbers_in(session, MEASURED_CAM_POSE)
+    poses, is_turned = numbers.poses(), [view.number in chosen for view in session.views]
+    for row, pose, mine in zip(cells, poses @ invert(right_from_read), is_turned, strict=True):
+        if mine and np.isfinite(pose).all():
+            row.update({f"cft_{name}": repr(value) for name, value in pose_row(pose).items()})
+    corners, boards = session.corner_table, session.boards
+    if corners is not None:
+        ids = corners.points.copy()
+        for view in chosen:
+            points = corner_positions(next(iter(boards.values())))
+            own = corners.views == view
+            turned = apply(right_from_read, points)[ids[own]]
+            away = np.linalg.norm(turned[:, None] - points, axis=-1)
+            ids[own] = away.argmin(axis=1)
+        corners = replace(corners, points=ids)
+    note = f"the board was turned back by {degrees:g} deg in views {ranges(chosen)}"
+    return _with_cells(session, cells, note, corners=corners)

@@ -1,0 +1,174 @@
+"""Mistakes of the record: named first, mended by the command that is printed, no sound one accused.
+
+Cells of poses measured with noise, without images.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.cells import pairs_session
+from support.commands import visioncal as typed
+from support.following import follow
+
+import visioncal
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import STAGES, run_stages
+from visioncal.calibration.suspects.undoing import likeliest
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.interchange.formats.rereading import shift_views, turn_boards
+from visioncal.session import Session
+from visioncal.vision.targets import corner_positions
+
+MOUNTS = ("eye-in-hand", "eye-to-hand")
+HALF_TURN = compose(np.diag([-1.0, -1.0, 1.0]), np.array([0.16, 0.12, 0.0]))
+BOARD = "charuco_9x6_30mm"
+CASES = Path(__file__).parents[3] / "shared/data/field/cases"
+
+
+def poses_of(mount, views=24, seed=0):
+    """(m, 4, 4) poses of the flange and `cam_from_target`, with a noise of half a millimetre."""
+    rng = np.random.default_rng(seed)
+    boards = exp(np.column_stack([rng.normal(0, 0.4, (views, 3)), rng.normal(0, 0.08, (views, 3))]))
+    boards[:, 2, 3] += 0.6
+    x, z = exp(rng.normal(0, 0.3, 6)), exp(rng.normal(0, 0.5, 6))
+    flanges = z @ invert(boards) @ invert(x)
+    flanges = flanges if mount == "eye-in-hand" else invert(flanges)
+    noise = rng.normal(size=(2, views, 6)) * np.repeat([1e-3, 5e-4], 3)
+    return flanges @ exp(noise[0]), boards @ exp(noise[1])
+
+
+def shifted(robot, boards, start=10, by=2):
+    """From a row on, each image is that of the robot's pose so many rows later."""
+    rows = np.arange(len(robot))
+    images = np.where(rows >= start, rows + by, rows)
+    there = images < len(rows)
+    return robot[there], boards[images[there]]
+
+
+def turned(robot, boards, some=(1, 4, 5, 8, 11, 13, 16, 19)):
+    boards = boards.copy()
+    boards[[*some]] = boards[[*some]] @ HALF_TURN
+    return robot, boards
+
+
+def copied(robot, boards, start=12):
+    robot = robot.copy()
+    robot[start:] = robot[start - 1]
+    return robot, boards
+
+
+PLANTED = {
+    "shifted_rows": (shifted, [*range(10, 22)], "From view 10 on, images and poses are 2 rows"),
+    "turned_board": (turned, [1, 4, 5, 8, 11, 13, 16, 19], "turned by 180 deg"),
+    "copied_poses": (copied, [*range(12, 24)], "to the last digit"),
+}
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("kind", PLANTED)
+def test_a_mistake_is_named_and_its_command_mends_it(tmp_path, monkeypatch, kind, mount):
+    monkeypatch.chdir(tmp_path)
+    plant, views, words = PLANTED[kind]
+    sound = visioncal.calibrate(pairs_session(mount, *poses_of(mount)))
+    session = pairs_session(mount, *plant(*poses_of(mount)))
+    session.save(tmp_path / "cell")
+    found = visioncal.calibrate(session)
+    cause = found.verdict.causes[0]
+    assert cause.kind == kind
+    assert words in cause.words
+    assert [*cause.views] == views
+    # The others alone give the result.
+    assert not {view.view for view in found.views if view.used} & {*views}
+    for name, edge in sound.edges.items():
+        # Ten times the noise of one view; what is wrong is off by centimetres.
+        np.testing.assert_allclose(found.edges[name].matrix, edge.matrix, atol=5e-3)
+    last = follow("calibrate", "cell", "-o", "out").last
+    assert last.status == 0, last.said
+
+
+@pytest.mark.parametrize("by", [1, 3, -1, -2])
+def test_rows_are_any_few_apart(by):
+    session = pairs_session(MOUNTS[0], *shifted(*poses_of(MOUNTS[0], 30), 15, by))
+    cause = visioncal.calibrate(session).verdict.causes[0]
+    assert cause.kind == "shifted_rows"
+    # The row before a shift back has the image before once more, which fits both.
+    assert cause.views[0] in (15, 15 - by if by < 0 else 15)
+    assert f":{by} &&" in cause.do.command
+
+
+def test_a_whole_table_two_rows_apart_is_named():
+    session = pairs_session(MOUNTS[1], *shifted(*poses_of(MOUNTS[1]), 0, 2))
+    cause = visioncal.calibrate(session).verdict.causes[0]
+    assert cause.kind == "shifted_rows"
+    assert "--shift 0-21:2" in cause.do.command
+
+
+def located(session):
+    """What is known of a session before its fit."""
+    return run_stages(RunState(session), STAGES[:5])
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_sound_and_otherwise_wrong_sessions_are_not_accused(mount):
+    rng = np.random.default_rng(3)
+    for seed in range(6):
+        robot, boards = poses_of(mount, 20, seed)
+        assert likeliest(located(pairs_session(mount, robot, boards))) is None
+        boards[[2, 9]] = boards[[2, 9]] @ exp(rng.normal(0, 0.3, (2, 6)))
+        assert likeliest(located(pairs_session(mount, robot, boards))) is None
+        # Two views of each stop, of which one shows something else.
+        robot, boards = np.repeat(robot, 2, axis=0), np.repeat(boards, 2, axis=0)
+        assert likeliest(located(pairs_session(mount, robot, boards))) is None
+
+
+def test_of_long_sessions_every_row_is_told():
+    run = located(pairs_session(MOUNTS[0], *shifted(*poses_of(MOUNTS[0], 200), 90, 3)))
+    found = likeliest(run)
+    assert found.found.kind == "shifted_rows"
+    assert len(found.found.views) == 107
+
+
+def test_corners_are_numbered_back_and_views_without_partner_go():
+    px = np.random.default_rng(0).uniform(0, 600, (4, 20, 2))
+    # The 8 x 5 inner corners of the board, the first of which is one square from both edges.
+    seen = [(np.arange(20), own) for own in px]
+    session = Session.from_corners(seen, poses_of(MOUNTS[0], 4)[0], BOARD, (640, 480))
+    points = corner_positions(next(iter(session.boards.values())))
+    back = turn_boards(session, [1], (180.0, *(1e3 * points.mean(axis=0)[:2])))
+    np.testing.assert_array_equal(back.corners[0].ids, np.arange(20))
+    np.testing.assert_array_equal(
+        np.sort(back.corners[1].ids), len(points) - 1 - np.arange(20)[::-1]
+    )
+    moved = shift_views(session, [2, 3], 1)
+    assert [view.number for view in moved.views] == [0, 1, 2]
+    assert moved.views[2].cell("x_m") == session.views[3].cell("x_m")
+    np.testing.assert_array_equal(moved.corners[2].px, session.corners[2].px)
+    assert "3 had none there and were dropped" in moved.declaration.corrected[0]
+
+
+@pytest.mark.parametrize(
+    ("case", "mount", "kind"),
+    [
+        ("pairing", "eye-in-hand", "shifted_rows"),
+        ("symmetric", "eye-to-hand", "turned_board"),
+    ],
+)
+def test_real_records_are_mended(tmp_path, monkeypatch, case, mount, kind):
+    if not CASES.is_dir():
+        pytest.skip("there are no recordings of others here")
+    monkeypatch.chdir(tmp_path)
+    source = CASES / case / f"{case}.json"
+    typed("convert", source, "cell", "--mount", mount).good()
+    assert visioncal.calibrate("cell").verdict.causes[0].kind == kind
+    assert follow("calibrate", "cell", "-o", "out").last.status == 0
+
+
+@pytest.mark.parametrize("words", ["3", "3-5:0", "3-5:x", "90:2"])
+def test_a_shift_that_cannot_be_made_is_refused(tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    pairs_session(MOUNTS[0], *poses_of(MOUNTS[0])).save(tmp_path / "cell")
+    done = typed("convert", "cell", "moved", "--shift", words)
+    assert done.status == 2
+    assert "--shift" in done.err
+    assert not (tmp_path / "moved").exists()

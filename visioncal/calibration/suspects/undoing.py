@@ -1,0 +1,312 @@
+"""Mistakes of a record that, undone, make the views agree.
+
+Rows may be shifted from one on, boards read as if they were turned, poses repeated.
+
+Each hypothesis pairs views with poses of the robot otherwise, or turns boards back. It is compared
+with the record as it stands, in which the same views are wrong for no known reason, by likelihoods
+whose noise is integrated out. No level of a wrong fit enters, and not even half of the rows need be
+right.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from scipy.special import gammaln
+
+from visioncal.calibration.guess.fit import CLOSING_SCORE, robust_fits
+from visioncal.calibration.guess.readings import ROW_ORDERS, shifted
+from visioncal.calibration.guess.search import CLEAR, EVIDENCE
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.clocks import waits_for_clock
+from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
+from visioncal.core.number_format import counted, ranges, some_of
+from visioncal.core.transforms import compose, exp, invert, rotation_angle
+from visioncal.core.types import FloatArray, IntArray, Mask, Rejection
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy, or_alone
+from visioncal.estimation.chain import robot_part
+from visioncal.vision.targets import rotation_transforms
+
+_SHIFTS = (0, 1, -1, 2, -2, 3, -3)
+# Share of the rows that a fit keeps, and its random starts: half of the rows may be wrong, and a
+# few lose their partner.
+_KEPT, _STARTS = 0.45, 40
+# Least standard deviation by axis, without unit: digits of a table.
+_LEAST = 5e-4
+# Log-density of a wrong view's pose, over two radians and two distances by axis, with the prior
+# probability of wrong views; the prior of a mistake of the record; the probability that a robot
+# reports one pose twice to the last digit though it moved.
+_WRONG = float(np.log(0.05)) - 6.0 * float(np.log(2.0))
+_MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
+# A turn of a board differs by less from a quarter or half one [rad]; copies of poses by less.
+_NEAR_RAD, _SAME = 0.1, 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class _Record:
+    """The poses of one robot and what one camera saw of one board, by row of the session."""
+
+    views: IntArray  # (n,) numbers of the session's rows.
+    robot: FloatArray  # (n, 4, 4) the robot's part of the chain; NaN where unknown.
+    rows: IntArray  # (m,) the rows that show the board.
+    camera: FloatArray  # (m, c, 4, 4) `cam_from_target` with all rivals.
+
+    @classmethod
+    def of(cls, run: RunState) -> Self:
+        """The record of a run after the stage `pnp`, of one robot and one camera."""
+        seen, views = run.poses_of_one_board, [view.number for view in run.session.views]
+        robot = np.full((len(views), 4, 4), np.nan)
+        rows, camera = [], list[FloatArray]()
+        boards = [*run.session.boards.values()]
+        for at, view in enumerate(views):
+            if view in run.base_from_flange:
+                robot[at] = run.base_from_flange[view]
+            if view in seen and view not in run.held_back | run.spared.keys():
+                turns = rotation_transforms(boards[seen[view].board]) if boards else np.eye(4)[None]
+                rows.append(at)
+                camera.append((seen[view].cam_from_target[:, None] @ turns).reshape(-1, 4, 4))
+        most = max(map(len, camera), default=0)
+        padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
+        known = robot_part(robot, run.mount or "eye-in-hand")
+        return cls(np.array(views), known, np.array(rows, dtype=int), np.array(padded))
+
+    def paired(self, order: IntArray) -> IntArray:
+        """(m,) the robot's row of each view that shows the board; -1 where it has no pose."""
+        at = order[self.rows]
+        return np.where((at >= 0) & np.isfinite(self.robot[at, 0, 0]), at, -1)
+
+    @cached_property
+    def copies(self) -> Mask:
+        """(m,) views in whose row the robot's pose before is there once more."""
+        same = np.abs(np.diff(self.robot, axis=0)).max(axis=(1, 2)) < _SAME
+        return np.append(False, same)[self.rows]
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Both edges by some pairing of the rows, and what they make of a record."""
+
+    record: _Record
+    x: FloatArray
+    z: FloatArray
+    lever: float
+
+    @classmethod
+    def by(
+        cls, record: _Record, pairs: IntArray, among: Mask, starts: int = _STARTS
+    ) -> Self | None:
+        """The edges that most of some paired rows agree on; None with too few."""
+        some = np.flatnonzero(among & (pairs >= 0))
+        if len(some) <= FEWEST_COMPARED:
+            return None
+        sides = record.robot[pairs[some]][None], record.camera[some, 0][None]
+        fit = robust_fits(*sides, starts, share=_KEPT)[0]
+        return cls(record, fit.x, fit.z, fit.lever)
+
+    def turned(self, pairs: IntArray) -> FloatArray:
+        """(m, 4, 4) each view's target in the common one, by the nearest of its rivals."""
+        robot = self.record.robot[pairs][:, None]
+        placed = invert(self.z) @ robot @ self.x @ self.record.camera
+        away = np.linalg.norm(self.squares(placed), axis=-1)
+        return np.asarray(placed[np.arange(len(pairs)), away.argmin(axis=1)])
+
+    def squares(self, turned: FloatArray) -> FloatArray:
+        """(..., 2) squared distances and angles without unit."""
+        shift = np.linalg.norm(turned[..., :3, 3], axis=-1) / self.lever
+        return np.stack([shift, rotation_angle(turned)], axis=-1) ** 2
+
+    def of(self, pairs: IntArray) -> FloatArray:
+        """(m, 2) squares of a pairing; infinite where a view has no pose."""
+        return np.where(pairs[:, None] < 0, np.inf, self.squares(self.turned(pairs)))
+
+
+def _evidence(squares: FloatArray) -> tuple[FloatArray, Mask]:
+    """Log marginal likelihoods of (k, m, 2) squares, and the (k, m) views that agree.
+
+    The noise of positions and of rotations is integrated over (a Student distribution); the number
+    of agreeing views is the likeliest, and both edges take six directions of each.
+    """
+    count = squares.shape[1]
+    order = np.argsort(squares.sum(axis=2), axis=1, kind="stable")
+    sums = np.cumsum(np.take_along_axis(squares, order[..., None], 1) + 3.0 * _LEAST**2, axis=1)
+    agreeing = np.arange(FEWEST_COMPARED, count + 1)
+    freedom = 3.0 * agreeing - 6.0
+    by_level = gammaln(0.5 * freedom) - 0.5 * freedom * np.log(np.pi)
+    logs = 2.0 * by_level - 0.5 * freedom * np.log(sums[:, agreeing - 1]).sum(axis=2)
+    logs += _WRONG * (count - agreeing)
+    best = logs.argmax(axis=1)
+    agrees = np.argsort(order, axis=1) < agreeing[best][:, None]
+    return logs[np.arange(len(logs)), best], agrees
+
+
+@dataclass(frozen=True, eq=False)
+class Undoing:
+    """A mistake of the record that explains views."""
+
+    odds: float  # Its log odds against views that are wrong for no known reason.
+    found: Finding  # The finding; its views are left out.
+    short: str  # The same as a clause, for each of the views.
+
+
+def undone(run: RunState) -> RunState:
+    """Leaves out the views that a mistake of the record explains, and names it."""
+    found = likeliest(run)
+    if found is None:
+        return run
+    views = set(found.found.views)
+    left = {view: pose for view, pose in run.poses.items() if view not in views}
+    if len(left) <= FEWEST_COMPARED:
+        return replace(run, misread=(found.found,))
+    run = replace(run, poses=left, misread=())
+    reasons = (Rejection(view, f"{found.short}, as the other views show") for view in views)
+    return run.noting(reasons, (found.found,))
+
+
+def likeliest(run: RunState) -> Undoing | None:
+    """The mistake that is clearly likelier than views wrong for no known reason, if any.
+
+    Of one robot and one camera whose poses stand beside their images, after the stage `pnp`.
+    """
+    if run.mount in (None, "instrument") or run.misread or waits_for_clock(run.session):
+        return None
+    record = _Record.of(run)
+    if len(record.rows) <= FEWEST_COMPARED + 1:
+        return None
+    own, fresh = record.paired(np.arange(len(record.views))), ~record.copies
+    declared = _Edges.by(record, own, fresh)
+    if declared is None:
+        return None
+    agrees = _evidence(declared.of(own)[None])[1]
+    if agrees.all() and declared.of(own).mean() < CLOSING_SCORE**2:
+        return None
+    pairs = {by: record.paired(shifted(by, len(record.views))) for by in _SHIFTS}
+    every = [declared]
+    every += filter(None, (_Edges.by(record, pairs[by], fresh) for by in _SHIFTS[1:]))
+    best = max(every, key=lambda edges: float(_evidence(edges.of(own)[None])[0][0]))
+    base, agrees = _evidence(best.of(own)[None])
+    rivals = [
+        *_copied(record, best, own, agrees[0]),
+        *_turned(record, best, own, float(base[0])),
+        *_shifted(record, every, pairs, float(base[0])),
+    ]
+    found = max(rivals, key=lambda rival: rival.odds, default=None)
+    return found if found is not None and found.odds > CLEAR else None
+
+
+def _copied(record: _Record, edges: _Edges, own: IntArray, agrees: Mask) -> Iterator[Undoing]:
+    """Poses that are there once more though the camera saw another view."""
+    closes = edges.of(own)[agrees].mean() < CLOSING_SCORE**2
+    copied = record.copies & ~agrees & (own >= 0)
+    if not copied.any() or not closes:
+        return
+    # Where the robot stands still between views, equal poses say little.
+    chance = max(float((record.copies & agrees).mean()), _EQUAL)
+    views = tuple(record.views[record.rows[copied]].tolist())
+    others = record.views[record.rows[~copied]].tolist()
+    words = f"Views {some_of([*map(str, views)])} have the robot's pose of the row before once more"
+    yield Undoing(
+        _MISTAKE - len(views) * float(np.log(chance)),
+        Finding(
+            "copied_poses",
+            f"{words}, to the last digit, though their images differ: the log repeated a pose that "
+            "was read before. They were left out.",
+            or_alone("Record them anew, or calibrate the other views alone.", others),
+            views,
+        ),
+        "the robot's pose is that of the row before, once more",
+    )
+
+
+def _turned(record: _Record, edges: _Edges, own: IntArray, base: float) -> Iterator[Undoing]:
+    """Boards that were read as if they were turned in their plane."""
+    known = np.flatnonzero(own >= 0)
+    turned = edges.turned(own)
+    for degrees in (180.0, 90.0, 270.0):
+        angle = np.deg2rad(degrees)
+        turn = exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))[:3, :3]
+        near = known[rotation_angle(turn.T @ turned[known, :3, :3]) < _NEAR_RAD]
+        if len(near) < 2:
+            continue
+        middle = np.median(turned[near, :2, 3], axis=0)
+        whole = compose(turn, np.array([*middle, 0.0]))
+        squares = edges.of(own)
+        squares[near] = edges.squares(invert(whole) @ turned[near])
+        (there,), (agrees,) = _evidence(squares[None])
+        wrong = near[agrees[near]]
+        # The middle is known by these views themselves, two directions of their six.
+        odds = EVIDENCE * float(there - base) + 3.0 * _MISTAKE
+        if len(wrong) < 2 or squares[agrees].mean() > CLOSING_SCORE**2:
+            continue
+        views = tuple(record.views[record.rows[wrong]].tolist())
+        centre = np.linalg.solve(np.eye(2) - turn[:2, :2], middle) * 1e3
+        about = ",".join(f"{value:g}" for value in np.round([degrees, *centre], 2).tolist())
+        short = f"the board was read turned by {degrees:.0f} deg"
+        fixed = CALIBRATE.replace("SESSION", "FIXED")
+        yield Undoing(
+            odds,
+            Finding(
+                "turned_board",
+                f"In views {some_of([*map(str, views)])} {short} in its plane, about "
+                f"({centre[0]:.1f}, {centre[1]:.1f}) mm. They were left out.",
+                Remedy(
+                    "Write a copy of the session in which it is turned back, and calibrate it.",
+                    f"visioncal convert SESSION FIXED --turned {ranges(views)}:{about} && {fixed}",
+                ),
+                views,
+            ),
+            short,
+        )
+
+
+def _shifted(
+    record: _Record, every: list[_Edges], pairs: dict[int, IntArray], base: float
+) -> Iterator[Undoing]:
+    """The likeliest row from which on, or before which, images and poses are rows apart."""
+    count = len(record.rows)
+    behind = np.arange(count) >= np.arange(count)[:, None]
+    found = []
+    for edges in every:
+        squares = {by: edges.of(pairs[by]) for by in _SHIFTS}
+        sides = np.concatenate([behind, ~behind[FEWEST_VIEWS:]])
+        for by in _SHIFTS[1:]:
+            mixed = np.where(sides[..., None], squares[by], squares[0])
+            logs, agrees = _evidence(mixed)
+            at = int(logs.argmax())
+            closes = mixed[at][agrees[at]].mean() < CLOSING_SCORE**2
+            found.append((float(logs[at]), by, sides[at], agrees[at], closes))
+        # Other orders of the rows are readings of the whole recording.
+        for order in ROW_ORDERS.values():
+            rival = edges.of(record.paired(order(len(record.views))))
+            found.append((float(_evidence(rival[None])[0][0]), 0, behind[0], behind[0], False))
+    log, by, side, agrees, closes = max(found, key=lambda item: item[0])
+    partnered = side & (pairs[by] >= 0)
+    if not by or not closes or np.sum(agrees & partnered) < max(2.0, 0.6 * partnered.sum()):
+        return
+    # One row, in all views, is a reading of the whole recording.
+    if side.all() and abs(by) == 1:
+        return
+    views = record.views[record.rows[side]].tolist()
+    first, last = views[0], views[-1]
+    apart = counted(abs(by), "row")
+    rows = f"{apart} {'later' if by > 0 else 'earlier'}"
+    when = f"From view {first} on" if side[-1] else f"Up to view {last}"
+    lost = [str(view) for view, pair in zip(views, pairs[by][side], strict=True) if pair < 0]
+    dropped = f" Without a partner, and dropped: view {some_of(lost)}." if lost else ""
+    fixed = CALIBRATE.replace("SESSION", "FIXED")
+    yield Undoing(
+        EVIDENCE * (log - base) + _MISTAKE - float(np.log(2.0 * count * len(_SHIFTS))),
+        Finding(
+            "shifted_rows",
+            f"{when}, images and poses are {apart} apart: the image of each row belongs to the "
+            f"robot's pose {rows}. They were left out.",
+            Remedy(
+                "Write a copy of the session in which each has its own pose, and calibrate it."
+                f"{dropped}",
+                f"visioncal convert SESSION FIXED --shift {first}-{last}:{by} && {fixed}",
+            ),
+            tuple(views),
+        ),
+        f"its image belongs to the robot's pose {rows}",
+    )
