@@ -62,13 +62,11 @@ def look_at(view: int) -> str:
     return f"{REVIEW} --view {view}"
 
 
-def exchanging(first: int, second: int) -> Remedy:
-    """Advice to exchange the images of two views, with the command that calibrates so."""
+def mending(words: str, option: str) -> Remedy:
+    """Advice to write a copy of the session with an option of `convert`, and to calibrate it."""
     fixed = CALIBRATE.replace("SESSION", "FIXED")
-    return Remedy(
-        "Write a copy of the session in which their images are exchanged, and calibrate it.",
-        f"visioncal convert SESSION FIXED --exchange {first},{second} && {fixed}",
-    )
+    words = f"Write a copy of the session in which {words}, and calibrate it."
+    return Remedy(words, f"visioncal convert SESSION FIXED {option} && {fixed}")
 
 
 def or_alone(words: str, views: Sequence[int]) -> Remedy:

@@ -15,7 +15,7 @@ from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import invert, log, mean_transform, pose_difference
 from visioncal.core.types import IntArray
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy, exchanging, or_alone
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import TWIST_UNITS
 from visioncal.estimation.outliers import InlierFit
 from visioncal.results import Moved
@@ -198,7 +198,8 @@ def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFau
             f"Views {first} and {second} are exchanged: the image of each fits the pose in "
             "the other's row. They were left out."
         )
-        yield _fault(cell_fit, EXCHANGED, pair, words, exchanging(first, second))
+        do = mending("their images are exchanged", f"--exchange {first},{second}")
+        yield _fault(cell_fit, EXCHANGED, pair, words, do)
 
 
 def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:

@@ -25,7 +25,7 @@ from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
 from visioncal.core.number_format import counted, ranges, some_of
 from visioncal.core.transforms import compose, exp, invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Rejection
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy, or_alone
+from visioncal.core.verdict import Finding, mending, or_alone
 from visioncal.estimation.chain import robot_part
 from visioncal.vision.targets import rotation_transforms
 
@@ -243,17 +243,13 @@ def _turned(record: _Record, edges: _Edges, own: IntArray, base: float) -> Itera
         centre = np.linalg.solve(np.eye(2) - turn[:2, :2], middle) * 1e3
         about = ",".join(f"{value:g}" for value in np.round([degrees, *centre], 2).tolist())
         short = f"the board was read turned by {degrees:.0f} deg"
-        fixed = CALIBRATE.replace("SESSION", "FIXED")
         yield Undoing(
             odds,
             Finding(
                 "turned_board",
                 f"In views {some_of([*map(str, views)])} {short} in its plane, about "
                 f"({centre[0]:.1f}, {centre[1]:.1f}) mm. They were left out.",
-                Remedy(
-                    "Write a copy of the session in which it is turned back, and calibrate it.",
-                    f"visioncal convert SESSION FIXED --turned {ranges(views)}:{about} && {fixed}",
-                ),
+                mending("it is turned back", f"--turned {ranges(views)}:{about}"),
                 views,
             ),
             short,
@@ -293,19 +289,14 @@ def _shifted(
     rows = f"{apart} {'later' if by > 0 else 'earlier'}"
     when = f"From view {first} on" if side[-1] else f"Up to view {last}"
     lost = [str(view) for view, pair in zip(views, pairs[by][side], strict=True) if pair < 0]
-    dropped = f" Without a partner, and dropped: view {some_of(lost)}." if lost else ""
-    fixed = CALIBRATE.replace("SESSION", "FIXED")
+    dropped = f" No row is left for view {some_of(lost)}." if lost else ""
     yield Undoing(
         EVIDENCE * (log - base) + _MISTAKE - float(np.log(2.0 * count * len(_SHIFTS))),
         Finding(
             "shifted_rows",
             f"{when}, images and poses are {apart} apart: the image of each row belongs to the "
-            f"robot's pose {rows}. They were left out.",
-            Remedy(
-                "Write a copy of the session in which each has its own pose, and calibrate it."
-                f"{dropped}",
-                f"visioncal convert SESSION FIXED --shift {first}-{last}:{by} && {fixed}",
-            ),
+            f"robot's pose {rows}. They were left out.{dropped}",
+            mending("each has its own pose", f"--shift {first}-{last}:{by}"),
             tuple(views),
         ),
         f"its image belongs to the robot's pose {rows}",
