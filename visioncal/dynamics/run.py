@@ -106,7 +106,16 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
     )
     request = replace(request, lag_s=request.lag_s if lag is None else lag.seconds)
     split = _split(robot, recorded, streams, request)
-    options = _with_rotors(robot, split, request)
+    options, rotors = request.options, request.rotors
+    if rotors is None and split is not None:
+        errors = []
+        for with_rotors in (False, True):
+            fit = identify(robot, split.fitted, _quick(options, with_rotors))
+            ahead = predict(fit.identified, split.held_out)
+            errors.append(ahead.rms_nm(ahead.predicted_nm))
+        # Rotors are kept where they help some joint clearly.
+        rotors = bool(np.min(errors[1] / np.maximum(errors[0], 1e-12)) < 0.75)
+    options = replace(options, terms=replace(options.terms, motor_inertia=bool(rotors)))
     identification = identify(robot, streams, options)
     predicted, validation = None, None
     if request.validate_on:
@@ -279,20 +288,6 @@ def _split(
     except (DataError, DegenerateError):
         return None
     return split
-
-
-def _with_rotors(robot: Robot, split: _Split | None, request: IdentificationRequest) -> Options:
-    """The options with rotors, where requested or where they predict far better."""
-    options, rotors = request.options, request.rotors
-    if rotors is None and split is not None:
-        errors = []
-        for with_rotors in (False, True):
-            fit = identify(robot, split.fitted, _quick(options, with_rotors))
-            predicted = predict(fit.identified, split.held_out)
-            errors.append(predicted.rms_nm(predicted.predicted_nm))
-        # Rotors are kept where they help some joint clearly.
-        rotors = bool(np.min(errors[1] / np.maximum(errors[0], 1e-12)) < 0.75)
-    return replace(options, terms=replace(options.terms, motor_inertia=bool(rotors)))
 
 
 def _quick(options: Options, rotors: bool) -> Options:

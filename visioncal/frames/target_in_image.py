@@ -60,7 +60,18 @@ def target_pose_candidates(
         DataError: The target is not in the image, its corners do not determine a pose, or they do
             not fit any pose of it.
     """
-    corners = seen if isinstance(seen, Corners) else _detected(eye, seen, target, label)
+    corners: Corners | NotFound
+    if isinstance(seen, Corners):
+        corners = seen
+    else:
+        check_image_size(eye, seen, label)
+        corners = corners_in(seen, target)
+        if isinstance(corners, NotFound):
+            cause = poor_image_reason(seen, MAX_BLUR_PX)
+            raise DataError(
+                f"{label}: target {target.name}: {corners.reason}{'; ' if cause else ''}{cause}.",
+                culprits=[label],
+            )
     positions = corner_positions(target)
     ids = corners.ids
     if len(ids) and not (int(ids.min()) >= 0 and int(ids.max()) < len(positions)):
@@ -146,18 +157,6 @@ def check_image_size(eye: CalibratedCamera, image: Image, label: str) -> None:
             if image.shape[:2] == (height, width)
             else "Take the image with the same camera, binning and region as calibrated.",
         )
-
-
-def _detected(eye: CalibratedCamera, image: Image, target: Target, label: str) -> Corners:
-    check_image_size(eye, image, label)
-    seen = corners_in(image, target)
-    if isinstance(seen, NotFound):
-        cause = poor_image_reason(image, MAX_BLUR_PX)
-        raise DataError(
-            f"{label}: target {target.name}: {seen.reason}{'; ' if cause else ''}{cause}.",
-            culprits=[label],
-        )
-    return seen
 
 
 def _fit_poses(

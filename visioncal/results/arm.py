@@ -174,13 +174,6 @@ class ArmResult(Section):
         return next(level for level in self.levels if level.level == self.level)
 
     @cached_property
-    def map_places_m(self) -> FloatArray:
-        """(k, 3) positions of `workspace_map` in the base [m]."""
-        return np.array(
-            [(place.x_m, place.y_m, place.z_m) for place in self.workspace_map]
-        ).reshape(-1, 3)
-
-    @cached_property
     def map_sigmas_mm(self) -> FloatArray:
         """(k,) predicted standard deviations there [mm]."""
         return np.array([place.sigma_mm for place in self.workspace_map])

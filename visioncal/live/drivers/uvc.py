@@ -31,8 +31,29 @@ class UvcCamera(stream.StreamingCamera):
         name = f"camera {without_password(str(source))}"
         capture = _open_capture(source, name, requested)
         closing.callback(capture.release)
-        settings = _configure(capture, requested)
-        return name, _arrivals(capture, 1e-6 * (requested.exposure_us or 0)), settings
+        if requested.resolution is not None:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, requested.resolution[0])
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, requested.resolution[1])
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        capture.set(cv2.CAP_PROP_AUTOFOCUS, 0)
+        if requested.focus is not None:
+            capture.set(cv2.CAP_PROP_FOCUS, requested.focus)
+        if requested.exposure_us is not None:
+            # V4L2's value for manual exposure, and its unit of 0.1 ms.
+            capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1.0)
+            capture.set(cv2.CAP_PROP_EXPOSURE, round(1e-6 * requested.exposure_us / 1e-4))
+        if requested.gain is not None:
+            capture.set(cv2.CAP_PROP_GAIN, requested.gain)
+        values = {
+            "exposure": capture.get(cv2.CAP_PROP_EXPOSURE),
+            "auto_exposure": capture.get(cv2.CAP_PROP_AUTO_EXPOSURE),
+            "focus": capture.get(cv2.CAP_PROP_FOCUS),
+            "gain": capture.get(cv2.CAP_PROP_GAIN),
+            "rate_hz": capture.get(cv2.CAP_PROP_FPS),
+        }
+        # OpenCV returns 0 or -1 for settings that the camera does not have.
+        settings = {key: value for key, value in values.items() if 0.0 < value < math.inf}
+        return name, _arrivals(capture, 1e-6 * (requested.exposure_us or 0)), {**settings}
 
 
 def _arrivals(capture: cv2.VideoCapture, exposure_s: float) -> Iterator[stream.Arrival]:
@@ -104,29 +125,3 @@ def _open_capture(source: int | str, name: str, requested: DeviceSetup) -> cv2.V
         capture.release()
         raise stream.camera_error(name, why, step)
     return capture
-
-
-def _configure(capture: cv2.VideoCapture, requested: DeviceSetup) -> dict[str, str | float]:
-    """Sets what is requested, disables autofocus, and reads back the settings."""
-    if requested.resolution is not None:
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, requested.resolution[0])
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, requested.resolution[1])
-    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-    capture.set(cv2.CAP_PROP_AUTOFOCUS, 0)
-    if requested.focus is not None:
-        capture.set(cv2.CAP_PROP_FOCUS, requested.focus)
-    if requested.exposure_us is not None:
-        # V4L2's value for manual exposure, and its unit of 0.1 ms.
-        capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1.0)
-        capture.set(cv2.CAP_PROP_EXPOSURE, round(1e-6 * requested.exposure_us / 1e-4))
-    if requested.gain is not None:
-        capture.set(cv2.CAP_PROP_GAIN, requested.gain)
-    values = {
-        "exposure": capture.get(cv2.CAP_PROP_EXPOSURE),
-        "auto_exposure": capture.get(cv2.CAP_PROP_AUTO_EXPOSURE),
-        "focus": capture.get(cv2.CAP_PROP_FOCUS),
-        "gain": capture.get(cv2.CAP_PROP_GAIN),
-        "rate_hz": capture.get(cv2.CAP_PROP_FPS),
-    }
-    # OpenCV returns 0 or -1 for settings that the camera does not have.
-    return {name: value for name, value in values.items() if math.isfinite(value) and value > 0.0}

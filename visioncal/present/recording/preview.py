@@ -72,8 +72,17 @@ def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None)
     It has two timelines: one step per stop, and the arm's path in small steps. The blueprint is the
     viewer's layout of it.
     """
-    path_q, reached = _path(preview)
-    states = states_of(preview.robot, path_q)
+    first = preview.stops[0]
+    # Postures on the path [rad], and the indices of the stops among them.
+    postures, reached = [[*first.via, first.q][0]], list[int]()
+    for stop in preview.stops:
+        for begin, end in pairwise([postures[-1], *stop.via, stop.q]):
+            # Postures in between turn joints by 0.05 rad at most.
+            count = int(np.ceil(np.abs(end - begin).max() / 0.05))
+            shares = np.arange(1, count + 1) / count
+            postures += [begin + share * (end - begin) for share in shares]
+        reached.append(len(postures) - 1)
+    states = states_of(preview.robot, np.array(postures))
     way = Scene.planned(preview.robot, states, preview.size_m, preview)
     steps = dict(zip((stop.view for stop in preview.stops), reached, strict=True))
     stops = {view: states[step] for view, step in steps.items()}
@@ -95,21 +104,8 @@ def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None)
         stream.log(paths.WAY, rr.CoordinateFrame(paths.BASE_FRAME), line, static=True)
         scene.log_views(stream, {view: row for row, view in enumerate(steps)})
         way.log_views(stream, {step: step for step in states}, paths.WAY_TIMELINE)
-        _log_stops(stream, preview, [*reached])
+        _log_stops(stream, preview, reached)
         recorder.keep()
-
-
-def _path(preview: Preview) -> tuple[FloatArray, list[int]]:
-    """Postures (m, n) on the path [rad], and the indices of the stops among them."""
-    first = preview.stops[0]
-    path, reached = [[*first.via, first.q][0]], []
-    for stop in preview.stops:
-        for begin, end in pairwise([path[-1], *stop.via, stop.q]):
-            # Postures in between turn joints by 0.05 rad at most.
-            count = int(np.ceil(np.abs(end - begin).max() / 0.05))
-            path += [begin + share * (end - begin) for share in np.arange(1, count + 1) / count]
-        reached.append(len(path) - 1)
-    return np.array(path), reached
 
 
 def _log_stops(stream: rr.RecordingStream, preview: Preview, steps: Sequence[int]) -> None:

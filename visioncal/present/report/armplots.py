@@ -85,7 +85,8 @@ def workspace(
     labels = ("base x [m]", "base y [m]")
     labels = labels if side == "top" else ("distance from the base's axis [m]", "base z [m]")
     axes.set(xlabel=labels[0], ylabel=labels[1], aspect="equal")
-    places, sigmas_mm = seen(arm.map_places_m)[order], arm.map_sigmas_mm[order]
+    places_m = np.array([(place.x_m, place.y_m, place.z_m) for place in arm.workspace_map])
+    places, sigmas_mm = seen(places_m)[order], arm.map_sigmas_mm[order]
     shown = scattered(axes, places, sigmas_mm, vmin=low, vmax=high, s=26.0)
     axes.plot(stops[:, 0], stops[:, 1], "x", color=INK, markersize=4.5)
     axes.plot([0.0], [0.0], "s", color=INK, markersize=6.0)
