@@ -236,6 +236,61 @@ def unnamed_angles(folder):
     write(folder / "poses.csv", "\n".join(["image,e1,e2,e3,e4,e5,e6", *lines]))
 
 
+def program_beside(folder):
+    """A table and the robot's program with the same poses, rounded."""
+    krl(folder)
+    shoot(folder, "{:02d}.png")
+    rows = ["Foto;X [mm];Y [mm];Z [mm];A;B;C"]
+    for at, pose in enumerate(world()[0]):
+        angles = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX", degrees=True)
+        rows.append(
+            f"{at:02d};" + ";".join(f"{float(n)!r}" for n in [*(1e3 * pose[:3, 3]), *angles])
+        )
+    write(folder / "Positionen.csv", "\n".join(rows))
+
+
+def times_and_names(folder):
+    """Two columns that name the same images, and a rotation before its position."""
+    shoot(folder / "rgb", "17{}.250000.png")
+    rows = ["stem,file,winkel_x,winkel_y,winkel_z,ort_x,ort_y,ort_z"]
+    for at, pose in enumerate(world()[0]):
+        angles = Rotation.from_matrix(pose[:3, :3]).as_euler("XYZ")
+        numbers = ",".join(f"{float(number)!r}" for number in [*angles, *pose[:3, 3]])
+        rows.append(f"17{at}.250000,C:\\shots\\17{at}.250000.png,{numbers}")
+    write(folder / "poses.csv", "\n".join(rows))
+
+
+def failed_rows(folder):
+    """Vectors of six, some of which failed, beside joints of different counts."""
+    shoot(folder / "shots", "{}.png")
+    log = [
+        {
+            "img": f"shots/{at}.png",
+            "tcp": [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_rotvec()],
+            "joints": [0.5] * (6 + at % 2),
+            "force": [0.1, 0.2, 9.8],
+        }
+        for at, pose in enumerate(world()[0])
+    ]
+    failed = {"img": None, "tcp": "n/a", "joints": None, "force": None}
+    write(folder / "log.json", [*log[:3], failed, *log[3:]])
+
+
+def two_of_a_language(folder):
+    """The robot's and the board's poses, named in German, and images of another machine."""
+    poses, _, session = world()
+    shoot(folder / "bilder", "{}.png")
+    rows = [
+        {
+            "datei": f"D:\\messung\\{at}.png",
+            "tafel_in_kamera": session.views[at].cam_from_target().as_matrix().tolist(),
+            "flansch_in_basis": pose.tolist(),
+        }
+        for at, pose in enumerate(poses)
+    ]
+    write(folder / "projekt.json", {"messungen": rows})
+
+
 def old_results(folder):
     """A result and a first guess beside the poses, and a row that failed."""
     shoot(folder, "{}.png")
@@ -250,7 +305,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     for make in (
         stems_with_depth, two_folders, array, sixes, opencv_each, nested, mappings, blanks,
         inverted, krl, fanuc, rapid, other_language, parallel, printed, messages, unnamed_angles,
-        old_results,
+        program_beside, times_and_names, failed_rows, two_of_a_language, old_results,
     )
 }  # fmt: skip
 

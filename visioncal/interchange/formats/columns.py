@@ -242,21 +242,21 @@ def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[s
     usual = (name for name in _IMAGE_NAMES if any(map(is_image_name, free.get(name, ()))))
     if name := next(usual, ""):
         return name
-    files = (file for group in groups for file in group.files)
-    image_names = {name for file in files for name in (file.name, file.stem)}
-    naming = [
-        name
+    files = [file for group in groups for file in group.files]
+    named = {file.stem: file for file in files} | {file.name: file for file in files}
+    naming = {
+        name: tuple(named.get(cell.replace("\\", "/").rpartition("/")[2]) for cell in cells)
         for name, cells in free.items()
-        if any(cells)
-        and all(not cell or is_image_name(cell) or cell in image_names for cell in cells)
-    ]
-    if len(naming) > 1:
+        if any(cells) and all(not cell or is_image_name(cell) or cell in named for cell in cells)
+    }
+    # Several columns may name the same images.
+    if len({*naming.values()}) > 1:
         raise DataError(
-            f"{fields.name}: {some_of(naming)} name images; one of them is needed.",
-            culprits=naming,
+            f"{fields.name}: {some_of([*naming])} name images; one of them is needed.",
+            culprits=[*naming],
             next_step=f"Say which with --image-{named_by(fields.places[0]).rstrip('s')}.",
         )
-    return next(iter(naming), "")
+    return max(naming, key=lambda name: is_image_name(free[name][0]), default="")
 
 
 def _recognises(path: Path, *, series: bool) -> bool:

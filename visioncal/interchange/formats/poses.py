@@ -27,14 +27,44 @@ _UNIT = re.compile(
     rf"|(?<=_)({'|'.join([*UNITS_M, *_ANGLES])}))",
     re.IGNORECASE,
 )
-_POSITION_WORDS = {"translation", "position", "pos", "tvec", "tvecs", "trans", "xyz", "t"}
+_POSITION_WORDS = {
+    "translation",
+    "position",
+    "pos",
+    "ort",
+    "posición",
+    "tvec",
+    "tvecs",
+    "trans",
+    "xyz",
+    "t",
+}
 _ROTATION_WORDS = {"rotation", "orientation", "quaternion", "quat", "rotvec", "rot", "r", "ori"}
+_ROTATION_WORDS |= {"winkel", "drehung", "angle", "ángulo", "giro", "rotación"}
 _ROTATION_WORDS |= {"rvec", "rvecs", "rpy", "euler", "vector", "matrix", "xyzw", "wxyz"}
 _POSE_WORDS = {"pose", "poses", "transform", "transforms", "t", "h", "matrix"}
 # Words of the parent frame and of the child frame, for the robot and for the camera.
 _FRAMES = {
-    "robot": ({"base", "world", "root"}, {"gripper", "flange", "ee", "tcp", "tool", "hand", "tip"}),
-    "camera": ({"cam", "camera", "eye", "sensor"}, {"target", "board", "marker", "tag", "object"}),
+    "robot": (
+        {"base", "world", "root", "basis", "sockel", "welt", "基座"},
+        {"gripper", "flange", "ee", "tcp", "tool", "hand", "tip", "flansch", "greifer", "werkzeug"}
+        | {"brida", "pinza", "herramienta", "bride", "outil", "法兰", "末端"},
+    ),
+    "camera": (
+        {"cam", "camera", "eye", "sensor", "kamera", "cámara", "camara", "caméra", "相机"},
+        {
+            "target",
+            "board",
+            "marker",
+            "tag",
+            "object",
+            "tafel",
+            "brett",
+            "tablero",
+            "mire",
+            "标定板",
+        },
+    ),
 }
 _SIDE_WORDS = {
     "robot": {"robot", "arm", "effector", "eef", "endeffector", "manipulator"},
@@ -43,7 +73,9 @@ _SIDE_WORDS = {
 # With these words between two frames the child is named first; otherwise second.
 _CHILD_FIRST = {"2", "to", "in", "wrt"}
 # Numbers of poses' sizes that are none, and poses that were not reached but asked for.
-_NO_POSE = re.compile(r"joint|axis|axes|angles|wrench|force|torque|twist|vel|effort|corner|intrins")
+_NO_POSE = re.compile(
+    r"joint|axis|axes|angles|wrench|speed|force|torque|twist|vel|effort|corner|intrins"
+)
 _ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "init", "ref", "guess"}
 # Columns that count or time rows.
 _COUNTED = {"view", "index", "id", "nr", "no", "t", "time", "timestamp", "stamp", "stamp_s"}
@@ -104,7 +136,8 @@ def possible_poses(fields: Fields, taken: Collection[str] = ()) -> list[PoseFiel
     rotations: dict[tuple[str, ...], list[tuple[int, tuple[str, ...]]]] = defaultdict(list)
     for names, words, size, look in (*_arrays(fields, taken), *_numbers(fields, taken)):
         rest = tuple(word for word in words if word not in _POSITION_WORDS | _ROTATION_WORDS)
-        is_named = {*words} & (_POSE_WORDS | _CHILD_FIRST) and not _NO_POSE.search(names[0].lower())
+        named = _POSE_WORDS | _CHILD_FIRST | _FRAMES["robot"][1]
+        is_named = {*words} & named and not _NO_POSE.search(names[0].lower())
         if look in ("rotation", "quaternion") or (size == 3 and _ROTATION_WORDS & {*words}):
             rotations[rest].append((size, names))
         elif size == 3 and _POSITION_WORDS & {*words}:
@@ -248,7 +281,7 @@ _JOINT_NAME = re.compile(
     re.IGNORECASE,
 )
 
-_ROTATION_NAME = re.compile(r"rvec|rot|quat|orient|rpy|euler|(^|\.)R(_|$)")
+_ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)R(_|$)")
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
 
 

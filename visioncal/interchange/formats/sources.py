@@ -182,8 +182,11 @@ def rows_in(source: Source, requested: ImportOptions) -> Fields:
     given = (*requested.robot.names, *requested.camera.names, *requested.joints)
     joined = _joined(source)
     usable = [fields for fields in joined if _has(fields, given) and _robot_fields(fields, given)]
+    # A robot's program beside a table has the same poses once more.
+    tables = [f for f in usable if not f.form]
     named = [f for f in usable if "pose" in f.name.lower() or "robot" in f.name.lower()]
-    chosen = next((group[0] for group in (joined, usable, named) if len(group) == 1), None)
+    groups = (joined, usable, tables, named)
+    chosen = next((group[0] for group in groups if len(group) == 1), None)
     if chosen is not None:
         return chosen
     faults = [part.fault for part in source.parts if part.fault and not part.lenses]
@@ -232,7 +235,7 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
 def _joined(source: Source) -> list[Fields]:
     """Rows of the parts, those that belong together joined: by numbers, names, or their count."""
     keyed: dict[bool, list[tuple[Part, Fields, Sequence[int | str]]]] = defaultdict(list)
-    counts: dict[int, list[tuple[Part, Fields]]] = defaultdict(list)
+    counts: dict[tuple[int, str], list[tuple[Part, Fields]]] = defaultdict(list)
     for part in source.parts:
         fields = part.fields
         if fields is None or (part.lenses and len(part.group.files) == 1 and not _holds(fields)):
@@ -240,7 +243,7 @@ def _joined(source: Source) -> list[Fields]:
         if fields.stems:
             keyed[bool(fields.views)].append((part, fields, fields.views or fields.stems))
         else:
-            counts[len(fields)].append((part, fields))
+            counts[len(fields), fields.form].append((part, fields))
     found = [_by_keys(source.path, parts) for parts in keyed.values()]
     found += [_by_rows(source.path, parts) for parts in counts.values()]
     holding = [fields for fields in found if _holds(fields)]
