@@ -89,7 +89,7 @@ def foreign_from(
     names = _pose_fields(fields, requested, unnamed)
     used = {name for of_side in names.values() for name in of_side}
     joint_fields = requested.joints or joint_names(fields, used)
-    if joint_fields and not (images or requested.images):
+    if joint_fields and fields.is_joined and not (images or requested.images):
         names = _seen_by_camera(fields, requested, names)
     used.update(map(fields.find, joint_fields))
     if not names["robot"] and not joint_fields:
@@ -173,7 +173,7 @@ def _further(
 def _seen_by_camera(
     fields: Fields, requested: ImportOptions, names: dict[Side, tuple[str, ...]]
 ) -> dict[Side, tuple[str, ...]]:
-    """The fields of poses beside joint angles: the target's where nothing else was seen."""
+    """The fields of poses in a file beside joint angles: the target's, as nothing else was seen."""
     is_said = bool(requested.robot.names) or any(
         item.names == names["robot"] and item.sides for item in possible_poses(fields)
     )

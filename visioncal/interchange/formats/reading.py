@@ -51,6 +51,7 @@ class Fields:
     stems: tuple[str, ...] = ()  # (n,) names of the rows' files without their ending.
     # Error messages of fields whose rows differ in shape, by name.
     shape_errors: Mapping[str, str] = field(default_factory=dict)
+    is_joined: bool = False  # Whether the rows are of several files.
     form: str = ""  # A name among `POSE_FORMS` where the rows state the form of the robot's poses.
 
     def __len__(self) -> int:

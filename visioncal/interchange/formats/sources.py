@@ -134,7 +134,7 @@ def _array(fields: Fields) -> FloatArray | None:
     if [*fields.numbers] == ["matrix"]:
         return fields.numbers["matrix"]
     names = [str(at) for at in range(1, len(fields.numbers) + 1)]
-    is_unnamed = [*fields.numbers] == names and len(fields.numbers) == len(fields.texts)
+    is_unnamed = bool(names) and [*fields.numbers] == names == [*fields.texts]
     return np.stack([*fields.numbers.values()], axis=1) if is_unnamed else None
 
 
@@ -317,4 +317,6 @@ def _by_rows(path: Path, parts: Sequence[tuple[Part, Fields]]) -> Fields:
         ragged |= {f"{name}.{column}": fault for column, fault in fields.shape_errors.items()}
     names = [part.group.files[0].name for part, _ in parts]
     places = tuple(f"row {at + 1} of {' and '.join(names)}" for at in range(len(parts[0][1])))
-    return Fields(path.resolve().name, path, places, numbers, texts, shape_errors=ragged)
+    return Fields(
+        path.resolve().name, path, places, numbers, texts, shape_errors=ragged, is_joined=True
+    )
