@@ -96,6 +96,8 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("repeated_views", chance=FACT),
     Suspect("corner_numbers", chance=FACT),
     Suspect("other_board", _unseen, FACT, hides=("lost_views",)),
+    Suspect("mirrored_images", chance=FACT, hides=("lost_views",)),
+    Suspect("image_sizes", chance=FACT, hides=("lost_views",)),
     Suspect("other_lens", chance=FACT),
     Suspect("lost_views", chance=REMARK),
     *map(Suspect, ("remark", "unused")),
