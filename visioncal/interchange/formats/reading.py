@@ -470,7 +470,7 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
         ):
             for at, number in value.items():
                 rows[int(at)][name] = number
-        match = re.fullmatch(r"(.*?)[_-]?([0-9]{1,9})", name)
+        match = re.fullmatch(r"(.*?)[_-]?([0-9]{1,9})", str(name))
         # Columns of numbers may have names such as q1; a matrix is a list of lists.
         nested = isinstance(value, list) and bool(value) and isinstance(value[0], list)
         if match and (nested or isinstance(value, np.ndarray)):
