@@ -21,7 +21,7 @@ from visioncal.session import Session
 from visioncal.simulation import CellOptions, prepare_scene, read_truth, render, simulate
 from visioncal.simulation.arms import forward
 from visioncal.simulation.render import LiveView
-from visioncal.vision.boards.charuco import CHARUCO
+from visioncal.vision.boards import KINDS
 from visioncal.vision.boards.kind import DetectedCorners
 
 OPTIONS = ControllerOptions(seed=3)
@@ -97,7 +97,7 @@ def a_cell(**options):
 
 
 def errors_px(image, exact):
-    found = CHARUCO.search(image, TARGET)
+    found = KINDS["charuco"].search(image, TARGET)
     assert isinstance(found, DetectedCorners)
     ids, mine, theirs = np.intersect1d(found.ids, exact.ids, return_indices=True)
     assert len(ids) > 0.8 * len(exact.ids)

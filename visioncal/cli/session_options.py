@@ -279,7 +279,8 @@ class RecordOptions(PageOptions):
     robot: str | None = _record_cell("The robot's model: a built-in name, a .urdf or .toml.")
     mount: CameraMount | None = _record_cell("Where the camera is; by default eye-in-hand.")
     pose_form: str | None = _record_cell(
-        "How poses are written that are bare numbers.", metavar="|".join(("ours", *POSE_FORMS))
+        f"How poses are written that are bare numbers: {', '.join(('ours', *POSE_FORMS))}.",
+        metavar="kuka|abb|...",
     )
     frames: int = _taking("Frames a view.", default=3, min=1, max=100)
     still_px: float = _taking(
