@@ -407,10 +407,13 @@ def test_cases_of_the_field_come_in(tmp_path, name, target, words):
     assert words in done.good().err
 
 
-def test_a_board_that_is_not_seen_leaves_a_form_to_be_asked_for(tmp_path):
+def test_a_board_of_other_counts_is_named_before_the_form_is_asked_for(tmp_path):
     if not FIELD.is_dir():
         pytest.skip("the cases of the field are not here (../shared/data)")
     said = ("--target", "checkerboard_9x6_35mm", "--mount", "eye-in-hand")
     done = visioncal("convert", FIELD / "checkerboard-miscounted", tmp_path / "out", *said)
-    done.refused("the form of the robot's rotations is not said", "9 x 6", "--robot-form")
+    done.refused("11 x 8 inner corners", "9 x 6", "--target")
     assert not (tmp_path / "out").exists()
+    said = ("--target", "checkerboard_11x8_35mm", "--mount", "eye-in-hand")
+    done = visioncal("convert", FIELD / "checkerboard-miscounted", tmp_path / "out", *said)
+    assert "Euler angles" in done.good().err

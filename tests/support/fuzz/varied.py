@@ -296,7 +296,8 @@ def _run(done: Walk, command: str, *arguments: object) -> str:
     """Runs a command; what it said, empty where there is no result. A check that says no is one."""
     with _noted(done, command):
         end = visioncal(command, *arguments)
-        done.steps.append((command, end.status, end.err))
+        # A check says no on standard output.
+        done.steps.append((command, end.status, end.said if end.status == 3 else end.err))
         return end.said or " " if end.status in (0, 3) else ""
     return ""
 

@@ -20,6 +20,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.clocks import waits_for_clock
+from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.errors import DataError, VisioncalError
@@ -101,7 +102,8 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     """Finds what a source does not say of its poses by what agrees with its images or target poses.
 
     Raises:
-        DataError: A form of rotations is not said, and nothing tells it.
+        DataError: A form of rotations is not said, and nothing tells it; or the images show another
+            board than declared.
     """
     unstated = frozenset[str]().union(*foreign.unstated.values())
     if not unstated - {"inverse"} or foreign.mount is None or foreign.stream is not None:
@@ -118,6 +120,15 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
             break
         try:
             guess = DoubtfulSession.of(rows_of(seen, rows[evenly(len(rows), most)])).guess(progress)
+        except OtherBoardError as error:
+            if error.finding and error.finding.kind == "other_board":
+                raise DataError(
+                    error.message,
+                    culprits=["--target"],
+                    next_step="Name this board with --target, by its kind, its columns x rows and "
+                    "the measured side (as checkerboard_9x6_25mm), or by its .toml.",
+                ) from error
+            why = error.message.rstrip(".")
         except VisioncalError as error:
             why = error.message.rstrip(".")
             continue
