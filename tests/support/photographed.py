@@ -49,7 +49,9 @@ def print_of(kind: str, rng: np.random.Generator, *, first: int | None = None) -
         ids = np.arange(columns * rows, dtype=np.int32) + first
         board = cv2.aruco.GridBoard((columns, rows), 1.0, gap, dictionary_of(name), ids)
         sides = np.array([columns, rows]) * (1.0 + gap) - gap
-        drawn = board.generateImage(np.rint(_UNIT * sides).astype(int).tolist())
+        # A margin takes what rounding adds to the last marker.
+        size = np.rint(_UNIT * sides).astype(int) + 2
+        drawn = board.generateImage(size.tolist(), marginSize=1)[1:-1, 1:-1]
         said |= {"columns": columns, "rows": rows, "first_id": first, "family": family}
         said |= {"spacing": gap}
     elif kind == "checkerboard":

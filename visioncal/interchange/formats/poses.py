@@ -129,8 +129,13 @@ class PoseFields:
         return (frames[0] in child) != bool({*self.words} & _CHILD_FIRST)
 
 
-def possible_poses(fields: Fields, taken: Collection[str] = ()) -> list[PoseFields]:
-    """All fields that may hold poses, by what the numbers look like and what they are called."""
+def possible_poses(
+    fields: Fields, taken: Collection[str] = (), *, by_shape: bool = True
+) -> list[PoseFields]:
+    """All fields that may hold poses, by what the numbers look like and what they are called.
+
+    Where no name says it, those of a pose's shape, unless `by_shape` is false.
+    """
     found: list[PoseFields] = []
     positions: dict[tuple[str, ...], tuple[str, ...]] = {}
     rotations: dict[tuple[str, ...], list[tuple[int, tuple[str, ...]]]] = defaultdict(list)
@@ -148,7 +153,7 @@ def possible_poses(fields: Fields, taken: Collection[str] = ()) -> list[PoseFiel
     # ambiguous is taken: a matrix, then a quaternion.
     both = ((rest, names) for rest, names in positions.items() if rotations[rest])
     found += [PoseFields((*names, *max(rotations[rest])[1]), rest) for rest, names in both]
-    return found or [*_by_shape(fields, taken)]
+    return found or ([*_by_shape(fields, taken)] if by_shape else [])
 
 
 def _by_shape(fields: Fields, taken: Collection[str]) -> Iterator[PoseFields]:
@@ -228,6 +233,8 @@ def pose_names(
     unnamed: tuple[str, ...],
     whose: str,
     taken: Collection[str],
+    *,
+    by_shape: bool = True,
 ) -> tuple[str, ...]:
     """Full names of the fields with the poses of the `robot` or `camera`; empty where none fit.
 
@@ -244,7 +251,7 @@ def pose_names(
         return held or tuple(fields.find(name) for name in given)
     if unnamed:
         return () if set(unnamed) & set(taken) else unnamed
-    possible = possible_poses(fields, taken)
+    possible = possible_poses(fields, taken, by_shape=by_shape)
     # OpenCV's names of a board's pose.
     seen = [item for item in possible if not item.sides and _is_opencv(item)]
     plain = [item for item in possible if not item.sides and item not in seen]

@@ -48,7 +48,8 @@ def read_touches(
         return touches_of(Session.load(path), robot)
     given, joints_rad = requested.robot, None
     fields = _of_robot(read_fields(path, given.form or given.usual), robot)
-    named = pose_names(fields, given.names, unnamed_columns(fields)["robot"], "robot", ())
+    unnamed = unnamed_columns(fields)["robot"]
+    named = pose_names(fields, given.names, unnamed, "robot", (), by_shape=False)
     if positions and (not named or (given.names and len(named) == 3)):
         maker = POSE_FORMS.get(given.form or "")
         unit = given.unit or (maker.unit if maker else None)
@@ -82,7 +83,9 @@ def read_typed(path: Path, given: PoseImportOptions) -> tuple[tuple[str, ...], P
         DataError: The table cannot be read, or its poses are in another form.
     """
     fields = read_fields(path, given.form or given.usual)
-    names = pose_names(fields, (), unnamed_columns(fields)["robot"], "robot", ())
+    # A robot moves to these: their names must say what they are.
+    unnamed = unnamed_columns(fields)["robot"]
+    names = pose_names(fields, (), unnamed, "robot", (), by_shape=False)
     is_ours = not names or names == POSE
     return None if is_ours else (names, poses_from(fields, names, given, "robot")[0])
 
