@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import socket
+import struct
 import urllib.request
 from contextlib import suppress
 from pathlib import Path
@@ -360,6 +361,21 @@ def test_no_message_of_a_browser_ends_in_a_traceback(local, browser):
         )
         assert "Traceback" not in process.said(), process.said()[-3000:]
         sync_api.expect(page.get_by_text("Start", exact=True)).to_be_visible()
+
+
+def test_a_request_whose_sender_is_gone_ends_in_no_traceback(local):
+    url, process = local
+    host, _, port = url.split("/")[2].rpartition(":")
+    for path in (SOCKET.replace("websocket", "polling"), "/", "/live.jpg", "/view/1"):
+        for method in (b"GET", b"POST"):
+            request = request_of(url, path, Content_Length="40").replace(b"GET", method, 1)
+            for _ in range(5):
+                with socket.create_connection((host, int(port)), timeout=10.0) as link:
+                    link.sendall(request)
+                    # Closed with a reset, as by a process that was killed.
+                    link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    assert answered(url, request_of(url)) == 200
+    assert "Traceback" not in process.said(), process.said()[-3000:]
 
 
 def test_silent_connections_take_no_place_for_long(local):

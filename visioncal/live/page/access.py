@@ -114,8 +114,8 @@ class Admission:
             if refused is None:
                 try:
                     await asgi(scope, heard, send)
-                except RuntimeError:
-                    # Starlette's, where nobody waits for the answer any more.
+                except (RuntimeError, KeyError):
+                    # Of Starlette and Engine.IO, where nobody waits for the answer any more.
                     if not is_gone:
                         raise
             elif kind == "websocket":
