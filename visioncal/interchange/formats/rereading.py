@@ -28,6 +28,7 @@ from visioncal.core.files import read_text_inside, read_toml
 from visioncal.core.number_format import ranges
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import MOUNTS, FloatArray, Progress
+from visioncal.core.verdict import Finding
 from visioncal.estimation.clock_correlation import evenly
 from visioncal.interchange.formats.assemble import assemble, pose_cells, with_observations_only
 from visioncal.interchange.formats.foreign import ForeignRecording, rows_of
@@ -115,27 +116,20 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     elif seen.camera is not None:
         here &= seen.camera.present
     rows, why = np.flatnonzero(here), "too few rows have a pose and what the camera saw"
+    other: Finding | None = None
     for least, most in pairwise((FEWEST_ROWS - 1, *_TESTED)):
         if len(rows) <= least:
             break
         try:
             guess = DoubtfulSession.of(rows_of(seen, rows[evenly(len(rows), most)])).guess(progress)
-        except OtherBoardError as error:
-            if error.finding and error.finding.kind == "other_board":
-                raise DataError(
-                    error.message,
-                    culprits=["--target"],
-                    next_step="Name this board with --target, by its kind, its columns x rows and "
-                    "the measured side (as checkerboard_9x6_25mm), or by its .toml.",
-                ) from error
-            why = error.message.rstrip(".")
         except VisioncalError as error:
+            other = error.finding if isinstance(error, OtherBoardError) else None
             why = error.message.rstrip(".")
             continue
         if guess.stands_out or guess.declared.fit.closes:
             return _applied(foreign, guess, is_measured=bool(seen.images))
         why = guess.sentence.rstrip(".")
-    return _untested(foreign, why)
+    return _untested(foreign, why, other)
 
 
 def _applied(foreign: ForeignRecording, guess: Guess, *, is_measured: bool) -> ForeignRecording:
@@ -174,9 +168,21 @@ def _applied(foreign: ForeignRecording, guess: Guess, *, is_measured: bool) -> F
     return replace(foreign, robot=robot, camera=camera, notes=(*kept, *notes), unstated={})
 
 
-def _untested(foreign: ForeignRecording, why: str) -> ForeignRecording:
-    """Asks for a form of rotations that nothing tells; else notes that nothing was tested."""
+def _untested(
+    foreign: ForeignRecording, why: str, other: Finding | None = None
+) -> ForeignRecording:
+    """Asks for a form of rotations that nothing tells, or for the `other` board that would.
+
+    Else notes that nothing was tested.
+    """
     for whose, free in foreign.unstated.items():
+        if "rotation" in free and other is not None and other.kind == "other_board":
+            raise DataError(
+                other.words,
+                culprits=["--target"],
+                next_step="Name this board with --target, by its kind, its columns x rows and the "
+                "measured side (as checkerboard_9x6_25mm), or by its .toml.",
+            )
         if "rotation" in free:
             numbers = foreign.robot if whose == "robot" else foreign.camera
             size = 0 if numbers is None else numbers.rotations.shape[1]
