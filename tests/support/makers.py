@@ -5,28 +5,25 @@ import re
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+
+def _euler(order, *, degrees=True):
+    """A rotation from and to angles; capitals turn about moving axes."""
+    return (
+        lambda angles: Rotation.from_euler(order, angles, degrees=degrees),
+        lambda turn: turn.as_euler(order, degrees=degrees),
+    )
+
+
 # By maker: the names of a pose's numbers, and its rotation from and to the last of them. Positions
 # are in millimetres, but for those of METRES.
 MAKERS = {
     # p[x, y, z, rx, ry, rz]: a rotation vector in radians (Script manual).
     "ur": ("x,y,z,rx,ry,rz", Rotation.from_rotvec, Rotation.as_rotvec),
     # A about z, B about the new y, C about the new x (System variables, FRAME).
-    "kuka": (
-        "X,Y,Z,A,B,C",
-        lambda abc: Rotation.from_euler("ZYX", abc, degrees=True),
-        lambda turn: turn.as_euler("ZYX", degrees=True),
-    ),
+    "kuka": ("X,Y,Z,A,B,C", *_euler("ZYX")),
     # W, P, R about the fixed x, y, z.
-    "fanuc": (
-        "X,Y,Z,W,P,R",
-        lambda wpr: Rotation.from_euler("xyz", wpr, degrees=True),
-        lambda turn: turn.as_euler("xyz", degrees=True),
-    ),
-    "yaskawa": (
-        "X,Y,Z,Rx,Ry,Rz",
-        lambda angles: Rotation.from_euler("xyz", angles, degrees=True),
-        lambda turn: turn.as_euler("xyz", degrees=True),
-    ),
+    "fanuc": ("X,Y,Z,W,P,R", *_euler("xyz")),
+    "yaskawa": ("X,Y,Z,Rx,Ry,Rz", *_euler("xyz")),
     # orient: q1 is the scalar (RAPID, data types).
     "abb": (
         "X,Y,Z,q1,q2,q3,q4",
@@ -34,53 +31,21 @@ MAKERS = {
         lambda turn: turn.as_quat(scalar_first=True, canonical=True),
     ),
     # About the moving x, y, z (VAL 3, trsf).
-    "staubli": (
-        "X,Y,Z,Rx,Ry,Rz",
-        lambda angles: Rotation.from_euler("XYZ", angles, degrees=True),
-        lambda turn: turn.as_euler("XYZ", degrees=True),
-    ),
+    "staubli": ("X,Y,Z,Rx,Ry,Rz", *_euler("XYZ")),
     # About the moving z, y, z (DRL, posx).
-    "doosan": (
-        "X,Y,Z,A,B,C",
-        lambda abc: Rotation.from_euler("ZYZ", abc, degrees=True),
-        lambda turn: turn.as_euler("ZYZ", degrees=True),
-    ),
+    "doosan": ("X,Y,Z,A,B,C", *_euler("ZYZ")),
     # Roll, pitch, yaw about the fixed x, y, z (xArm user manual, terms and definitions).
-    "xarm": (
-        "X,Y,Z,roll,pitch,yaw",
-        lambda rpy: Rotation.from_euler("xyz", rpy, degrees=True),
-        lambda turn: turn.as_euler("xyz", degrees=True),
-    ),
+    "xarm": ("X,Y,Z,roll,pitch,yaw", *_euler("xyz")),
     # Intrinsic XYZ (mecademicpy, MovePose).
-    "mecademic": (
-        "X,Y,Z,alpha,beta,gamma",
-        lambda angles: Rotation.from_euler("XYZ", angles, degrees=True),
-        lambda turn: turn.as_euler("XYZ", degrees=True),
-    ),
+    "mecademic": ("X,Y,Z,alpha,beta,gamma", *_euler("XYZ")),
     # O about z, A about the new y, T about the new z (rc_visard manual, pose formats).
-    "kawasaki": (
-        "X,Y,Z,O,A,T",
-        lambda oat: Rotation.from_euler("ZYZ", oat, degrees=True),
-        lambda turn: turn.as_euler("ZYZ", degrees=True),
-    ),
+    "kawasaki": ("X,Y,Z,O,A,T", *_euler("ZYZ")),
     # eDO_core, vZYZm.
-    "comau": (
-        "X,Y,Z,A,E,R",
-        lambda aer: Rotation.from_euler("ZYZ", aer, degrees=True),
-        lambda turn: turn.as_euler("ZYZ", degrees=True),
-    ),
+    "comau": ("X,Y,Z,A,E,R", *_euler("ZYZ")),
     # Roll, pitch, yaw, intrinsic ZYX [rad and m] (SDK FAQ).
-    "realman": (
-        "x,y,z,rx,ry,rz",
-        lambda angles: Rotation.from_euler("xyz", angles),
-        lambda turn: turn.as_euler("xyz"),
-    ),
+    "realman": ("x,y,z,rx,ry,rz", *_euler("xyz", degrees=False)),
     # setRPY of Rx, Ry, Rz (tmr_ros1).
-    "techman": (
-        "X,Y,Z,Rx,Ry,Rz",
-        lambda angles: Rotation.from_euler("xyz", angles, degrees=True),
-        lambda turn: turn.as_euler("xyz", degrees=True),
-    ),
+    "techman": ("X,Y,Z,Rx,Ry,Rz", *_euler("xyz")),
 }
 # Of these, those in metres and radians.
 METRES = ("ur", "realman")

@@ -17,7 +17,7 @@ from visioncal.core.transforms import rotation_angle
 from visioncal.core.types import Image, Progress
 from visioncal.session import MemoryImages, Session
 from visioncal.vision.boards.identify import identify
-from visioncal.vision.boards.imaging import decode_image, encode_png, exif_turn
+from visioncal.vision.boards.imaging import decode_image, encode_png, exif_turn, grey_of
 
 # A half turn about the optical axis.
 _HALF = np.diag([-1.0, -1.0, 1.0])
@@ -51,7 +51,7 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
         mine = [view for view in present if session.board_of(view) == board]
         some = [images[view.image] for view in spread(mine) if view.image in images]
         try:
-            mirrored = identify([*map(_grey, some)], target).is_mirrored if some else False
+            mirrored = identify([*map(grey_of, some)], target).is_mirrored if some else False
         except DataError:
             mirrored = False
         for name in {view.image for view in mine if mirrored} & images.keys():
@@ -97,10 +97,6 @@ def _sized(image: Image, usual: tuple[int, int], data: bytes) -> tuple[Image, li
         scaled = np.asarray(cv2.resize(image, usual, interpolation=way), np.uint8)
         return scaled, [f"scaled from {size[0]} x {size[1]} px"]
     return image, []
-
-
-def _grey(image: Image) -> Image:
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def _with(session: Session, images: Mapping[str, Image], done: Mapping[str, list[str]]) -> Session:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import tomli_w
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Image, Target
@@ -167,8 +168,8 @@ def _remedy(
     declared, board = session.boards[name], identity.board
     share = declared.marker_m / declared.square_m
     if "kind" not in found and abs(board.marker_m - share) < 0.06:
-        figures = [f"{key} = {_toml(value)}" for key, value in found.items()]
-        words, command = board_correction(session, name, " and ".join(figures))
+        figures = " and ".join(tomli_w.dumps(found).splitlines())
+        words, command = board_correction(session, name, figures)
         return Remedy(f"{words[0].upper()}{words[1:]}, or name another target.", command)
     side, mm = kind_of(board).side, f"{1e3 * declared.square_m:g}"
     images = " ".join(f"SESSION/{shlex.quote(view.image)}" for view, _ in looked)
@@ -178,12 +179,6 @@ def _remedy(
         f'command. In session.toml, write {key} = "seen.toml", which it makes.',
         f"visioncal target check {images} --square-mm {mm} -o SESSION/seen.toml",
     )
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, str):
-        return f'"{value}"'
-    return str(value).lower()
 
 
 def board_correction(session: Session | None, board: str, figures: str) -> tuple[str, str]:

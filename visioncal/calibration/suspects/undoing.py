@@ -178,8 +178,9 @@ def likeliest(run: RunState) -> Undoing | None:
     declared = _Edges.by(record, own, fresh)
     if declared is None:
         return None
-    agrees = _evidence(declared.of(own)[None])[1]
-    if agrees.all() and declared.of(own).mean() < CLOSING_SCORE**2:
+    squares = declared.of(own)
+    agrees = _evidence(squares[None])[1]
+    if agrees.all() and squares.mean() < CLOSING_SCORE**2:
         return None
     pairs = {by: record.paired(shifted(by, len(record.views))) for by in _SHIFTS}
     every = [declared]
@@ -222,7 +223,7 @@ def _copied(record: _Record, edges: _Edges, own: IntArray, agrees: Mask) -> Iter
 def _turned(record: _Record, edges: _Edges, own: IntArray, base: float) -> Iterator[Undoing]:
     """Boards that were read as if they were turned in their plane."""
     known = np.flatnonzero(own >= 0)
-    turned = edges.turned(own)
+    turned, apart = edges.turned(own), edges.of(own)
     for degrees in (180.0, 90.0, 270.0):
         angle = np.deg2rad(degrees)
         turn = exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))[:3, :3]
@@ -231,7 +232,7 @@ def _turned(record: _Record, edges: _Edges, own: IntArray, base: float) -> Itera
             continue
         middle = np.median(turned[near, :2, 3], axis=0)
         whole = compose(turn, np.array([*middle, 0.0]))
-        squares = edges.of(own)
+        squares = apart.copy()
         squares[near] = edges.squares(invert(whole) @ turned[near])
         (there,), (agrees,) = _evidence(squares[None])
         wrong = near[agrees[near]]
@@ -262,10 +263,11 @@ def _shifted(
     """The likeliest row from which on, or before which, images and poses are rows apart."""
     count = len(record.rows)
     behind = np.arange(count) >= np.arange(count)[:, None]
+    sides = np.concatenate([behind, ~behind[FEWEST_VIEWS:]])
+    orders = [record.paired(order(len(record.views))) for order in ROW_ORDERS.values()]
     found = []
     for edges in every:
         squares = {by: edges.of(pairs[by]) for by in _SHIFTS}
-        sides = np.concatenate([behind, ~behind[FEWEST_VIEWS:]])
         for by in _SHIFTS[1:]:
             mixed = np.where(sides[..., None], squares[by], squares[0])
             logs, agrees = _evidence(mixed)
@@ -273,8 +275,8 @@ def _shifted(
             closes = mixed[at][agrees[at]].mean() < CLOSING_SCORE**2
             found.append((float(logs[at]), by, sides[at], agrees[at], closes))
         # Other orders of the rows are readings of the whole recording.
-        for order in ROW_ORDERS.values():
-            rival = edges.of(record.paired(order(len(record.views))))
+        for order in orders:
+            rival = edges.of(order)
             found.append((float(_evidence(rival[None])[0][0]), 0, behind[0], behind[0], False))
     log, by, side, agrees, closes = max(found, key=lambda item: item[0])
     partnered = side & (pairs[by] >= 0)

@@ -24,6 +24,7 @@ from visioncal.interchange.formats.reading import (
     DOCUMENTS,
     Fields,
     appearance,
+    fields_of_document,
     fields_of_records,
     flattened,
     named_by,
@@ -39,6 +40,8 @@ class Part:
 
     group: FileGroup
     fields: Fields | None = None  # Rows of named values, one a file of several; None without.
+    # What each of several files holds, by name.
+    records: Sequence[Mapping[str, object]] = ()
     fault: DataError | None = None  # Why they cannot be read.
     # Fields of `[camera]` by where they stand.
     lenses: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -141,29 +144,34 @@ def _array(fields: Fields) -> FloatArray | None:
 def _part(group: FileGroup, form: str | None) -> Part:
     if not group.is_data:
         return Part(group)
-    file, lenses = group.files[0], {}
+    first, *others = group.files
+    lenses, records = dict[str, Mapping[str, Any]](), list[Mapping[str, object]]()
+    is_document = first.suffix.lower() in DOCUMENTS
     try:
-        if file.suffix.lower() in DOCUMENTS:
-            lenses = dict(lenses_in(read_document(file), group.label))
-        fields = _fields_of(group) if len(group.files) > 1 else read_fields(file, form)
+        document = read_document(first) if is_document else None
+        lenses = dict(lenses_in(document, group.label)) if is_document else {}
+        if others:
+            records = [_record(first, document), *map(_record, others)]
+            fields = _fields_of(group, records)
+        else:
+            fields = fields_of_document(document, first) if document else read_fields(first, form)
     except DataError as error:
         return Part(group, fault=error, lenses=lenses)
-    return Part(group, fields, lenses=lenses)
+    return Part(group, fields, records, lenses=lenses)
 
 
-def _fields_of(group: FileGroup) -> Fields:
+def _fields_of(group: FileGroup, records: Sequence[Mapping[str, object]]) -> Fields:
     """The rows of several files, one each."""
-    records = [_record(file) for file in group.files]
     places = [file.name for file in group.files]
     folder = group.files[0].parent
     fields = fields_of_records(records, places, group.name, folder, group.numbers)
     return replace(fields, stems=tuple(file.stem for file in group.files))
 
 
-def _record(path: Path) -> dict[str, object]:
-    """Reads one view's file; numbers without a name are its `matrix`."""
+def _record(path: Path, document: object = None) -> dict[str, object]:
+    """What one view's file holds, read unless it was; numbers without a name are its `matrix`."""
     if path.suffix.lower() in DOCUMENTS:
-        document = read_document(path)
+        document = document or read_document(path)
     else:
         table = read_table(path)
         rows = [[float(cell) if is_number(cell) else cell for cell in row] for row in table.rows]
@@ -267,14 +275,15 @@ def _by_keys(path: Path, parts: Sequence[tuple[Part, Fields, Sequence[int | str]
     places: dict[int | str, list[str]] = defaultdict(list)
     stems: dict[int | str, str] = {}
     for part, fields, found in parts:
-        for key, place, file in zip(found, fields.places, part.group.files, strict=True):
+        each = zip(found, fields.places, part.group.files, part.records, strict=True)
+        for key, place, file, record in each:
             if key not in rows:
                 continue
             places[key].append(place)
             stems.setdefault(key, file.stem)
             rows[key] |= {
                 part.group.name if name == "matrix" else f"{part.group.name}.{name}": value
-                for name, value in _record(file).items()
+                for name, value in record.items()
             }
     joined = [" and ".join(places[key]) for key in keys]
     views = tuple(key for key in keys if isinstance(key, int))

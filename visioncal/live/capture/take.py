@@ -15,6 +15,7 @@ from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.drivers.protocols import ArmState, Frame
 from visioncal.vision.boards import blur_of
+from visioncal.vision.boards.imaging import grey_of
 
 # Tolerance of a frame's stamp before it was requested, or after it arrived [s].
 _EARLY_S = 0.02
@@ -140,13 +141,6 @@ def _selected(
     blurs = [blur_of(grey_of(frame.frame.image), target, ids, px) for frame in frames]
     sharpest = int(np.argmin(blurs))
     return first if sharpest == 0 else detected(frames[sharpest])
-
-
-def grey_of(image: Image) -> Image:
-    """Grey image (h, w) of an image that may be coloured."""
-    if image.ndim == 2:
-        return image
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 def why_arm_moves(first: ArmState, latest: ArmState, still: Stillness) -> str:

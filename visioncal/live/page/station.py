@@ -23,7 +23,7 @@ from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.journal import Journal, RecordedCell, picture_name, posed, state_of
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
-from visioncal.live.capture.take import Missed, TakenView, grey_of, image_motion_px
+from visioncal.live.capture.take import Missed, TakenView, image_motion_px
 from visioncal.live.drivers.manual import ManualArm
 from visioncal.live.drivers.protocols import (
     ArmState,
@@ -37,7 +37,7 @@ from visioncal.live.page.outcome import Light, Outcome, ask_command
 from visioncal.live.page.suggestion import NextPose, near, next_view
 from visioncal.live.planning.cell import PlanCell, flange_at
 from visioncal.session import View
-from visioncal.vision.boards.imaging import decode_image
+from visioncal.vision.boards.imaging import decode_image, grey_of
 
 _P = ParamSpec("_P")
 # What may be wrong with a view of the table. Where its picture has no pose, or its pose no picture,

@@ -33,6 +33,13 @@ def looks_like_image(data: bytes) -> bool:
     return data.startswith(_SIGNATURES)
 
 
+def grey_of(image: Image) -> Image:
+    """Grey image (h, w) of an image that may be coloured."""
+    if image.ndim == 2:
+        return image
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
 def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     """Decodes an image file to a (h, w) grey or (h, w, 3) BGR image, or says why not.
 
