@@ -21,7 +21,7 @@ from visioncal.vision.boards.imaging import decode_image, encode_png, exif_turn,
 
 # A half turn about the optical axis.
 _HALF = np.diag([-1.0, -1.0, 1.0])
-# Views whose angles to the others tell a half turn, at least, and how much better they fit with it.
+# Views whose angles to the others show a half turn, at least, and how much better they fit then.
 _FEWEST, _CLEARLY = 4, 3.0
 
 
@@ -144,7 +144,7 @@ def _half_turned(session: Session, progress: Progress | None) -> set[int]:
         np.abs(by_robot - rotation_angle(camera[:, None] @ np.swapaxes(turned, 1, 2)[None]))
         for turned in (camera, _HALF @ camera)
     ]
-    # One view tells which of the others are turned relative to it; most are upright.
+    # One view shows which of the others are turned relative to it; most are upright.
     rows = np.minimum(*away)
     best = int(np.argmin(np.median(rows, axis=1)))
     is_turned = away[1][best] < away[0][best]

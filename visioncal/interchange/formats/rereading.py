@@ -103,7 +103,7 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     """Finds what a source does not say of its poses by what agrees with its images or target poses.
 
     Raises:
-        DataError: A form of rotations is not said, and nothing tells it; or the images show another
+        DataError: A form of rotations is not said, and nothing determines it; or the images show another
             board than declared.
     """
     unstated = frozenset[str]().union(*foreign.unstated.values())
@@ -171,7 +171,7 @@ def _applied(foreign: ForeignRecording, guess: Guess, *, is_measured: bool) -> F
 def _untested(
     foreign: ForeignRecording, why: str, other: Finding | None = None
 ) -> ForeignRecording:
-    """Asks for a form of rotations that nothing tells, or for the `other` board that would.
+    """Asks for a form of rotations that nothing determines, or for the `other` board that would.
 
     Else notes that nothing was tested.
     """
@@ -194,7 +194,7 @@ def _untested(
             )
             raise DataError(
                 f"{foreign.name}: the form of the {whose}'s rotations is not said, and nothing "
-                f"tells it: {why}.",
+                f"determines it: {why}.",
                 culprits=[f"--{whose}-form"],
                 next_step=f"Say --{whose}-form {forms}.",
             )
