@@ -103,8 +103,8 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     """Finds what a source does not say of its poses by what agrees with its images or target poses.
 
     Raises:
-        DataError: A form of rotations is not said, and nothing determines it; or the images show another
-            board than declared.
+        DataError: A form of rotations is not said, and nothing determines it; or the images show
+            another board than declared.
     """
     unstated = frozenset[str]().union(*foreign.unstated.values())
     if not unstated - {"inverse"} or foreign.mount is None or foreign.stream is not None:
