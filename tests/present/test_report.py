@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pypdfium2
 import pytest
+from markdown_it import MarkdownIt
 from support import browser
 from support import whole_cells as two_arms
 from support.arm_documents import calibrated
@@ -95,6 +96,18 @@ def test_views_lead_to_the_recording_and_back(sample, outputs):
         assert f"(report.html#{anchor})" in view_markdown(view)
     # Where there is no recording, nothing leads to it.
     assert "--viewer" not in render(sample.calibration, None, ())
+
+
+def test_notes_show_commands_as_they_are_typed(tmp_path):
+    """Back-ticks in a path neither end the code span of a command nor run in the shell."""
+    session = tmp_path / "a`b`` ![x](y)"
+    write_session(simulate(CellOptions(views=12)), session, images=False)
+    visioncal("calibrate", session, "-o", tmp_path / "`out").good()
+    calibration = Calibration.load(tmp_path / "`out")
+    commands = [step.command for step in calibration.next_steps if step.command]
+    shown = re.findall(r"<code>(.*?)</code>", MarkdownIt().render(verdict_markdown(calibration)))
+    assert [unescape(command) for command in shown] == commands
+    assert str(session) in commands[0] or str(tmp_path / "`out") in commands[0]
 
 
 def test_report_without_its_recording_says_so(outputs, tmp_path):

@@ -101,7 +101,7 @@ def verdict_markdown(calibration: Calibration) -> str:
     judged, cell, budget = calibration.verdict, calibration.cell, calibration.budget
     turned = calibration.rotation_words
     steps = [
-        f"{at}. {plain(step.words)}" + (f"  \n   `{step.command}`" if step.command else "")
+        f"{at}. {plain(step.words)}" + (f"  \n   {code(step.command)}" if step.command else "")
         for at, step in enumerate(calibration.next_steps, 1)
     ]
     frames = [
@@ -162,6 +162,12 @@ def view_markdown(sight: ViewResult, unposed: Sequence[str] = ()) -> str:
 def plain(text: str) -> str:
     """Escapes text from outside: in Markdown, the viewer would load pictures and follow links."""
     return re.sub(r"([\\`*_{}\[\]()#+\-.!|<>~&])", r"\\\1", " ".join(text.split()))
+
+
+def code(text: str) -> str:
+    """A code span, which ends at as many back-ticks as it began with: more than are in a row."""
+    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    return f"{fence} {text} {fence}" if "`" in text else f"`{text}`"
 
 
 def markdown(text: str) -> rr.TextDocument:
