@@ -8,7 +8,7 @@ Each session is written once, by this checkout's simulation or by the independen
 alone, each in a process of its own (`compare_worker.py`). All worlds get their first seed, then all
 their second, until the time is over. A row a world, with intervals of 95 % of the paired ratio or
 difference; the last line says what differs beyond chance, by a limit that counts all comparisons
-(Holm 1979). Exit status 1 where anything is worse.
+(Holm 1979). Exit status 1 where anything is worse, or a bug.
 """
 
 import argparse
@@ -156,7 +156,10 @@ def main() -> None:
             (folder / "pairs.json").write_text(json.dumps([asdict(pair) for pair in pairs]))
     text, odd = report(pairs)
     print(text)
-    sys.exit(any(item.is_worse for item in odd))
+    broken = [pair for pair in pairs if pair.after.status == "bug"]
+    if broken:
+        print(f"bugs: {', '.join(f'{pair.world} {pair.seed}' for pair in broken)}")
+    sys.exit(bool(broken) or any(item.is_worse for item in odd))
 
 
 if __name__ == "__main__":
