@@ -1,0 +1,277 @@
+"""Identities of the one likelihood: gradients, the dense likelihood, sightings left out, truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from support.small_cells import made
+
+from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import IntArray
+from visioncal.fit.assemble import mixed_model
+from visioncal.fit.linearise import linearised, pairs_of
+from visioncal.fit.solve import solve, state_of, unknowns_of
+from visioncal.fit.start import start_of
+from visioncal.fit.unknowns import State
+from visioncal.model import MeasuredPlace, MeasuredPose, Sighting
+from visioncal.model.effects.effect import Effect, Size
+
+
+class Tilt(Effect):
+    """An effect on an edge, to be differentiated."""
+
+    @property
+    def name(self):
+        """See `Effect`."""
+        return f"tilt {self.frame}"
+
+    @property
+    def size(self):
+        """See `Effect`."""
+        return Size(self.name, 1e-3, 1e-7, 0.1)
+
+    @property
+    def count(self):
+        """See `Effect`."""
+        return 2
+
+    def columns(self, moments, distances):
+        """See `Effect`."""
+        del distances
+        columns = np.zeros((len(moments), 6, 2))
+        columns[:, :2] = np.eye(2) * moments.progress[:, None, None]
+        columns[:, 4, 1] = 0.3
+        return columns
+
+
+class Breath(Tilt):
+    """An effect on a lens."""
+
+    place = "lens"
+
+    @property
+    def name(self):
+        """See `Effect`."""
+        return f"breath {self.frame}"
+
+    def columns(self, moments, distances):
+        """See `Effect`."""
+        columns = np.zeros((len(moments), 9, 2))
+        columns[:, 0, 0] = columns[:, 1, 0] = 1000.0 * (distances - 1.0)
+        columns[:, 2, 1] = moments.progress
+        return columns
+
+
+def measured(cell):
+    """The cell with a measured pose and a measured place beside its corners."""
+    rng = np.random.default_rng(4)
+    added = [
+        Sighting(90, 1, "cam", "target", MeasuredPose(exp(rng.normal(0, 0.2, 6)), (2e-3, 1e-3))),
+        Sighting(91, 2, "cam", "target", MeasuredPlace(np.array([0.1, 0.0, 0.5]), 1e-3)),
+    ]
+    return cell.with_sightings([*cell.sightings, *added])
+
+
+def somewhere(cell, effects=()):
+    """Unknowns of a cell, and a state at which everything differs from the start."""
+    rng = np.random.default_rng(3)
+    start = start_of(cell)
+    unknowns, state = unknowns_of(start, effects), state_of(start, effects)
+    step = 1e-3 * rng.normal(size=unknowns.count)
+    errors = {name: 1e-2 * rng.normal(size=at.shape) for name, at in state.errors.items()}
+    moved = unknowns.moved(State(state.values, errors), step, {})
+    return start.cell, unknowns, moved
+
+
+EFFECTS = (Tilt("flange"), Tilt("cam"), Breath("cam"))
+
+
+@pytest.mark.parametrize("in_hand", [True, False])
+def test_rows_have_the_slopes_that_differences_show(in_hand):
+    small = made(stops=7, in_hand=in_hand).cell
+    cell, unknowns, state = somewhere(small, EFFECTS)
+    # Slopes leave out that distances, on which this one depends, depend on the pose.
+    state = replace(state, values={**state.values, ("effect", "breath cam"): np.zeros(2)})
+    cell = measured(cell)
+    logs = np.zeros(len(unknowns.sizes))
+    pairs = pairs_of(cell)
+
+    def costs(at):
+        return [gram.weighted(logs)[:, -1, -1] for gram in linearised(cell, unknowns, at, pairs)]
+
+    grams = linearised(cell, unknowns, state, pairs)
+    assert unknowns.count > 6 * 2 + 9 + 10
+    slopes = [gram.in_common(gram.weighted(logs))[:, :-1, -1] for gram in grams]
+    for column in range(unknowns.count):
+        step = np.zeros(unknowns.count)
+        # In the columns' units, all of which change the residuals alike.
+        step[column] = 1e-6
+        ahead, behind = (costs(unknowns.moved(state, sign * step, {})) for sign in (1, -1))
+        for gram, slope, a, b in zip(grams, slopes, ahead, behind, strict=True):
+            at = np.flatnonzero(gram.columns == column)
+            expected = slope[:, 6 * len(gram.flanges) + at].sum(axis=1)
+            found = -(a - b) / 4e-6
+            # Rounding of costs up to 1e9 in differences of a millionth.
+            assert found == pytest.approx(expected, rel=2e-4, abs=1e-6 * a.max() + 1e-2)
+    for axis in range(6):
+        step = np.zeros((len(cell.moments), 6))
+        step[:, axis] = 1e-7
+        ahead, behind = (
+            costs(replace(state, errors={"flange": state.errors["flange"] + sign * step}))
+            for sign in (1, -1)
+        )
+        for slope, a, b in zip(slopes, ahead, behind, strict=True):
+            found = -(a - b) / 4e-7
+            assert found == pytest.approx(slope[:, axis], rel=2e-4, abs=1e-5 * a.max() + 1e-2)
+
+
+def model(cell):
+    cell, unknowns, state = somewhere(cell)
+    grams = linearised(cell, unknowns, state, pairs_of(cell))
+    return mixed_model(cell, unknowns, state, grams, np.ones(len(cell.sightings), bool)), unknowns
+
+
+def test_the_likelihood_has_the_gradient_that_differences_show():
+    mixed, unknowns = model(made(stops=7, cameras=2).cell)
+    logs = unknowns.starts()
+    found = mixed.at(logs)
+    for size in range(len(logs)):
+        step = np.zeros(len(logs))
+        step[size] = 1e-4
+        ahead, behind = (mixed.at(logs + sign * step).value for sign in (1, -1))
+        # A second-order difference of values around 1e4 to 1e7.
+        assert (ahead - behind) / 2e-4 == pytest.approx(found.gradient[size], rel=1e-3, abs=0.05)
+
+
+def test_the_curvature_is_the_mean_of_observed_and_expected_information():
+    mixed, unknowns = model(made(stops=7).cell)
+    logs, dense = unknowns.starts(), Dense(mixed)
+    found = mixed.at(logs)
+    step, observed = 1e-4, np.zeros((len(logs), len(logs)))
+    for size in range(len(logs)):
+        move = step * (np.arange(len(logs)) == size)
+        ahead, behind = (mixed.at(logs + sign * move).gradient for sign in (1, -1))
+        observed[size] = (ahead - behind) / (2 * step)
+    expected = dense.expected_information(logs)
+    expected += mixed.at(logs).curvature - replace(mixed, ratios=()).at(logs).curvature
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((observed + expected) / 2 - found.curvature).max() < 1e-3 * scale.max()
+
+
+class Dense:
+    """The same rows without elimination: one matrix of information for all errors and unknowns."""
+
+    def __init__(self, mixed):
+        self.mixed, p = mixed, mixed.count
+        starts = np.cumsum([p, *(body.stops.size * body.width for body in mixed.bodies)])
+        self.count = int(starts[-1])
+        self.grams = []
+        for term in mixed.terms:
+            gram = np.zeros((self.count + 1, self.count + 1))
+            common = np.append(term.columns, self.count)
+            gram[np.ix_(common, common)] += term.common
+            for part in term.parts:
+                width = mixed.bodies[part.body].width
+                for unit in range(len(mixed.bodies[part.body].stops)):
+                    own: IntArray = starts[part.body] + width * unit + np.arange(width)
+                    at = np.append(part.columns, self.count)
+                    gram[np.ix_(own, own)] += part.errors[unit]
+                    gram[np.ix_(own, at)] += part.cross[unit]
+                    gram[np.ix_(at, own)] += part.cross[unit].T
+            self.grams.append(gram)
+
+    def information(self, logs):
+        """See `Mixed`."""
+        weights = np.append(np.exp(-2 * logs), 1.0)
+        pairs = zip(self.mixed.terms, self.grams, strict=True)
+        return sum(weights[term.size] * gram for term, gram in pairs)
+
+    def value(self, logs):
+        """See `Mixed`."""
+        full = self.information(logs)
+        inner, right = full[:-1, :-1], full[:-1, -1]
+        solved = np.linalg.solve(inner, right)
+        counts = sum(2 * t.count * logs[t.size] for t in self.mixed.terms if t.size >= 0)
+        value = counts + full[-1, -1] - right @ solved + np.linalg.slogdet(inner)[1]
+        mean, width = self.mixed.ratio
+        return value + sum(((logs[b] - logs[a] - mean) / width) ** 2 for a, b in self.mixed.ratios)
+
+    def expected_information(self, logs):
+        """2 tr(P V_t P V_s) of the log sizes: 4 (n - 2 c) on the diagonal, and 4 T."""
+        inverse = np.linalg.inv(self.information(logs)[:-1, :-1])
+        found = np.zeros((len(logs), len(logs)))
+        hats = {}
+        for term, gram in zip(self.mixed.terms, self.grams, strict=True):
+            if term.size >= 0:
+                hats[term.size] = np.exp(-2 * logs[term.size]) * inverse @ gram[:-1, :-1]
+                found[term.size, term.size] += 4 * (term.count - 2 * np.trace(hats[term.size]))
+        for a, first in hats.items():
+            for b, second in hats.items():
+                found[a, b] += 4 * np.sum(first * second.T)
+        return found
+
+
+def test_the_likelihood_is_that_of_all_unknowns_at_once():
+    mixed, unknowns = model(made(stops=7, cameras=2).cell)
+    dense, logs = Dense(mixed), unknowns.starts()
+    differ = logs - 0.7 * np.arange(len(logs)) % 1.0
+    # Differences are compared: both leave out the same constant.
+    found = mixed.at(logs, is_sloped=False).value - mixed.at(differ, is_sloped=False).value
+    assert found == pytest.approx(dense.value(logs) - dense.value(differ), rel=1e-6)
+    inner = dense.information(logs)[:-1, :-1]
+    covariance = np.linalg.inv(inner)[: mixed.count, : mixed.count]
+    scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    assert np.abs((mixed.at(logs).covariance - covariance) / scale).max() < 1e-5
+
+
+def test_a_sighting_left_out_is_predicted_as_by_a_refit():
+    solved = solve(made(stops=8, cameras=2, seed=5).cell)
+    fit, left_out = solved.fit, solved.left_out
+    for row in (0, 5, 11):
+        used = fit.used.copy()
+        used[row] = False
+        mixed = mixed_model(fit.cell, fit.unknowns, fit.linearised, fit.grams, used)
+        other = replace(fit, mixed=mixed, used=used, estimate=mixed.at(fit.estimate.logs))
+        refit = other.left_out()
+        sigma = np.sqrt(np.diagonal(left_out.own[row]))
+        assert left_out.away[row] == pytest.approx(refit.away[row], abs=1e-3 * sigma.min())
+        assert left_out.squares[row] == pytest.approx(refit.squares[row], rel=1e-3)
+
+
+def test_the_budget_sums_to_the_covariance():
+    fit = solve(made(stops=8).cell).fit
+    shares = fit.budget(("edge", "cam"))
+    whole = fit.covariance(("edge", "cam"))
+    assert sum(shares.values()) == pytest.approx(whole, rel=1e-5, abs=1e-6 * whole.max())
+    assert np.trace(shares["m flange"]) > 0.0
+
+
+@pytest.mark.parametrize(("given", "in_hand"), [(True, True), (False, True), (True, False)])
+def test_errors_are_as_large_as_the_covariance_says(given, in_hand):
+    squares = []
+    for seed in range(60):
+        small = made(seed, stops=12, given=given, in_hand=in_hand)
+        fit = solve(small.cell).fit
+        assert fit.used.all() or fit.used.sum() >= 11
+        away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
+        squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away))
+    # The mean of 60 of six degrees, but that noise levels of 12 stops are known to a sixth only:
+    # a t distribution of 60 degrees of freedom or more, a share of 1.04.
+    low, high = chi2.ppf([0.001, 0.999], 360) / 60
+    assert low < np.mean(squares) / 1.04 < high
+
+
+def test_predictions_err_as_much_as_they_say():
+    squares = []
+    for seed in range(40):
+        small = made(seed, stops=12)
+        fit = solve(small.cell).fit
+        moments = small.cell.moments.take(np.arange(3))
+        found = fit.predict("base", "cam", moments)
+        true = moments.poses["flange"] @ small.edges["cam"]
+        away = log(invert(true) @ found.poses)
+        each = np.linalg.solve(found.calibration, away[:, :, None])[:, :, 0]
+        squares.append(np.sum(away * each, axis=1).mean())
+        assert (np.trace(found.noise, axis1=1, axis2=2) > 0.0).all()
+    assert np.mean(squares) / 6 == pytest.approx(1.0, abs=0.35)  # three sigma of 40 cells

@@ -1,0 +1,89 @@
+"""The mixed model of some of the sightings, from their Gram matrices."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.fit.linearise import Gram
+from visioncal.fit.mixed import Body, Mixed, Part, Term, prior_term, summed
+from visioncal.fit.unknowns import RATIO_LOG, RATIO_M, State, Unknowns
+from visioncal.model import Cell
+
+
+def bodies_of(cell: Cell, unknowns: Unknowns, grams: Sequence[Gram]) -> tuple[Body, ...]:
+    """Bodies with the stops and columns of all sightings, used or not."""
+    found = []
+    for names in cell.bodies:
+        flanges = tuple(name for name in names if name in unknowns.erring)
+        own = [gram for gram in grams if set(gram.flanges) & set(flanges)]
+        if own:
+            stops = np.unique(np.concatenate([gram.stops for gram in own]))
+            columns = np.unique(np.concatenate([gram.columns for gram in own]))
+            found.append(Body(flanges, stops, columns))
+    return tuple(found)
+
+
+def mixed_model(
+    cell: Cell, unknowns: Unknowns, state: State, grams: Sequence[Gram], used: Mask
+) -> Mixed:
+    """The mixed model of the sightings in an (n,) mask."""
+    bodies = bodies_of(cell, unknowns, grams)
+    terms = dict[int, list[Term]]()
+    for gram in grams:
+        kept = used[gram.rows]
+        if kept.any():
+            for term in _terms(gram if kept.all() else gram.take(kept), bodies):
+                terms.setdefault(term.size, []).append(term)
+    for at, body in enumerate(bodies):
+        for place, name in enumerate(body.flanges):
+            for part, unit in enumerate(("rad", "m")):
+                own = 6 * place + 3 * part + np.arange(3)
+                size = unknowns.size_of(f"{unit} {name}")
+                past = state.errors[name][body.stops, 3 * part : 3 * part + 3]
+                terms.setdefault(size, []).append(_flange_term(size, at, body.width, own, past))
+    offsets = unknowns.offsets(state)
+    for size, columns, sigma in unknowns.priors():
+        terms.setdefault(size, []).append(prior_term(size, columns, offsets[columns], sigma))
+    ratios = tuple((unknowns.size_of(a), unknowns.size_of(b)) for a, b in unknowns.ratios)
+    return Mixed(
+        tuple(summed(group, bodies) for group in terms.values()),
+        bodies,
+        unknowns.count,
+        len(unknowns.sizes),
+        ratios,
+        (float(np.log(RATIO_M)), RATIO_LOG),
+    )
+
+
+def _terms(gram: Gram, bodies: Sequence[Body]) -> list[Term]:
+    """The terms of some sightings, by size."""
+    f = 6 * len(gram.flanges)
+    at = next((i for i, body in enumerate(bodies) if set(gram.flanges) & set(body.flanges)), -1)
+    found = []
+    for size, grams, counts in gram.parts:
+        full = gram.in_common(grams)
+        parts: tuple[Part, ...] = ()
+        if f:
+            body = bodies[at]
+            units = np.searchsorted(body.stops, gram.stops)
+            own = np.concatenate(
+                [6 * body.flanges.index(name) + np.arange(6) for name in gram.flanges]
+            )
+            errors = np.zeros((len(body.stops), body.width, body.width))
+            cross = np.zeros((len(body.stops), body.width, full.shape[2] - f))
+            np.add.at(errors, (units[:, None, None], own[:, None], own), full[:, :f, :f])
+            np.add.at(cross, (units[:, None], own), full[:, :f, f:])
+            parts = (Part(at, gram.columns, errors, cross),)
+        common = full[:, f:, f:].sum(axis=0)
+        found.append(Term(size, float(counts.sum()), gram.columns, common, parts))
+    return found
+
+
+def _flange_term(size: int, body: int, width: int, own: IntArray, past: FloatArray) -> Term:
+    """Rows of the errors (u, 3) of one flange, of which some are in the state already."""
+    errors, cross = np.zeros((len(past), width, width)), np.zeros((len(past), width, 1))
+    errors[:, own, own], cross[:, own, 0] = 1.0, -past
+    none = np.zeros(0, dtype=np.int64)
+    square = np.array([[float(np.sum(past**2))]])
+    return Term(size, float(past.size), none, square, (Part(body, none, errors, cross),))

@@ -1,0 +1,332 @@
+"""Sightings linearised at a state: a Gram matrix each, of its pose and its own columns.
+
+The rows of a sighting depend on its pose `seer_from_seen` and on what lens, board and field add.
+Its pose depends on the errors of the flanges in its path, on the edges, and on effects that move
+them. Thus every derivative is a small matrix times one Gram matrix (cf. the reduced camera matrix
+of Triggs, McLauchlan, Hartley and Fitzgibbon 2000, section 6), and nothing beyond this module
+grows with the number of corners.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log, skew
+from visioncal.core.types import Corners, FloatArray, IntArray, Mask
+from visioncal.estimation.tree import PathStep
+from visioncal.fit.unknowns import Key, State, Unknowns
+from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Moments, Sighting
+from visioncal.model.boards import shape_basis
+from visioncal.vision.camera import project_with_jacobian
+from visioncal.vision.targets import corner_positions
+
+
+@dataclass(frozen=True, eq=False)
+class Gram:
+    """The k sightings of one frame by another.
+
+    Local columns are (pose: 6, lens: q, shape: 10, field: e), then the residual: d + 1 in all;
+    poses and places that were measured have the pose alone. Common ones are the c that act on the
+    pose or the lens through `moves`, of which the first f are errors of flanges, then those that
+    are `picked`.
+    """
+
+    rows: IntArray  # (k,) indices of the sightings.
+    stops: IntArray  # (k,)
+    # By size (-1 for none): (k, d + 1, d + 1) Gram matrices, and (k,) numbers of rows.
+    parts: tuple[tuple[int, FloatArray, FloatArray], ...]
+    flanges: tuple[str, ...]  # Those in the path that err.
+    moves: FloatArray  # (k, h, f + c) of the first h local columns by errors and common columns.
+    picked: IntArray  # (n,) local columns that are unknowns themselves.
+    units: FloatArray  # (n,) what one unit of these is.
+    columns: IntArray  # (c + n,) of the unknowns.
+    poses: FloatArray  # (k, 4, 4) `seer_from_seen` as predicted.
+    slopes: Mapping[str, FloatArray]  # (k, 6, 6) of the pose by each edge's right perturbation.
+
+    @property
+    def local(self) -> int:
+        """The number d of local columns."""
+        return int(self.parts[0][1].shape[1]) - 1
+
+    def weighted(self, logs: FloatArray) -> FloatArray:
+        """(k, d + 1, d + 1) Gram matrices of rows in units of their noise."""
+        weights = np.append(np.exp(-2.0 * logs), 1.0)
+        return np.asarray(sum(weights[size] * grams for size, grams, _ in self.parts))
+
+    def spread(self) -> FloatArray:
+        """(k, d, f + c + n) derivatives of the local columns by errors and unknowns."""
+        own = np.zeros((len(self.rows), self.local, self.moves.shape[2] + len(self.picked)))
+        own[:, : self.moves.shape[1], : self.moves.shape[2]] = self.moves
+        own[:, self.picked, self.moves.shape[2] + np.arange(len(self.picked))] = self.units
+        return own
+
+    def in_common(self, grams: FloatArray) -> FloatArray:
+        """Gram matrices (k, f + c + n + 1, same) by errors, unknowns and residual of local ones."""
+        head, moves = self.moves.shape[1], self.moves
+        last = np.append(self.picked, self.local)
+        units = np.append(self.units, 1.0)
+        heads = np.swapaxes(moves, 1, 2) @ grams[:, :head]
+        both = heads[:, :, last] * units
+        own = grams[:, last[:, None], last] * (units[:, None] * units)
+        return np.concatenate(
+            [
+                np.concatenate([heads[:, :, :head] @ moves, both], axis=2),
+                np.concatenate([np.swapaxes(both, 1, 2), own], axis=2),
+            ],
+            axis=1,
+        )
+
+    def take(self, mask: Mask) -> "Gram":
+        """Some of the sightings."""
+        return replace(
+            self,
+            rows=self.rows[mask], stops=self.stops[mask], moves=self.moves[mask],
+            parts=tuple((size, grams[mask], counts[mask]) for size, grams, counts in self.parts),
+            poses=self.poses[mask],
+            slopes={name: slope[mask] for name, slope in self.slopes.items()},
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """The sightings of one frame by another, in arrays."""
+
+    rows: IntArray  # (k,) their indices.
+    stops: IntArray  # (k,)
+    sightings: tuple[Sighting, ...]
+    path: tuple[PathStep, ...]
+    moments: Moments  # (k) theirs.
+    points: FloatArray  # (c, 3) corners of the board [m].
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Seer and seen."""
+        return self.sightings[0].pair
+
+    @cached_property
+    def counts(self) -> IntArray:
+        """(k,) numbers of corners."""
+        return np.array([len(at.ids) for at in self.corners])
+
+    @cached_property
+    def corners(self) -> tuple[Corners, ...]:
+        """The corners of each; empty of what was measured otherwise."""
+        return tuple(at.corners for at in self.sightings if at.corners is not None)
+
+    @cached_property
+    def ids(self) -> IntArray:
+        """(n,) numbers of all corners."""
+        return np.concatenate([at.ids for at in self.corners])
+
+    @cached_property
+    def px(self) -> FloatArray:
+        """(n, 2) all corners [px]."""
+        return np.concatenate([at.px for at in self.corners])
+
+    @cached_property
+    def owner(self) -> IntArray:
+        """(n,) index of each corner's sighting in the pair."""
+        return np.repeat(np.arange(len(self.rows)), self.counts)
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """(n,) typical noise over each corner's; over the noise itself where that is stated."""
+        each = [
+            (np.ones(len(at.ids)) if at.weights is None else at.weights) / (at.stated_px or 1.0)
+            for at in self.corners
+        ]
+        return np.concatenate(each)
+
+    @cached_property
+    def basis(self) -> FloatArray:
+        """(c, 3, 10) derivatives of the board's corners by its shape [m]."""
+        return shape_basis(self.points)
+
+
+def pairs_of(cell: Cell) -> tuple[Pair, ...]:
+    """All sightings of a cell, by what they are of; those measured and those in images apart."""
+    found = []
+    for names, indices in cell.pairs.items():
+        kinds: dict[type, list[int]] = {}
+        for index in indices:
+            kinds.setdefault(type(cell.sightings[index].evidence), []).append(index)
+        for kind, rows in kinds.items():
+            stops = np.array([cell.sightings[row].stop for row in rows])
+            points = (
+                corner_positions(cell.boards[names[1]]) if kind is Corners else np.zeros((0, 3))
+            )
+            pair = Pair(
+                np.array(rows), stops, tuple(cell.sightings[row] for row in rows),
+                cell.tree.path(*names), cell.moments.take(stops), points,
+            )  # fmt: skip
+            found.append(pair)
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """Poses as a path predicts them."""
+
+    poses: FloatArray  # (k, 4, 4) `start_from_end`.
+    # (k, 6, 6) of their right perturbations, by each edge in the path: an unknown one's own right
+    # perturbation, a flange's error.
+    slopes: Mapping[str, FloatArray]
+    # The same by effects, which act behind an edge's own perturbation.
+    by_effects: Mapping[str, FloatArray]
+
+
+def predicted(
+    cell: Cell,
+    unknowns: Unknowns,
+    state: State,
+    path: tuple[PathStep, ...],
+    moments: Moments,
+    errors: Mapping[str, FloatArray],
+) -> Predicted:
+    """Predicts the poses along a path at k moments, with (k, 6) errors of some flanges."""
+    count = len(moments)
+    back, slopes = np.tile(np.eye(4), (count, 1, 1)), dict[str, FloatArray]()
+    by_effects = dict[str, FloatArray]()
+    for step in reversed(path):
+        name = step.frame
+        twist = errors.get(name, np.zeros((count, 6)))
+        for effect in unknowns.effects:
+            if effect.place == "edge" and effect.frame == name:
+                columns = effect.columns(moments, np.ones(count))
+                twist = twist + columns @ state.values["effect", effect.name]
+        edge = moments.poses[name] if step.robot else _edge(cell, state, name)
+        moved = exp(twist)
+        edge = edge @ moved
+        before, back = back, back @ (edge if step.is_up else invert(edge))
+        slope = -adjoint(back) if step.is_up else adjoint(before)
+        # Twists that are there already and the next ones do not commute.
+        by_effects[name] = slope @ np.linalg.inv(inverse_right_jacobian(twist))
+        slopes[name] = by_effects[name] if step.robot else slope @ adjoint(invert(moved))
+    return Predicted(invert(back), slopes, by_effects)
+
+
+def _edge(cell: Cell, state: State, name: str) -> FloatArray:
+    """(4, 4) `parent_from_frame`, unknown or known."""
+    found = state.get("edge", name)
+    if found is None:
+        found = cell.known_edge(name)
+    if found is None:
+        raise KeyError(name)
+    return found
+
+
+def linearised(
+    cell: Cell, unknowns: Unknowns, state: State, pairs: tuple[Pair, ...]
+) -> tuple[Gram, ...]:
+    """All sightings at a state, used or not."""
+    return tuple(_linearised(cell, unknowns, state, pair) for pair in pairs)
+
+
+def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gram:
+    errors = {name: errors[pair.stops] for name, errors in state.errors.items()}
+    at = predicted(cell, unknowns, state, pair.path, pair.moments, errors)
+    if pair.corners:
+        parts, own, distances = _corner_parts(unknowns, state, pair, at.poses)
+    else:
+        parts, own, distances = (
+            _measured_parts(unknowns, pair, at.poses),
+            {},
+            np.ones(len(at.poses)),
+        )
+    seer, _ = pair.names
+    frames = [step.frame for step in pair.path]
+    flanges = tuple(name for name in unknowns.erring if name in frames)
+    edges = [name for name in frames if ("edge", name) in unknowns]
+    by_pose = [at.slopes[name] for name in (*flanges, *edges)]
+    columns = [unknowns.columns("edge", name) for name in edges]
+    by_lens = list[FloatArray]()
+    for effect in unknowns.effects:
+        known = unknowns.columns("effect", effect.name)
+        if effect.place == "edge" and effect.frame in frames:
+            slope = at.by_effects[effect.frame]
+            by_pose.append(slope @ effect.columns(pair.moments, distances))
+            columns.append(known)
+        elif effect.place == "lens" and effect.frame == seer and pair.corners:
+            by_lens.append(effect.columns(pair.moments, distances))
+            columns.append(known)
+    moves = np.concatenate([np.zeros((len(pair.rows), 6, 0)), *by_pose], axis=2)
+    if by_lens:
+        lens, old = np.concatenate(by_lens, axis=2), moves
+        moves = np.zeros((len(lens), 6 + lens.shape[1], old.shape[2] + lens.shape[2]))
+        moves[:, :6, : old.shape[2]], moves[:, 6:, old.shape[2] :] = old, lens
+    free = {key: places for key, places in own.items() if key in unknowns}
+    kept = {key: places[: unknowns[key].count] for key, places in free.items()}
+    return Gram(
+        pair.rows, pair.stops, parts, flanges, moves,
+        np.concatenate([np.zeros(0, int), *kept.values()]).astype(np.int64),
+        np.concatenate([np.zeros(0), *(unknowns[key].units for key in kept)]),
+        np.concatenate([np.zeros(0, int), *columns, *(unknowns.columns(*key) for key in kept)]),
+        at.poses, at.slopes,
+    )  # fmt: skip
+
+
+_Parts = tuple[tuple[int, FloatArray, FloatArray], ...]
+
+
+def _corner_parts(
+    unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray
+) -> tuple[_Parts, dict[Key, IntArray], FloatArray]:
+    """Gram matrices of corners, the local columns of what is their own, and relative distances."""
+    seer, seen = pair.names
+    lens, owner, basis = unknowns.camera(state, seer), pair.owner, pair.basis[pair.ids]
+    points = pair.points[pair.ids] + basis @ state.values["shape", seen]
+    turns = poses[owner, :3, :3]
+    in_camera = (turns @ points[:, :, None])[:, :, 0] + poses[owner, :3, 3]
+    found = project_with_jacobian(lens, in_camera)
+    by_point = found.jacobian_point @ turns
+    middle = pair.points.mean(axis=0)
+    far = poses[:, 2, 3] + poses[:, 2, :3] @ middle
+    distances = far / np.median(far)
+    columns: dict[Key, FloatArray] = {
+        ("lens", seer): found.jacobian_intrinsics,
+        ("shape", seen): by_point @ basis,
+    }
+    residual = pair.px - found.px
+    for effect in unknowns.effects:
+        if effect.place == "lens" and effect.frame == seer:
+            moved = effect.columns(pair.moments, distances) @ state.values["effect", effect.name]
+            residual = residual - (found.jacobian_intrinsics @ moved[owner, :, None])[:, :, 0]
+    lines = [by_point @ -skew(points), by_point, *columns.values(), residual[:, :, None]]
+    rows = np.concatenate(lines, axis=2)
+    # Corners behind the camera say nothing.
+    rows = np.where(np.isfinite(rows).all(axis=(1, 2), keepdims=True), rows, 0.0)
+    rows *= pair.weights[:, None, None]
+    within = np.arange(len(owner)) - (np.cumsum(pair.counts) - pair.counts)[owner]
+    padded = np.zeros((len(pair.rows), int(pair.counts.max()), *rows.shape[1:]))
+    padded[owner, within] = rows
+    padded = padded.reshape(len(pair.rows), -1, rows.shape[2])
+    ends = 6 + np.cumsum([0, *(value.shape[2] for value in columns.values())])
+    own = {key: np.arange(ends[at], ends[at + 1]) for at, key in enumerate(columns)}
+    grams: FloatArray = np.swapaxes(padded, 1, 2) @ padded
+    part = unknowns.size_of(f"px {seer}"), grams, np.asarray(2.0 * pair.counts)
+    return (part,), own, np.asarray(distances)
+
+
+def _measured_parts(unknowns: Unknowns, pair: Pair, poses: FloatArray) -> _Parts:
+    """Gram matrices of measured poses and places."""
+    count, seer = len(pair.rows), pair.names[0]
+    rows, sigmas = np.zeros((count, 6, 7)), np.ones((count, 6))
+    for at, sighting in enumerate(pair.sightings):
+        evidence = sighting.evidence
+        if isinstance(evidence, MeasuredPose):
+            residual = log(invert(poses[at]) @ evidence.matrix)
+            rows[at] = np.column_stack([inverse_right_jacobian(-residual), residual])
+            sigmas[at] = np.repeat(evidence.sigmas or (1.0, 1.0), 3)
+        elif isinstance(evidence, MeasuredPlace):
+            rows[at, 3:, 3:6] = poses[at, :3, :3]
+            rows[at, 3:, 6] = evidence.place_m - poses[at, :3, 3]
+            sigmas[at] = evidence.sigma_m or 1.0
+    rows /= sigmas[:, :, None]
+    parts = []
+    for name, part in (("rad", rows[:, :3]), ("m", rows[:, 3:])):
+        number = np.full(count, 3.0 * part.any())
+        grams = np.swapaxes(part, 1, 2) @ part
+        parts.append((unknowns.size_of(f"{name} {seer}"), grams, number))
+    return tuple(parts)

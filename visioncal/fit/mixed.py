@@ -1,0 +1,282 @@
+"""One linear mixed model: terms of rows, each with a size, and their restricted likelihood.
+
+    -2 log L = sum_t (2 n_t log s_t + |rows_t|^2 / s_t^2) + log det(information)
+
+A term's rows depend on errors of units (the flanges at one stop) and on common unknowns: noise of
+corners, errors of flanges and priors of random unknowns are all treated alike. Its derivative by
+log s_t is 2 (n_t - E|rows_t|^2 / s_t^2), with the expectation over the unknowns at their estimate
+(Patterson and Thompson 1971; Harville 1977). As curvature serves the average of the observed and
+the expected information, without traces of products (Gilmour, Thompson and Cullis 1995). Errors are
+eliminated unit by unit, so that an evaluation is linear in units and sightings.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.core.types import FloatArray, IntArray
+
+# Shares of a unit diagonal that are added where a factor does not exist.
+_RIDGES = (1e-12, 1e-9, 1e-6, 1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What a term's rows say of the errors of a body's units."""
+
+    body: int
+    columns: IntArray  # (c,) of the common unknowns.
+    errors: FloatArray  # (u, m, m) Gram matrices of the errors of each unit.
+    cross: FloatArray  # (u, m, c + 1) with the columns and the residual.
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """Rows of one size."""
+
+    size: int  # Index of the size; -1 for rows that are whitened already.
+    count: float  # Number n of rows.
+    columns: IntArray  # (c,) of the common unknowns.
+    common: FloatArray  # (c + 1, c + 1) Gram matrix of columns and residual, summed over all.
+    parts: tuple[Part, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Flanges whose errors sightings connect; a unit is what they err by at one stop."""
+
+    flanges: tuple[str, ...]
+    stops: IntArray  # (u,) of its units.
+    columns: IntArray  # (c,) common unknowns on which rows with these errors depend.
+
+    @property
+    def width(self) -> int:
+        """The number m of errors of a unit."""
+        return 6 * len(self.flanges)
+
+
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """The errors of one body, at given common unknowns."""
+
+    own: FloatArray  # (u, m, m) their covariance.
+    response: FloatArray  # (u, m, c) their derivative by the body's columns.
+    errors: FloatArray  # (u, m) at the estimate.
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The restricted likelihood at some sizes, and the estimate there."""
+
+    logs: FloatArray  # (t,) logarithms of the sizes.
+    value: float  # -2 log L, up to a constant.
+    values: FloatArray  # (p,) common unknowns.
+    covariance: FloatArray  # (p, p) theirs.
+    bodies: tuple[Eliminated, ...]
+    gradient: FloatArray  # (t,) of the value by the logarithms; zeros where not asked for.
+    curvature: FloatArray  # (t, t) average information.
+
+
+@dataclass(frozen=True, eq=False)
+class Mixed:
+    """Terms with t sizes, p common unknowns and the errors of some bodies."""
+
+    terms: tuple[Term, ...]
+    bodies: tuple[Body, ...]
+    count: int  # p.
+    sizes: int  # t.
+    # Pairs of sizes with a prior of the second over the first; its mean and width as logarithms.
+    ratios: tuple[tuple[int, int], ...] = ()
+    ratio: tuple[float, float] = (0.0, 1.0)
+
+    @cached_property
+    def places(self) -> dict[int, IntArray]:
+        """(p + 1,) place of each common unknown, and the residual, among a body's columns."""
+        found = {}
+        for at, body in enumerate(self.bodies):
+            found[at] = np.zeros(self.count + 1, dtype=np.int64)
+            found[at][np.append(body.columns, self.count)] = np.arange(len(body.columns) + 1)
+        return found
+
+    def assembled(self, logs: FloatArray) -> tuple[list[tuple[FloatArray, FloatArray]], FloatArray]:
+        """Information: of each body's units (u, m, m) and (u, m, c + 1); common (p + 1, p + 1)."""
+        weights, p = np.append(np.exp(-2.0 * logs), 1.0), self.count
+        common = np.zeros((p + 1, p + 1))
+        units = [
+            (
+                np.zeros((len(body.stops), body.width, body.width)),
+                np.zeros((len(body.stops), body.width, len(body.columns) + 1)),
+            )
+            for body in self.bodies
+        ]
+        for term in self.terms:
+            at = np.append(term.columns, p)
+            common[at[:, None], at] += weights[term.size] * term.common
+            for part in term.parts:
+                errors, cross = units[part.body]
+                errors += weights[term.size] * part.errors
+                where = self.places[part.body][np.append(part.columns, p)]
+                cross[:, :, where] += weights[term.size] * part.cross
+        return units, common
+
+    def at(self, logs: FloatArray, *, is_sloped: bool = True) -> Estimate:
+        """The estimate at (t,) logarithms of the sizes; without slopes, these are zero."""
+        p = self.count
+        units, common = self.assembled(logs)
+        value, inner = 2.0 * sum(t.count * logs[t.size] for t in self.terms if t.size >= 0), []
+        for body, (errors, cross) in zip(self.bodies, units, strict=True):
+            root = np.linalg.inv(np.linalg.cholesky(errors))
+            value -= 2.0 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+            solved = (root @ cross).reshape(-1, cross.shape[2])
+            at = np.append(body.columns, p)
+            common[at[:, None], at] -= solved.T @ solved
+            inner.append(np.swapaxes(root, 1, 2) @ root)
+        covariance, log_det = inverse(common[:p, :p])
+        values = covariance @ common[:p, p]
+        value += float(common[p, p] - common[:p, p] @ values) + log_det
+        eliminated = []
+        for body, (_, cross), own in zip(self.bodies, units, inner, strict=True):
+            by = own @ cross
+            response = -by[:, :, :-1]
+            solved = by[:, :, -1] + response @ values[body.columns]
+            eliminated.append(Eliminated(own, response, solved))
+        none = np.zeros(self.sizes)
+        found = Estimate(
+            logs, float(value), values, covariance, tuple(eliminated), none, np.diag(none)
+        )
+        return self._with_prior(self._sloped(found) if is_sloped else found)
+
+    def _sloped(self, found: Estimate) -> Estimate:
+        """An estimate with its gradient and curvature."""
+        weights, p = np.append(np.exp(-2.0 * found.logs), 1.0), self.count
+        gradient, diagonal = np.zeros(self.sizes), np.zeros(self.sizes)
+        # Gradients of each size's squares by the common unknowns, errors eliminated; and by these.
+        pulls = np.zeros((self.sizes, p))
+        inner = np.zeros((self.sizes, self.sizes))
+        spreads, insides = [], []
+        for body, by in zip(self.bodies, found.bodies, strict=True):
+            c = body.columns
+            flat = by.response.reshape(-1, len(c)) @ found.covariance[c[:, None], c]
+            spreads.append(flat.reshape(by.response.shape))
+            insides.append(by.own + spreads[-1] @ np.swapaxes(by.response, 1, 2))
+        at_errors = [np.zeros((self.sizes, *own.errors.shape)) for own in found.bodies]
+        for term in self.terms:
+            if term.size < 0:
+                continue
+            x = np.append(found.values[term.columns], -1.0)
+            pull = term.common @ x
+            square = float(x @ pull)
+            some = found.covariance[term.columns[:, None], term.columns]
+            absorbed = float(np.sum(term.common[:-1, :-1] * some))
+            for part in term.parts:
+                e, own = found.bodies[part.body].errors, self.places[part.body][part.columns]
+                by_error = (part.errors @ e[:, :, None])[:, :, 0]
+                by_common = part.cross @ np.append(found.values[part.columns], -1.0)
+                square += float(np.sum(e * (by_error + 2.0 * by_common)))
+                absorbed += float(np.sum(part.errors * insides[part.body]))
+                spread = spreads[part.body][:, :, own]
+                absorbed += 2.0 * float(np.sum(part.cross[:, :, :-1] * spread))
+                at_errors[part.body][term.size] += by_error + by_common
+                pulls[term.size, part.columns] += np.einsum("umc,um->c", part.cross[:, :, :-1], e)
+            pulls[term.size, term.columns] += pull[:-1]
+            weight = weights[term.size]
+            gradient[term.size] += 2.0 * (term.count - weight * (square + absorbed))
+            diagonal[term.size] += 2.0 * (weight * (square - absorbed) + term.count)
+        for body, by, each in zip(self.bodies, found.bodies, at_errors, strict=True):
+            flat = each.reshape(self.sizes, -1)
+            solved = (by.own @ each[:, :, :, None])[:, :, :, 0].reshape(self.sizes, -1)
+            inner += flat @ solved.T
+            pulls[:, body.columns] += np.tensordot(each, by.response, axes=([1, 2], [0, 1]))
+        inner += pulls @ found.covariance @ pulls.T
+        scale = weights[:-1]
+        curvature = np.diag(diagonal) - 4.0 * inner * np.outer(scale, scale)
+        return Estimate(
+            found.logs, found.value, found.values, found.covariance, found.bodies, gradient,
+            curvature,
+        )  # fmt: skip
+
+    def _with_prior(self, found: Estimate) -> Estimate:
+        """An estimate with the prior of the ratios."""
+        value, gradient, curvature = found.value, found.gradient.copy(), found.curvature.copy()
+        mean, width = self.ratio
+        for first, second in self.ratios:
+            away = (found.logs[second] - found.logs[first] - mean) / width
+            value += away**2
+            slope = 2.0 * away / width
+            gradient[[first, second]] += [-slope, slope]
+            both = np.array([first, second])
+            curvature[both[:, None], both] += 2.0 / width**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        return Estimate(
+            found.logs, value, found.values, found.covariance, found.bodies, gradient, curvature
+        )
+
+    def shares(self, found: Estimate) -> list[tuple[int, FloatArray]]:
+        """Covariance (p, p) of the common unknowns by each term; all of them sum to the whole.
+
+        As far as the term's rows are noise: `C M C` with M the term's information about the common
+        unknowns, errors replaced by their response.
+        """
+        weights, found_shares = np.append(np.exp(-2.0 * found.logs), 1.0), []
+        for term in self.terms:
+            reduced = np.zeros((self.count, self.count))
+            t = term.columns
+            reduced[t[:, None], t] += term.common[:-1, :-1]
+            for part in term.parts:
+                c, response = self.bodies[part.body].columns, found.bodies[part.body].response
+                own = np.einsum("umc,umn,und->cd", response, part.errors, response, optimize=True)
+                reduced[c[:, None], c] += own
+                mixed = np.einsum("umc,umt->ct", response, part.cross[:, :, :-1], optimize=True)
+                reduced[c[:, None], part.columns] += mixed
+                reduced[part.columns[:, None], c] += mixed.T
+            by = found.covariance @ reduced @ found.covariance
+            found_shares.append((term.size, weights[term.size] * by))
+        return found_shares
+
+
+def inverse(information: FloatArray) -> tuple[FloatArray, float]:
+    """Inverse (p, p) of an information matrix, and its log-determinant.
+
+    What nothing determines, or elimination leaves slightly indefinite, gets a large variance.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information * np.outer(scale, scale)
+    for ridge in _RIDGES:
+        try:
+            root = np.linalg.cholesky(scaled + ridge * np.eye(len(scaled)))
+        except np.linalg.LinAlgError:
+            continue
+        break
+    else:
+        root = np.linalg.cholesky(scaled + np.eye(len(scaled)))
+    whitening = np.linalg.inv(root) * scale
+    log_det = 2.0 * float(np.log(np.diag(root)).sum() - np.log(scale).sum())
+    return np.asarray(whitening.T @ whitening), log_det
+
+
+def prior_term(size: int, columns: IntArray, offsets: FloatArray, sigma: float) -> Term:
+    """Rows of a prior: columns whose offsets (n,) from zero are one noise each."""
+    rows = np.column_stack([np.eye(len(columns)), -offsets]) / sigma
+    return Term(size, len(columns), columns, rows.T @ rows)
+
+
+def summed(terms: Sequence[Term], bodies: Sequence[Body]) -> Term:
+    """Terms of one size as one, with all of their columns."""
+    columns = np.unique(np.concatenate([term.columns for term in terms]))
+    common = np.zeros((len(columns) + 1, len(columns) + 1))
+    for term in terms:
+        at = np.append(np.searchsorted(columns, term.columns), len(columns))
+        common[at[:, None], at] += term.common
+    parts = []
+    for body in sorted({part.body for term in terms for part in term.parts}):
+        own = [part for term in terms for part in term.parts if part.body == body]
+        union = np.unique(np.concatenate([part.columns for part in own]))
+        units, width = len(bodies[body].stops), bodies[body].width
+        errors, cross = np.zeros((units, width, width)), np.zeros((units, width, len(union) + 1))
+        for part in own:
+            errors += part.errors
+            cross[:, :, np.append(np.searchsorted(union, part.columns), len(union))] += part.cross
+        parts.append(Part(body, union, errors, cross))
+    count = sum(term.count for term in terms)
+    return Term(terms[0].size, count, columns, common, tuple(parts))

@@ -1,0 +1,123 @@
+"""The search: which sightings agree, the most likely sizes, and Gauss-Newton steps."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from visioncal.core.quantiles import f_limit
+from visioncal.core.types import Mask
+from visioncal.fit.assemble import mixed_model
+from visioncal.fit.fit import Fit, LeftOut
+from visioncal.fit.linearise import Gram, Pair, linearised, pairs_of
+from visioncal.fit.mixed import Mixed
+from visioncal.fit.sizes import Found, most_likely, significant
+from visioncal.fit.start import Start
+from visioncal.fit.unknowns import State, Unknowns
+from visioncal.model import Cell
+
+# Chance that a sound session loses a sighting.
+_FALSE = 0.01
+# Most linearisations; a step under this share of every sigma is not worth one.
+_ROUNDS, _SETTLED = 8, 0.02
+# Rounds in which sightings come back while the noise is scaled by what most have: the nearest half
+# has less noise than all.
+_SCALED, _WIDENED = 4, 6
+
+
+@dataclass
+class Effort:
+    """What a fit took."""
+
+    linearisations: int = 0
+    likelihoods: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """A cell with the unknowns that are sought."""
+
+    cell: Cell
+    unknowns: Unknowns
+    pairs: tuple[Pair, ...]
+    effort: Effort = field(default_factory=Effort)
+
+    @classmethod
+    def of(cls, cell: Cell, unknowns: Unknowns) -> "Search":
+        """A search of some unknowns of a cell."""
+        return cls(cell, unknowns, pairs_of(cell))
+
+    def with_unknowns(self, unknowns: Unknowns) -> "Search":
+        """The search of others."""
+        return replace(self, unknowns=unknowns)
+
+    def run(self, state: State, used: Mask) -> tuple[Fit, LeftOut]:
+        """The fit of the sightings that agree, from a state and a first guess of these."""
+        fit, left_out = self._agreeing(self._sized(state, used, None))
+        for _ in range(_ROUNDS):
+            before = fit.used
+            fit, left_out = self._agreeing(self._sized(fit.state, before, fit))
+            sigmas = np.sqrt(np.diag(fit.estimate.covariance))
+            is_settled = bool(np.all(np.abs(fit.estimate.values) < _SETTLED * sigmas))
+            if is_settled and np.array_equal(before, fit.used):
+                break
+        return fit, left_out
+
+    def _sized(self, state: State, used: Mask, last: Fit | None) -> Fit:
+        """The fit at a linearisation, with the most likely sizes."""
+        grams = linearised(self.cell, self.unknowns, state, self.pairs)
+        self.effort.linearisations += 1
+        mixed = mixed_model(self.cell, self.unknowns, state, grams, used)
+        closed = self.unknowns.closed if last is None else last.unknowns.closed
+        unknowns = self.unknowns.closing(closed)
+        starts, (low, high) = unknowns.starts(), unknowns.bounds()
+        begin = starts if last is None else np.clip(last.estimate.logs, low + 2.0, high)
+        found = most_likely(mixed, begin, low, high)
+        random = {size for size, *_ in unknowns.priors() if size >= 0}
+        found, more = significant(mixed, found, starts, low, high, sorted(random))
+        names = {unknowns.sizes[size].name for size in more}
+        return self._fit(state, grams, used, unknowns.closing(closed | names), mixed, found)
+
+    def _fit(
+        self, state: State, grams: tuple[Gram, ...], used: Mask, unknowns: Unknowns, mixed: Mixed,
+        found: Found,
+    ) -> Fit:  # fmt: skip
+        self.effort.likelihoods += found.evaluations
+        return Fit(self.cell, unknowns, state, grams, used, mixed, found.estimate)
+
+    def _agreeing(self, fit: Fit) -> tuple[Fit, LeftOut]:
+        """The fit of the sightings within the reach of noise; steps at one linearisation."""
+        count, fewest = len(fit.used), max(len(fit.used) // 2, 5)
+        for turn in range(_WIDENED + count):
+            left_out = fit.left_out()
+            squares = left_out.squares
+            freedom = max(3.0 * fit.used.sum() - 3.0 * len(self.cell.unknown), 6.0)
+            limits = left_out.directions * f_limit(_FALSE / count, left_out.directions, freedom)
+            # The median of chi-square of six degrees is 5.35.
+            scale = max(float(np.median(squares[fit.used])) / 5.35, 1.0) if turn < _SCALED else 1.0
+            inside = squares < limits * scale
+            if turn < _WIDENED and (inside & ~fit.used).any():
+                after = fit.used | inside
+            elif (fit.used & ~inside).any() and fit.used.sum() > fewest:
+                after = fit.used.copy()
+                after[np.argmax(np.where(fit.used, squares / limits, 0.0))] = False
+            else:
+                break
+            fit = self._refitted(fit, after)
+        return fit, left_out
+
+    def _refitted(self, fit: Fit, used: Mask) -> Fit:
+        """The same linearisation with other sightings."""
+        mixed = mixed_model(self.cell, fit.unknowns, fit.linearised, fit.grams, used)
+        low, high = fit.unknowns.bounds()
+        found = most_likely(mixed, np.clip(fit.estimate.logs, low, high), low, high)
+        return self._fit(fit.linearised, fit.grams, used, fit.unknowns, mixed, found)
+
+
+def nearest(start: Start) -> Mask:
+    """(n,) sightings near a start's prediction; half of each pair, to determine all edges."""
+    near = start.distances
+    limit = max(4.0 * float(np.median(near)), float(np.sort(near)[min(len(near) - 1, 6)]))
+    used: Mask = near <= limit
+    for rows in map(np.array, start.cell.pairs.values()):
+        used[rows[near[rows].argsort()][: len(rows) // 2 + 1]] = True
+    return used

@@ -1,0 +1,351 @@
+"""Start of a fit: lenses and boards' poses by OpenCV, edges by closed forms.
+
+Edges are joined pair by pair, the surest first; each by the nearest half of its sightings, so that
+wrong ones may be nearly as many as right ones. A flat board has two poses, and a symmetric one
+looks the same after a turn: all stay candidates until edges tell which agree.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from visioncal.core.transforms import (
+    compose,
+    invert,
+    log,
+    mean_transform,
+    nearest_rotation,
+    rotation_angle,
+)
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray
+from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
+from visioncal.model.effects.effect import LEVER_M
+from visioncal.vision.camera import normalise, project
+from visioncal.vision.targets import corner_positions, rotation_transforms, rotations
+
+# Images of which a lens is estimated, and pairs of poses of which a closed form is, at most.
+_IMAGES, _PAIRS = 40, 800
+# Small sets of sightings of which edges are tried; how many are refined.
+_SETS, _BEST = 200, 5
+# The second pose of a flat board stays where it fits within this factor and addition [px].
+_ALIKE, _ALIKE_PX = 2.0, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Possible poses of a sighting."""
+
+    poses: FloatArray  # (j, 4, 4) `seer_from_seen`.
+    turns: IntArray  # (j,) symmetry of the board by which each is turned.
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a fit starts."""
+
+    cell: Cell  # With the sightings that have a pose; turned boards are numbered as they lie.
+    lenses: Mapping[str, Camera]
+    edges: Mapping[str, FloatArray]  # (4, 4) `parent_from_frame` of the unknown edges.
+    distances: FloatArray  # (n,) of the sightings from what the edges predict [m].
+    rivals: tuple[FloatArray, ...]  # Other poses (j, 4, 4) that each sighting may have.
+
+
+def start_of(cell: Cell) -> Start:
+    """Starts a fit; sightings without a pose, or whose frames are not connected, are left out."""
+    lenses = start_lenses(cell)
+    options = [candidates(cell, lenses, sighting) for sighting in cell.sightings]
+    kept = [at for at, option in enumerate(options) if option is not None]
+    cell = cell.with_sightings([cell.sightings[at] for at in kept])
+    known = [option for option in options if option is not None]
+    places = _Places(cell)
+    places.join_all(known)
+    joined = [at for at, s in enumerate(cell.sightings) if places.are_joined(*s.pair)]
+    cell, known = (
+        cell.with_sightings([cell.sightings[at] for at in joined]),
+        [known[at] for at in joined],
+    )
+    edges = {name: places.edge(name) for name in cell.unknown}
+    sightings, distances, rivals = list(cell.sightings), np.zeros(len(known)), []
+    for at, (sighting, option) in enumerate(zip(cell.sightings, known, strict=True)):
+        off = away(places.predicted(sighting), option.poses)
+        if isinstance(sighting.evidence, MeasuredPlace):
+            between = places.predicted(sighting)[:3, 3] - sighting.evidence.place_m
+            off = np.array([np.linalg.norm(between)])
+        best = int(off.argmin())
+        distances[at] = off[best]
+        turn = int(option.turns[best])
+        if turn and isinstance(sighting.evidence, Corners):
+            board = cell.boards[sighting.seen]
+            ids = np.argsort(rotations(board)[turn])[sighting.evidence.ids]
+            sightings[at] = replace(sighting, evidence=replace(sighting.evidence, ids=ids))
+        others = np.flatnonzero((option.turns == turn) & (np.arange(len(off)) != best))
+        rivals.append(option.poses[[best, *others]])
+    return Start(cell.with_sightings(sightings), lenses, edges, distances, tuple(rivals))
+
+
+def start_lenses(cell: Cell) -> dict[str, Camera]:
+    """The stated lenses by camera, and those that corners determine (Zhang 2000)."""
+    found = {}
+    for frame in {s.seer for s in cell.sightings if s.corners is not None}:
+        table = cell.cameras[frame]
+        if table.stated is not None:
+            found[frame] = table.stated
+            continue
+        seen = [s for s in cell.sightings if s.seer == frame and s.corners is not None]
+        seen = [seen[at] for at in _spread(len(seen), _IMAGES)]
+        px = [s.corners.px.astype(np.float32)[:, None] for s in seen if s.corners is not None]
+        points = [
+            corner_positions(cell.boards[s.seen])[s.corners.ids].astype(np.float32)[:, None]
+            for s in seen
+            if s.corners is not None
+        ]
+        most = np.max([at.max(axis=(0, 1)) for at in px], axis=0)
+        size = table.size or (int(most[0]) + 1, int(most[1]) + 1)
+        if table.model == "fisheye":
+            focal = 0.4 * size[0]
+            guess = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1.0]])
+            flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
+            flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
+            _, matrix, lens, *_ = cv2.fisheye.calibrate(
+                points, px, size, guess, np.zeros(4), flags=flags
+            )
+        else:
+            _, matrix, lens, *_ = cv2.calibrateCamera(points, px, size, np.eye(3), np.zeros(5))
+        four = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], float)
+        found[frame] = Camera(table.model, size, four, np.asarray(lens, float).ravel()[:5])
+    return found
+
+
+def _spread(count: int, most: int) -> IntArray:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+
+
+def candidates(cell: Cell, lenses: Mapping[str, Camera], sighting: Sighting) -> Candidates | None:
+    """Both poses of a flat board, in all turns of a symmetric one; None where it has none."""
+    if isinstance(sighting.evidence, MeasuredPose):
+        return Candidates(sighting.evidence.matrix[None], np.zeros(1, dtype=np.int64))
+    if isinstance(sighting.evidence, MeasuredPlace):
+        place = compose(np.eye(3), sighting.evidence.place_m)
+        return Candidates(place[None], np.zeros(1, dtype=np.int64))
+    lens, board = lenses[sighting.seer], cell.boards[sighting.seen]
+    px, points = sighting.evidence.px, corner_positions(board)[sighting.evidence.ids]
+    plane = normalise(lens, px)
+    good = np.isfinite(plane).all(axis=1)
+    if good.sum() < 4:
+        return None
+    flag = cv2.SOLVEPNP_SQPNP if points[:, 2].any() else cv2.SOLVEPNP_IPPE
+    try:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(
+            points[good], plane[good], np.eye(3), np.zeros(0), flags=flag
+        )
+    except cv2.error:
+        return None
+    poses = np.array(
+        [
+            compose(np.asarray(cv2.Rodrigues(turn)[0], float), np.asarray(shift, float).ravel())
+            for turn, shift in zip(turns, shifts, strict=True)
+        ]
+    )
+    off = np.array([_off_px(lens, pose, points, px) for pose in poses])
+    if not np.isfinite(off).any():
+        return None
+    alike = poses[off < _ALIKE * np.nanmin(off) + _ALIKE_PX]
+    symmetries = rotation_transforms(board)
+    numbers = np.tile(np.arange(len(symmetries)), len(alike))
+    return Candidates((alike[:, None] @ symmetries).reshape(-1, 4, 4), numbers)
+
+
+def _off_px(lens: Camera, pose: FloatArray, points: FloatArray, px: FloatArray) -> float:
+    found = project(lens, points @ pose[:3, :3].T + pose[:3, 3])
+    return float(np.sqrt(np.nanmean((found - px) ** 2)))
+
+
+def away(predicted: FloatArray, poses: FloatArray) -> FloatArray:
+    """Distances (..., j) [m] of (..., j, 4, 4) poses from (..., 4, 4) predictions."""
+    between = invert(predicted)[..., None, :, :] @ poses
+    distances = np.linalg.norm(between[..., :3, 3], axis=-1)
+    return np.asarray(distances + LEVER_M * rotation_angle(between))
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """Edges that a pair's sightings determine, and how surely."""
+
+    typical: float  # Mean distance of the nearest half, less where they are many [m].
+    # First and second frame, (4, 4) `first_from_second`.
+    links: tuple[tuple[str, str, FloatArray], ...]
+
+
+class _Places:
+    """Frames whose relative poses are known form parts; sightings join these."""
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell, self.tree = cell, cell.tree
+        frames = [cell.tree.root, *cell.tree.branches]
+        self.part = {name: name for name in frames}
+        self.pose = {name: np.eye(4) for name in frames}  # In the part's own frame.
+        for name, branch in cell.tree.branches.items():
+            if branch.known is not None:
+                self.join(branch.parent, name, branch.known)
+
+    def join(self, first: str, second: str, first_from_second: FloatArray) -> None:
+        """Makes one part of two."""
+        if self.part[first] == self.part[second]:
+            return
+        change = self.pose[first] @ first_from_second @ invert(self.pose[second])
+        gone, kept = self.part[second], self.part[first]
+        for name in [name for name, part in self.part.items() if part == gone]:
+            self.part[name], self.pose[name] = kept, change @ self.pose[name]
+
+    def segments(self, seer: str, seen: str) -> list[tuple[str, str, str, bool]]:
+        """Frames between which no robot moves, along a path, each with the robot behind it."""
+        found, at = [], seer
+        for step in self.tree.path(seer, seen):
+            if step.robot:
+                base = self.tree.branches[step.frame].parent
+                near, far = (step.frame, base) if step.is_up else (base, step.frame)
+                found.append((at, near, step.robot, step.is_up))
+                at = far
+        return [*found, (at, seen, "", True)]
+
+    def are_joined(self, seer: str, seen: str) -> bool:
+        """Whether all between two frames is known."""
+        return all(self.part[a] == self.part[b] for a, b, *_ in self.segments(seer, seen))
+
+    def edge(self, name: str) -> FloatArray:
+        """(4, 4) `parent_from_frame`."""
+        return np.asarray(invert(self.pose[self.tree.branches[name].parent]) @ self.pose[name])
+
+    def predicted(self, sighting: Sighting) -> FloatArray:
+        """(4, 4) `seer_from_seen` where all between is known."""
+        found = np.eye(4)
+        for first, second, robot, is_up in self.segments(*sighting.pair):
+            found = found @ invert(self.pose[first]) @ self.pose[second]
+            if robot:
+                moved = self.cell.arms[robot].poses[sighting.stop]
+                found = found @ (invert(moved) if is_up else moved)
+        return found
+
+    def join_all(self, options: Sequence[Candidates]) -> None:
+        """Joins all that sightings join."""
+        known: dict[tuple[tuple[str, str], tuple[bool, ...]], _Joint | None] = {}
+        while True:
+            joints = []
+            for pair, rows in self.cell.pairs.items():
+                state = tuple(self.part[a] == self.part[b] for a, b, *_ in self.segments(*pair))
+                if all(state):
+                    continue
+                if (pair, state) not in known:
+                    known[pair, state] = self._joint(pair, rows, options)
+                joint = known[pair, state]
+                if joint is not None:
+                    joints.append(joint)
+            if not joints:
+                return
+            for first, second, matrix in min(joints, key=lambda joint: joint.typical).links:
+                self.join(first, second, matrix)
+
+    def _joint(
+        self, pair: tuple[str, str], rows: Sequence[int], options: Sequence[Candidates]
+    ) -> _Joint | None:
+        """What the sightings of a pair determine, where one or two edges are unknown."""
+        sightings = [self.cell.sightings[row] for row in rows]
+        stops = np.array([sighting.stop for sighting in sightings])
+        open_links, parts = list[tuple[str, str]](), [np.tile(np.eye(4), (len(rows), 1, 1))]
+        for first, second, robot, is_up in self.segments(*pair):
+            if self.part[first] == self.part[second]:
+                parts[-1] = parts[-1] @ invert(self.pose[first]) @ self.pose[second]
+            else:
+                open_links.append((first, second))
+                parts.append(np.tile(np.eye(4), (len(rows), 1, 1)))
+            if robot:
+                moved = self.cell.arms[robot].poses[stops]
+                parts[-1] = parts[-1] @ (invert(moved) if is_up else moved)
+        if any(isinstance(sighting.evidence, MeasuredPlace) for sighting in sightings):
+            return None
+        seen = _padded([options[row] for row in rows])
+        seen = invert(parts[0])[:, None] @ seen @ invert(parts[-1])[:, None]
+        if len(open_links) == 1:
+            matrix, typical = _agreed(seen)
+            return _Joint(typical, ((*open_links[0], matrix),))
+        if len(open_links) == 2 and len(rows) >= 3:
+            x, z, typical = robust_hand_eye(invert(parts[1]), seen)
+            links = ((*open_links[0], invert(x)), (*open_links[1], z))
+            return _Joint(typical, links)
+        return None
+
+
+def _padded(options: Sequence[Candidates]) -> FloatArray:
+    """(m, j, 4, 4) poses, the first repeated where there are fewer."""
+    most = max(len(option.poses) for option in options)
+    rows = [np.minimum(np.arange(most), len(option.poses) - 1) for option in options]
+    return np.array([option.poses[at] for option, at in zip(options, rows, strict=True)])
+
+
+def _agreed(seen: FloatArray) -> tuple[FloatArray, float]:
+    """The pose (4, 4) on which the nearest half of (m, j, 4, 4) agree, and its distance [m]."""
+    count = len(seen)
+    flat = seen.reshape(-1, 4, 4)
+    flat = flat[:: len(flat) // 100 + 1]
+    off = away(np.broadcast_to(flat[:, None], (len(flat), count, 4, 4)), seen)
+    half = count // 2 + 1
+    best = int(np.sort(off.min(axis=2), axis=1)[:, :half].sum(axis=1).argmin())
+    own = off[best].min(axis=1)
+    near = own.argsort()[:half]
+    matrix = mean_transform(seen[near, off[best, near].argmin(axis=1)])
+    return matrix, float(own[near].mean() / np.sqrt(half))
+
+
+def robust_hand_eye(robot: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Both edges (4, 4) of `robot X seen = Z`, and the mean distance of the nearest half [m].
+
+    Least trimmed squares over small sets (Rousseeuw and Van Driessen 1999).
+
+    Args:
+        robot: (m, 4, 4) poses.
+        seen: (m, j, 4, 4) candidates for what was seen there.
+    """
+    count, rng = len(robot), np.random.default_rng(0)
+    half = max(count // 2 + 1, 3)
+    sets = np.array([rng.choice(count, min(4, count), replace=False) for _ in range(_SETS)])
+    picks = rng.integers(seen.shape[1], size=sets.shape)
+    picks[::2] = 0
+    x, z = _hand_eye(robot[sets], seen[sets, picks])
+    off = away(invert(robot[None] @ x[:, None]) @ z[:, None], seen[None])
+    sums = np.sort(off.min(axis=2), axis=1)[:, :half].sum(axis=1)
+    found = []
+    for at in sums.argsort()[:_BEST]:
+        best, own, total = (x[at], z[at]), off[at], float(sums[at])
+        for _ in range(10):
+            rows = own.min(axis=1).argsort()[:half]
+            one = _hand_eye(robot[rows][None], seen[rows, own[rows].argmin(axis=1)][None])
+            trial = away(invert(robot @ one[0]) @ one[1], seen)
+            lower = float(np.sort(trial.min(axis=1))[:half].sum())
+            if lower >= total:
+                break
+            best, own, total = (one[0][0], one[1][0]), trial, lower
+        found.append((total, best))
+    total, best = min(found, key=lambda item: item[0])
+    return *best, total / half
+
+
+def _hand_eye(robot: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """X and Z (k, 4, 4) of `robot X seen = Z`, of k sets of m poses (Park and Martin 1994)."""
+    first, second = np.triu_indices(robot.shape[1], 1)
+    if len(first) > _PAIRS:
+        chosen = np.random.default_rng(0).choice(len(first), _PAIRS, replace=False)
+        first, second = first[chosen], second[chosen]
+    a = invert(robot[:, second]) @ robot[:, first]
+    b = seen[:, second] @ invert(seen[:, first])
+    turns_a, turns_b = log(a)[..., :3], log(b)[..., :3]
+    rotation = nearest_rotation(np.swapaxes(turns_a, 1, 2) @ turns_b)
+    left = (a[..., :3, :3] - np.eye(3)).reshape(len(robot), -1, 3)
+    right = (rotation[:, None] @ b[..., :3, 3:] - a[..., :3, 3:]).reshape(len(robot), -1, 1)
+    normal = np.swapaxes(left, 1, 2) @ left
+    place = np.linalg.pinv(normal, hermitian=True) @ np.swapaxes(left, 1, 2) @ right
+    x = compose(rotation, place[..., 0])
+    placed = robot @ x[:, None] @ seen
+    middle = np.median(placed[..., :3, 3], axis=1)
+    return x, compose(nearest_rotation(placed[..., :3, :3].sum(axis=1)), middle)

@@ -1,0 +1,280 @@
+"""Unknowns of a cell: the one place that knows columns, sizes and how a step moves a value."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.core.transforms import exp
+from visioncal.core.types import Camera, FloatArray, IntArray, Target
+from visioncal.model.boards import BEND, PLANE, SHAPES, SIZE
+from visioncal.model.effects import Effect, Size
+from visioncal.vision.camera import intrinsics, project_with_jacobian, with_intrinsics
+
+Kind: TypeAlias = Literal["edge", "lens", "shape", "effect", "field"]
+Key: TypeAlias = tuple[Kind, str]
+
+# A maker's lens: its centre is in the middle of the image within this share of the width, and p1
+# and p2 are within this.
+CENTRE, TANGENTIAL = 0.02, 1e-3
+# Size of a noise over that of the other, per metre and radian, within this factor's logarithm.
+RATIO_M, RATIO_LOG = 0.6, 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """A zero-mean Gaussian prior of some columns of an unknown."""
+
+    columns: IntArray  # (n,) among the unknown's own.
+    size: Size | None = None  # Its standard deviation, which is estimated.
+    sigma: float = 1.0  # Its standard deviation where it is known, in the columns' units.
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown(ABC):
+    """One unknown of d columns."""
+
+    key: Key
+    priors: tuple[Prior, ...] = ()  # Columns without one are flat.
+
+    @property
+    @abstractmethod
+    def units(self) -> FloatArray:
+        """(d,) what one unit of each column is, in SI units or pixels."""
+
+    @abstractmethod
+    def moved(self, value: FloatArray, step: FloatArray) -> FloatArray:
+        """The value after a step (d,), in the columns' units."""
+
+    @abstractmethod
+    def offset(self, value: FloatArray) -> FloatArray:
+        """(d,) how far a value is from its prior's mean, in the columns' units."""
+
+    @property
+    def count(self) -> int:
+        """The number of its columns."""
+        return len(self.units)
+
+
+@dataclass(frozen=True, eq=False)
+class Edge(Unknown):
+    """`parent_from_frame` (4, 4), perturbed on the right by (rotation [rad], translation [m])."""
+
+    @property
+    def units(self) -> FloatArray:
+        """See `Unknown`."""
+        return np.ones(6)
+
+    def moved(self, value: FloatArray, step: FloatArray) -> FloatArray:
+        """See `Unknown`."""
+        return value @ exp(step)
+
+    def offset(self, value: FloatArray) -> FloatArray:
+        """See `Unknown`."""
+        del value
+        return np.zeros(6)
+
+
+@dataclass(frozen=True, eq=False)
+class Vector(Unknown):
+    """A (n,) vector, of which the first d are unknown: a lens, a board, an effect or a field."""
+
+    mean: FloatArray = field(default_factory=lambda: np.zeros(0))  # (d,) of its prior.
+    scale: FloatArray = field(default_factory=lambda: np.zeros(0))  # (d,) `units`.
+
+    @property
+    def units(self) -> FloatArray:
+        """See `Unknown`."""
+        return self.scale
+
+    def moved(self, value: FloatArray, step: FloatArray) -> FloatArray:
+        """See `Unknown`."""
+        found = value.copy()
+        found[: len(step)] += step * self.scale
+        return found
+
+    def offset(self, value: FloatArray) -> FloatArray:
+        """See `Unknown`."""
+        return np.asarray((value[: len(self.mean)] - self.mean) / self.scale)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A point of linearisation."""
+
+    # What is estimated or held: (4, 4) edges, intrinsics, (10,) shapes, effects, fields.
+    values: Mapping[Key, FloatArray]
+    errors: Mapping[str, FloatArray]  # (s, 6) right perturbations of each flange's pose.
+
+    def get(self, kind: Kind, name: str) -> FloatArray | None:
+        """The value of something; None where it has none."""
+        return self.values.get((kind, name))
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """All unknowns and sizes of a fit."""
+
+    members: tuple[Unknown, ...]
+    effects: tuple[Effect, ...]  # Of which there are unknowns.
+    lenses: Mapping[str, Camera]  # By camera: its model; the state has its intrinsics.
+    # Flanges that err at each stop: sizes `rad NAME` and `m NAME`.
+    erring: tuple[str, ...]
+    noise: tuple[Size, ...]  # Of sightings and flanges.
+    # Pairs of sizes [rad], [m], whose ratio has a prior.
+    ratios: tuple[tuple[str, str], ...] = ()
+    closed: frozenset[str] = frozenset()  # Sizes that are held at their lower bounds.
+
+    @cached_property
+    def slices(self) -> Mapping[Key, slice]:
+        """Columns of each unknown."""
+        ends = np.cumsum([0, *(member.count for member in self.members)]).tolist()
+        return {m.key: slice(a, b) for m, a, b in zip(self.members, ends, ends[1:], strict=False)}
+
+    @property
+    def count(self) -> int:
+        """The number p of columns."""
+        return sum(member.count for member in self.members)
+
+    def columns(self, kind: Kind, name: str) -> IntArray:
+        """Columns of an unknown; none where it is held."""
+        found = self.slices.get((kind, name), slice(0, 0))
+        return np.arange(found.start, found.stop)
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self.slices
+
+    def __getitem__(self, key: Key) -> Unknown:
+        return next(member for member in self.members if member.key == key)
+
+    @cached_property
+    def units(self) -> FloatArray:
+        """(p,) what one unit of each column is."""
+        return np.concatenate([np.zeros(0), *(member.units for member in self.members)])
+
+    @cached_property
+    def sizes(self) -> tuple[Size, ...]:
+        """All sizes: of noise, then of random unknowns."""
+        random = (prior.size for member in self.members for prior in member.priors)
+        return (*self.noise, *(size for size in random if size is not None))
+
+    @cached_property
+    def size_index(self) -> Mapping[str, int]:
+        """Index of each size by its name."""
+        return {size.name: at for at, size in enumerate(self.sizes)}
+
+    def size_of(self, name: str) -> int:
+        """Index of a size; -1 where there is none, since the rows are whitened."""
+        return self.size_index.get(name, -1)
+
+    def priors(self) -> Iterable[tuple[int, IntArray, float]]:
+        """Each prior: its size (-1 for none), its columns (n,) and its known sigma."""
+        for member in self.members:
+            start = self.slices[member.key].start
+            for prior in member.priors:
+                name = prior.size.name if prior.size else ""
+                yield self.size_of(name), start + prior.columns, prior.sigma
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """(t,) lowest and highest logarithms of the sizes."""
+        low, high = np.log([[size.low, size.high] for size in self.sizes] or np.ones((0, 2))).T
+        is_closed = np.array([size.name in self.closed for size in self.sizes], bool)
+        return low, np.where(is_closed, low, high)
+
+    def starts(self) -> FloatArray:
+        """(t,) logarithms at which a search begins."""
+        low, high = self.bounds()
+        return np.clip(np.log([size.start for size in self.sizes]), low, high)
+
+    def offsets(self, state: State) -> FloatArray:
+        """(p,) distances of a state from the priors' means."""
+        parts = [member.offset(state.values[member.key]) for member in self.members]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def moved(self, state: State, steps: FloatArray, errors: Mapping[str, FloatArray]) -> State:
+        """The state after a step (p,) of the unknowns, and (s, 6) of each flange's errors."""
+        values = dict(state.values)
+        for member in self.members:
+            step = steps[self.slices[member.key]]
+            values[member.key] = member.moved(values[member.key], step)
+        added = {name: state.errors[name] + step for name, step in errors.items()}
+        return State(values, {**state.errors, **added})
+
+    def camera(self, state: State, frame: str) -> Camera:
+        """A lens at a state."""
+        return with_intrinsics(self.lenses[frame], state.values["lens", frame])
+
+    def with_members(self, *more: Unknown) -> "Unknowns":
+        """The unknowns with others, which take the place of those of their names."""
+        keys = {member.key for member in more}
+        kept = (member for member in self.members if member.key not in keys)
+        return replace(self, members=(*kept, *more))
+
+    def closing(self, names: Iterable[str]) -> "Unknowns":
+        """The unknowns with some sizes held at their lower bounds."""
+        return replace(self, closed=frozenset(names))
+
+
+def given_lens(frame: str, lens: Camera, px: FloatArray) -> Vector:
+    """A stated lens, which may be off: focal lengths, centre and distortion by a size each.
+
+    In units of intrinsics that move the (n, 2) corners by one pixel (rms).
+    """
+    values = intrinsics(lens)
+    moved = np.sqrt(np.nanmean(by_lens(lens, px) ** 2, axis=(0, 1)) * 2.0)
+    parts = {"focal": (0, 2), "centre": (2, 4), "distortion": (4, len(values))}
+    priors = tuple(
+        Prior(np.arange(*ends), Size(f"{part} {frame}", 1.0, 1e-3, 100.0))
+        for part, ends in parts.items()
+    )
+    return Vector(("lens", frame), priors, values, 1.0 / moved)
+
+
+def estimated_lens(frame: str, lens: Camera) -> Vector:
+    """A lens of which nothing is stated, but that it is a maker's."""
+    values, width, height = intrinsics(lens), *lens.resolution
+    mean = values.copy()
+    mean[2:4] = (width - 1) / 2, (height - 1) / 2
+    priors = [Prior(np.array([2, 3]), sigma=CENTRE * width)]
+    if lens.model == "brown":
+        mean[6:8] = 0.0
+        priors.append(Prior(np.array([6, 7]), sigma=TANGENTIAL))
+    return Vector(("lens", frame), tuple(priors), mean, np.ones(len(values)))
+
+
+def printed_board(frame: str, board: Target, *, has_shape: bool, is_sized: bool) -> Vector:
+    """A printed board: its size, and its other errors where `has_shape`.
+
+    `is_sized` where errors of the arms cannot look like its size: then that is estimated.
+    """
+    low = max(board.square_sigma_m / board.square_m, 1e-7)
+    high = 0.2 if is_sized else low
+    size = Size(f"scale {frame}", min(0.01, high), low, high)
+    priors = [Prior(np.arange(SHAPES)[SIZE], size)]
+    if has_shape:
+        priors.append(Prior(np.arange(SHAPES)[PLANE], Size(f"plane {frame}", 3e-4, 1e-7, 0.02)))
+        priors.append(Prior(np.arange(SHAPES)[BEND], Size(f"bend {frame}", 1e-4, 1e-7, 0.05)))
+    count = SHAPES if has_shape else 1
+    return Vector(("shape", frame), tuple(priors), np.zeros(count), np.ones(count))
+
+
+def random_effect(effect: Effect) -> Vector:
+    """The unknowns of an effect."""
+    none, prior = np.zeros(effect.count), Prior(np.arange(effect.count), effect.size)
+    return Vector(("effect", effect.name), (prior,), none, np.ones(effect.count))
+
+
+def flange_noise(flanges: Sequence[str]) -> tuple[Size, ...]:
+    """Sizes of what each arm errs by from stop to stop [rad], [m]."""
+    return tuple(
+        Size(f"{unit} {name}", 1e-3, 1e-8, 0.3) for name in flanges for unit in ("rad", "m")
+    )
+
+
+def by_lens(lens: Camera, px: FloatArray) -> FloatArray:
+    """Derivatives (n, 2, q) of (n, 2) corners by the intrinsics, near the lens's own rays."""
+    rays = np.column_stack([(px - lens.matrix[2:]) / lens.matrix[:2], np.ones(len(px))])
+    return np.nan_to_num(project_with_jacobian(lens, rays).jacobian_intrinsics)

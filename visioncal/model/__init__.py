@@ -1,0 +1,9 @@
+"""What is seen in a cell, and what it depends on: frames, arms, boards, sightings, effects."""
+
+from visioncal.model.arm import Arm as Arm
+from visioncal.model.arm import Moments as Moments
+from visioncal.model.cell import Cell as Cell
+from visioncal.model.reading import read_cell as read_cell
+from visioncal.model.sightings import MeasuredPlace as MeasuredPlace
+from visioncal.model.sightings import MeasuredPose as MeasuredPose
+from visioncal.model.sightings import Sighting as Sighting

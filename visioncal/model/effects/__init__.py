@@ -1,0 +1,5 @@
+"""What moves a frame, or changes a lens, beside noise: one file an effect."""
+
+from visioncal.model.effects.effect import Effect as Effect
+from visioncal.model.effects.effect import Size as Size
+from visioncal.model.effects.links import Links as Links

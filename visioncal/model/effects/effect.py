@@ -1,0 +1,64 @@
+"""An effect: columns that act on an edge or on a lens at each moment, and their common size."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal, TypeAlias
+
+import numpy as np
+
+from visioncal.core.types import FloatArray
+from visioncal.model.arm import Moments
+
+Place: TypeAlias = Literal["edge", "lens"]
+
+# Arms err by half a millimetre for each milliradian.
+LEVER_M = 0.5
+# (6,) twists [rad], [m] of a size of one radian.
+TWIST = np.repeat([1.0, LEVER_M], 3)
+
+
+@dataclass(frozen=True)
+class Size:
+    """Standard deviation of noise or of random unknowns, which is to be estimated."""
+
+    name: str
+    start: float  # Where a search begins: above what is likely.
+    low: float  # At this it stands for none.
+    high: float
+
+
+@dataclass(frozen=True)
+class Effect(ABC):
+    """Random unknowns a ~ N(0, s^2): they add `columns @ a` to a frame's pose or a lens.
+
+    Of an edge, a robot's or an unknown one, the columns are right perturbations of
+    `parent_from_frame` [rad, m]; of a lens, changes of its intrinsics.
+    """
+
+    place: ClassVar[Place] = "edge"
+    frame: str  # The edge's child frame, or the camera.
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Its name: in sizes, budget and result."""
+
+    @property
+    @abstractmethod
+    def size(self) -> Size:
+        """Bounds of its size."""
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """Number c of its unknowns."""
+
+    @abstractmethod
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """Columns (k, 6, c), or (k, q, c) of a lens with q intrinsics.
+
+        Args:
+            moments: The k moments.
+            distances: (k,) distance of what is seen from the camera along its axis, over the
+                session's median one.
+        """

@@ -1,0 +1,44 @@
+"""Errors of an arm's links: each joint's frame is placed elsewhere than its model says."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray
+from visioncal.model.arm import Moments
+from visioncal.model.effects.effect import TWIST, Effect, Size
+from visioncal.robot import Robot
+
+
+@dataclass(frozen=True)
+class Links(Effect):
+    """Six errors a joint, of one size [rad], [m / 0.5].
+
+    They are the placements of everything behind each joint, so that those of the base and the
+    flange, which edges have already, are not among them but for one joint's.
+    """
+
+    robot: Robot
+
+    @property
+    def name(self) -> str:
+        """See `Effect`."""
+        return f"links {self.frame}"
+
+    @property
+    def size(self) -> Size:
+        """See `Effect`."""
+        return Size(self.name, 1e-3, 1e-7, 0.1)
+
+    @property
+    def count(self) -> int:
+        """See `Effect`."""
+        return 6 * self.robot.joint_count
+
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """See `Effect`."""
+        del distances
+        frames = self.robot.link_frames(moments.joints[self.frame])
+        twists = adjoint(invert(frames[:, -1:]) @ frames[:, :-1]) * TWIST
+        return np.asarray(np.moveaxis(twists, 1, 2).reshape(len(frames), 6, self.count))

@@ -1,0 +1,119 @@
+"""Reading a session as a cell."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import Corners, FloatArray
+from visioncal.estimation.tree import Branch, Tree
+from visioncal.model.arm import Arm, Moments, even_progress
+from visioncal.model.cell import Cell
+from visioncal.model.sightings import Evidence, MeasuredPlace, MeasuredPose, Sighting
+from visioncal.robot import Robot
+from visioncal.session import Observation, Session, frame_name
+from visioncal.session.columns import MEASURED_CAM_POSE
+from visioncal.session.frames import CELL
+from visioncal.session.kinds import name_of, stated_instrument
+
+# Corners that determine a board's pose.
+_FEWEST_CORNERS = 4
+
+
+def read_cell(session: Session, corners: Mapping[int, Corners]) -> Cell:
+    """Reads a session.
+
+    Args:
+        session: The session; rows that are held out or of the lens alone are left out.
+        corners: The corners in its images by view, each numbered on its own board.
+
+    Raises:
+        DataError: No row has an observation, or frames are ambiguous.
+    """
+    rows = [
+        row
+        for row in session.observations
+        if not row.view.is_of_lens and not row.view.holdout and not row.missing_robots
+    ]
+    if not rows:
+        raise DataError(
+            f"session {session.name!r}: no row has an observation of a camera or an instrument.",
+            next_step="Give rows images and cameras, or poses in cft_ columns.",
+        )
+    stations = {station: at for at, station in enumerate(sorted({row.station for row in rows}))}
+    arms = {arm.flange: arm for arm in _arms(session, rows, stations)}
+    sightings = []
+    for row in rows:
+        stop = stations[row.station]
+        known = (arms[frame_name("flange", name)].poses[stop] for name in row.robots)
+        found = corners.get(row.view.number)
+        evidence = _evidence(session, row, found)
+        if evidence is not None and all(np.isfinite(pose).all() for pose in known):
+            sighting = Sighting(row.view.number, stop, row.seer, row.seen, evidence)
+            sightings.append(sighting)
+    return Cell(
+        _tree(session, [*arms], sightings),
+        arms,
+        {frame_name("camera", name): table for name, table in session.cameras.items()},
+        {frame_name("target", name): plate for name, plate in session.plates.items()},
+        tuple(sightings),
+        Moments.of(arms, even_progress(len(stations))),
+    )
+
+
+def _arms(session: Session, rows: list[Observation], stations: Mapping[int, int]) -> Iterator[Arm]:
+    models = {name: Robot.from_document(at) for name, at in session.robot_documents.items()}
+    for name in session.robots:
+        poses = np.full((len(stations), 4, 4), np.nan)
+        model = models.get(name)
+        joints = np.full((len(stations), model.joint_count if model else 0), np.nan)
+        for row in rows:
+            if name not in row.robots:
+                continue
+            at, angles = stations[row.station], row.robots[name].joints_rad
+            if model is not None and angles is not None:
+                joints[at] = angles
+            reported = row.robots[name].base_from_flange()
+            if reported is not None:
+                poses[at] = reported.as_matrix()
+            elif model is not None and angles is not None:
+                poses[at] = model.base_from_flange(angles[None])[0]
+        is_known = model is not None and bool(
+            np.isfinite(joints[np.isfinite(poses[:, 0, 0])]).all()
+        )
+        known: FloatArray | None = np.nan_to_num(joints) if is_known else None
+        yield Arm(frame_name("flange", name), poses, known, model)
+
+
+def _evidence(session: Session, row: Observation, corners: Corners | None) -> Evidence | None:
+    """What a row says; None where that is nothing."""
+    if corners is not None:
+        return corners if len(corners.ids) >= _FEWEST_CORNERS else None
+    measured = row.view.matrix(MEASURED_CAM_POSE)
+    if measured is not None:
+        return MeasuredPose(measured)
+    place = row.view.reading_m
+    if place is None:
+        return None
+    name = name_of(session.declaration, "instrument", row.view)
+    noise = stated_instrument(session.instruments[name])
+    sigma_m = float(noise.sigmas_m(place))
+    probe = row.view.instrument_from_probe()
+    if probe is None or noise.sigma_rad is None:
+        return MeasuredPlace(place, sigma_m)
+    return MeasuredPose(probe, (noise.sigma_rad, sigma_m))
+
+
+def _tree(session: Session, flanges: list[str], sightings: list[Sighting]) -> Tree:
+    """The tree; the base of the robot that most sightings move with is the cell's own frame."""
+    branches = {
+        name: Branch(parent, robot=name if name in flanges else "")
+        for name, parent in session.frames.items()
+    }
+    tree = Tree(CELL, branches)
+    passed = [step.robot for sight in sightings for step in tree.path(*sight.pair)]
+    most = max(flanges, key=passed.count, default=None)
+    if most is None:
+        first = next(iter(tree.unknown), None)
+        return tree if first is None else tree.with_known(first, np.eye(4))
+    return tree.with_known(tree.branches[most].parent, np.eye(4))
