@@ -58,6 +58,20 @@ def recorded(out):
     return [cv2.imread(str(out / view.image), -1) for view in Session.load(out).views]
 
 
+@pytest.mark.parametrize("typed", [[], ["1 2 3"], ["0.1 0.2 0.3 0 0 0.1"]])
+def test_poses_that_were_none_leave_no_folder_in_the_way_of_the_next_ones(seen, tmp_path, typed):
+    lines, pictures = seen
+    shown, live = tmp_path / "pictures", tmp_path / "live"
+    shown.mkdir()
+    for at, picture in enumerate(pictures):
+        cv2.imwrite(str(shown / f"{at}.png"), picture)
+    camera = f"folder:{shown}"
+    record(typed, camera, live).refused("there is no session yet", "Then record again")
+    assert not live.exists()
+    record(lines, camera, live).good()
+    assert np.array_equal(recorded(live), pictures)
+
+
 def test_a_folder_that_still_grows_gives_each_picture_to_its_pose(seen, tmp_path, monkeypatch):
     lines, pictures = seen
     inbox, camera = tmp_path / "bilder ü", f"folder:{tmp_path / 'bilder ü'}"

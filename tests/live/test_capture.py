@@ -545,6 +545,15 @@ def test_devices_and_pictures_that_do_not_fit_are_named(planned, cell, tmp_path)
     )
 
 
+def test_what_ends_before_its_first_view_leaves_no_folder_behind(planned, cell, tmp_path):
+    """The same command can be given again; it said that its folder was not empty."""
+    live, sent = tmp_path / "live", ("--plan", planned[0], "--yes")
+    cell[1].hidden_at = range(9)
+    record(live, *sent).refused("No view was taken")
+    record(live, *sent, "--resume").refused("Then record again")
+    assert not live.exists()
+
+
 def test_a_guided_arm_is_followed(planned, cell, tmp_path):
     arm, stops = cell[0], iter(read_plan(planned[0]).stops)
     state, rested = arm.state, [arm.clock.now()]

@@ -88,13 +88,16 @@ def record_command(options: RecordOptions) -> None:
         count = options.views if driven is None else len(driven.stops)
         facts = CaptureFacts.of(cell, options.out.name, recorded, plan)
         journal = start(options.out, facts, cell.clock.unix_offset_s(), count)
-        if driven is not None:
-            steps = record_driven(cell, driven, journal, taking, consent, say_line)
-        else:
-            lens = cell.camera.factory or (None if plan is None else plan.cell.camera)
-            target, robot = recorded.target, recorded.robot
-            capture = Capture(cell, target, robot, lens, journal, taking, None, say_line)
-            steps = _guided(capture, options.views)
+        try:
+            if driven is not None:
+                steps = record_driven(cell, driven, journal, taking, consent, say_line)
+            else:
+                lens = cell.camera.factory or (None if plan is None else plan.cell.camera)
+                target, robot = recorded.target, recorded.robot
+                capture = Capture(cell, target, robot, lens, journal, taking, None, say_line)
+                steps = _guided(capture, options.views)
+        finally:
+            journal.remove_unbegun()
     if drives:
         check_all(journal, steps)
     _finish(journal, steps, as_json=options.as_json)

@@ -303,6 +303,14 @@ class Journal:
         journal._settle()
         return journal
 
+    def remove_unbegun(self) -> None:
+        """Removes the folder of a recording without a view, with nothing else in it."""
+        with suppress(OSError):
+            if {path.name for path in self.folder.iterdir()} == {PROVENANCE, _IMAGES}:
+                (self.folder / _IMAGES).rmdir()
+                (self.folder / PROVENANCE).unlink()
+                self.folder.rmdir()
+
     @property
     def left_out(self) -> tuple[str, ...]:
         """Names of a folder's pictures that are no view's and not to be given."""

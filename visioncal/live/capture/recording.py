@@ -209,10 +209,10 @@ class Capture:
         except (KeyboardInterrupt, VisioncalError) as error:
             count, folder = len(self.journal.views), self.journal.folder
             stored = f"{count} view{'s are' if count > 1 else ' is'} safe in {folder}."
-            if not count:
-                stored = f"No view was taken; {folder} is no session yet."
             resume = "Go on with --resume."
-            if self.cell.is_stored:
+            if not count:
+                stored, resume = "No view was taken: there is no session yet.", "Then record again."
+            elif self.cell.is_stored:
                 resume = "Record all into a new session: a folder begins with its first picture."
             if isinstance(error, KeyboardInterrupt):
                 halted = "; the arm was halted" if isinstance(self.cell.arm, MovingArm) else ""
@@ -445,11 +445,18 @@ def ask_and_take(capture: Capture, arm: RequestingArm, count: int) -> list[Captu
         count: Number of views; 0 for as many as are requested.
 
     Raises:
-        DriverError: The arm or the camera failed, or Ctrl-C was pressed.
+        DriverError: The arm or the camera failed, Ctrl-C was pressed, or no view was requested.
         DataError: A view cannot be written, or too many in a row gave none.
     """
-    with capture.halting(), suppress(EOFError):
-        while not count or len(capture.journal.views) < count:
-            if not take_requested(capture, arm, count):
-                break
+    with capture.halting():
+        with suppress(EOFError):
+            while not count or len(capture.journal.views) < count:
+                if not take_requested(capture, arm, count):
+                    break
+        if not capture.journal.views:
+            raise DriverError(
+                f"{arm.name}: the poses ended before the first view.",
+                culprits=[arm.name],
+                next_step="Give the pose at which the camera sees the board.",
+            )
     return capture.steps
