@@ -477,6 +477,14 @@ def test_what_cannot_be_exported_is_refused(source, name, chosen, words):
     assert words in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["camera-info", "kalibr"])
+def test_a_lens_that_is_not_there_is_named_with_what_can_be_exported(name):
+    refused = raised(DataError, "measured poses", export, replace(SAMPLE, camera=None), name)
+    assert refused.culprits == ("calibration.json: camera",)
+    (can,) = re.findall("--to ([a-z]+)", refused.next_step)
+    assert export(replace(SAMPLE, camera=None), can)
+
+
 def test_a_frame_has_its_own_origin_sigma_and_verdict():
     # The calibration itself comes from another file, of another day, with another verdict.
     bad = Verdict.of("bad", "Touch 4 is off by 7 mm.")

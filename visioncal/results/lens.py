@@ -17,6 +17,7 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, CameraKind, FloatArray
 from visioncal.estimation.lens_field import LensLevels, displacements
 from visioncal.results.edge import Covariance, Edge, StoredEdge, StoredPose
+from visioncal.session.document import COEFFICIENTS
 from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian, with_intrinsics
 
 # Places of p1 and p2 among Brown's intrinsics.
@@ -60,6 +61,14 @@ class CameraForm:
     resolution: tuple[int, int]  # Width and height [px].
     matrix: Annotated[FloatArray, Array((4,))]  # fx, fy, cx, cy [px].
     distortion: Vector  # The coefficients in OpenCV's order.
+
+    def __post_init__(self) -> None:
+        count, counts = len(self.distortion), COEFFICIENTS[self.model]
+        if count not in counts:
+            needed = " or ".join(map(str, counts))
+            raise ValueError(f"{self.model} has {count} coefficients; {needed} are needed")
+        if min(*self.resolution, *self.matrix[:2]) <= 0:
+            raise ValueError("resolution, fx and fy must be above 0")
 
 
 StoredCamera = Annotated[

@@ -35,7 +35,8 @@ NotNegative = Annotated[FiniteFloat, Field(ge=0, le=_LARGEST)]
 # Largest side of an image: four times that of the largest sensors [px].
 Side = Annotated[int, Field(gt=0, le=65_535)]
 
-_COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
+# Numbers of distortion coefficients, by the model.
+COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
 
 
 class TableModel(BaseModel):
@@ -90,7 +91,7 @@ class CameraTable(TableModel):
 
     @model_validator(mode="after")
     def _is_one(self) -> Self:
-        counts, count = _COEFFICIENTS[self.model], len(self.distortion or ())
+        counts, count = COEFFICIENTS[self.model], len(self.distortion or ())
         if self.distortion is not None and count not in counts:
             needed = " or ".join(map(str, counts))
             raise ValueError(

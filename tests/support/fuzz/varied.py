@@ -40,7 +40,7 @@ TITLES = ("Zelle 4, 2026-11-20", "[red]cell[/red] <b>&amp;", "📷 робот", 
 FOLDERS = ("-session", ".session", "zwei Wörter", "s" * 200, "📷 'q' \"r\"", "[x] 100%")
 POSES = ("ros", "ros-launch", "easy-handeye2", "urdf", "opencv", "zivid", "text", "ur", "kuka",
          "fanuc", "abb", "staubli", "yaskawa", "doosan")  # fmt: skip
-LENSES, ARMS = ("camera-info", "kalibr", "oak"), ("robot-urdf", "robot-dh", "robot-json")
+LENSES, ARMS = ("camera-info", "kalibr"), ("robot-urdf", "robot-dh", "robot-json")
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,21 +34,14 @@ _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
 
 
 def _camera_of(content: Content) -> Camera:
-    """The camera, by one of `_ROS_MODELS`."""
     if content.lens is None:
         raise DataError(
             "This calibration has no camera: its session brought measured poses of the target, "
-            "and no images.",
+            "and no images. A lens is calibrated with images.",
+            culprits=["calibration.json: camera"],
             next_step="Export its transform, as with --to ros.",
         )
-    camera = content.lens.camera
-    if len(camera.distortion) not in _ROS_MODELS:
-        raise DataError(
-            f"The lens has {len(camera.distortion)} coefficients; 4 (fisheye), 5 or 8 (brown) are "
-            "needed.",
-            culprits=["camera.distortion"],
-        )
-    return camera
+    return content.lens.camera
 
 
 def _lens_notes(content: Content) -> list[str]:
