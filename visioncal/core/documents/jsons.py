@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.io import loadmat
 
 from visioncal.core.documents.values import read_plain_text, shown
 from visioncal.core.errors import DataError
@@ -27,7 +28,7 @@ Array: TypeAlias = npt.NDArray[Any]
 
 
 def read_arrays(path: Path) -> Mapping[str, Array]:
-    """Reads the arrays of an .npz by their names, or the one of an .npy as `matrix`.
+    """Reads the arrays of an .npz or a .mat by their names, or the one of an .npy as `matrix`.
 
     Raises:
         DataError: It is missing, no such file, damaged, holds Python objects, or unpacks to more
@@ -43,6 +44,11 @@ def read_arrays(path: Path) -> Mapping[str, Array]:
         data.seek(0)
         if unpacked <= MOST_BYTES:
             # Memory is allocated lazily, so that a size beyond the data costs nothing.
+            if path.suffix.lower() == ".mat":
+                found = loadmat(data)
+                arrays = {name: each for name, each in found.items() if name[:2] != "__"}
+                # Structures and cells are of other kinds.
+                return {name: each for name, each in arrays.items() if each.dtype.kind in "fiubU"}
             loaded = np.load(data, allow_pickle=False)
             arrays = (
                 dict(loaded) if isinstance(loaded, np.lib.npyio.NpzFile) else {"matrix": loaded}

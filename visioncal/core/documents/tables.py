@@ -136,13 +136,15 @@ def read_table(path: Path) -> TextTable:
     if all(listed):
         inside = (match[1] for match in listed if match)
         lines = list(zip((at for at, _ in lines), inside, strict=True))
-    first = lines[0][1] if lines else ""
-    separator = declared[1] if declared else next((mark for mark in ";\t," if mark in first), " ")
+    # Titles may stand above.
+    middle = lines[len(lines) // 2][1] if lines else ""
+    separator = declared[1] if declared else next((mark for mark in ";\t," if mark in middle), " ")
     split = [(at, tuple(line.split())) for at, line in lines]
     if separator != " ":
         split = list(_split(lines, where, separator, stripped=True))
     if not split or not all(cells for _, cells in split):
         raise DataError(f"{where} has no rows.", culprits=[where])
+    split = _below_titles(split)
     numbers, cells = [at for at, _ in split], [cells for _, cells in split]
     rows = _without_margin(cells)
     columns = rows[0] if not any(is_number(cell) for cell in rows[0]) else None
@@ -163,6 +165,17 @@ def read_table(path: Path) -> TextTable:
     return TextTable(
         path.name, _named(columns, width, where), tuple(rows), numbers, columns is not None
     )
+
+
+def _below_titles(
+    rows: list[tuple[int, tuple[str, ...]]],
+) -> list[tuple[int, tuple[str, ...]]]:
+    """Rows without titles above, which have other numbers of cells than all that follows."""
+    widths = [len(cells) for _, cells in rows]
+    usual = Counter(widths).most_common(1)[0][0]
+    above = widths.index(usual)
+    is_title = 0 < above < 9 and len(rows) > above + 2 and {*widths[above:]} == {usual}
+    return rows[above:] if is_title else rows
 
 
 def _named(columns: Sequence[str] | None, width: int, where: str) -> tuple[str, ...]:

@@ -16,9 +16,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Mount
+from visioncal.interchange.formats.fields import named_by
 from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions, rows_of
 from visioncal.interchange.formats.intrinsics import read_intrinsics, read_target_description
-from visioncal.interchange.formats.reading import named_by
 from visioncal.robot import Robot
 from visioncal.robot.files import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session import ImageStore, Session, Stream

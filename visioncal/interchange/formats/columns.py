@@ -13,6 +13,14 @@ from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Samples
+from visioncal.interchange.formats.fields import (
+    Fields,
+    in_seconds,
+    is_image_name,
+    named_by,
+    stamp_name,
+    unnamed_columns,
+)
 from visioncal.interchange.formats.file_search import (
     FileGroup,
     Pairing,
@@ -20,7 +28,6 @@ from visioncal.interchange.formats.file_search import (
     image_groups,
     images_named,
     images_of,
-    is_image_name,
     paired,
 )
 from visioncal.interchange.formats.foreign import (
@@ -38,22 +45,13 @@ from visioncal.interchange.formats.poses import (
     joints_from,
     pose_names,
     poses_from,
-    possible_poses,
     without_unit,
 )
-from visioncal.interchange.formats.reading import (
-    Fields,
-    named_by,
-    read_fields,
-    stamp_name,
-    unnamed_columns,
-)
-from visioncal.interchange.formats.sources import Source, look, rows_in, unknown
+from visioncal.interchange.formats.reading import read_fields
+from visioncal.interchange.formats.sources import Source, look, proposed, unknown
 from visioncal.session.columns import INSTRUMENT_POSITION
 
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
-# Present epochs are about 1e9 s: (larger than, seconds a unit).
-_EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 
 def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
@@ -64,13 +62,26 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     source = look(path, requested.robot.form)
     if path.is_file() and source.parts[0].fault:
         raise source.parts[0].fault
-    fields = rows_in(source, requested)
     images = source.images
     if path.is_file() and requested.target and not requested.images:
         images = images_of(path.parent)
-    foreign = foreign_from(fields, requested, images=images, source=source)
     lens, notes = (None, ()) if requested.intrinsics else source.lens()
-    return replace(foreign, lens=lens, notes=(*foreign.notes, *notes))
+    found: list[tuple[int, ForeignRecording]] = []
+    faults: list[DataError] = []
+    readings = proposed(source, requested)
+    for rank, fields, asked in readings:
+        try:
+            foreign = foreign_from(fields, asked, images=images, source=source)
+        except DataError as error:
+            faults.append(error)
+            continue
+        found.append((rank, replace(foreign, lens=lens, notes=(*foreign.notes, *notes))))
+    if not found:
+        raise faults[0]
+    (rank, first), *others = found
+    is_clear = not others or others[0][0] > rank
+    doubt = None if is_clear else unknown(source, requested, [each for _, each, _ in readings[:1]])
+    return replace(first, rivals=tuple((at - rank, other) for at, other in others), doubt=doubt)
 
 
 def foreign_from(
@@ -89,8 +100,6 @@ def foreign_from(
     names = _pose_fields(fields, requested, unnamed)
     used = {name for of_side in names.values() for name in of_side}
     joint_fields = requested.joints or joint_names(fields, used)
-    if joint_fields and fields.is_joined and not (images or requested.images):
-        names = _seen_by_camera(fields, requested, names)
     used.update(map(fields.find, joint_fields))
     if not names["robot"] and not joint_fields:
         if source is not None:
@@ -131,7 +140,7 @@ def foreign_from(
         camera=poses.get("camera"),
         images=pairing.images,
         joints_rad=joints,
-        stamps_s=_in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
+        stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
         form=fields.form,
         views=fields.views or view_numbers(fields),
         columns=columns,
@@ -168,16 +177,6 @@ def _further(
     if pairing.depths:
         found["source_depth"] = tuple(str(file or "") for file in pairing.depths)
     return found
-
-
-def _seen_by_camera(
-    fields: Fields, requested: ImportOptions, names: dict[Side, tuple[str, ...]]
-) -> dict[Side, tuple[str, ...]]:
-    """The fields of poses in a file beside joint angles: the target's, as nothing else was seen."""
-    is_said = bool(requested.robot.names) or any(
-        item.names == names["robot"] and item.sides for item in possible_poses(fields)
-    )
-    return names if is_said or names["camera"] else {"robot": (), "camera": names["robot"]}
 
 
 def _joint_angles(
@@ -242,13 +241,16 @@ def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[s
     usual = (name for name in _IMAGE_NAMES if any(map(is_image_name, free.get(name, ()))))
     if name := next(usual, ""):
         return name
-    files = [file for group in groups for file in group.files]
+    pictures = [group for group in groups if not group.is_depth] or groups
+    files = [file for group in pictures for file in group.files]
     named = {file.stem: file for file in files} | {file.name: file for file in files}
     naming = {
         name: tuple(named.get(cell.replace("\\", "/").rpartition("/")[2]) for cell in cells)
         for name, cells in free.items()
         if any(cells) and all(not cell or is_image_name(cell) or cell in named for cell in cells)
     }
+    if any(any(found) for found in naming.values()):
+        naming = {name: found for name, found in naming.items() if any(found)}
     # Several columns may name the same images.
     if len({*naming.values()}) > 1:
         raise DataError(
@@ -354,11 +356,4 @@ def _timed(fields: Fields, stamp: str, numbers: PoseNumbers) -> tuple[FloatArray
             culprits=[place],
             next_step="Sort the rows by time and remove doubled ones.",
         )
-    return _in_seconds(stamps)[rows], numbers.rows(rows)
-
-
-def _in_seconds(stamps: FloatArray) -> FloatArray:
-    """Converts stamps to seconds; the size of an epoch shows milli-, micro- or nanoseconds."""
-    sizes = np.abs(stamps[np.isfinite(stamps)])
-    largest = float(sizes.max()) if len(sizes) else 0.0
-    return stamps * next((unit_s for limit, unit_s in _EPOCHS if largest > limit), 1.0)
+    return in_seconds(stamps)[rows], numbers.rows(rows)

@@ -14,9 +14,23 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, is_inside, natural, read_bytes
 from visioncal.core.number_format import counted, some_of
-from visioncal.interchange.formats.reading import ENDINGS, Fields, named_by
+from visioncal.core.types import IntArray
+from visioncal.interchange.formats.fields import (
+    HOW,
+    Fields,
+    Keys,
+    Match,
+    is_image_name,
+    keys_of,
+    matched,
+    named_by,
+    number_in,
+)
+from visioncal.interchange.formats.reading import ENDINGS
 from visioncal.session.images import IMAGE_ENDINGS
 
+# Endings of texts with numbers that are none of a recording.
+_NO_DATA = (".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg")
 # Folders below a source that are looked through, and the most files in all.
 _DEPTH, _MOST_FILES = 3, 100_000
 # Words of pictures that a program drew: they are no camera's where there are others.
@@ -25,17 +39,6 @@ _DRAWN = re.compile(
     r"preview|thumb|reproj|heat|undist|rectif",
     re.IGNORECASE,
 )
-
-
-def number_in(name: str) -> int | None:
-    """Last number in a file's name without its ending; None where there is none."""
-    digits = re.findall(r"[0-9]+", Path(name).stem)
-    return int(digits[-1]) if digits and len(digits[-1]) < 19 else None
-
-
-def is_image_name(name: str) -> bool:
-    """Whether a name has an image's ending."""
-    return name.lower().endswith(IMAGE_ENDINGS)
 
 
 @dataclass(frozen=True)
@@ -80,10 +83,22 @@ class FileGroup:
         """Whether they are images by their names."""
         return is_image_name(self.label)
 
-    @property
+    @cached_property
     def is_data(self) -> bool:
-        """Whether they have the ending of numbers."""
-        return self.label.lower().endswith(ENDINGS)
+        """Whether they have the ending of numbers, or an unknown one and numbers in them."""
+        words = self.label.lower()
+        if words.endswith((*ENDINGS, *_NO_DATA, *IMAGE_ENDINGS)):
+            return words.endswith(ENDINGS)
+        return len(re.findall(r"[0-9]\.[0-9]", head(self.files[0]))) > 5
+
+    @cached_property
+    def keys(self) -> Keys:
+        """What tells the files apart."""
+        parts = [(file.stem, *reversed(file.parent.parts)) for file in self.files]
+        # In folders of their own, files of one name are told apart by these.
+        names = next((each for each in zip(*parts, strict=False) if len({*each}) == len(parts)), ())
+        numbers = {"": self.numbers} if self.numbers else {}
+        return Keys.of(len(self.files), {"": names} if names else {}, numbers)
 
     @cached_property
     def image(self) -> ImageKind | None:
@@ -94,6 +109,10 @@ class FileGroup:
     def is_depth(self) -> bool:
         """Whether they are depth pictures."""
         return self.image is not None and self.image.is_depth
+
+    def taken(self, rows: IntArray) -> tuple[Path | None, ...]:
+        """The files of some rows; None of -1."""
+        return tuple(self.files[at] if at >= 0 else None for at in rows)
 
     def listed(self) -> str:
         """The label and the number of files, for messages."""
@@ -242,7 +261,8 @@ def images_named(
     by_name = {item.stem: item for item in files} | {item.name: item for item in files}
     numbers = [number_in(name) for name in names if name]
     is_unique = asked is not None and len(set(numbers)) == len(numbers)
-    by_number = _by_number(files, [number_in(file.name) for file in files]) if is_unique else {}
+    by_number = {number_in(file.name): file for file in files} if is_unique else {}
+    by_number = by_number if len(by_number) == len(files) else {}
     paths: list[Path | None] = []
     for name in names:
         path: Path | None = None
@@ -266,12 +286,6 @@ def images_named(
     return tuple(paths)
 
 
-def _by_number(files: Sequence[Path], numbers: Sequence[int | None]) -> dict[int | None, Path]:
-    """Files by their numbers; empty where two have the same, or one has none."""
-    by_number = dict(zip(numbers, files, strict=True))
-    return {} if None in by_number or len(by_number) < len(files) else by_number
-
-
 @dataclass(frozen=True)
 class Pairing:
     """The images of n rows."""
@@ -281,40 +295,21 @@ class Pairing:
     notes: tuple[str, ...] = ()  # What was paired with what, and what was left out.
 
 
-def _matched(fields: Fields, group: FileGroup) -> tuple[str, tuple[Path | None, ...]] | None:
-    """How a group's files belong to rows, and those of each; None where they do not."""
-    by_stem = {file.stem: file for file in group.files}
-    if fields.stems and {*fields.stems} <= by_stem.keys():
-        return "equal names", tuple(by_stem[stem] for stem in fields.stems)
-    numbers, count = group.numbers, len(fields)
-    columns = (each.tolist() for each in fields.numbers.values() if each.shape == (count,))
-    # A column with the numbers of the images.
-    named = (cells for cells in columns if len({*cells}) == count and {*cells} <= {*numbers})
-    views = fields.views or tuple(map(int, next(named, ())))
-    by_number = _by_number(group.files, numbers) if numbers else {}
-    # Numbers that begin one later are of the same rows.
-    shifted = {b - a for a, b in zip(sorted(views), sorted(numbers), strict=False)} - {0}
-    is_shifted = len(views) == len(numbers) == count and len(shifted) == 1
-    if {*views} & by_number.keys() and not (is_shifted and {*views} != {*numbers}):
-        return "equal numbers", tuple(map(by_number.get, views))
-    return ("their order", group.files) if len(group.files) == count else None
-
-
 def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     """Pairs rows with one kind of image: by equal names or numbers, else in natural order.
 
     Depth pictures of the rows are kept beside; raises DataError where nothing fits, or several do.
     """
-    matches = [(group, found) for group in groups if (found := _matched(fields, group))]
-    order = ["equal names", "equal numbers", "their order"]
+    keys = keys_of(fields)
+    matches = [(group, found) for group in groups if (found := matched(keys, group.keys))]
 
-    def rank(item: tuple[FileGroup, tuple[str, tuple[Path | None, ...]]]) -> tuple[object, ...]:
-        group, (how, files) = item
+    def rank(item: tuple[FileGroup, Match]) -> tuple[object, ...]:
+        group, found = item
         drawn = _DRAWN.search(group.label) is not None
         is_named = re.search("rgb|colou?r", group.label, re.IGNORECASE) is not None
         # What another program drew, and pictures of some of the rows alone, come last.
-        extra = order.index(how), not is_named, -len(group.files)
-        return group.is_depth, drawn, files.count(None), *extra
+        extra = found.lost, HOW.index(found.how), not is_named, -len(group.files)
+        return group.is_depth, drawn, found.how == HOW[-1], *extra
 
     ranked = sorted(matches, key=rank)
     if not ranked:
@@ -336,11 +331,12 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
             culprits=[group.label for group in rivals],
             next_step=f"Say --images {rivals[0].files[0]}, or the first file of the others.",
         )
-    chosen, (how, images) = ranked[0]
+    (chosen, match), how = ranked[0], ranked[0][1].how
+    images = chosen.taken(match.rows)
     depth = next((item for item in ranked[1:] if item[0].is_depth), None)
     both = [(place, file.name) for place, file in zip(fields.places, images, strict=True) if file]
     ends = ", ".join(f"{place} with {name}" for place, name in dict.fromkeys((both[0], both[-1])))
-    hint = "; --image-column names a column that names each row's image" * (how == order[2])
+    hint = "; --image-column names a column that names each row's image" * (how == HOW[-1])
     notes = [f"Rows and images are paired by {how}: {ends}{hint}."]
     left = [group.listed() for group in groups if group is not chosen]
     if depth is not None:
@@ -351,7 +347,8 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         )
     if left:
         notes.append(f"Left out of the images: {some_of(left)}.")
-    return Pairing(images, () if depth is None else depth[1][1], tuple(notes))
+    depths = () if depth is None else depth[0].taken(depth[1].rows)
+    return Pairing(images, depths, tuple(notes))
 
 
 def path_inside(base: Path, name: str) -> Path:

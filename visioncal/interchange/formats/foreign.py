@@ -8,6 +8,7 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
+from visioncal.core.errors import DataError
 from visioncal.core.number_format import known_name
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress, chosen_rows
 from visioncal.estimation.clock_correlation import evenly
@@ -129,6 +130,9 @@ class ForeignRecording:
     notes: tuple[str, ...] = ()  # Assumptions and omissions, in sentences for the user.
     # What is assumed of the poses of each side.
     unstated: Mapping[Side, Unstated] = field(default_factory=dict)
+    # The same source otherwise read, the likeliest first; each with how unlikely it is beside this.
+    rivals: tuple[tuple[int, "ForeignRecording"], ...] = ()
+    doubt: DataError | None = None  # What is said where nothing decides between these.
 
 
 def frames_to_take(
@@ -155,7 +159,7 @@ def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:
     """Some rows of a recording, in the given order."""
     views = foreign.views or tuple(range(len(foreign.robot)))
     return replace(
-        chosen_rows(replace(foreign, views=views), rows, "notes"),
+        chosen_rows(replace(foreign, views=views), rows, "notes", "rivals"),
         robot=foreign.robot.rows(rows),
         camera=None if foreign.camera is None else foreign.camera.rows(rows),
         columns={

@@ -16,7 +16,8 @@ from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.columns import foreign_from
-from visioncal.interchange.formats.file_search import files_in, head, number_in, path_inside
+from visioncal.interchange.formats.fields import fields_of_records, number_in
+from visioncal.interchange.formats.file_search import files_in, head, path_inside
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
     ForeignRecording,
@@ -26,7 +27,6 @@ from visioncal.interchange.formats.foreign import (
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 from visioncal.interchange.formats.reading import (
     fields_of_document,
-    fields_of_records,
     flattened,
     read_document,
 )

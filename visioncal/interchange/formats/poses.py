@@ -4,7 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from itertools import combinations
 
 import numpy as np
 
@@ -14,8 +14,14 @@ from visioncal.core.documents.pendants import forms_named
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.types import FloatArray
+from visioncal.interchange.formats.fields import (
+    Fields,
+    appearance,
+    named_by,
+    position_first,
+    split_matrices,
+)
 from visioncal.interchange.formats.foreign import PoseImportOptions, Side, Unstated
-from visioncal.interchange.formats.reading import Fields, appearance, named_by, split_matrices
 from visioncal.session.columns import joint_columns
 
 # An ordinal indicator is common for the degree sign, too.
@@ -77,6 +83,8 @@ _NO_POSE = re.compile(
     r"joint|axis|axes|angles|wrench|speed|force|torque|twist|vel|effort|corner|intrins"
 )
 _ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "init", "ref", "guess"}
+# Columns among which poses are looked for by their numbers alone.
+_MOST_COLUMNS = 40
 # Columns that count or time rows.
 _COUNTED = {"view", "index", "id", "nr", "no", "t", "time", "timestamp", "stamp", "stamp_s"}
 # Names of the numbers of a position and of a rotation, the rotations that tell most first.
@@ -110,6 +118,7 @@ class PoseFields:
 
     names: tuple[str, ...]
     words: tuple[str, ...]  # What the names say beside `position` and the like.
+    is_named: bool = True  # Whether the names say that it is a pose.
 
     @property
     def sides(self) -> list[str]:
@@ -132,66 +141,100 @@ class PoseFields:
 def possible_poses(
     fields: Fields, taken: Collection[str] = (), *, by_shape: bool = True
 ) -> list[PoseFields]:
-    """All fields that may hold poses, by what the numbers look like and what they are called.
+    """All fields that may hold poses, by what they are called and what the numbers look like.
 
-    Where no name says it, those of a pose's shape, unless `by_shape` is false.
+    Those whose names say it come first; `by_shape` is whether others are taken at all.
     """
     found: list[PoseFields] = []
-    positions: dict[tuple[str, ...], tuple[str, ...]] = {}
-    rotations: dict[tuple[str, ...], list[tuple[int, tuple[str, ...]]]] = defaultdict(list)
-    for names, words, size, look in (*_arrays(fields, taken), *_numbers(fields, taken)):
-        rest = tuple(word for word in words if word not in _POSITION_WORDS | _ROTATION_WORDS)
+    places: list[_Piece] = []
+    turns: list[_Piece] = []
+    for piece in (*_arrays(fields, taken), *_numbers(fields, taken)):
+        words, name = {*piece.words}, piece.names[0].lower()
+        is_turn = piece.size == 3 and bool(_ROTATION_WORDS & words)
         named = _POSE_WORDS | _CHILD_FIRST | _FRAMES["robot"][1]
-        is_named = {*words} & named and not _NO_POSE.search(names[0].lower())
-        if look in ("rotation", "quaternion") or (size == 3 and _ROTATION_WORDS & {*words}):
-            rotations[rest].append((size, names))
-        elif size == 3 and _POSITION_WORDS & {*words}:
-            positions[rest] = names
-        elif look == "pose" or (size in (6, 7, 12, 16) and is_named):
-            found.append(PoseFields(names, words))
-    # Names of position and rotation share all other words; of several rotations the least
-    # ambiguous is taken: a matrix, then a quaternion.
-    both = ((rest, names) for rest, names in positions.items() if rotations[rest])
-    found += [PoseFields((*names, *max(rotations[rest])[1]), rest) for rest, names in both]
-    return found or ([*_by_shape(fields, taken)] if by_shape else [])
+        is_named = bool(words & named) and not _NO_POSE.search(name)
+        if is_turn or piece.look in ("rotation", "quaternion"):
+            turns.append(piece)
+        elif piece.look == "pose" or (piece.size in (6, 7, 12, 16) and is_named):
+            found.append(PoseFields(piece.names, piece.words))
+        elif piece.size == 6 and not _NO_POSE.search(name):
+            found.append(PoseFields(piece.names, piece.words, is_named=False))
+        elif piece.size == 3:
+            places.append(piece)
+    # A position and a rotation share all other words; of several rotations the least ambiguous is
+    # taken: a matrix, then a quaternion. Of other names they share what they stand in.
+    for place in places:
+        is_named = bool(_POSITION_WORDS & {*place.words})
+        alike = [turn for turn in turns if is_named and turn.rest == place.rest]
+        alike = alike or [turn for turn in turns if turn.parent == place.parent]
+        if alike:
+            turn = max(alike, key=lambda turn: turn.size)
+            said = place.rest if is_named else (*place.words, *turn.words)
+            found.append(PoseFields((*place.names, *turn.names), said, is_named))
+    known = {name for item in found if item.is_named for name in item.names}
+    found += _without_names(fields, {*taken, *known}, places)
+    complete = {item.names: item for item in reversed(found) if item.is_named or by_shape}
+    return sorted(complete.values(), key=lambda item: (not item.is_named, found.index(item)))
 
 
-def _by_shape(fields: Fields, taken: Collection[str]) -> Iterator[PoseFields]:
-    """Positions and rotations of one mapping by their numbers, in whatever language."""
-    groups: dict[str, list[tuple[int, str]]] = defaultdict(list)
-    for (name,), _, size, look in _arrays(fields, taken):
-        if size == 3 or look in ("rotation", "quaternion"):
-            groups[name.rpartition(".")[0]].append((size, name))
-    columns = tuple(
-        name
-        for name, numbers in fields.numbers.items()
-        if numbers.ndim == 1 and name not in taken and name.lower() not in _COUNTED
-    )
-    # The only numbers of a table, in the usual order.
-    if len(columns) in (6, 7, 12, 16) and not groups and not joint_names(fields, ()):
-        yield PoseFields(columns, ())
-    for group in groups.values():
-        threes = [name for size, name in group if size == 3]
-        more = [name for size, name in sorted(group) if size > 3]
-        # Of two times three numbers the position comes first, unless the names say otherwise.
-        threes.sort(key=lambda name: _ROTATION_NAME.search(name) is not None)
-        if len(threes) == 1 + (not more):
-            names = (threes[0], *(more[-1:] or threes[1:]))
-            words = dict.fromkeys(word for name in names for word in words_of(name))
-            yield PoseFields(names, tuple(words))
+def _without_names(
+    fields: Fields, taken: Collection[str], places: Sequence["_Piece"]
+) -> Iterator[PoseFields]:
+    """Poses by their numbers alone: two times three in one mapping, or adjoining columns."""
+    for first, second in combinations(places, 2):
+        if first.parent == second.parent and len(first.names) == 1 == len(second.names):
+            # The position comes first, unless the names say otherwise.
+            names = sorted((*first.names, *second.names), key=_is_rotation_name)
+            yield PoseFields((*names,), (*first.words, *second.words), is_named=False)
+    for parent, columns in column_groups(fields, taken).items():
+        if {*joint_names(fields, ())} & {*columns} or len(columns) > _MOST_COLUMNS:
+            continue
+        flat = np.stack([fields.numbers[name] for name in columns], axis=1)
+        for size in (16, 12, 7, 6):
+            for at in range(len(columns) - size + 1):
+                is_pose = bool(appearance(flat[:, at : at + size]))
+                if is_pose if size > 6 else len(columns) < 9:
+                    window = columns[at : at + size]
+                    yield PoseFields(window, tuple(words_of(parent)), is_named=False)
 
 
-# Fields with their words, the number of values, and what they look like.
-_Sorted: TypeAlias = tuple[tuple[str, ...], tuple[str, ...], int, str]
+def column_groups(fields: Fields, taken: Collection[str] = ()) -> dict[str, tuple[str, ...]]:
+    """Columns of a number each that may be measured, in their order, by what they stand in."""
+    groups: dict[str, tuple[str, ...]] = defaultdict(tuple)
+    for name, numbers in fields.numbers.items():
+        parent, _, last = name.rpartition(".")
+        if numbers.ndim == 1 and name not in taken and last.lower() not in _COUNTED:
+            groups[parent] += (name,)
+    return groups
 
 
-def _arrays(fields: Fields, taken: Collection[str]) -> Iterator[_Sorted]:
+@dataclass(frozen=True)
+class _Piece:
+    """Fields that may be a pose or a part of one."""
+
+    names: tuple[str, ...]
+    words: tuple[str, ...]
+    size: int  # Number of values.
+    look: str  # What these look like.
+
+    @property
+    def rest(self) -> tuple[str, ...]:
+        """The words beside those of positions and rotations."""
+        return tuple(word for word in self.words if word not in _POSITION_WORDS | _ROTATION_WORDS)
+
+    @property
+    def parent(self) -> str:
+        """What the fields stand in."""
+        return self.names[0].rpartition(".")[0]
+
+
+def _arrays(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:
     for name, numbers in fields.numbers.items():
         if numbers.ndim > 1 and name not in taken and len(numbers):
-            yield (name,), tuple(words_of(name)), numbers[0].size, appearance(numbers)
+            yield _Piece((name,), tuple(words_of(name)), numbers[0].size, appearance(numbers))
 
 
-def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Sorted]:
+def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:
     """Positions and rotations of a column a number."""
     for prefix, named in _by_prefix(fields, taken).items():
         words = words_of(prefix)
@@ -206,9 +249,10 @@ def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Sorted]:
         # Five and more of these are joints.
         if rotation and "q5" not in named:
             names = tuple(named[each] for each in rotation)
-            yield names, (*words, "rotation"), len(rotation), "rotation"
+            yield _Piece(names, (*words, "rotation"), len(rotation), "rotation")
         if position:
-            yield tuple(named[each] for each in position), (*words, "position"), 3, ""
+            names = tuple(named[each] for each in position)
+            yield _Piece(names, (*words, "position"), 3, "")
 
 
 def _by_prefix(fields: Fields, taken: Collection[str]) -> dict[str, dict[str, str]]:
@@ -251,19 +295,9 @@ def pose_names(
         return held or tuple(fields.find(name) for name in given)
     if unnamed:
         return () if set(unnamed) & set(taken) else unnamed
-    possible = possible_poses(fields, taken, by_shape=by_shape)
-    # OpenCV's names of a board's pose.
-    seen = [item for item in possible if not item.sides and _is_opencv(item)]
-    plain = [item for item in possible if not item.sides and item not in seen]
-    of_side = [item for item in possible if item.sides == [whose]]
-    in_order = [item for item in of_side if not item.is_reversed(whose)]
-    others = [plain, seen] if whose == "robot" else [seen]
-    for group in (in_order, of_side, *others):
-        wanted = [item for item in group if not {*item.words} & _ASKED_FOR] or group
-        if len(wanted) == 1:
-            return wanted[0].names
-        if wanted:
-            return ()
+    first = next(iter(ranked_poses(fields, whose, taken, by_shape=by_shape)), [])
+    if first:
+        return first[0].names if len(first) == 1 else ()
     # A field whose rows are irregular is refused by its row.
     ragged = (PoseFields((name,), tuple(words_of(name))) for name in fields.shape_errors)
     return next(
@@ -274,6 +308,33 @@ def pose_names(
         ),
         (),
     )
+
+
+def ranked_poses(
+    fields: Fields, whose: str, taken: Collection[str] = (), *, by_shape: bool = True
+) -> list[list[PoseFields]]:
+    """Fields that may hold the poses of the `robot` or `camera`, in groups, the likeliest first."""
+    possible = possible_poses(fields, taken, by_shape=by_shape)
+    of_side = [item for item in possible if item.sides == [whose]]
+    plain = [item for item in possible if not item.sides]
+    seen = [item for item in plain if item.is_named and _is_opencv(item)]
+    groups = [
+        [item for item in of_side if item.is_named and not item.is_reversed(whose)],
+        [item for item in of_side if item.is_named],
+        [item for item in plain if item.is_named and item not in seen] * (whose == "robot"),
+        seen,
+        [item for item in (*of_side, *plain) if not item.is_named] * (whose == "robot"),
+        [item for item in possible if len(item.sides) > 1] * (whose == "robot"),
+    ]
+    taken_up, ranked = set[PoseFields](), list[list[PoseFields]]()
+    for group in groups:
+        fresh = [item for item in group if item not in taken_up]
+        wanted = [item for item in fresh if not {*item.words} & _ASKED_FOR]
+        ranked += [
+            each for each in (wanted, [item for item in fresh if item not in wanted]) if each
+        ]
+        taken_up.update(fresh)
+    return ranked
 
 
 def _is_opencv(item: PoseFields) -> bool:
@@ -290,6 +351,10 @@ _JOINT_NAME = re.compile(
 
 _ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)R(_|$)")
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
+
+
+def _is_rotation_name(name: str) -> bool:
+    return _ROTATION_NAME.search(name) is not None
 
 
 def columns_named(fields: Fields, wanted: Sequence[str]) -> tuple[str, ...]:
@@ -369,12 +434,14 @@ def _split(
 ) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     """Positions, rotations, and the names of the rotations' fields; raises DataError."""
     flat, sizes = np.hstack(blocks), [block.shape[1] for block in blocks]
+    if flat.shape[1] == 7 and 4 not in sizes:
+        flat = position_first(flat)
     positions, rotations = flat[:, :3], flat[:, 3:]
     of_rotation = tuple(names[int(np.searchsorted(np.cumsum(sizes), 3)) + 1 :] or names)
     if len(blocks) == 2:
         rotation_first = sizes[1] == 3
         if sizes[0] == sizes[1]:
-            rotation_first = _ROTATION_NAME.search(names[0]) is not None
+            rotation_first = _is_rotation_name(names[0])
         positions, rotations = blocks[::-1] if rotation_first else blocks
         of_rotation = (names[0] if rotation_first else names[1],)
     if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:

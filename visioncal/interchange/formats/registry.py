@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -158,9 +159,9 @@ def read_foreign(
     """
     # With a second file, both are tables, whatever the first looks like.
     form = form or (TABLE.name if requested.camera_file is not None else None)
-    return with_user_options(
-        _foreign_format(source, form, requested).read(source, requested), requested
-    )
+    foreign = _foreign_format(source, form, requested).read(source, requested)
+    rivals = ((rank, with_user_options(each, requested)) for rank, each in foreign.rivals)
+    return replace(with_user_options(foreign, requested), rivals=tuple(rivals))
 
 
 def write_session(session: Session, dest: Path) -> None:

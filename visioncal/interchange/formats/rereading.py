@@ -1,8 +1,8 @@
 """Finds another reading of a recording's poses, and applies it."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, Self
 
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess import Candidate, Guess
 from visioncal.calibration.guess.readings import Hypothesis
-from visioncal.calibration.guess.search import FEWEST_ROWS
+from visioncal.calibration.guess.search import CLEAR, FEWEST_ROWS
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
@@ -86,56 +86,165 @@ class DoubtfulSession:
             DegenerateError: Too few views have both poses.
             ConvergenceError: The intrinsics do not converge.
         """
-        # What the camera's poses need, whatever the robot's are. The offset of a stream's clock is
-        # found by rotation angles, which no reading changes.
-        by_clock = {"robot", "clock"} if waits_for_clock(self.session) else set()
-        names = {"detect", "intrinsics", "pnp"} | by_clock
-        stages = [stage for stage in STAGES if stage.name in names]
-        run = run_stages(RunState(self.session, progress), stages)
+        run = _measured(self.session, progress)
         return guess_from_camera_poses(run, self.robot, self.camera, knows_mount=self.knows_mount)
 
 
-# Rows by which a reading is tested, evenly spread: few first, more where these cannot tell.
+def _measured(session: Session, progress: Progress | None) -> RunState:
+    """What the camera's poses need, whatever the robot's are; raises as `DoubtfulSession.guess`."""
+    # The offset of a stream's clock is found by rotation angles, which no reading changes.
+    by_clock = {"robot", "clock"} if waits_for_clock(session) else set()
+    names = {"detect", "intrinsics", "pnp"} | by_clock
+    return run_stages(RunState(session, progress), [each for each in STAGES if each.name in names])
+
+
+# Rows by which readings are tested, evenly spread: few first, more where these cannot tell.
 _TESTED = (12, 36)
 
 
 def settled(foreign: ForeignRecording, progress: Progress | None = None) -> ForeignRecording:
     """Finds what a source does not say of its poses by what agrees with its images or target poses.
 
+    All readings of the source are tested, then those with the six numbers of a pose in another
+    order.
+
     Raises:
-        DataError: A form of rotations is not said, and nothing determines it; or the images show
-            another board than declared.
+        DataError: Nothing determines which fields are poses, or a form of rotations that is not
+            said; or the images show another board than declared.
     """
     unstated = frozenset[str]().union(*foreign.unstated.values())
-    if not unstated - {"inverse"} or foreign.mount is None or foreign.stream is not None:
+    if foreign.stream is not None or not (unstated - {"inverse"} or foreign.doubt):
         return foreign
-    seen = with_observations_only(foreign)
-    here = seen.robot.present
-    if seen.images:
-        here &= np.array([image is not None and image.is_file() for image in seen.images])
-    elif seen.camera is not None:
-        here &= seen.camera.present
-    rows, why = np.flatnonzero(here), "too few rows have a pose and what the camera saw"
-    other: Finding | None = None
+    if foreign.mount is None:
+        return foreign
+    readings = [(0, foreign), *foreign.rivals]
+    other_orders = [(rank, each) for rank, item in readings for each in _reordered(item)]
+    why, other = "too few rows have a pose and what the camera saw", None
     for least, most in pairwise((FEWEST_ROWS - 1, *_TESTED)):
-        if len(rows) <= least:
-            break
         try:
-            guess = DoubtfulSession.of(rows_of(seen, rows[evenly(len(rows), most)])).guess(progress)
+            seen = _Seen.of(foreign, most, progress)
         except VisioncalError as error:
             other = error.finding if isinstance(error, OtherBoardError) else None
             why = error.message.rstrip(".")
             continue
-        if guess.stands_out or guess.declared.fit.closes:
-            return _applied(foreign, guess, is_measured=bool(seen.images))
-        why = guess.sentence.rstrip(".")
+        if seen.count <= least:
+            break
+        for tried in (readings, other_orders):
+            found, said = _tested(tried, seen)
+            why = said if tried is readings else why
+            if found is not None:
+                return found
     return _untested(foreign, why, other)
 
 
-def _applied(foreign: ForeignRecording, guess: Guess, *, is_measured: bool) -> ForeignRecording:
-    """The recording as its best reading has it, where that changes only what is not said."""
+def _tested(
+    readings: Sequence[tuple[int, ForeignRecording]], seen: "_Seen"
+) -> tuple[ForeignRecording | None, str]:
+    """The reading that agrees best with what was seen, or why the first does not.
+
+    Raises DataError where several agree alike, and are not the same.
+    """
+    found: list[tuple[float, int, ForeignRecording]] = []
+    why = ""
+    for rank, item in readings:
+        try:
+            guess = seen.guess(item)
+        except VisioncalError as error:
+            why = why or error.message.rstrip(".")
+            continue
+        why = why or guess.sentence.rstrip(".")
+        if guess.stands_out or guess.declared.fit.closes:
+            done = _applied(item, guess, is_measured=seen.run is not None)
+            score = guess.best.log_posterior - CLEAR * rank
+            found += [] if done is None else [(score, rank, done)]
+    if not found:
+        return None, why
+    score, rank, best = max(found, key=lambda each: each[0])
+    alike = (each for at, same, each in found if same == rank and at > score - CLEAR)
+    doubt = next((item.doubt for _, item in readings), None)
+    if doubt is not None and not all(_are_same(best, each) for each in alike):
+        raise doubt
+    return best, ""
+
+
+def _are_same(first: ForeignRecording, second: ForeignRecording) -> bool:
+    """Whether two readings have the same poses, but for what is written with fewer digits."""
+    if len(first.robot) != len(second.robot):
+        return True
+    away = np.abs(first.robot.poses() - second.robot.poses())
+    return bool(np.nanmax(away, initial=0.0) < 1e-3)
+
+
+def _reordered(foreign: ForeignRecording) -> Iterator[ForeignRecording]:
+    """The recording with the six numbers of the robot's poses in other orders.
+
+    Either half is the position; with all forms of Euler angles, the orders of three angles with
+    another one in the middle are all products of three turns.
+    """
+    if "angles" not in foreign.unstated.get("robot", frozenset()):
+        return
+    flat = np.hstack([foreign.robot.positions, foreign.robot.rotations])
+    for first, turn in product((0, 3), ((0, 1, 2), (1, 0, 2), (0, 2, 1))):
+        order = [*range(first, first + 3), *(3 - first + at for at in turn)]
+        robot = replace(foreign.robot, positions=flat[:, order[:3]], rotations=flat[:, order[3:]])
+        if order != [*range(6)]:
+            words = ", ".join(str(1 + at) for at in order)
+            note = f"The numbers of the robot's poses are taken in the order {words}."
+            yield replace(foreign, robot=robot, notes=(*foreign.notes, note))
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What the camera saw in some rows of a source, by which its readings are tested."""
+
+    run: RunState | None  # With the board's poses by the images; None for poses of the target.
+    images: tuple[Path | None, ...]  # The images of these rows.
+    count: int  # The number of rows.
+    progress: Progress | None
+
+    @classmethod
+    def of(cls, foreign: ForeignRecording, most: int, progress: Progress | None) -> Self:
+        """What was seen in at most so many rows; raises VisioncalError."""
+        seen = with_observations_only(foreign)
+        if not seen.images:
+            return cls(None, (), min(len(seen.robot), most), progress)
+        there = [at for at, image in enumerate(seen.images) if image and image.is_file()]
+        rows = np.array(there, dtype=int)[evenly(len(there), most)]
+        run = None
+        if len(rows) >= FEWEST_ROWS:
+            session = assemble(rows_of(replace(seen, rivals=()), rows), mount=MOUNTS[0])
+            run = _measured(session, progress)
+        return cls(run, tuple(seen.images[at] for at in rows), len(rows), progress)
+
+    def guess(self, foreign: ForeignRecording) -> Guess:
+        """Tries the readings of one recording's poses; raises VisioncalError."""
+        item = with_observations_only(replace(foreign, rivals=()))
+        if self.run is None:
+            here = (
+                item.robot.present if item.robot.present.any() else np.full(len(item.robot), True)
+            )
+            here &= np.full(len(here), True) if item.camera is None else item.camera.present
+            rows = np.flatnonzero(here)
+            rows = rows[evenly(len(rows), self.count)]
+            return DoubtfulSession.of(rows_of(item, rows)).guess(self.progress)
+        row = {image: at for at, image in enumerate(item.images)}
+        rows = np.array([row.get(image, -1) for image in self.images])
+        robot = item.robot
+        if not robot.present.any():
+            chain = chain_poses(assemble(item))
+            robot = robot if chain is None else PoseNumbers.of_poses(chain, robot.places)
+        robot = robot.rows(np.maximum(rows, 0))
+        robot.positions[rows < 0] = np.nan
+        knows_mount = foreign.mount is not None
+        return guess_from_camera_poses(self.run, robot, None, knows_mount=knows_mount)
+
+
+def _applied(
+    foreign: ForeignRecording, guess: Guess, *, is_measured: bool
+) -> ForeignRecording | None:
+    """The recording as its best reading has it; None where that changes more than is not said."""
     best, declared = guess.best.hypothesis, guess.declared.hypothesis
-    numbers, said = {"robot": foreign.robot, "camera": foreign.camera}, dict[str, Reading]()
+    numbers = {"robot": foreign.robot, "camera": foreign.camera}
     fits = (best.mount, best.order) == (declared.mount, declared.order)
     for whose in ("robot", "camera"):
         found, stated = getattr(best, whose), getattr(declared, whose)
@@ -147,11 +256,13 @@ def _applied(foreign: ForeignRecording, guess: Guess, *, is_measured: bool) -> F
         }
         changed |= {"rotation"} if found.rotation != stated.rotation else set()
         may = free | ({"rotation"} if "angles" in free else set())
-        fits &= found.reading is not None and changed <= may
-        if found.reading is not None:
-            said[whose] = found.reading
+        # Nine numbers do not say whether they are by rows.
+        by_columns = found.transposed and found.rotation == "matrix" and "inverse" in free
+        fits &= (found.reading is not None or by_columns) and not found.mirrored and changed <= may
+        old = numbers[whose]
+        numbers[whose] = None if old is None or not fits else found.corrected(old)
     if not fits:
-        return _untested(foreign, guess.sentence.rstrip("."))
+        return None
     # One unit of both sides scales the cell, which poses alone do not show.
     is_open = not is_measured and all("unit" in each for each in foreign.unstated.values())
     kept = (
@@ -160,12 +271,15 @@ def _applied(foreign: ForeignRecording, guess: Guess, *, is_measured: bool) -> F
         if not (note.startswith("The ") and " taken for " in note)
         or (is_open and "positions" in note)
     )
-    camera = numbers["camera"]
-    if camera is not None and "camera" in said:
-        camera = camera.read_as(said["camera"])
-    robot = foreign.robot.read_as(said.get("robot", foreign.robot.reading))
     notes = (f"Found by the {'images' if is_measured else 'poses'}: {guess.sentence}", *guess.notes)
-    return replace(foreign, robot=robot, camera=camera, notes=(*kept, *notes), unstated={})
+    return replace(
+        foreign,
+        robot=numbers["robot"] or foreign.robot,
+        camera=numbers["camera"],
+        notes=(*kept, *notes),
+        unstated={},
+        rivals=(),
+    )
 
 
 def _untested(
@@ -175,14 +289,17 @@ def _untested(
 
     Else notes that nothing was tested.
     """
+    is_asked = foreign.doubt or any("rotation" in free for free in foreign.unstated.values())
+    if is_asked and other is not None and other.kind == "other_board":
+        raise DataError(
+            other.words,
+            culprits=["--target"],
+            next_step="Name this board with --target, by its kind, its columns x rows and the "
+            "measured side (as checkerboard_9x6_25mm), or by its .toml.",
+        )
+    if foreign.doubt is not None:
+        raise foreign.doubt
     for whose, free in foreign.unstated.items():
-        if "rotation" in free and other is not None and other.kind == "other_board":
-            raise DataError(
-                other.words,
-                culprits=["--target"],
-                next_step="Name this board with --target, by its kind, its columns x rows and the "
-                "measured side (as checkerboard_9x6_25mm), or by its .toml.",
-            )
         if "rotation" in free:
             numbers = foreign.robot if whose == "robot" else foreign.camera
             size = 0 if numbers is None else numbers.rotations.shape[1]

@@ -3,8 +3,8 @@
 `look` describes a source and `rows_in` proposes which of its rows are a recording's.
 """
 
+import re
 import shlex
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,26 +12,38 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.core.documents.tables import is_number, read_table
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import FloatArray
+from visioncal.interchange.formats.fields import (
+    Fields,
+    appearance,
+    fields_of_records,
+    joined,
+    named_by,
+    unnamed_columns,
+)
 from visioncal.interchange.formats.file_search import FileGroup, groups_in
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.intrinsics import LENS_KEYS, lenses_in
-from visioncal.interchange.formats.poses import joint_names, pose_names, possible_poses
+from visioncal.interchange.formats.poses import (
+    column_groups,
+    joint_names,
+    pose_names,
+    possible_poses,
+    ranked_poses,
+)
 from visioncal.interchange.formats.reading import (
     DOCUMENTS,
-    Fields,
-    appearance,
-    fields_of_document,
-    fields_of_records,
-    flattened,
-    named_by,
     read_document,
-    read_fields,
-    unnamed_columns,
+    read_record,
+    read_rows,
 )
+from visioncal.robot import Robot
+from visioncal.robot.files import read_robot_document
+
+# Readings of one source that are tested, and names of rows that are a robot's.
+_MOST_READINGS, _NAMED = 16, re.compile("pose|robot|arm", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +51,7 @@ class Part:
     """Files of one kind, and what they hold."""
 
     group: FileGroup
-    fields: Fields | None = None  # Rows of named values, one a file of several; None without.
-    # What each of several files holds, by name.
-    records: Sequence[Mapping[str, object]] = ()
+    rows: tuple[Fields, ...] = ()  # Rows of named values, one a file of several.
     fault: DataError | None = None  # Why they cannot be read.
     # Fields of `[camera]` by where they stand.
     lenses: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -75,7 +85,8 @@ class Source:
         lines = [f"{self.path} holds {counted(len(self.parts), 'kind')} of files:"]
         for part in self.parts:
             lines.append(f"  {part.group.listed()}: {_kind(part)}")
-            lines += [f"    {line}" for line in _field_lines(part.fields)]
+            for fields in part.rows:
+                lines += [f"    {line}" for line in _field_lines(fields)]
             lines += [f"    {place}: looks like a lens" for place in part.lenses]
         return "\n".join(lines[:60])
 
@@ -85,15 +96,13 @@ def _kind(part: Part) -> str:
     if image is not None:
         depth = ", looks like depth" * image.is_depth
         return f"images, {image.size[0]} x {image.size[1]}, {image.words}{depth}"
-    if part.fields is not None:
-        return f"{counted(len(part.fields), 'row')} of named values"
+    if part.rows:
+        return f"{' and '.join(counted(len(each), 'row') for each in part.rows)} of named values"
     return "not read" if part.fault is None else part.fault.message
 
 
-def _field_lines(fields: Fields | None) -> Iterator[str]:
+def _field_lines(fields: Fields) -> Iterator[str]:
     """A line a field: its name, the shape of a row, the range, and what it looks like."""
-    if fields is None:
-        return
     poses = {name: item for item in possible_poses(fields) for name in item.names}
     columns = [name for name, numbers in fields.numbers.items() if numbers.ndim == 1]
     for name, numbers in fields.numbers.items():
@@ -124,7 +133,7 @@ def look(path: Path, form: str | None = None) -> Source:
     """
     parts = [_part(group, form) for group in groups_in(path)]
     single = {part.group.files[0].stem: part for part in parts if len(part.group.files) == 1}
-    arrays = {name: _array(part.fields) for name, part in single.items() if part.fields}
+    arrays = {name: _array(part.rows[0]) for name, part in single.items() if part.rows}
     for place, lens in lenses_in({k: v for k, v in arrays.items() if v is not None}, path.name):
         # A matrix and coefficients in a file each.
         of_lens = [single[name] for name in arrays if name in LENS_KEYS]
@@ -145,72 +154,71 @@ def _part(group: FileGroup, form: str | None) -> Part:
     if not group.is_data:
         return Part(group)
     first, *others = group.files
-    lenses, records = dict[str, Mapping[str, Any]](), list[Mapping[str, object]]()
+    lenses: dict[str, Mapping[str, Any]] = {}
     is_document = first.suffix.lower() in DOCUMENTS
     try:
         document = read_document(first) if is_document else None
         lenses = dict(lenses_in(document, group.label)) if is_document else {}
-        if others:
-            records = [_record(first, document), *map(_record, others)]
-            fields = _fields_of(group, records)
-        else:
-            fields = fields_of_document(document, first) if document else read_fields(first, form)
+        if not others:
+            rows = joined(read_rows(first, form, document), first.stem, first.parent)
+            return Part(group, tuple(rows), lenses=lenses)
+        records = [read_record(first, document), *map(read_record, others)]
     except DataError as error:
         return Part(group, fault=error, lenses=lenses)
-    return Part(group, fields, records, lenses=lenses)
-
-
-def _fields_of(group: FileGroup, records: Sequence[Mapping[str, object]]) -> Fields:
-    """The rows of several files, one each."""
-    places = [file.name for file in group.files]
-    folder = group.files[0].parent
+    places, folder = [file.name for file in group.files], first.parent
     fields = fields_of_records(records, places, group.name, folder, group.numbers)
-    return replace(fields, stems=tuple(file.stem for file in group.files))
+    stems = next(iter(group.keys.names.values()), ())
+    return Part(group, (replace(fields, stems=stems),), lenses=lenses)
 
 
-def _record(path: Path, document: object = None) -> dict[str, object]:
-    """What one view's file holds, read unless it was; numbers without a name are its `matrix`."""
-    if path.suffix.lower() in DOCUMENTS:
-        document = document or read_document(path)
-    else:
-        table = read_table(path)
-        rows = [[float(cell) if is_number(cell) else cell for cell in row] for row in table.rows]
-        document = rows[0] if len(rows) == 1 else rows
-        if table.has_header and len(rows) == 1:
-            document = dict(zip(table.columns, rows[0], strict=True))
-    return flattened(document if isinstance(document, Mapping) else {"matrix": document})
+def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields, ImportOptions]]:
+    """Possible recordings in a source: how unlikely each is, its rows, and which fields are poses.
 
-
-def rows_in(source: Source, requested: ImportOptions) -> Fields:
-    """The rows of a source that are its recording: of one kind of file, or of several that fit.
-
-    Files of one number, or of as many rows, are joined. Raises DataError, with the description,
-    where no rows have the robot's poses or joints, or several do.
+    Each is of one kind of file, or of several whose rows belong together. Raises DataError, with
+    the description, where no rows have the robot's poses or joints.
     """
     given = (*requested.robot.names, *requested.camera.names, *requested.joints)
-    joined = _joined(source)
-    usable = [fields for fields in joined if _has(fields, given) and _robot_fields(fields, given)]
-    # A robot's program beside a table has the same poses once more.
-    tables = [f for f in usable if not f.form]
-    named = [f for f in usable if "pose" in f.name.lower() or "robot" in f.name.lower()]
-    groups = (joined, usable, tables, named)
-    chosen = next((group[0] for group in groups if len(group) == 1), None)
-    if chosen is not None:
-        return chosen
+    is_seen = bool(source.images or requested.images)
+    found: list[tuple[int, Fields, ImportOptions]] = []
+    rows = _joined(source)
+    for fields in [each for each in rows if _has(each, given)] or rows:
+        # A robot's program beside a table has the same poses once more.
+        later = 4 * bool(fields.form) + 2 * (len(rows) > 1 and not _NAMED.search(fields.name))
+        by_count = () if requested.joints or joint_names(fields, ()) else _joints(fields, requested)
+        asked = replace(requested, joints=requested.joints or by_count)
+        joints, unnamed = asked.joints or joint_names(fields, ()), unnamed_columns(fields)["robot"]
+        groups = [] if given else ranked_poses(fields, "robot", joints)
+        said = pose_names(fields, (), unnamed, "robot", joints) if is_seen or not joints else ()
+        if given or said or unnamed or (joints and (is_seen or not groups)):
+            found.append((later + len(groups) * (not said), fields, asked))
+        for rank, item in ((rank, item) for rank, group in enumerate(groups) for item in group):
+            # Beside joint angles the pose is what was seen.
+            if joints and not is_seen and item.sides != ["robot"]:
+                of_item = replace(asked, camera=replace(requested.camera, names=item.names))
+            else:
+                of_item = replace(asked, robot=replace(requested.robot, names=item.names))
+            if item.names != said:
+                found.append((later + rank + bool(unnamed), fields, of_item))
     faults = [part.fault for part in source.parts if part.fault and not part.lenses]
-    if not joined and len(faults) == 1:
+    if not rows and len(faults) == 1:
         raise faults[0]
-    raise unknown(source, requested, joined)
+    if not found:
+        raise unknown(source, requested, rows)
+    return sorted(found, key=lambda item: item[0])[:_MOST_READINGS]
+
+
+def _joints(fields: Fields, requested: ImportOptions) -> tuple[str, ...]:
+    """The only columns beside each other that are as many as the joints of the user's robot."""
+    if requested.robot_model is None:
+        return ()
+    count = Robot.from_document(read_robot_document(requested.robot_model)).joint_count
+    groups = [names for names in column_groups(fields).values() if len(names) == count]
+    return groups[0] if len(groups) == 1 else ()
 
 
 def _has(fields: Fields, given: Sequence[str]) -> bool:
     names = [*fields.numbers, *fields.texts]
     return all(any(f".{name}.".find(f".{each}.") >= 0 for name in names) for each in given)
-
-
-def _robot_fields(fields: Fields, given: Sequence[str]) -> bool:
-    unnamed = unnamed_columns(fields)["robot"]
-    return bool(given or pose_names(fields, (), unnamed, "robot", ()) or joint_names(fields, ()))
 
 
 def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = ()) -> DataError:
@@ -241,91 +249,21 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
 
 
 def _joined(source: Source) -> list[Fields]:
-    """Rows of the parts, those that belong together joined: by numbers, names, or their count."""
-    keyed: dict[bool, list[tuple[Part, Fields, Sequence[int | str]]]] = defaultdict(list)
-    counts: dict[tuple[int, str], list[tuple[Part, Fields]]] = defaultdict(list)
-    for part in source.parts:
-        fields = part.fields
-        if fields is None or (part.lenses and len(part.group.files) == 1 and not _holds(fields)):
-            continue
-        if fields.stems:
-            keyed[bool(fields.views)].append((part, fields, fields.views or fields.stems))
-        else:
-            counts[len(fields), fields.form].append((part, fields))
-    found = [_by_keys(source.path, parts) for parts in keyed.values()]
-    found += [_by_rows(source.path, parts) for parts in counts.values()]
-    holding = [fields for fields in found if _holds(fields)]
-    return holding or found
+    """Rows of the parts, those joined that belong together; those of poses where there are any."""
+    found = joined(
+        [
+            fields
+            for part in source.parts
+            for fields in part.rows
+            if not part.lenses or len(part.group.files) > 1 or _holds(fields)
+        ],
+        source.path.resolve().name,
+        source.path,
+        prefixed=True,
+    )
+    named = [replace(f, name=source.path.resolve().name) if f.stems else f for f in found]
+    return [fields for fields in named if _holds(fields)] or named
 
 
 def _holds(fields: Fields) -> bool:
     return bool(possible_poses(fields) or unnamed_columns(fields)["robot"])
-
-
-def _by_keys(path: Path, parts: Sequence[tuple[Part, Fields, Sequence[int | str]]]) -> Fields:
-    """Joins files of one number or name; rows are those of the files with poses."""
-    if len(parts) == 1:
-        part, fields, _ = parts[0]
-        return _called(fields, path, part)
-    main = [item for item in parts if _holds(item[1])] or [*parts]
-    keys = [*dict.fromkeys(key for _, _, found in main for key in found)]
-    if main[0][1].views:
-        keys.sort(key=lambda key: (isinstance(key, str), key))
-    rows: dict[int | str, dict[str, object]] = {key: {} for key in keys}
-    places: dict[int | str, list[str]] = defaultdict(list)
-    stems: dict[int | str, str] = {}
-    for part, fields, found in parts:
-        each = zip(found, fields.places, part.group.files, part.records, strict=True)
-        for key, place, file, record in each:
-            if key not in rows:
-                continue
-            places[key].append(place)
-            stems.setdefault(key, file.stem)
-            rows[key] |= {
-                part.group.name if name == "matrix" else f"{part.group.name}.{name}": value
-                for name, value in record.items()
-            }
-    joined = [" and ".join(places[key]) for key in keys]
-    views = tuple(key for key in keys if isinstance(key, int))
-    fields = fields_of_records(
-        [rows[key] for key in keys], joined, path.resolve().name, path, views
-    )
-    return replace(fields, stems=tuple(stems[key] for key in keys))
-
-
-def _called(fields: Fields, path: Path, part: Part) -> Fields:
-    """The rows of one kind of file, under the name of the folder."""
-    if part.group.files == (path,):
-        return fields
-    name = path.resolve().name if fields.stems else fields.name
-    folder = path if "/" not in part.group.label else part.group.files[0].parent
-    return replace(fields, name=name, folder=folder)
-
-
-def _by_rows(path: Path, parts: Sequence[tuple[Part, Fields]]) -> Fields:
-    """Joins single files of as many rows; columns without names are an array of the file's name."""
-    if len(parts) == 1:
-        return _called(parts[0][1], path, parts[0][0])
-    numbers: dict[str, FloatArray] = {}
-    texts: dict[str, tuple[str, ...]] = {}
-    ragged: dict[str, str] = {}
-    for part, fields in parts:
-        name = part.group.files[0].stem
-        is_unnamed = [*fields.texts] == [str(at) for at in range(1, len(fields.texts) + 1)]
-        if is_unnamed and fields.texts:
-            numbers[name] = np.stack([*fields.numbers.values()], axis=1)
-            texts |= {
-                f"{name}.{column}": cells
-                for column, cells in fields.texts.items()
-                if column not in fields.numbers
-            }
-            continue
-        for column, values in fields.numbers.items():
-            numbers[name if column == "matrix" else f"{name}.{column}"] = values
-        texts |= {f"{name}.{column}": cells for column, cells in fields.texts.items()}
-        ragged |= {f"{name}.{column}": fault for column, fault in fields.shape_errors.items()}
-    names = [part.group.files[0].name for part, _ in parts]
-    places = tuple(f"row {at + 1} of {' and '.join(names)}" for at in range(len(parts[0][1])))
-    return Fields(
-        path.resolve().name, path, places, numbers, texts, shape_errors=ragged, is_joined=True
-    )

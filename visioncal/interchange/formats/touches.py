@@ -12,6 +12,7 @@ from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 from visioncal.frames.touches import NominalPoints, TouchRows, touches_of
 from visioncal.interchange.formats.columns import foreign_from, view_numbers
+from visioncal.interchange.formats.fields import Fields, named_by, unnamed_columns
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.poses import (
     check_radians,
@@ -20,7 +21,7 @@ from visioncal.interchange.formats.poses import (
     poses_from,
     without_unit,
 )
-from visioncal.interchange.formats.reading import Fields, named_by, read_fields, unnamed_columns
+from visioncal.interchange.formats.reading import read_fields
 from visioncal.session import Session
 from visioncal.session.columns import POSE, joint_columns
 

@@ -10,11 +10,11 @@ from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.values import as_numbers, mapping, read_plain_text
 from visioncal.core.types import MOUNTS
 from visioncal.interchange.formats.columns import foreign_from
+from visioncal.interchange.formats.fields import Fields, fields_of_records, number_in
 from visioncal.interchange.formats.file_search import (
     files_in,
     head,
     images_of,
-    number_in,
 )
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -23,7 +23,7 @@ from visioncal.interchange.formats.foreign import (
     PoseImportOptions,
 )
 from visioncal.interchange.formats.intrinsics import read_intrinsics
-from visioncal.interchange.formats.reading import Fields, fields_of_records, flattened
+from visioncal.interchange.formats.reading import flattened
 
 # `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame; `pose_cPo_3.yaml`: the
 # object in the camera.

@@ -1,0 +1,538 @@
+"""Rows of named values, and how rows of several sources belong together."""
+
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from pathlib import Path, PureWindowsPath
+from typing import Self
+
+import numpy as np
+
+from visioncal.core.conventions import ROTATION_FORMS
+from visioncal.core.documents.pendants import is_marked_pose, line_numbers, read_pose
+from visioncal.core.documents.tables import is_number
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import did_you_mean, some_of
+from visioncal.core.types import FloatArray, IntArray, chosen_rows
+from visioncal.session.images import IMAGE_ENDINGS
+
+_TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
+# Layout of a table without a header by its number of columns: (times, robot pose, camera pose),
+# each pose a position with a quaternion or a matrix by rows.
+_LAYOUTS = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16, 0)}
+_LAYOUTS |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
+_NORM_TOLERANCE = 0.01
+# A pose with its covariance has fewer numbers; lists of corners and images have more.
+MOST_NUMBERS = 200
+
+
+def named_by(place: str) -> str:
+    """What the option that names fields is called after: the `columns` of a table, else a `key`."""
+    return "columns" if ", line " in place else "key"
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Named values of n rows."""
+
+    name: str  # Name of the recording.
+    folder: Path  # What the names of images are relative to.
+    places: tuple[str, ...]  # (n,) place of each row in the source, for messages.
+    numbers: Mapping[str, FloatArray]  # (n, ...) arrays by name; NaN where a row has none.
+    # (n,) texts by name, of every column of a table and of single numbers.
+    texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    views: tuple[int, ...] = ()  # (n,) the rows' numbers, where their files' names have them.
+    stems: tuple[str, ...] = ()  # (n,) names of the rows' files without their ending.
+    # Error messages of fields whose rows differ in shape, by name.
+    shape_errors: Mapping[str, str] = field(default_factory=dict)
+    form: str = ""  # A name among `POSE_FORMS` where the rows state the form of the robot's poses.
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def rows(self, chosen: Sequence[int]) -> Self:
+        """The same values for some rows only."""
+        return replace(
+            chosen_rows(self, list(chosen)),
+            numbers={name: number[list(chosen)] for name, number in self.numbers.items()},
+            texts={name: tuple(text[at] for at in chosen) for name, text in self.texts.items()},
+        )
+
+    def find(self, name: str) -> str:
+        """Full name of a field, which may be given without the prefix before its last point.
+
+        Raises:
+            DataError: There is no such field; the message lists the existing ones.
+        """
+        names = list(dict.fromkeys([*self.numbers, *self.texts, *self.shape_errors]))
+        if name in names:
+            return name
+        matches = [word for word in names if word.endswith(f".{name}")]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            raise DataError(
+                f"{self.name}: {name!r} may be {some_of(matches)}; the full name is needed.",
+                culprits=matches,
+            )
+        raise DataError(
+            f"{self.name} has no column or key {name!r}; it has {self.listing()}.",
+            culprits=[name],
+            next_step=did_you_mean(name, names),
+        )
+
+    def column(self, name: str) -> FloatArray:
+        """The numbers of a field, (n, k); raises DataError."""
+        full = self.find(name)
+        if full in self.shape_errors:
+            raise DataError(self.shape_errors[full], culprits=[full])
+        if full not in self.numbers:
+            cells = zip(self.places, self.texts[full], strict=True)
+            odd = ((place, word) for place, word in cells if word and not is_number(word))
+            place, text = next(odd, (self.places[0], ""))
+            raise DataError(
+                f"{place}: {full} holds {text[:40]!r}; a number is needed.",
+                culprits=[place],
+                next_step=f"Correct the cell, or delete {place}; or leave the whole pose of that "
+                "row empty.",
+            )
+        return self.numbers[full].reshape(len(self), -1)
+
+    def listing(self) -> str:
+        """Lists the fields with their numbers of values a row, for messages."""
+        names = list(dict.fromkeys([*self.numbers, *self.texts]))
+        words = [
+            f"{name} ({int(np.prod(self.numbers[name].shape[1:]))})"
+            if name in self.numbers and self.numbers[name].ndim > 1
+            else name
+            for name in names
+        ]
+        return some_of(words, 40)
+
+
+def fields_of_records(
+    records: Sequence[Mapping[str, object]],
+    places: Sequence[str],
+    name: str,
+    folder: Path,
+    views: tuple[int, ...] = (),
+) -> Fields:
+    """Fields of n records of texts and arrays, as `flattened` returns them.
+
+    Texts that are numbers in all filled rows are numbers, too; a value missing in a row is NaN.
+    """
+    numbers: dict[str, FloatArray] = {}
+    texts: dict[str, tuple[str, ...]] = {}
+    ragged: dict[str, str] = {}
+    for key in dict.fromkeys(name for record in records for name in record):
+        values = [record.get(key) for record in records]
+        arrays = sum(isinstance(value, np.ndarray) and value.ndim > 0 for value in values)
+        if 2 * arrays > len(values):
+            # A word where others have numbers says that there were none.
+            values = [None if isinstance(value, str) else value for value in values]
+        values = arrays_in_texts(values)
+        if any(isinstance(value, str) for value in values):
+            cells = texts[key] = tuple("" if value is None else str(value) for value in values)
+            if any(cells) and all(not cell or is_number(cell) for cell in cells):
+                numbers[key] = np.array([float(cell) if cell else np.nan for cell in cells])
+            continue
+        shapes = Counter(value.shape for value in values if isinstance(value, np.ndarray))
+        shape = shapes.most_common(1)[0][0] if shapes else ()
+        for place, value in zip(places, values, strict=True):
+            if value is not None and getattr(value, "shape", None) != shape:
+                ragged[key] = (
+                    f"{place}: {key} is no regular list or matrix of numbers of the shape {shape}, "
+                    "as most rows have."
+                )
+                break
+        else:
+            empty = np.full(shape, np.nan)
+            numbers[key] = np.array([empty if value is None else value for value in values], float)
+            if not shape:
+                # As cells of a table: whole numbers without a decimal point.
+                texts[key] = tuple(
+                    "" if np.isnan(each) else str(int(each)) if each % 1 == 0 else repr(each)
+                    for each in numbers[key].tolist()
+                )
+    return Fields(name, folder, tuple(places), numbers, texts, views, shape_errors=ragged)
+
+
+def arrays_in_texts(values: list[object]) -> list[object]:
+    """Values with arrays in the place of texts, where all of these are lists of numbers or poses.
+
+    A pose in a maker's notation becomes its matrix [m].
+    """
+    texts = [value for value in values if isinstance(value, str) and value]
+    if len(texts) < 2 or any(isinstance(value, np.ndarray) for value in values):
+        return values
+    arrays = dict[str, FloatArray]()
+    for text in texts:
+        with suppress(DataError):
+            numbers = [*_separate(text)]
+            if len(numbers) > 2:
+                arrays[text] = np.array(numbers)
+            elif len(text) < MOST_NUMBERS and is_marked_pose(text):
+                arrays[text] = read_pose(text, text).pose
+        if text not in arrays:
+            return values
+    return [arrays.get(value) if isinstance(value, str) else value for value in values]
+
+
+def _separate(text: str) -> Iterator[float]:
+    """The numbers of a text of nothing else, with blanks, commas or semicolons between."""
+    words = [word for word in re.split(r"[\s,|\[\](){}]+", text) if word]
+    if all(map(is_number, words)) and (";" not in text and ("." in text or ", " in text)):
+        return map(float, words)
+    return iter(line_numbers(text))
+
+
+def appearance(numbers: FloatArray) -> str:
+    """What (n, ...) numbers look like: a `pose`, a `rotation`, a `quaternion`; else empty."""
+    flat = numbers.reshape(len(numbers), -1)
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    size, matrix = flat.shape[1], ROTATION_FORMS["matrix"]
+    if not len(flat) or size not in (4, 7, 9, 12, 16):
+        return ""
+    if size in (4, 7):
+        is_unit = _are_unit(flat[:, -4:]) or _are_unit(flat[:, :4])
+        return ("quaternion" if size == 4 else "pose") * is_unit
+    rotations = flat if size == 9 else split_matrices(flat)[1]
+    is_rotation = bool(np.isfinite(matrix.read(rotations)).all())
+    return ("rotation" if size == 9 else "pose") * is_rotation
+
+
+def _are_unit(numbers: FloatArray) -> bool:
+    """Whether (n, k) numbers, or the filled rows of them, are unit vectors."""
+    norms = np.linalg.norm(numbers[np.isfinite(numbers).all(axis=1)], axis=1)
+    return bool(len(norms) and (np.abs(norms - 1.0) < _NORM_TOLERANCE).all())
+
+
+def position_first(flat: FloatArray) -> FloatArray:
+    """(n, 7) numbers with the position first, whichever four are unit quaternions."""
+    is_last = _are_unit(flat[:, -4:]) or not _are_unit(flat[:, :4])
+    return flat if is_last else np.roll(flat, 3, axis=1)
+
+
+def holds_pose(fields: Fields) -> bool:
+    """Whether numbers of a row look like a pose or a rotation, whatever they are called."""
+    return any(appearance(numbers) for numbers in fields.numbers.values())
+
+
+def split_matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Splits (n, 16) or (n, 12) numbers of matrices into (n, 3) positions and (n, 9) rotations."""
+    last = np.array([0.0, 0, 0, 1])
+    if flat.shape[1] == 12:
+        matrices = flat.reshape(-1, 3, 4)
+        after_position = ROTATION_FORMS["matrix"].read(flat[:, 3:])
+        upper_rows = ROTATION_FORMS["matrix"].read(matrices[:, :, :3].reshape(-1, 9))
+        if (
+            np.isfinite(after_position).all(axis=(1, 2)).sum()
+            > np.isfinite(upper_rows).all(axis=(1, 2)).sum()
+        ):
+            return flat[:, :3].copy(), flat[:, 3:].copy()
+    else:
+        square = flat.reshape(-1, 4, 4)
+        by_columns = (square[:, :, 3] == last).all(axis=1) & ~(square[:, 3] == last).all(axis=1)
+        matrices = np.where(by_columns[:, None, None], np.swapaxes(square, 1, 2), square)
+        wrong = np.isfinite(matrices).all(axis=(1, 2)) & (
+            np.abs(matrices[:, 3] - last).max(axis=1) > 1e-6
+        )
+        # A matrix with another last row is no rigid transform: its zeroed rotation is refused
+        # later.
+        matrices = np.where(wrong[:, None, None], 0.0, matrices)
+    return matrices[:, :3, 3].copy(), matrices[:, :3, :3].reshape(-1, 9).copy()
+
+
+def is_image_name(name: str) -> bool:
+    """Whether a name has an image's ending."""
+    return name.lower().endswith(IMAGE_ENDINGS)
+
+
+def number_in(name: str) -> int | None:
+    """Last number in a file's name without its ending; None where there is none."""
+    digits = re.findall(r"[0-9]+", Path(name).stem)
+    return int(digits[-1]) if digits and len(digits[-1]) < 19 else None
+
+
+def plain_name(cell: str) -> str:
+    """A file's name, on whatever machine, without its folder and an image's ending."""
+    name = PureWindowsPath(cell).name
+    return (name.rpartition(".")[0] if is_image_name(name) else name).casefold()
+
+
+_DATE = re.compile(
+    r"((?:19|20)[0-9]{2})\D?([01][0-9])\D?([0-3][0-9])\D{0,3}([0-2][0-9])\D?([0-5][0-9])\D?([0-5][0-9])"
+    r"(?:[._,-]?([0-9]{1,9}))?"
+)
+
+
+def time_in(name: str) -> float:
+    """The time [s] in a name, as a date or as seconds of an epoch; NaN without one."""
+    if match := _DATE.search(name):
+        with suppress(ValueError):
+            whole = datetime(*map(int, match.groups()[:6]))  # type: ignore[arg-type]
+            return (whole - datetime(1970, 1, 1)).total_seconds() + float(f"0.{match[7] or 0}")
+    digits = re.search(r"[0-9]{9,19}(?:\.[0-9]+)?|[0-9]+\.[0-9]{2,}", name)
+    return float(in_seconds(np.array([float(digits[0])]))[0]) if digits else float("nan")
+
+
+# Present epochs are about 1e9 s: (larger than, seconds a unit).
+_EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+
+
+def in_seconds(stamps: FloatArray) -> FloatArray:
+    """Converts stamps to seconds; the size of an epoch shows milli-, micro- or nanoseconds."""
+    sizes = np.abs(stamps[np.isfinite(stamps)])
+    largest = float(sizes.max()) if len(sizes) else 0.0
+    return stamps * next((unit_s for limit, unit_s in _EPOCHS if largest > limit), 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Keys:
+    """What tells n rows or files apart, by which those of another source belong to them."""
+
+    count: int
+    names: Mapping[str, tuple[str, ...]]  # (n,) names by column; those of files have none.
+    numbers: Mapping[str, tuple[int | None, ...]]
+    times_s: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(
+        cls,
+        count: int,
+        names: Mapping[str, tuple[str, ...]],
+        numbers: Mapping[str, tuple[int | None, ...]],
+    ) -> "Keys":
+        """From (n,) names by column, and (n,) numbers that are known."""
+        plain = {column: tuple(map(plain_name, cells)) for column, cells in names.items()}
+        counted = {column: tuple(map(number_in, cells)) for column, cells in plain.items()}
+        times = {column: np.array([*map(time_in, cells)]) for column, cells in plain.items()}
+        return cls(
+            count,
+            {column: cells for column, cells in plain.items() if _are_keys(cells)},
+            {k: cells for k, cells in {**counted, **numbers}.items() if _are_keys(cells)},
+            {k: s for k, s in times.items() if len(s) > 2 and _are_keys(tuple(s[np.isfinite(s)]))},
+        )
+
+
+def _are_keys(cells: Sequence[object]) -> bool:
+    """Whether the filled cells are most of them, and no two are the same."""
+    filled = [cell for cell in cells if cell not in ("", None)]
+    return len({*filled}) == len(filled) and 2 * len(filled) >= len(cells) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """How rows of one source belong to those of another."""
+
+    how: str  # A name among `HOW`.
+    rows: IntArray  # (n,) the other's row of each; -1 for none.
+
+    @property
+    def lost(self) -> int:
+        """The number of rows without another."""
+        return int((self.rows < 0).sum())
+
+
+HOW = ("equal names", "equal numbers", "their times", "their order")
+
+
+def keys_of(fields: Fields) -> Keys:
+    """What tells the rows of a source apart."""
+    names = {"": fields.stems} if fields.stems else {}
+    # A measured number is no name, and its digits no number.
+    measured = {
+        name
+        for name, numbers in fields.numbers.items()
+        if numbers.ndim == 1 and (np.mod(numbers[np.isfinite(numbers)], 1) != 0).any()
+    }
+    names |= {k: cells for k, cells in fields.texts.items() if any(cells) and k not in measured}
+    keys = Keys.of(len(fields), names, {"": fields.views} if fields.views else {})
+    stamp = stamp_name(fields, unnamed_columns(fields)["robot"])
+    times_s = {} if not stamp else {stamp: in_seconds(fields.column(stamp)[:, 0])}
+    return replace(keys, times_s={**keys.times_s, **times_s})
+
+
+def matched(first: Keys, second: Keys) -> Match | None:
+    """Matches rows by equal names, else numbers, else times, else by their order; None if none."""
+    fewest = min(first.count, second.count)
+    kinds = ((HOW[0], first.names, second.names), (HOW[1], first.numbers, second.numbers))
+    for how, mine, others in kinds:
+        best: tuple[tuple[int, bool, bool], IntArray] = ((1, False, False), np.zeros(0, int))
+        for a, keys in mine.items():
+            for b, their in others.items():
+                rows, is_equal = _equal(keys, their)
+                common, is_same = int((rows >= 0).sum()), a == b
+                # Columns of different names have some numbers in common by chance.
+                is_sure = is_same or any(len(str(key)) > 4 for key in their)
+                fits = common == fewest or (2 * common > fewest and is_sure)
+                if fits and (common, is_equal, is_same) > best[0]:
+                    best = (common, is_equal, is_same), rows
+        if len(best[1]):
+            return Match(how, best[1])
+    for mine_s in first.times_s.values():
+        for their_s in second.times_s.values():
+            rows = _nearest(mine_s, their_s)
+            if 2 * (rows >= 0).sum() > fewest > 2:
+                return Match(HOW[2], rows)
+    return Match(HOW[3], np.arange(first.count)) if first.count == second.count else None
+
+
+def _equal(keys: Sequence[object], their: Sequence[object]) -> tuple[IntArray, bool]:
+    """(n,) the other's row of each key, -1 for none, and whether the keys are equal.
+
+    Numbers of two counts of the same rows, one begun later, are the same.
+    """
+    place = {key: at for at, key in enumerate(their) if key not in ("", None)}
+    whole = [key for key in keys if isinstance(key, int)]
+    others = [key for key in place if isinstance(key, int)]
+    by = 0
+    if len(whole) == len(others) == len(keys) == len(their):
+        steps = {b - a for a, b in zip(sorted(whole), sorted(others), strict=True)}
+        by = steps.pop() if len(steps) == 1 else 0
+    if by:
+        return np.array([place[key + by] for key in whole]), False
+    return np.array([place.get(key, -1) for key in keys]), True
+
+
+def _nearest(mine_s: FloatArray, their_s: FloatArray) -> IntArray:
+    """(n,) the other's row of the nearest time, but for a constant offset; -1 for none."""
+    if len(mine_s) > len(their_s):
+        back = _nearest(their_s, mine_s)
+        rows = np.full(len(mine_s), -1)
+        rows[back[back >= 0]] = np.flatnonzero(back >= 0)
+        return rows
+    own, best = mine_s[np.isfinite(mine_s)], np.full(len(mine_s), -1)
+    order = np.argsort(their_s)
+    ends = their_s[order][np.isfinite(their_s[order])]
+    if len(own) < 3 or len(ends) < 3:
+        return best
+    # A fifth of the usual step is no other row's.
+    within, most = 0.2 * float(np.median(np.diff(np.sort(own)))), 0
+    offsets = np.concatenate([[0.0], (ends[:200, None] - own[:2]).ravel()])
+    for offset in offsets[np.argsort(np.abs(offsets), kind="stable")]:
+        after = np.searchsorted(ends, mine_s + offset).clip(1, len(ends) - 1)
+        at = after - (mine_s + offset - ends[after - 1] <= ends[after] - mine_s - offset)
+        near = np.abs(ends[at] - mine_s - offset) <= within
+        if (count := len({*at[near]})) > most and count == near.sum():
+            best, most = np.where(near, order[at], -1), count
+    return best
+
+
+def joined(
+    parts: Sequence[Fields], name: str, folder: Path, *, prefixed: bool = False
+) -> list[Fields]:
+    """Rows of several sources, those joined that belong together; fields with poses come first.
+
+    `name` and `folder` are those of the joined rows; `prefixed` puts the source's name before each
+    field's.
+    """
+    # Each with its row for every row of the first.
+    clusters: list[list[tuple[Fields, IntArray]]] = []
+    for part in sorted(parts, key=lambda item: (not holds_pose(item), -len(item))):
+        own = keys_of(part)
+        for cluster in clusters:
+            main = cluster[0][0]
+            match = matched(keys_of(main), own) if main.form == part.form else None
+            if match is not None:
+                cluster.append((part, match.rows))
+                break
+        else:
+            clusters.append([(part, np.arange(len(part)))])
+    return [
+        cluster[0][0] if len(cluster) == 1 else _merged(cluster, name, folder, prefixed=prefixed)
+        for cluster in clusters
+    ]
+
+
+def _merged(
+    members: Sequence[tuple[Fields, IntArray]], name: str, folder: Path, *, prefixed: bool
+) -> Fields:
+    numbers, texts, ragged = dict[str, FloatArray](), dict[str, tuple[str, ...]](), dict[str, str]()
+    places: list[list[str]] = [[] for _ in members[0][1]]
+    for part, rows in members:
+        known = {*numbers, *texts}
+        new = {
+            key: part.name
+            if key == "matrix" and prefixed
+            else f"{part.name}." * (prefixed or key in known) + key
+            for key in (*part.numbers, *part.texts, *part.shape_errors)
+        }
+        values = dict(part.numbers)
+        columns = [*map(str, range(1, len(part.texts) + 1))]
+        if prefixed and columns and [*part.texts] == columns:
+            # Columns without names are an array of the file's.
+            new[part.name], values = part.name, {part.name: np.stack([*values.values()], axis=1)}
+        for key, each in values.items():
+            numbers[new[key]] = each[rows].astype(float)
+            numbers[new[key]][rows < 0] = np.nan
+        texts |= {
+            new[key]: tuple(cells[at] if at >= 0 else "" for at in rows)
+            for key, cells in part.texts.items()
+            if key in values or key not in part.numbers
+        }
+        ragged |= {new[key]: fault for key, fault in part.shape_errors.items()}
+        for row in np.flatnonzero(rows >= 0):
+            places[row].append(part.places[rows[row]])
+    return replace(
+        members[0][0],
+        name=name,
+        folder=folder,
+        places=tuple(" and ".join(dict.fromkeys(each)) for each in places),
+        numbers=numbers,
+        texts=texts,
+        shape_errors=ragged,
+    )
+
+
+def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
+    """Interprets the columns of a table without a header by their number.
+
+    Returns:
+        The columns of `time`, `robot` and `camera`; all empty for a table with a header or another
+        number of columns.
+    """
+    names = [str(at) for at in range(1, len(fields.texts) + 1)]
+    if not names or list(fields.texts) != names:
+        return {"time": (), "robot": (), "camera": ()}
+    # Names of images are no part of a pose.
+    names = [name for name in names if not all(map(is_image_name, fields.texts[name]))]
+    time, robot, camera = _LAYOUTS.get(len(names), (0, 0, 0))
+    is_numeric = set(names) == set(fields.numbers)
+    if is_numeric and len(names) == 12:
+        numbers = np.stack([fields.numbers[name] for name in names], axis=1)
+        lengths = np.linalg.norm(numbers.reshape(-1, 3, 4)[..., :3], axis=2)
+        if (np.abs(lengths - 1.0) < _NORM_TOLERANCE).all():
+            # The upper three rows of matrices, not two poses.
+            robot = 12
+    if is_numeric and len(names) == 7:
+        last = np.stack([fields.numbers[name] for name in names[3:]])
+        if (np.abs(np.linalg.norm(last, axis=0) - 1.0) > _NORM_TOLERANCE).all():
+            # A number or a time, and a position with three angles.
+            time, robot = 1, 6
+    pose = names[time : time + robot]
+    return {
+        "time": tuple(names[:time]),
+        "robot": tuple(pose),
+        "camera": tuple(names[time + robot :]) if camera else (),
+    }
+
+
+def stamp_name(fields: Fields, taken: Collection[str]) -> str:
+    """Finds the field of times, one number a row and not `taken`; else empty."""
+    unnamed = unnamed_columns(fields)
+    # In a table without a header, the poses follow the times.
+    for name in unnamed["time"] if set(unnamed["robot"]) <= set(taken) else ():
+        numbers = fields.column(name)[:, 0]
+        # Numbers that count rows, possibly with gaps, are no times; those of an epoch are larger.
+        if (numbers % 1 != 0).any() or numbers.max(initial=0.0) >= 1e6:
+            return name
+    named = (
+        name
+        for name, numbers in fields.numbers.items()
+        if name.lower() in _TIME_NAMES and name not in taken and numbers.size == len(fields)
+    )
+    return next(named, "")
