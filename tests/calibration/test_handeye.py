@@ -37,9 +37,9 @@ def test_the_whole_chain_states_its_errors_honestly():
     options = CellOptions(pixel_sigma_px=0.1, robot_sigma_rad=sigmas[0], robot_sigma_m=sigmas[1])
     for seed in range(8):
         known = calibrated(cell := simulate(replace(options, seed=seed)))
-        error, covariance = error_of(cell, known), known.assessment.covariance[:12, :12]
+        error, covariance = error_of(cell, known), known.assessment.fit.whole[:12, :12]
         surprises.append(error @ np.linalg.solve(covariance, error) / 12)
-        noises.append(known.assessment.noise.robots[0])
+        noises.append(known.assessment.fit.noise.robots[0])
         assert known.pixel_px == pytest.approx(0.1, rel=0.1)
     # The mean of 8 chi-square of 12 has the standard deviation 0.144: four of it. The estimated
     # noise raises the expectation by some percent (F against chi-square).

@@ -40,7 +40,7 @@ def test_errors_follow_their_covariance(options):
         shop = tracked(replace(options, seed=seed))
         known = known_of(session_of(shop), level="hand-eye")
         error = errors_of(shop, known)[kept]
-        covariance = known.assessment.covariance[np.ix_(kept, kept)]
+        covariance = known.assessment.fit.whole[np.ix_(kept, kept)]
         squares += float(error @ np.linalg.solve(covariance, error))
     # In one case of a thousand chi-square is beyond either.
     low, high = chi2_limit(np.array([0.9995, 0.0005]), 3 * len(kept))
@@ -53,7 +53,7 @@ def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace():
     assert known.robot_arm.kinematics.level == "geometry"
     assert known.verdict.status == "good"
     q = postures(known.robot)
-    (x, z), size = known.assessment.state.edges[:2], len(known.robot_arm.model.values)
+    (x, z), size = known.assessment.fit.state.edges[:2], len(known.robot_arm.model.values)
 
     def place(robot):
         return (invert(x) @ robot.base_from_flange(q) @ z)[:, :3, 3]

@@ -28,9 +28,10 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.chain import chain, robot_part
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.identifiability import observability_indices
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
-from visioncal.estimation.solve import Solution, covariance_of
+from visioncal.estimation.solve import Solution
 from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports import document
 from visioncal.live.planning.information import stop_factors
@@ -69,15 +70,10 @@ def arm_data(robot, q, mount="eye-in-hand", blocks=("links",)):
     seen = invert(robot_part(poses, mount) @ X) @ Z
     problem = chain(mount, poses, seen, covariance, effects=[effect])
     state = State(np.stack([X, Z]), np.zeros(len(model.values)))
-    covariance = covariance_of(problem, Solution(state, NOISE))
     return ArmData(
-        problem,
-        state,
-        NOISE,
-        covariance,
+        Fit(problem, Solution(state, NOISE)),
         ROBOT,
         model,
-        np.arange(12, len(covariance)),
         ERROR_RAD,
         np.arange(len(q)),
         q,
@@ -129,8 +125,7 @@ def place_sigmas_m(known):
     """(k,) predicted sigmas of the place of what the arm carries, over its workspace [m]."""
     answer, arm = known.assessment, known.robot_arm
     middles = middles_of(known.cell_fit.cell)
-    data = arm.data(answer.problem, answer.fit, answer.covariance, middles)
-    return data.place_sigmas_m(postures(arm.model.robot))
+    return arm.data(answer.fit, middles).place_sigmas_m(postures(arm.model.robot))
 
 
 def test_offsets_alone_are_told_from_wrong_links():
@@ -191,11 +186,11 @@ def wrong():
 
 def test_predictions_move_as_their_derivatives_say(wrong):
     cell, known = wrong
-    mount, edges = cell.options.mount, known.assessment.state.edges
+    mount, edges = cell.options.mount, known.assessment.fit.state.edges
     arm = known.robot_arm.at(np.arange(3))
     model, q = arm.model, arm.joints_rad
     middle = invert(target_in_camera(mount, *edges, model.robot.base_from_flange(q)))
-    problem = known.assessment.problem.with_effects([])
+    problem = known.assessment.fit.problem.with_effects([])
     pair = ArmPair.of(problem, State(edges, np.zeros(0)), ROBOT)
     expected = pair.jacobian(model.base_from_flange(q), model.basis(q))[1]
 
@@ -274,9 +269,9 @@ def test_readings_of_one_point_tell_three_values_less(name):
     """A point of the tool has a place and no direction."""
     robot = load_robot(name)
     arm = arm_data(robot, postures(robot)[:60], "eye-to-hand")
-    places = replace(arm.problem.observations, has_rotation=np.zeros(60, dtype=bool))
-    problem = replace(arm.problem, observations=places)
-    positions = replace(arm, problem=problem, measured=np.arange(6) > 2)
+    places = replace(arm.fit.problem.observations, has_rotation=np.zeros(60, dtype=bool))
+    fit = replace(arm.fit, problem=replace(arm.fit.problem, observations=places))
+    positions = replace(arm, fit=fit, measured=np.arange(6) > 2)
     whole, point = (identified(data)[0].observability for data in (arm, positions))
     assert (point.identifiable, point.determined) == (whole.identifiable - 3, whole.determined - 3)
 
@@ -293,7 +288,7 @@ def waved():
 
 def away_m(shop: InstrumentRecord, known: RunState) -> FloatArray:
     """(m, 3) how far the probe is predicted off at postures all over the workspace."""
-    x, z = known.assessment.state.edges[:2]
+    x, z = known.assessment.fit.state.edges[:2]
     found = invert(x) @ known.robot_arm.model.base_from_flange(Q) @ z
     true = invert(shop.base_from_instrument) @ forward(shop.true_arm, Q) @ shop.flange_from_probe
     return (invert(found) @ true)[:, :3, 3]
@@ -301,9 +296,7 @@ def away_m(shop: InstrumentRecord, known: RunState) -> FloatArray:
 
 def sigmas_m(known: RunState) -> FloatArray:
     """(m,) what is predicted of that."""
-    answer = known.assessment
-    fit = Solution(answer.state, answer.noise)
-    return known.robot_arm.data(answer.problem, fit, answer.covariance, {}).place_sigmas_m(Q)
+    return known.robot_arm.data(known.assessment.fit, {}).place_sigmas_m(Q)
 
 
 def test_functions_of_joints_are_found_and_make_the_arm_better_where_it_never_was(waved):

@@ -190,7 +190,7 @@ def test_a_board_of_several_may_be_known_whole():
     prior = dict(zip(("x_m", "y_m", "z_m"), edge[:3, 3].tolist(), strict=True))
     prior |= {"sigma_m": SIGMA_M, "quaternion_xyzw": turn, "sigma_rad": 1e-5}
     known = run_with(cell, {name: prior})
-    sigmas = np.sqrt(np.diag(known.assessment.covariance)[:18])
+    sigmas = np.sqrt(np.diag(known.assessment.fit.whole)[:18])
     # Four sigma, for eighteen numbers.
     assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
     # The board is turned no farther than that is known.
@@ -232,7 +232,7 @@ def test_a_plan_counts_what_was_measured():
 
 def mahalanobis_sq(cell, known):
     """Squared error of both edges over the covariance, divided by their twelve numbers."""
-    error, covariance = error_of(cell, known)[:12], known.assessment.covariance[:12, :12]
+    error, covariance = error_of(cell, known)[:12], known.assessment.fit.whole[:12, :12]
     return error @ np.linalg.solve(covariance, error) / 12
 
 
@@ -296,7 +296,7 @@ def test_a_stated_lens_counts_by_its_prior_and_is_refined_where_that_helps(
         assert known.verdict.status == (status or known.verdict.status), known.verdict.reasons
         if refined:
             camera = known.cell_fit.camera_parameters.camera("cam")
-            sigma = np.sqrt(np.diag(known.assessment.covariance))[12:16]
+            sigma = np.sqrt(np.diag(known.assessment.fit.whole))[12:16]
             # Chi-square of four under 23.5 in all but one case of ten thousand.
             assert np.all(np.abs(camera.matrix - options.camera.matrix) < 4.5 * sigma)
         elif "matrix_sigma_px" in table:
@@ -388,10 +388,10 @@ def test_what_is_written_of_the_fit_is_read_back():
     known = calibrated(simulate(wrong))
     assert known.robot_arm.model is not None
     prior, solved = CalibrationPrior.of(result_of(known)), known.assessment
-    np.testing.assert_allclose(prior.state.edges, solved.state.edges, atol=1e-12)
+    np.testing.assert_allclose(prior.state.edges, solved.fit.state.edges, atol=1e-12)
     # What lenses do beyond their models is not written.
-    own = np.delete(np.arange(len(solved.covariance)), known.cell_fit.field_columns)
-    covariance = solved.covariance[np.ix_(own, own)]
+    own = np.delete(np.arange(len(solved.fit.whole)), solved.fit.unknowns.of_kinds("lens errors"))
+    covariance = solved.fit.whole[np.ix_(own, own)]
     scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
     # Slopes there and back undo each other up to rounding.
     np.testing.assert_allclose(prior.covariance / scale, covariance / scale, atol=1e-6)

@@ -37,7 +37,7 @@ from visioncal.core.verdict import (
     remarks,
     with_paths,
 )
-from visioncal.estimation.arm import ArmErrors, misfit_jacobian, pose_basis
+from visioncal.estimation.arm import ArmErrors, pose_basis
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.present.report.content import need_facts
@@ -367,8 +367,8 @@ def without_arm_errors(known: RunState) -> RunState:
     """The same with an arm of which nothing but noise is known."""
     answer, solved = known.assessment, known.cell_fit
     arms = {name: replace(arm, errors=None) for name, arm in solved.arms.items()}
-    covariance = answer.covariance - answer.covariance_by_source["arm"]
-    changed = replace(answer, covariance=covariance)
+    beside = {name: part for name, part in answer.fit.beside.items() if name != "arm"}
+    changed = replace(answer, fit=replace(answer.fit, beside=beside))
     return replace(known, assessment_or_none=changed, cell_fit_or_none=replace(solved, arms=arms))
 
 
@@ -380,7 +380,7 @@ def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm() -> None
     assert all(arm.is_modelled for arm in known.cell_fit.arms.values())
     (picks,) = known.findings.picks
     middle, scaled = np.array([0.135, 0.09, 0.0, 1.0]), np.diag([size, size, size, 1.0])
-    went = known.assessment.problem.predicted(known.assessment.state) @ middle
+    went = known.assessment.fit.problem.predicted(known.assessment.fit.state) @ middle
     seen = cell.cam_from_target[np.array(known.used)] @ scaled @ middle
     away_mm = 1e3 * np.sqrt(np.mean(np.sum((went - seen)[:, :3] ** 2, axis=1)))
     # 1.5 sigma of that size make nearly all of it, and what is held counts by its pull as well.
@@ -397,16 +397,15 @@ def test_only_views_that_are_known_well_show_what_is_not_predicted(views: slice,
     """A view of a small board from the front: off by 2 deg, which is 2.5 times its sigma."""
     known = calibrated(simulate(CellOptions(views=12)), joints=False)
     answer = known.assessment
-    seen = answer.problem.observations
+    seen = answer.fit.problem.observations
     among = seen.covariance.copy()
     among[0, :3, :3] = np.deg2rad(0.8) ** 2 / 3.0 * np.eye(3)
     away_rad = answer.held_out.residual_rad.copy()
     away_rad[views] = np.deg2rad(2.0)
-    blurred = replace(answer.problem, observations=replace(seen, covariance=among))
+    blurred = replace(answer.fit.problem, observations=replace(seen, covariance=among))
     held = replace(answer.held_out, residual_rad=away_rad)
-    findings = findings_of(
-        replace(known, assessment_or_none=replace(answer, problem=blurred, held_out=held))
-    )
+    answer = replace(answer, fit=replace(answer.fit, problem=blurred), held_out=held)
+    findings = findings_of(replace(known, assessment_or_none=answer))
     (picks,) = findings.picks
     kinds = [finding.kind for finding in judge(findings).findings]
     assert (("left out" in picks.parts), ("unexplained" in kinds)) == (is_found, is_found)
@@ -586,16 +585,16 @@ def test_rows_that_were_shuffled_are_named(options, order, status, words):
 def drawn_misses_m(known: RunState, mount: str) -> np.ndarray:
     """(n, 3) by how much picks miss, drawn one by one and seen through the chain [m]."""
     answer, rng, count = known.assessment, np.random.default_rng(0), 20_000
-    problem, (camera, target) = answer.problem, answer.state.edges[:2]
+    problem, (camera, target) = answer.fit.problem, answer.fit.state.edges[:2]
     views = rng.integers(len(known.used), size=count)
     (poses,) = problem.poses.values()
     flange, middle = poses[problem.observations.stops][views], np.array([0.135, 0.09, 0.0, 1.0])
-    sigmas = np.repeat(answer.noise.robots[0], 3)
+    sigmas = np.repeat(answer.fit.noise.robots[0], 3)
     look, pick = (sigmas * rng.standard_normal((count, 6)) for _ in range(2))
-    edges = rng.standard_normal((count, 12)) @ np.linalg.cholesky(answer.covariance[:12, :12]).T
+    edges = rng.standard_normal((count, 12)) @ np.linalg.cholesky(answer.fit.whole[:12, :12]).T
     first, second = exp(edges[:, :6]), exp(edges[:, 6:])
     if mount == "eye-in-hand":
-        seen = problem.measured(answer.state)[views] @ middle[:, None]
+        seen = problem.measured(answer.fit.state)[views] @ middle[:, None]
         away = flange @ (exp(look) @ camera @ first - camera) @ seen
         return away[:, :3, 0] + pick[:, 3:]
     went = flange @ exp(pick) @ target @ second
@@ -624,12 +623,13 @@ def test_what_an_arm_does_again_moves_no_pick() -> None:
     answer, solved = known.assessment, known.cell_fit
     ((robot, arm),) = solved.arms.items()
     errors = ArmErrors(
-        pose_basis(answer.problem.poses[robot])[:, :, :12], 4e-3, 0.0, of_links=False
+        pose_basis(answer.fit.problem.poses[robot])[:, :, :12], 4e-3, 0.0, of_links=False
     )
-    off = errors.sigma * misfit_jacobian(answer.problem, answer.state, answer.noise, robot, errors)
+    off = errors.sigma * answer.fit.bias(robot, errors)
+    fit = replace(answer.fit, beside={**answer.fit.beside, "arm": off @ off.T})
     erring = replace(
         known,
-        assessment_or_none=replace(answer, covariance=answer.covariance + off @ off.T),
+        assessment_or_none=replace(answer, fit=fit),
         cell_fit_or_none=replace(solved, arms={robot: replace(arm, errors=errors)}),
     )
     (before,), (after,) = (findings_of(run_state).picks for run_state in (known, erring))

@@ -379,7 +379,7 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
     if cell.wrong_views or "wrong_views" in world.never:
         assert set(range(len(cell.corners))) - set(known.used) == set(cell.wrong_views)
     error = error_of(cell, known)[slice(*world.of)]
-    covariance = known.assessment.covariance[slice(*world.of), slice(*world.of)]
+    covariance = known.assessment.fit.whole[slice(*world.of), slice(*world.of)]
     square = float(error @ np.linalg.solve(covariance, error))
     # Chi-square exceeds this in one case of a thousand.
     assert not len(error) or square < world.slack * chi2.ppf(0.999, len(error))
@@ -402,15 +402,13 @@ def test_what_grows_is_named_recovered_and_in_the_budget(change, kind, true):
     assert kind in next(iter(known.assessment.budget_mm.values()))
     if true is None:
         return
-    problem, fit = known.cell_fit.inlier_problem, known.cell_fit.inlier_fit.fit
-    (name,) = (name for name in problem.effect_columns if name.startswith(f"{kind} of "))
-    sigmas = np.sqrt(np.diag(known.assessment.covariance))
+    fit = known.assessment.fit
+    ((_, name),) = fit.unknowns.all_of(kind)
     # Up to six values: beyond four sigma once in some thousand.
-    away = problem.values_of(name, fit.state) - true
-    assert np.all(np.abs(away) < 4.0 * sigmas[problem.effect_columns[name]])
+    assert np.all(np.abs(fit.values((kind, name)) - true) < 4.0 * fit.sigmas((kind, name)))
     # The mean of what a base tilts by is a base that stands otherwise.
     if kind != "base_tilts":
-        assert np.all(np.abs(error_of(cell, known)) < 4.5 * sigmas[:12])
+        assert np.all(np.abs(error_of(cell, known)) < 4.5 * np.sqrt(np.diag(fit.whole))[:12])
 
 
 def test_a_bump_is_in_the_covariance():

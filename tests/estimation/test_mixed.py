@@ -10,6 +10,7 @@ from support.problems import observed as observed_world
 from support.problems import world
 from support.slopes import jacobian
 
+from visioncal.calibration.pipeline.arm_results import misfit_covariance
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
@@ -18,7 +19,6 @@ from visioncal.estimation.arm import (
     ArmErrors,
     covariance_of_size,
     link_basis,
-    misfit_covariance,
     pose_basis,
 )
 from visioncal.estimation.armmodel import ArmModel
@@ -26,6 +26,7 @@ from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.field_modes import field_modes
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.gating import gate
 from visioncal.estimation.lens_field import LensLevels, displacements, distances
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
@@ -334,7 +335,7 @@ def test_errors_are_as_large_as_the_covariance_says(errors):
         covariance = covariance_of(problem, fit)[:6, :6]
         away = log(invert(fit.state.edges[0]) @ X)
         before.append(away @ np.linalg.solve(covariance, away) / 6)
-        more = misfit_covariance(problem, fit.state, fit.noise, ROBOT, found)[:6, :6]
+        more = misfit_covariance(Fit(problem, fit), ROBOT, found)[:6, :6]
         after.append(away @ np.linalg.solve(covariance + more, away) / 6)
     # A mean of 72 squares is known to 0.17, and levels of few stops leave some 0.3. Seen 0.8 and
     # 0.4: of a smooth error, what looks the same in all views is counted though there is none.
@@ -452,7 +453,7 @@ def test_the_size_of_an_arms_errors_is_known_as_well_as_these_are_told():
     # The place of a frame makes up for one that is not told.
     covariance[0, arm.start] = covariance[arm.start, 0] = -5e-7
     covariance[0, 0] = 3e-7
-    more = covariance_of_size(erring, covariance, "a", errors)
+    more = covariance_of_size(arm, covariance, errors)
     # Student's t of four degrees has twice the variance of the normal.
     np.testing.assert_allclose(np.diag(more[arm, arm]), [1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0])
     assert more[0, arm.start] == pytest.approx(-5e-7)

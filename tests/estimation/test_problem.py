@@ -16,10 +16,12 @@ from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.estimation import joint
+from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.budget import Sources, covariance_by_source
 from visioncal.estimation.chain import chain
 from visioncal.estimation.clock import clock_problem
 from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.linalg import covariance_from, damped_step, eigenvalue_shares
 from visioncal.estimation.mixed import PriorInformation
@@ -45,6 +47,7 @@ from visioncal.estimation.solve import (
 from visioncal.estimation.steps import find_steps, frames_of
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.simulation import CAMERAS, CellOptions, simulate
+from visioncal.vision.camera import intrinsics
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")
 FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
@@ -534,8 +537,8 @@ def pushed(cell, frame, stop, twist, stops=20):
 @cache
 def answered(given, **changes):
     known = calibrated(simulate(replace(FINE, state_intrinsics=given, **changes)))
-    problem = known.assessment.problem
-    return problem, fit_problem(problem, known.assessment.state)
+    problem = known.assessment.fit.problem
+    return problem, fit_problem(problem, known.assessment.fit.state)
 
 
 def test_the_variance_to_be_expected_is_that_of_a_level_with_its_degrees_of_freedom():
@@ -549,6 +552,48 @@ def test_the_variance_to_be_expected_is_that_of_a_level_with_its_degrees_of_free
     problem, fit = answered(True, views=6, seed=1, robot_sigma_m=0.0, robot_sigma_rad=0.0)
     at = replace(fit.noise, robots=np.full((1, 2), 1e-9))
     assert 1e-6 < expected_levels(problem, fit.state, at)[0, 1] < 1e-4
+
+
+def test_a_fit_has_its_unknowns_by_name_and_none_of_exact_values():
+    for given in (True, False):
+        known = calibrated(simulate(replace(FINE, state_intrinsics=given, views=12, seed=0)))
+        fit, lens, board = known.assessment.fit, ("lens", "cam"), ("board", "")
+        parts, size = fit.unknowns.parts, len(fit.whole)
+        assert [*parts][:4] == [("edge", "cam"), ("edge", "target"), lens, board]
+        columns = fit.unknowns.columns(*parts)
+        np.testing.assert_array_equal(columns, np.arange(size))
+        assert fit.unknowns["lens", "another"] == slice(0, 0)
+        np.testing.assert_array_equal(fit.values(lens), intrinsics(fit.camera("cam")))
+        np.testing.assert_array_equal(fit.covariance(board, lens), fit.whole[
+            np.ix_(*[np.r_[parts[board], parts[lens]]] * 2)
+        ])  # fmt: skip
+        # Of a board as it is printed, the scale alone is uncertain, and of a given lens nothing.
+        assert fit.unknowns.values_of(board).tolist() == [SCALE]
+        assert not fit.values(board)[SCALE + 1 :].any()
+        assert len(fit.unknowns.values_of(lens)) == (0 if given else len(fit.values(lens)))
+
+
+def test_a_forward_model_of_a_fit_errs_by_the_whole_covariance():
+    known = calibrated(simulate(replace(FINE, state_intrinsics=False, views=12, seed=1)))
+    fit, rng = known.assessment.fit, np.random.default_rng(0)
+    parts = {
+        unknown: rng.normal(size=(5, 3, len(fit.covariance(unknown))))
+        for unknown in fit.unknowns.all_of("edge", "lens")
+    }
+    names, whole = [*parts], fit.covariance(*parts)
+    slope = np.concatenate([parts[name] for name in names], axis=2)
+    np.testing.assert_allclose(fit.predicted(parts), slope @ whole @ slope.mT, rtol=1e-12)
+
+
+def test_one_more_column_of_a_fit_steps_to_what_a_fit_with_it_finds():
+    problem, fit = answered(False, views=8, seed=6)
+    size = joint.target_sizes(problem, ["target"], 1e-3)
+    widened = Fit(problem, fit).with_columns(size)
+    step = -widened.absorbed @ widened.equations[1]
+    state, _ = solve_problem(widened.problem, widened.state, fit.noise, is_near=True)
+    # The problem is linear to the square of a step of some 1e-4.
+    assert step[-1] == pytest.approx(state.values[-1], rel=1e-3)
+    assert abs(step[-1]) > 1e-6
 
 
 @pytest.mark.parametrize("kind", ["one a stop", "places", "combined"])

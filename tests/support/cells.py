@@ -113,7 +113,7 @@ def board_numbers(cell: SimulatedCell) -> np.ndarray:
 def error_of(cell: SimulatedCell, known: RunState) -> np.ndarray:
     """(6 + 6 b,) right perturbations of all edges, true to estimated (rotation, translation)."""
     true = np.array(list(cell.transforms.values()))
-    return log(invert(true) @ known.assessment.state.edges).ravel()
+    return log(invert(true) @ known.assessment.fit.state.edges).ravel()
 
 
 def exact(options: CellOptions | None = None) -> CellOptions:

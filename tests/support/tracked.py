@@ -23,4 +23,4 @@ def known_of(session: Session, **changes) -> RunState:
 def errors_of(shop: InstrumentRecord, known: RunState) -> FloatArray:
     """(12,) right perturbations of both edges, true to estimated (rotation, translation)."""
     true = np.array([shop.base_from_instrument, shop.flange_from_probe])
-    return log(invert(true) @ known.assessment.state.edges[:2]).ravel()
+    return log(invert(true) @ known.assessment.fit.state.edges[:2]).ravel()

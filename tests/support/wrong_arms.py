@@ -43,7 +43,7 @@ def error_m(cell, known, robot):
     `robot` may be an `ArmModel`, which bends under its own weight.
     """
     q = postures(getattr(robot, "nominal", robot))
-    return away_m(cell, known.assessment.state.edges, q, robot.base_from_flange(q))
+    return away_m(cell, known.assessment.fit.state.edges, q, robot.base_from_flange(q))
 
 
 def away_m(cell, edges, q, flanges):

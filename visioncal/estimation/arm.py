@@ -15,12 +15,9 @@ from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.budget import less_noise
-from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.mixed import LEAST_SIGMA, PriorInformation, level_weight
-from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.robot_likelihood import RobotLikelihood
 from visioncal.robot import Robot
 
@@ -178,48 +175,15 @@ def stops_of(problem: Problem, robot: str) -> IntArray:
     return np.unique(problem.observations.stops[rows_of(problem, robot)])
 
 
-def misfit_covariance(
-    problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
-) -> FloatArray:
-    """Covariance (p, p) that arm errors add to a fit that models them as white noise.
-
-    Where the white noise beside the errors is known, the fit was weighted with too much noise; the
-    excess is subtracted. The errors are at the problem's stops.
-    """
-    response = errors.sigma * misfit_jacobian(problem, state, noise, robot, errors)
-    covariance = response @ response.T
-    if errors.white is not None:
-        covariance += less_noise(problem, state, noise, robot, errors.white)
-    return np.asarray(covariance)
-
-
-def covariance_of_size(
-    problem: Problem, covariance: FloatArray, robot: str, errors: ArmErrors
-) -> FloatArray:
+def covariance_of_size(arm: slice, covariance: FloatArray, errors: ArmErrors) -> FloatArray:
     """Covariance (p, p) added because the size of an arm's errors was itself estimated.
 
     Undetermined errors are drawn from a distribution whose variance was estimated from the k
     determined ones. They follow Student's t, whose variance is k / (k - 2) times that. To first
-    order in the variance of the errors, for all unknowns. The errors are unknowns of the problem.
+    order in the variance of the errors, for all unknowns with a (p, p) covariance, of which `arm`
+    are the errors.
     """
-    arm, variance = problem.effect_columns[f"arm of {robot}"], errors.sigma**2
-    with_arm = covariance[arm]
+    variance, with_arm = errors.sigma**2, covariance[arm]
     determined = len(with_arm) - float(np.trace(with_arm[:, arm])) / variance
     # The variance is unbounded for two or fewer.
     return np.asarray(2.0 / (max(determined - 2.0, 1.0) * variance) * with_arm.T @ with_arm)
-
-
-def misfit_jacobian(
-    problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
-) -> FloatArray:
-    """(p, q) Jacobian of a fit that models arm errors as white noise, by these errors.
-
-    The state and the noise are those of the fit; the errors are at the same stops.
-    """
-    effect = errors.effect(robot)
-    widened = problem.with_effects([*problem.effects, effect])
-    widened_state = State(state.edges, np.concatenate([state.values, effect.values]))
-    information = normal_equations(widened, widened_state, noise)[0]
-    size = problem.size
-    fitted = covariance_among(information[:size, :size], problem.moving)
-    return np.asarray(fitted @ information[:size, size:])

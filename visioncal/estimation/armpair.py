@@ -7,8 +7,10 @@ import numpy as np
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.problem_parts import Noise, Observations, State
+from visioncal.estimation.unknowns import ARM
 from visioncal.robot import Loads
 
 
@@ -138,13 +140,9 @@ class ArmPair:
 class ArmData:
     """Observations of a robot's arm whose errors are estimated."""
 
-    problem: Problem
-    state: State
-    noise: Noise
-    covariance: FloatArray  # (u, u) of the unknowns.
+    fit: Fit  # Their fit.
     robot: str
     model: ArmModel
-    columns: IntArray  # (p,) columns of its errors among the unknowns.
     error_rad: float  # Size of the errors.
     stops: IntArray  # (m,) the stops at which it was observed.
     q: FloatArray  # (m, n) joint angles there [rad].
@@ -155,9 +153,14 @@ class ArmData:
     measured: Mask
 
     @property
+    def columns(self) -> IntArray:
+        """(p,) columns of its errors among the unknowns."""
+        return self.fit.unknowns.columns((ARM, self.robot))
+
+    @property
     def arm_covariance(self) -> FloatArray:
         """(p, p) covariance of its errors."""
-        return self.covariance[np.ix_(self.columns, self.columns)]
+        return self.fit.covariance((ARM, self.robot))
 
     @property
     def chain(self) -> IntArray:
@@ -167,7 +170,7 @@ class ArmData:
     @property
     def pair(self) -> ArmPair:
         """The pair of frames between which the arm is observed."""
-        return ArmPair.of(self.problem, self.state, self.robot)
+        return ArmPair.of(self.fit.problem, self.fit.state, self.robot)
 
     def place_jacobian(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Jacobian of the carried point's position at (k, n) joint angles [rad].
@@ -186,7 +189,7 @@ class ArmData:
     def place_sigmas_m(self, q: FloatArray) -> FloatArray:
         """(k,) predicted sigma of that position at (k, n) joint angles, over all three axes [m]."""
         by_chain, by_flange = self.place_jacobian(q)
-        chain_covariance = self.covariance[np.ix_(self.chain, self.chain)]
+        chain_covariance = self.fit.whole[np.ix_(self.chain, self.chain)]
         undetermined = self.error_rad**2 * self.model.undetermined_covariance(q)
         variances = np.einsum("mij,jk,mik->m", by_chain, chain_covariance, by_chain)
         variances += np.einsum("mij,mjk,mik->m", by_flange, undetermined, by_flange)

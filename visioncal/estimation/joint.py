@@ -15,16 +15,18 @@ import numpy as np
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray, IntArray, Target
+from visioncal.estimation.appearance import SCALE, stated_board_sigma
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
-from visioncal.estimation.linalg import ROUNDING, covariance_among, covariance_from
+from visioncal.estimation.fit import Fit
+from visioncal.estimation.linalg import ROUNDING, covariance_from
 from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.estimation.solve import Solution, covariance_of, fit_problem, fitted_covariance
+from visioncal.estimation.solve import covariance_of, fit_problem
+from visioncal.estimation.unknowns import BOARD
 
 # Values that change by less than this share of their sigma have converged.
 _SETTLED = 0.02
@@ -50,62 +52,12 @@ class FrameModel(Protocol):
         """Builds the problem of the used observations, with lenses and boards as first effect."""
 
 
-@dataclass(frozen=True, eq=False)
-class ConvergedFit:
-    """Converged fit: linearised corners, the problem of all frames, and its solution."""
-
-    linearised: LinearisedCorners
-    problem: Problem
-    fit: Solution
-
-    @property
-    def columns(self) -> slice:
-        """Columns of the free lens and board parameters, the first effect."""
-        first = 6 * len(self.problem.unknown)
-        return slice(first, first + len(self.linearised.free))
-
-    @property
-    def frames(self) -> Mapping[str, FloatArray]:
-        """Poses of the unknown frames."""
-        return self.problem.frames(self.fit.state)
-
-    @property
-    def others(self) -> FloatArray:
-        """(k,) values of all other effects."""
-        mine = self.problem.effect_columns.get(LENSES, self.columns)
-        return self.fit.state.values[mine.stop - self.columns.start :]
-
-    @property
-    def change(self) -> FloatArray:
-        """(f,) change of the free values from the linearisation point."""
-        free = self.linearised.free
-        return np.asarray(
-            self.fit.state.values[: len(free)] - self.linearised.camera_parameters.values[free]
-        )
-
-    @property
-    def camera_parameters(self) -> CameraParameters:
-        """Fitted lens and board parameters; held ones are unchanged."""
-        free = self.linearised.free
-        return self.linearised.camera_parameters.with_values(
-            free, self.fit.state.values[: len(free)]
-        )
-
-    def covariance(self) -> FloatArray:
-        """(p, p) covariance of the fitted unknowns, at the measured poses."""
-        return fitted_covariance(self.problem, self.fit.state, self.fit.noise)
-
-    def columns_of(self, places: IntArray) -> IntArray:
-        """Columns of free lens and board values, given their indices."""
-        return np.asarray(self.columns.start + np.searchsorted(self.linearised.free, places))
-
-
 def fit_jointly(
     optics: CameraParameters,
     model: FrameModel,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None = None,
-) -> ConvergedFit:
+) -> Fit:
     """Alternates linearisation of the corners and the frame fit until the values converge.
 
     It starts at given parameters, (4, 4) poses of the frames, and (k,) values of all other effects
@@ -117,15 +69,15 @@ def fit_jointly(
     with diverging():
         fitted = _fitted(model, optics.linearised(), frames, others, model.noise)
         for _ in range(8):
-            sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
-            if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
+            sigma = np.sqrt(np.diag(fitted.absorbed)[fitted.lens_columns])
+            if np.all(np.abs(_change(fitted)) <= _SETTLED * sigma):
                 break
             corners = _stepped(fitted)
             if corners is fitted.linearised:
                 raise np.linalg.LinAlgError("the corners follow no part of the step")
             previous = fitted
-            fitted = _fitted(model, corners, fitted.frames, fitted.others, fitted.fit.noise)
-            if not (previous.fit.settled or fitted.fit.settled):
+            fitted = _fitted(model, corners, fitted.frames, others_of(fitted), fitted.noise)
+            if not (previous.solution.settled or fitted.solution.settled):
                 break
         return fitted
 
@@ -148,13 +100,26 @@ def diverging() -> Iterator[None]:
         ) from error
 
 
-def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
+def others_of(fitted: Fit) -> FloatArray:
+    """(k,) values of all effects but lenses and boards."""
+    first = fitted.lens_columns.start
+    mine = fitted.problem.effect_columns.get(LENSES, slice(first, first))
+    return fitted.state.values[mine.stop - first :]
+
+
+def _change(fitted: Fit) -> FloatArray:
+    """(f,) change of the free values of lenses and boards from the linearisation point."""
+    seen = fitted.linearised
+    return fitted.state.values[: len(seen.free)] - seen.camera_parameters.values[seen.free]
+
+
+def _stepped(fitted: Fit) -> LinearisedCorners:
     """Linearises the corners at the fitted values, or after a shorter step if they fit worse."""
     # Far from the solution, as with a lens stated for another image size, the full step leads to
     # lenses that image nothing.
     limits = [FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.linearised.sigmas_px]
     optics, free = fitted.linearised.camera_parameters, fitted.linearised.free
-    change = fitted.change
+    change = _change(fitted)
     for _ in range(12):
         candidate = optics.with_values(free, optics.values[free] + change)
         change = change / 2
@@ -172,14 +137,14 @@ def _fitted(
     frames: Mapping[str, FloatArray],
     others: FloatArray | None,
     noise: Noise | None,
-) -> ConvergedFit:
+) -> Fit:
     problem = model.problem(corners)
     start = problem.start(frames)
     if others is not None:
         first = len(start.values) - len(others)
         start = State(start.edges, np.concatenate([start.values[:first], others]))
     problem = problem.sized_at(start)
-    return ConvergedFit(corners, problem, fit_problem(problem, start, noise))
+    return Fit(problem, fit_problem(problem, start, noise), corners)
 
 
 @dataclass(frozen=True)
@@ -202,39 +167,35 @@ class MeasuredScale:
 
 
 def measured_scale(
-    model: FrameModel, fitted: ConvergedFit, frame: str, board: int
+    model: FrameModel, fitted: Fit, frame: str, name: str, target: Target
 ) -> MeasuredScale:
     """Measures the scale of a target by the robots' motion, without the prior of its size.
 
-    Its views alone cannot determine it: a larger target farther away looks the same. `board` is its
-    index, and `frame` its frame.
+    Its views alone cannot determine it: a larger target farther away looks the same. `name` is that
+    of the target in the session, and `frame` its frame.
     """
-    problem, state, optics = fitted.problem, fitted.fit.state, fitted.camera_parameters
-    widened = problem.with_effects([*problem.effects, target_sizes(problem, [frame])])
-    extended = State(state.edges, np.append(state.values, 0.0))
-    widened = widened.sized_at(extended)
-    information, gradient = normal_equations(widened, extended, fitted.fit.noise)
-    covariance = covariance_among(information, widened.moving)
-    total, scale, stated = np.zeros(widened.size), 0.0, 0.0
+    widened = fitted.with_columns(target_sizes(fitted.problem, [frame]))
+    widened = replace(widened, problem=widened.problem.sized_at(widened.state))
+    covariance, (_, gradient) = widened.absorbed, widened.equations
+    board, total, scale, stated = (BOARD, name), np.zeros(len(gradient)), 0.0, 0.0
     total[-1] = 1.0
-    if board in optics.printed and optics.shape_of(board)[0] in fitted.linearised.free:
-        place, corners = optics.shape_of(board)[:1], next(iter(optics.problems.values()))
-        scale = float(optics.values[place[0]])
-        stated = float(corners.stated_sigma[corners.scale_of(board)][0])
-        total[fitted.columns_of(place)] = 1.0
+    if not target.is_rig and SCALE in fitted.unknowns.values_of(board):
+        scale = float(fitted.values(board)[SCALE])
+        stated = float(stated_board_sigma(target)[SCALE])
+        total[fitted.unknowns[board].start] = 1.0
     scale -= float(total @ covariance @ gradient)
     sigma = float(total @ covariance @ total) ** 0.5
     return MeasuredScale(scale, (UNEVEN_LINKS if model.has_links else 1.0) * sigma, stated)
 
 
-def scale_by_stated_arms(fitted: ConvergedFit, stated: Problem, frame: str) -> MeasuredScale | None:
+def scale_by_stated_arms(fitted: Fit, stated: Problem, frame: str) -> MeasuredScale | None:
     """Measures the scale of an exact target with nominal arms; None where errors are likelier.
 
     Longer links explain a larger target as well, but one scale is simpler than many link errors.
     """
     widened = stated.with_effects([*stated.effects, target_sizes(stated, [frame])])
-    fit = fit_problem(widened, State(fitted.fit.state.edges, widened.start_values))
-    pairs = ((fitted.problem, fitted.fit), (widened, fit))
+    fit = fit_problem(widened, State(fitted.state.edges, widened.start_values))
+    pairs = ((fitted.problem, fitted.solution), (widened, fit))
     calibrated, sized = (robot_likelihood(at, by.state, by.noise).white[1] for at, by in pairs)
     if sized > calibrated:
         return None
@@ -253,13 +214,13 @@ def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf)
     return replace(effect, sizes=np.arange(len(frames)))
 
 
-def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:
-    """Squared Mahalanobis distance of (k,) free lens and board values from the stated ones."""
-    at, optics = fitted.columns_of(places), fitted.camera_parameters
-    covariance = fitted.covariance()[np.ix_(at, at)]
+def moved_mahalanobis_sq(fitted: Fit, columns: IntArray) -> float:
+    """Squared Mahalanobis distance of lens and board values, of (k,) columns, from the stated."""
+    optics = fitted.camera_parameters
+    places = fitted.linearised.free[columns - fitted.lens_columns.start]
     # The prior of these values given the others draws them towards the stated ones.
     prior = optics.prior_information[np.ix_(places, places)]
-    information = covariance_from(covariance)
+    information = covariance_from(fitted.absorbed[np.ix_(columns, columns)])
     offset = information @ (optics.values - optics.stated)[places]
     values, vectors = np.linalg.eigh(information - prior)
     kept = values > ROUNDING * np.diag(information).max()

@@ -12,13 +12,16 @@ from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.thermal import LEVEL
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import ArmErrors, covariance_of_size, misfit_covariance
+from visioncal.estimation.arm import ArmErrors, covariance_of_size
+from visioncal.estimation.budget import less_noise
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.solve import Solution, covariance_of, held_shift
+from visioncal.estimation.solve import Solution
 from visioncal.estimation.steps import DRIFT, FRAME, SIZE, Step, with_step
+from visioncal.estimation.unknowns import ARM
 
 # Name of a sudden step (a frame that moved, a joint that slipped) as a source of uncertainty.
 STEP = "what moved at once"
@@ -48,24 +51,18 @@ def joint_offsets(arms: Mapping[str, RobotArm]) -> dict[str, FloatArray]:
 
 
 def covariance_from_other_sources(
-    problem: Problem,
-    fit: Solution,
-    arms: Mapping[str, RobotArm],
-    steps: Sequence[Step],
-    *,
-    is_fit: bool = True,
+    fit: Fit, arms: Mapping[str, RobotArm], steps: Sequence[Step], *, is_fit: bool = True
 ) -> dict[str, FloatArray]:
     """Covariances (p, p) of a fit from sources other than noise, by source.
 
     Args:
-        problem: The inliers.
-        fit: Their fit.
+        fit: The fit.
         arms: The arms. Errors that are not estimated count, and of others the uncertainty of their
             size.
         steps: Steps that the residuals show, likeliest first.
         is_fit: Whether it minimises the problem; a closed form is not biased by held values alone.
     """
-    parts, covariance = dict[str, FloatArray](), covariance_of(problem, fit)
+    parts, problem = dict[str, FloatArray](), fit.problem
     if len(problem.units[1]):
         levels = expected_levels(problem, fit.state, fit.noise)
         # Where an arm has errors that are not estimated, the noise is what remains beside them, not
@@ -76,23 +73,35 @@ def covariance_from_other_sources(
             if arm.errors is not None and arm.errors.is_significant and not arm.errors.is_estimated
         ]
         levels[beside] = fit.noise.robots[beside]
-        raised = replace(fit, noise=replace(fit.noise, robots=levels))
-        parts["noise_level"] = covariance_of(problem, raised) - covariance
-    shift = held_shift(problem, fit) * float(is_fit)
+        noise = replace(fit.noise, robots=levels)
+        raised = replace(fit, solution=replace(fit.solution, noise=noise))
+        parts["noise_level"] = raised.by_noise - fit.by_noise
+    shift = fit.shift * float(is_fit)
     if shift.any():
         parts["held_values"] = np.outer(shift, shift)
     for robot, arm in arms.items():
         suffix = f" of robot {robot}" if len(arms) > 1 else ""
         if arm.errors is not None and not arm.errors.is_estimated:
-            errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
-            parts[f"arm{suffix}"] = errors
+            parts[f"arm{suffix}"] = misfit_covariance(fit, robot, arm.errors)
         elif arm.errors is not None:
-            parts[f"size of arm errors{suffix}"] = covariance_of_size(
-                problem, covariance, robot, arm.errors
-            )
+            at, by_noise = fit.unknowns[ARM, robot], fit.by_noise
+            parts[f"size of arm errors{suffix}"] = covariance_of_size(at, by_noise, arm.errors)
     if steps and steps[0].kind != DRIFT:
         parts[STEP] = steps[0].spread
     return parts
+
+
+def misfit_covariance(fit: Fit, robot: str, errors: ArmErrors) -> FloatArray:
+    """Covariance (p, p) that arm errors add to a fit that takes them for white noise.
+
+    Where the white noise beside the errors is known, the fit was weighted with too much noise; the
+    excess is subtracted.
+    """
+    response = errors.sigma * fit.bias(robot, errors)
+    covariance = response @ response.T
+    if errors.white is not None:
+        covariance += less_noise(fit.problem, fit.state, fit.noise, robot, errors.white)
+    return np.asarray(covariance)
 
 
 def change_each(

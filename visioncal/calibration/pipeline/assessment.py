@@ -35,12 +35,13 @@ from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import scatter
 from visioncal.estimation.corners import CornerStack
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import Solution, covariance_of, fit_problem
+from visioncal.estimation.solve import fit_problem
 from visioncal.estimation.steps import Step
+from visioncal.estimation.unknowns import EDGE, Unknown
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
 from visioncal.results.sections import ClockResult, Intervals
 
@@ -51,11 +52,8 @@ _T = TypeVar("_T")
 class FitAssessment:
     """A fit with its covariance and diagnosis."""
 
-    cell_fit: CellFit  # The fit.
-    problem: Problem  # The problem of its inliers.
-    covariance: FloatArray  # (p, p) of its unknowns, from noise and all other sources.
-    # (p, p) covariances from sources other than noise, by source.
-    covariance_by_source: Mapping[str, FloatArray]
+    cell_fit: CellFit  # The fit, with what it is of.
+    fit: Fit  # The same with its covariance from all sources.
     lenses: Mapping[str, LensErrors]  # Lens errors beyond the camera models, by camera.
     steps: tuple[Step, ...]  # Steps that the residuals show, likeliest first.
     arms: Mapping[str, ArmReport]  # What was found of the arms, by robot.
@@ -66,21 +64,6 @@ class FitAssessment:
     # Estimated standard deviations, by frame or robot and by name.
     sigmas: Mapping[str, Mapping[str, float]]
 
-    @property
-    def fit(self) -> Solution:
-        """Estimated unknowns and noise."""
-        return self.cell_fit.inlier_fit.fit
-
-    @property
-    def state(self) -> State:
-        """Estimated unknowns."""
-        return self.fit.state
-
-    @property
-    def noise(self) -> Noise:
-        """Noise levels of robots and sensors."""
-        return self.fit.noise
-
     @cached_property
     def versions(self) -> dict[str, str]:
         """Names in the result of all unknown frames over time, by their names in the problem."""
@@ -89,11 +72,10 @@ class FitAssessment:
     @cached_property
     def edges(self) -> dict[str, Edge]:
         """The estimated transforms, by the result's names of their child frames."""
-        transforms, edges = {}, self.state.edges
-        for key, index in self.problem.unknown.items():
-            block = self.covariance[6 * index : 6 * index + 6, 6 * index : 6 * index + 6]
-            transforms[self.versions[key]] = Edge(edges[index], block)
-        return transforms
+        return {
+            self.versions[frame]: Edge(matrix, self.fit.covariance((EDGE, frame)))
+            for frame, matrix in self.fit.frames.items()
+        }
 
     @property
     def last_edges(self) -> dict[str, Edge]:
@@ -106,7 +88,7 @@ class FitAssessment:
         clocks = {}
         for pair, clocked in observed.clocks.items():
             clock = clocked.clock
-            offset, readout = self._fitted_time(pair.effect), self._fitted_time(pair.readout)
+            offset, readout = map(self._fitted_time, (pair.effect, pair.readout))
             if offset is not None:
                 ahead_s, shutter = clock.camera_minus_robot_s + offset[0], clock.shutter
                 if shutter is not None and readout is not None:
@@ -119,27 +101,25 @@ class FitAssessment:
 
     def _fitted_time(self, effect: str) -> tuple[float, float] | None:
         """Estimated correction of a time, and its sigma [s]; None where the fit has none."""
-        columns = self.problem.effect_columns.get(effect)
-        if columns is None:
-            return None
-        (shift_s,) = self.problem.values_of(effect, self.state)
-        return float(shift_s), float(np.sqrt(self.covariance[columns.start, columns.start]))
+        unknown = Unknown.of_effect(effect)
+        pairs = zip(self.fit.values(unknown), self.fit.sigmas(unknown), strict=True)
+        return next(((float(value), float(sigma)) for value, sigma in pairs), None)
 
     @cached_property
     def budget_mm(self) -> dict[str, dict[str, float]]:
         """Standard deviations of each frame's position in its parent, by source [mm]."""
-        budget = budget_mm(self.cell_fit, self.covariance_by_source)
+        budget = budget_mm(self.cell_fit, self.fit)
         return {self.versions[key]: sigmas for key, sigmas in budget.items()}
 
     @cached_property
     def intervals(self) -> FloatArray:
         """(r, 2, 2) 95 % intervals of the robots' noise; see `estimation.intervals`."""
-        return noise_intervals(self.problem, self.state, self.noise)
+        return noise_intervals(self.fit.problem, self.fit.state, self.fit.noise)
 
     @property
     def noise_95(self) -> dict[str, Intervals]:
         """95 % intervals of the robots' noise levels, by robot and by name."""
-        pairs = zip(self.problem.robots, self.intervals.tolist(), strict=True)
+        pairs = zip(self.fit.problem.robots, self.intervals.tolist(), strict=True)
         return {
             robot: {
                 "translation_mm": (1e3 * metres[0], 1e3 * metres[1]),
@@ -150,8 +130,9 @@ class FitAssessment:
 
     def of_robot(self, levels: Mapping[str, Mapping[str, _T]]) -> dict[str, _T]:
         """Figures on the noise of the only robot, or of robot and camera combined, by name."""
-        of = "combined" if self.problem.is_combined else "robot"
-        return {f"{of}_{name}": level for name, level in levels[self.problem.robots[0]].items()}
+        problem = self.fit.problem
+        of = "combined" if problem.is_combined else "robot"
+        return {f"{of}_{name}": level for name, level in levels[problem.robots[0]].items()}
 
 
 def assess_fit(
@@ -165,7 +146,7 @@ def assess_fit(
         cell_fit: The fit of its connected part.
         convention: Joint table convention of calibrated arms' parameters.
     """
-    part, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
+    fit = cell_fit.fit
     # A closed form is no minimum, which would pass for a misfit.
     is_fit = cell_fit.solver == "joint"
     errors = {
@@ -175,24 +156,20 @@ def assess_fit(
     }
     steps: tuple[Step, ...] = ()
     if not observed.misread:
-        converged = fit if is_fit else fit_problem(part, fit.state)
-        steps = likely_steps(part, converged, errors, joint_offsets(cell_fit.arms))
-        cell_fit = replace(cell_fit, arms=with_errors_beside_step(cell_fit.arms, part, fit, steps))
-    beside = covariance_from_other_sources(part, fit, cell_fit.arms, steps, is_fit=is_fit)
-    covariance = sum(beside.values(), covariance_of(part, fit))
+        converged = fit.solution if is_fit else fit_problem(fit.problem, fit.state)
+        steps = likely_steps(fit.problem, converged, errors, joint_offsets(cell_fit.arms))
+        arms = with_errors_beside_step(cell_fit.arms, fit.problem, fit.solution, steps)
+        cell_fit = replace(cell_fit, arms=arms)
+    beside = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)
+    fit = replace(fit, beside=beside)
     held_out = left_out(cell_fit)
     (faults, reasons), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
     return FitAssessment(
         cell_fit,
-        part,
-        covariance,
-        beside,
-        lens_errors(cell_fit),
+        fit,
+        lens_errors(fit),
         steps,
-        {
-            name: arm.report(part, fit, covariance, middles, convention)
-            for name, arm in cell_fit.arms.items()
-        },
+        {name: arm.report(fit, middles, convention) for name, arm in cell_fit.arms.items()},
         held_out,
         movements(cell_fit),
         faults,
@@ -203,15 +180,13 @@ def assess_fit(
 
 def _sigmas(cell_fit: CellFit) -> dict[str, dict[str, float]]:
     """Estimated standard deviations of robots by name, and of cameras and instruments by frame."""
-    noise, seen = cell_fit.inlier_fit.fit.noise, cell_fit.linearised_corners
-    of_robots = zip(cell_fit.inlier_fit.problem.robots, noise.robots.tolist(), strict=True)
+    fit, noise = cell_fit.fit, cell_fit.fit.noise
+    of_robots = zip(fit.problem.robots, noise.robots.tolist(), strict=True)
     results = {
         robot: {"translation_mm": 1e3 * sigma_m, "rotation_deg": float(np.rad2deg(sigma_rad))}
         for robot, (sigma_rad, sigma_m) in of_robots
     }
-    if seen is not None:
-        pairs = zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True)
-        results |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
+    results |= {frame: {"pixel_px": sigma} for frame, sigma in fit.sigmas_px.items()}
     sensors = dict.fromkeys(
         (*sensors_of(cell_fit.cell, cell_fit.poses), *(row.seer for row in cell_fit.cell.rows))
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.pipeline.assessment import FitAssessment
-from visioncal.calibration.pipeline.budget import columns_of_boards, middle_jacobians, middles_of
+from visioncal.calibration.pipeline.budget import middle_jacobians, middles_of
 from visioncal.calibration.pipeline.connectivity import robot_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
@@ -93,15 +93,13 @@ def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
     answer, cell_fit = run.assessment, run.cell_fit
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
     return PickInputs(
-        answer.problem,
         answer.fit,
-        answer.covariance,
+        answer.fit.problem,
         answer.held_out,
         middles_of(cell_fit.cell),
-        dict(zip(answer.problem.robots, freedom, strict=True)),
+        dict(zip(answer.fit.problem.robots, freedom, strict=True)),
         cell_fit.arms,
-        columns_of_boards(cell_fit),
-        middle_jacobians(cell_fit),
+        middle_jacobians(answer.fit, run.session),
         {name: lens.noise_px * lens.levels.jitter for name, lens in answer.lenses.items()},
         _strays(answer, explained),
     )
@@ -123,10 +121,10 @@ def _strays(answer: FitAssessment, explained: Collection[int]) -> dict[str, Floa
 
 def _worst(run: RunState) -> list[Direction]:
     """The least certain directions of the unknown frames, the worst first."""
-    answer, cell = run.assessment, run.cell_fit.cell
+    answer, cell, fit = run.assessment, run.cell_fit.cell, run.assessment.fit
     if run.mount is not None:
-        names = chain_words(answer.problem, run.session.mount).names
-        found = directions(answer.problem, answer.state, answer.covariance, names)
+        names = chain_words(fit.problem, run.session.mount).names
+        found = directions(fit.problem, fit.state, fit.whole, names)
         return [direction for _, direction in found]
     absorbing = {*_absorbing(run)}
     edges = {frame: edge for frame, edge in answer.last_edges.items() if frame not in absorbing}
@@ -178,7 +176,7 @@ def _weighted_rms(answer: FitAssessment, views: Sequence[ViewResult]) -> tuple[R
     # The variance of a square is proportional to the square of its mean, so that views are weighted
     # by the inverse square of the expected residual at the limit of doubt: a view whose own pose is
     # uncertain says nothing of the others.
-    used, held_out, limits = answer.problem.observations, answer.held_out, CalibrationLimits()
+    used, held_out, limits = answer.fit.problem.observations, answer.held_out, CalibrationLimits()
     pairs = {(view.seer, view.seen) for view in views}
     of_pairs = np.array([pair in pairs for pair in zip(used.observers, used.observed, strict=True)])
     rms: list[tuple[float, float] | None] = []
@@ -222,7 +220,7 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
 
 
 def _arms(answer: FitAssessment) -> list[JudgedArm]:
-    problem, cell_fit = answer.problem, answer.cell_fit
+    problem, cell_fit = answer.fit.problem, answer.cell_fit
     arms = []
     for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
         arm, found = cell_fit.arms[robot], answer.arms[robot].sections.arm
@@ -268,18 +266,17 @@ def check_answer(run: RunState) -> None:
     if run.misread and poor_motion(run) is None:
         # With misread poses, sigmas predicted at their fit say nothing of the motion.
         return
-    part, fit, seen = run.cell_fit.inlier_problem, run.cell_fit.inlier_fit.fit, None
-    pixel_px, is_estimated = dict[str, float](), False
-    if (seen := run.cell_fit.linearised_corners) is not None:
-        pixel_px = dict(zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True))
-        is_estimated = any(scene.estimated for scene in run.scenes.values())
-    words = chain_words(part, run.mount) if run.mount is not None else _words_of(run)
-    check_determined(part, fit.state, fit.noise, words, pixel_px, with_first_effect=is_estimated)
+    fit = run.cell_fit.fit
+    is_estimated = bool(fit.sigmas_px) and any(scene.estimated for scene in run.scenes.values())
+    words = chain_words(fit.problem, run.mount) if run.mount is not None else _words_of(run)
+    check_determined(
+        *(fit.problem, fit.state, fit.noise, words, fit.sigmas_px), with_first_effect=is_estimated
+    )
 
 
 def _words_of(run: RunState) -> CellWords:
     """What is wrong with the motion of a cell that leaves a frame undetermined, and what to do."""
-    cell, part = run.cell_fit.cell, run.cell_fit.inlier_problem
+    cell, part = run.cell_fit.cell, run.cell_fit.fit.problem
 
     def advice(frame: str, _: str) -> str:
         frame = frame.partition("@")[0]

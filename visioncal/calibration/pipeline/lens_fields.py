@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
+from visioncal.estimation.effects.lenses import LinearisedCorners
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.lens_field import LensLevels, depths_m, displacements
+from visioncal.estimation.unknowns import BOARD, LENS, LENS_ERRORS
 from visioncal.results.lens import LensField
 
 # Variance of displacements that is negligible beside that of corners; grid points per image axis.
@@ -30,10 +31,9 @@ class LensErrors:
         return self.levels.field * self.noise_px
 
 
-def lens_errors(cell_fit: CellFit) -> dict[str, LensErrors]:
+def lens_errors(fit: Fit) -> dict[str, LensErrors]:
     """Lens errors of each camera; empty for a session without images."""
-    seen = cell_fit.linearised_corners
-    if seen is None:
+    if (seen := fit.corners) is None:
         return {}
     optics = seen.camera_parameters
     return {
@@ -53,44 +53,35 @@ def _distance_m(seen: LinearisedCorners, which: int) -> float:
     return float(np.mean(depths_m(stack, seen.compressed[which].cam_from_target)))
 
 
-def lens_field_of(
-    cell_fit: CellFit, camera: str, covariance: FloatArray, edges: int
-) -> LensField | None:
+def lens_field_of(fit: Fit, camera: str) -> LensField | None:
     """The result's section on one lens's errors beyond its model; None where there are none.
 
-    Args:
-        cell_fit: The fit.
-        camera: The frame of the camera.
-        covariance: (p, p) of the fit's unknowns.
-        edges: How many of these, the first, belong to edges.
+    `camera` is its frame.
     """
-    seen = cell_fit.linearised_corners
-    if seen is None:
-        return None
-    optics, which = seen.camera_parameters, list(seen.camera_parameters.problems).index(camera)
+    seen, covariance, lens = fit.linearised, fit.whole, (LENS, camera)
+    optics, which = seen.camera_parameters, fit.unknowns.of(LENS).index(camera)
     levels, noise_px = optics.problems[camera].levels, floored_sigma_px(seen.sigmas_px[which])
     if levels is None or not (levels.field or levels.breathing or levels.jitter):
         return None
-    lens, places = optics.lens_of(camera), optics.places(camera)
     mean, jacobian, root = np.zeros(0), np.zeros((0, len(covariance))), np.zeros((0, 0))
     if (coefficients := seen.compressed[which].coefficients) is not None:
         # Coefficients depend on lens and boards, and on those directions of themselves that also
         # move the poses, which are unknowns of the fit.
-        sizes = seen.field_sizes
-        first, is_free = sum(sizes[:which]), np.isin(places, seen.free)
-        beyond = cell_fit.field_columns[first : first + sizes[which]]
-        jacobian = np.zeros((len(coefficients.mean), len(covariance)))
-        jacobian[:, cell_fit.columns_of(places[is_free])] = coefficients.slope[:, is_free]
-        jacobian[:, beyond] = coefficients.moving_roots
-        values = cell_fit.inlier_fit.problem.values_of(LENSES, cell_fit.inlier_fit.fit.state)
-        change = (values[: len(seen.free)] - optics.values[seen.free])[np.isin(seen.free, places)]
-        fitted = coefficients.moving_roots @ values[beyond - cell_fit.lens_columns.start]
-        mean = (coefficients.mean + coefficients.slope[:, is_free] @ change + fitted) / noise_px
+        places, beyond = optics.places(camera), (LENS_ERRORS, camera)
+        slope = coefficients.slope[:, np.isin(places, seen.free)]
+        columns = np.append(fit.unknowns.columns(lens), fit.unknowns.of_kinds(BOARD))
+        jacobian = fit.by_columns({beyond: coefficients.moving_roots})
+        jacobian[:, columns] = slope
+        change = (fit.camera_parameters.values - optics.values)[np.intersect1d(places, seen.free)]
+        fitted = coefficients.moving_roots @ fit.values(beyond)
+        mean = (coefficients.mean + slope @ change + fitted) / noise_px
         rest = coefficients.rest @ coefficients.rest.T
         own = jacobian @ covariance @ jacobian.T / noise_px**2 + rest
         root = _root(own, optics.camera(camera), levels)
-    with_lens, free = np.zeros((len(mean), len(lens))), np.isin(lens, seen.free)
-    with_lens[:, free] = jacobian @ covariance[:, cell_fit.columns_of(lens[free])] / noise_px
+    with_lens = np.zeros((len(mean), len(fit.values(lens))))
+    with_lens[:, fit.unknowns.values_of(lens)] = (
+        jacobian @ covariance[:, fit.unknowns.columns(lens)] / noise_px
+    )
     return LensField(
         field_px=noise_px * levels.field,
         length=levels.length,
@@ -100,7 +91,7 @@ def lens_field_of(
         coefficients=mean,
         root=root,
         intrinsics_covariance=with_lens,
-        edge_covariance=jacobian @ covariance[:, :edges] / noise_px,
+        edge_covariance=jacobian @ covariance[:, : 6 * len(fit.frames)] / noise_px,
     )
 
 

@@ -17,17 +17,17 @@ from visioncal.calibration.pipeline.lens_fields import lens_field_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import robot_key
-from visioncal.calibration.stages.cell_fit import within
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
 from visioncal.calibration.stages.random_effects import of_random_effects
 from visioncal.core.transforms import apply, log
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
-from visioncal.estimation.arm import misfit_jacobian
+from visioncal.estimation.appearance import BOARD_NAMES, shape_basis
 from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.chain import edge_names
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem_parts import State
+from visioncal.estimation.unknowns import ARM, BOARD, EDGE, LENS
 from visioncal.results import (
     HELD_BACK,
     Calibration,
@@ -56,7 +56,7 @@ from visioncal.robot import Robot
 from visioncal.session import frame_name
 from visioncal.session.frames import CELL, object_name
 from visioncal.vision.camera import project
-from visioncal.vision.targets import first_corners, target_document
+from visioncal.vision.targets import corner_positions, first_corners, target_document
 
 _OF_LENS = "it serves the camera's lens alone (role = intrinsics)"
 _NO_POSE = (
@@ -77,7 +77,6 @@ def result_of(run: RunState) -> Calibration:
         raise RuntimeError("a stage is missing")
     session, answer, is_pair = run.session, run.assessment, run.mount is not None
     names = _edge_names(run)
-    size = 6 * len(names)
     was_left_out = np.isfinite(answer.held_out.residual_m).any()
     cell = None if is_pair else _cell(run, names)
     boards, rigs = _shapes(run)
@@ -87,7 +86,7 @@ def result_of(run: RunState) -> Calibration:
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         mount=session.mount if cell is None else cell.mount,
         edges={name: answer.edges[frame] for frame, name in names.items()},
-        joint_covariance=answer.covariance[:size, :size],
+        joint_covariance=answer.fit.covariance(*answer.fit.unknowns.all_of(EDGE)[: len(names)]),
         solvers={},
         noise={},
         views=answer.views,
@@ -110,8 +109,8 @@ def _edge_names(run: RunState) -> dict[str, str]:
     answer = run.assessment
     if run.mount == "instrument":
         # Of the points that an instrument read, the first is the probe.
-        return dict(zip(answer.problem.unknown, edge_names(run.mount), strict=False))
-    branches = answer.problem.tree.branches
+        return dict(zip(answer.fit.frames, edge_names(run.mount), strict=False))
+    branches = answer.fit.problem.tree.branches
     parents = {name: branches[key].parent for key, name in answer.versions.items()}
     # The root of a pair's frames is the robot's base.
     root = CELL if run.mount is None else "base"
@@ -135,7 +134,7 @@ def _sections_of_pair(
     is_unnamed = not session.targets
     return {
         "solvers": compare_solvers(
-            answer.problem, answer.state, session.mount, run.solver, [*names.values()]
+            answer.fit.problem, answer.fit.state, session.mount, run.solver, [*names.values()]
         ),
         "noise": _noise(run),
         "views": _views(run),
@@ -205,14 +204,19 @@ def _joint_fit(run: RunState) -> JointFit | None:
     """The unknowns of the fit with their covariance; None for a calibration by an instrument."""
     if run.mount == "instrument":
         return None
-    boards, seen = run.session.boards, run.cell_fit.linearised_corners
-    unknown = run.assessment.problem.unknown
-    names = [board for board in boards if len(boards) < 2 or frame_name("target", board) in unknown]
+    boards, fit = run.session.boards, run.assessment.fit
+    names = [
+        board for board in boards if len(boards) < 2 or frame_name("target", board) in fit.frames
+    ]
     covariance, by_noise = _fit_covariance(run)
+    looks, first = list[int](), 0
+    for unknown in fit.unknowns.all_of(LENS, BOARD):
+        looks += (first + fit.unknowns.values_of(unknown)).tolist()
+        first += len(fit.values(unknown))
     return JointFit(
         targets={name: target_document(board) for name, board in boards.items()},
         boards=tuple(names) or ("",),
-        looks=() if seen is None else tuple(seen.free.tolist()),
+        looks=tuple(looks),
         arm=_fitted_arm(run, run.robot_arm),
         covariance=covariance,
         stops=_fitted_stops(run, by_noise),
@@ -226,7 +230,7 @@ def _fitted_stops(run: RunState, by_noise: FloatArray) -> FittedStops | None:
     if assessment.moved or len(growing) < len(beside):
         return None
     # Of what grew with time or reach, a check knows nothing: it is in the residuals.
-    whole, state = assessment.problem, assessment.state
+    whole, state = assessment.fit.problem, assessment.fit.state
     problem = whole.with_effects([part for part in whole.effects if part.name not in growing])
     values = [whole.values_of(part.name, state) for part in problem.effects]
     linear = problem.linear(State(state.edges, np.concatenate([np.zeros(0), *values])))
@@ -248,9 +252,7 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
         return None
     # Errors that are not estimated are zero. Estimates of a model are the change from its
     # linearisation point, which its arm contains.
-    problem, name = run.assessment.problem, f"arm of {arm.robot}"
-    start = problem.start({frame: np.eye(4) for frame in problem.unknown})
-    values = problem.values_of(name, run.assessment.state) - problem.values_of(name, start)
+    values = run.assessment.fit.values((ARM, arm.robot))
     values = values if errors.is_estimated else np.zeros(errors.basis.shape[2])
     if model is None:
         return FittedArm(of="links", values=values, hidden=True if not errors.gain else None)
@@ -270,14 +272,11 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     )
 
 
-def _fitted_columns(run: RunState, arms: Iterable[RobotArm]) -> IntArray:
+def _fitted_columns(fit: Fit, arms: Iterable[RobotArm]) -> IntArray:
     """Columns of a fit's edges, of free values of lenses and boards, and of arms' errors."""
-    problem, seen = run.assessment.problem, run.cell_fit.linearised_corners
-    columns = [np.arange(6 * len(problem.unknown))]
-    columns += [] if seen is None else [run.cell_fit.columns_of(seen.free)]
+    columns = [fit.unknowns.of_kinds(EDGE, LENS, BOARD)]
     for arm in arms:
-        of_arm = problem.effect_columns.get(f"arm of {arm.robot}", slice(0, 0))
-        errors = np.arange(of_arm.start, of_arm.stop)
+        errors = fit.unknowns.columns((ARM, arm.robot))
         columns.append(errors if arm.model is None else errors[arm.model.is_kept])
     return np.concatenate(columns)
 
@@ -287,14 +286,13 @@ def _fit_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
 
     The second is the part by noise, and by errors that change with time.
     """
-    answer, arm, errors = run.assessment, run.robot_arm, run.robot_arm.errors
-    columns = _fitted_columns(run, [arm])
-    by_noise = answer.covariance - sum(answer.covariance_by_source.values(), np.zeros(()))
-    parts = [part[np.ix_(columns, columns)] for part in (answer.covariance, by_noise)]
+    fit, arm, errors = run.assessment.fit, run.robot_arm, run.robot_arm.errors
+    columns = _fitted_columns(fit, [arm])
+    by_noise = fit.whole - sum(fit.beside.values(), np.zeros(()))
+    parts = [part[np.ix_(columns, columns)] for part in (fit.whole, by_noise)]
     if errors is None or errors.is_estimated:
         return parts[0], parts[1]
-    misfit = misfit_jacobian(answer.problem, answer.state, answer.noise, arm.robot, errors)
-    jacobian = misfit[columns]
+    jacobian = fit.bias(arm.robot, errors)[columns]
     size, variance = jacobian.shape[1], errors.sigma**2
     lasting = jacobian[:, errors.is_time_correlated]
     parts[1] += variance * lasting @ lasting.T
@@ -353,30 +351,26 @@ def _cameras(run: RunState) -> dict[str, CameraResult]:
     intrinsics of which only a part is uncertain (the matrix and not the distortion) have zeros for
     the rest.
     """
-    cell_fit, covariance = run.cell_fit, run.assessment.covariance
-    edges = 6 * len(run.assessment.edges)
-    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
+    fit, edges = run.assessment.fit, run.assessment.fit.unknowns.of_kinds(EDGE)
     # Measured poses need no camera, but later use of the result may.
     cameras = {
         frame: CameraResult(camera, estimated=False)
         for name, table in run.session.cameras.items()
-        if (frame := frame_name("camera", name)) in cell_fit.cell.tree.branches
+        if (frame := frame_name("camera", name)) in run.cell_fit.cell.tree.branches
         and (camera := table.stated) is not None
     }
-    if seen is None or optics is None:
+    if not fit.unknowns.of(LENS):
         return cameras | dict(run.lenses)
     for name, scene in run.scenes.items():
-        lens = optics.lens_of(name)
-        free = np.isin(lens, seen.free)
-        estimated = scene.estimated or bool(np.isin(lens, seen.moving).any())
-        result = CameraResult(
-            optics.camera(name), estimated, field=lens_field_of(cell_fit, name, covariance, edges)
-        )
-        if free.any():
-            columns = cell_fit.columns_of(lens[free])
-            own, cross = np.zeros((len(lens),) * 2), np.zeros((len(lens), edges))
-            own[np.ix_(free, free)] = covariance[np.ix_(columns, columns)]
-            cross[free] = covariance[columns, :edges]
+        lens = (LENS, name)
+        free, columns = fit.unknowns.values_of(lens), fit.unknowns.columns(lens)
+        estimated = scene.estimated or bool(fit.unknowns.moved[columns].any())
+        result = CameraResult(fit.camera(name), estimated, field=lens_field_of(fit, name))
+        if len(free):
+            size = len(fit.values(lens))
+            own, cross = np.zeros((size, size)), np.zeros((size, len(edges)))
+            own[np.ix_(free, free)] = fit.covariance(lens)
+            cross[free] = fit.whole[np.ix_(columns, edges)]
             result = replace(result, covariance=own, edge_covariance=cross)
         cameras[name] = result
     return cameras
@@ -384,85 +378,66 @@ def _cameras(run: RunState) -> dict[str, CameraResult]:
 
 def _joint_fit_of_cell(run: RunState) -> CellJointFit:
     """The unknowns of a whole cell's fit, with their covariance."""
-    cell_fit, answer = run.cell_fit, run.assessment
-    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
-    cameras, targets = dict[str, tuple[int, ...]](), dict[str, tuple[int, ...]]()
-    if seen is not None and optics is not None:
-        for name, at in optics.lenses.items():
-            cameras[object_name(name, "camera")] = _relative_indices(seen.free, at)
-        for name, shape in _shape_slices(run).items():
-            targets[name] = _relative_indices(seen.free, shape)
+    fit, plates = run.assessment.fit, tuple(run.session.plates) or ("target",)
     arms = {
         robot or "robot": (arm, fitted)
-        for robot, arm in cell_fit.arms.items()
-        if arm.model is not None and f"arm of {arm.robot}" in answer.problem.effect_columns
+        for robot, arm in run.cell_fit.arms.items()
+        if arm.model is not None and arm.robot in fit.unknowns.of(ARM)
         for fitted in [_fitted_arm(run, arm)]
         if fitted is not None
     }
-    columns = _fitted_columns(run, [arm for arm, _ in arms.values()])
+    columns = _fitted_columns(fit, [arm for arm, _ in arms.values()])
     return CellJointFit(
-        cameras=cameras,
-        targets=targets,
+        cameras={
+            object_name(name, "camera"): tuple(fit.unknowns.values_of((LENS, name)).tolist())
+            for name in fit.unknowns.of(LENS)
+        },
+        targets={
+            plate: tuple(fit.unknowns.values_of((BOARD, name)).tolist())
+            for plate, name in zip(plates, fit.unknowns.of(BOARD), strict=False)
+        },
         arms={robot: fitted for robot, (_, fitted) in arms.items()},
-        covariance=answer.covariance[np.ix_(columns, columns)],
+        covariance=fit.whole[np.ix_(columns, columns)],
     )
 
 
 def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
     """The estimated shapes of boards and rigs, by name; exact rigs are left out."""
-    cell_fit, covariance = run.cell_fit, run.assessment.covariance
-    seen, optics = cell_fit.linearised_corners, cell_fit.camera_parameters
-    boards, rigs = dict[str, BoardResult](), dict[str, RigResult]()
-    if seen is None or optics is None:
-        return boards, rigs
-    all_sigmas = np.zeros(len(optics.values))
-    all_sigmas[seen.free] = np.sqrt(np.diag(covariance))[cell_fit.columns_of(seen.free)]
-    shapes = zip(
-        _shape_slices(run).items(), run.session.boards.items(), optics.corners, strict=True
-    )
-    for (name, shape), (plate, target), corners in shapes:
-        values, sigmas = optics.values[shape], all_sigmas[shape]
-        free = _relative_indices(seen.free, shape)
-        if frame_name("target", plate) not in cell_fit.inlier_problem.tree.branches:
+    fit, boards, rigs = run.assessment.fit, dict[str, BoardResult](), dict[str, RigResult]()
+    names = tuple(name or "target" for name in run.session.plates) or ("target",)
+    for name, plate in zip(names, fit.unknowns.of(BOARD), strict=False):
+        board, target = (BOARD, plate), run.session.boards[plate]
+        values, free = fit.values(board), fit.unknowns.values_of(board)
+        sigmas = np.zeros(len(values))
+        sigmas[free] = fit.sigmas(board)
+        if frame_name("target", plate) not in fit.problem.tree.branches:
             continue
         if not target.is_rig:
+            corners = corner_positions(target) + shape_basis(target) @ values
             boards[name] = BoardResult(
                 shape=dict(zip(BOARD_NAMES, values.tolist(), strict=True)),
                 sigma={BOARD_NAMES[at]: float(sigmas[at]) for at in free},
-                estimated=tuple(BOARD_NAMES[at] for at in _relative_indices(seen.moving, shape)),
+                estimated=tuple(
+                    BOARD_NAMES[at] for at in fit.unknowns.values_of(board, moved=True)
+                ),
                 bend_mm=1e3 * float(np.ptp(corners[:, 2])),
             )
-        elif free:
+        elif len(free):
             rigs[name] = RigResult(shape=values.reshape(-1, 3), sigma=sigmas.reshape(-1, 3))
     return boards, rigs
 
 
-def _shape_slices(run: RunState) -> dict[str, slice]:
-    """The slice of each target's shape in the values of lenses and boards, by name."""
-    optics = run.cell_fit.camera_parameters
-    if optics is None:
-        return {}
-    targets = tuple(run.session.boards.values())
-    names = tuple(name or "target" for name in run.session.plates) or ("target",)
-    return dict(zip(names, shape_slices(targets, optics.boards.start), strict=True))
-
-
-def _relative_indices(indices: IntArray, part: slice) -> tuple[int, ...]:
-    """Those of ascending indices that lie in a slice, relative to its start."""
-    return tuple(int(value) for value in within(indices, part) - part.start)
-
-
 def view_evidence(run: RunState) -> tuple[ViewEvidence, ...]:
     """Collects the evidence of each view: corners, predictions, poses."""
-    cell_fit, state, boards = run.cell_fit, run.assessment.state, tuple(run.session.boards.values())
-    optics, evidence = cell_fit.camera_parameters, dict[int, Any]()
+    cell_fit, boards, fit = run.cell_fit, tuple(run.session.boards.values()), run.assessment.fit
+    state, evidence = fit.state, dict[int, Any]()
     for seen in seen_rows(cell_fit, run):
         poses = zip(seen.problem.measured(state), seen.problem.predicted(state), strict=True)
         for row, view, (measured, predicted) in zip(seen.rows, seen.views, poses, strict=True):
             px = None
-            if view.corners is not None and optics is not None and row.seer in optics.problems:
-                points = optics.points[view.corners.ids]
-                px = project(optics.camera(row.seer), apply(predicted, points))
+            if view.corners is not None and row.seer in fit.unknowns.of(LENS):
+                points = fit.camera_parameters.points[view.corners.ids]
+                px = project(fit.camera(row.seer), apply(predicted, points))
             evidence[row.view] = (view.corners, px, measured)
     observations = {observation.view.number: observation for observation in run.timed.observations}
     views = []

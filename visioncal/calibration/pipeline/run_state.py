@@ -87,7 +87,7 @@ class RunState(Observed):
     def uncertainty(self) -> UncertaintyResult:
         """Uncertainty of one camera and one robot where their views look."""
         answer = self.assessment
-        work = uncertainty_of(self.cell_fit, answer.covariance_by_source, answer.covariance)
+        work = uncertainty_of(self.cell_fit, answer.fit)
         return replace(work, noise_95=answer.of_robot(answer.noise_95))
 
     @property
@@ -98,9 +98,8 @@ class RunState(Observed):
     @property
     def pixel_px(self) -> float | None:
         """Standard deviation of a corner coordinate of the only camera, after the fit [px]."""
-        fit = self.cell_fit_or_none
-        seen = None if fit is None else fit.linearised_corners
-        return super().pixel_px if seen is None else seen.sigmas_px[0]
+        sigmas_px = {} if self.cell_fit_or_none is None else self.cell_fit.fit.sigmas_px
+        return next(iter(sigmas_px.values()), super().pixel_px)
 
     @property
     def used(self) -> tuple[int, ...]:

@@ -30,7 +30,8 @@ from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
-from visioncal.estimation.joint import ConvergedFit, fit_jointly, target_sizes
+from visioncal.estimation.fit import Fit
+from visioncal.estimation.joint import fit_jointly, target_sizes
 from visioncal.estimation.observability import chain_words, check_determined
 from visioncal.estimation.outliers import (
     InlierFit,
@@ -43,7 +44,6 @@ from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     Solution,
-    covariance_of,
     estimate_noise,
     solve_problem,
     starting_noise,
@@ -136,7 +136,7 @@ def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
         start, noise = problem.start(cell_fit.frames), cell_fit.inlier_fit.fit.noise
         state = solve_problem(problem, start, noise)[0]
         fit = Solution(state, estimate_noise(problem, state, noise))
-        return cell_fit.with_joint_fit(ConvergedFit(corners, problem, fit))
+        return cell_fit.with_joint_fit(Fit(problem, fit, corners))
     return replace(cell_fit, inlier_fit=cell_fit.inlier_fit.refitted())
 
 
@@ -428,7 +428,7 @@ def _with_priors(cell: Cell, inliers: InlierFit) -> InlierFit:
     while True:
         part = problem.subset(inliers.used)
         fit = Solution(solve_problem(part, inliers.fit.state, noise)[0], noise)
-        kept = without_most_contradicted(part, fit.state, covariance_of(part, fit))
+        kept = without_most_contradicted(Fit(part, fit))
         if kept is None:
             return replace(inliers, problem=problem, fit=fit)
         problem = replace(problem, priors=kept)

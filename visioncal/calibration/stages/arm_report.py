@@ -101,7 +101,7 @@ def add_parameters(
     shares = np.random.default_rng(0).uniform(size=(_PLACES, arm.q.shape[1]))
     near = arm.q.min(axis=0) + shares * np.ptp(arm.q, axis=0)
     with one_blas_thread():
-        weight = arm.pair.weight(arm.noise, arm.measured)
+        weight = arm.pair.weight(arm.fit.noise, arm.measured)
         by_stops = Jacobians.of_stops(arm)
         by_errors = _error_jacobians(arm, anywhere, weight)
         counts = Identifiability.of(by_stops, by_errors)

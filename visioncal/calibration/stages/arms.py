@@ -32,10 +32,12 @@ from visioncal.estimation.arm import (
 from visioncal.estimation.arm_sizes import most_orders
 from visioncal.estimation.armmodel import HARMONICS, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
 from visioncal.estimation.solve import Solution
+from visioncal.estimation.unknowns import ARM, EDGE
 from visioncal.results.arm import ArmErrorsResult, ArmSections
 from visioncal.robot import Loads
 from visioncal.session import Session, View
@@ -200,61 +202,44 @@ class RobotArm:
         )
         return matches
 
-    def data(
-        self,
-        problem: Problem,
-        fit: Solution,
-        covariance: FloatArray,
-        middles: Mapping[str, FloatArray],
-    ) -> ArmData | None:
+    def data(self, fit: Fit, middles: Mapping[str, FloatArray]) -> ArmData | None:
         """The observations of its errors; None for a nominal arm. See `report`."""
-        columns = problem.effect_columns.get(f"arm of {self.robot}")
+        problem = fit.problem
         stops = stops_of(problem, self.robot)
-        used, every = self.at(stops), np.arange(problem.size)
-        if self.model is None or self.errors is None or used.joints_rad is None or columns is None:
+        used, columns = self.at(stops), fit.unknowns.columns((ARM, self.robot))
+        if self.model is None or self.errors is None or used.joints_rad is None or not len(columns):
             return None
         pair = ArmPair.of(problem, fit.state, self.robot)
         # A single point shows no rotation; several points make a frame.
         shows_pose = bool((problem.observations.directions[pair.rows] > 3).any())
         # A point has no rotation to be determined.
         edges = problem.counted.copy()
-        edges[problem.edge_columns(pair.observed)] = True
+        edges[fit.unknowns[EDGE, pair.observed]] = True
         edges[6 * len(problem.unknown) :] = False
         return ArmData(
-            problem,
-            fit.state,
-            fit.noise,
-            covariance,
+            fit,
             self.robot,
             self.model,
-            every[columns],
             self.errors.sigma,
             stops,
             used.joints_rad,
             used.loads,
             middles.get(pair.observed, np.zeros(3)),
-            every[edges],
+            np.flatnonzero(edges),
             np.repeat([shows_pose, True], 3),
         )
 
     def report(
-        self,
-        problem: Problem,
-        fit: Solution,
-        covariance: FloatArray,
-        middles: Mapping[str, FloatArray],
-        convention: Convention | None = None,
+        self, fit: Fit, middles: Mapping[str, FloatArray], convention: Convention | None = None
     ) -> ArmReport:
         """What was found of the arm.
 
         Args:
-            problem: The inlier observations, with the arm's errors among the unknowns.
-            fit: Their fit.
-            covariance: (p, p) its covariance.
+            fit: The fit of a cell, with the arm's errors among the unknowns.
             middles: (3,) centre of each printed target by its frame, in that frame [m].
             convention: Convention of the arm's table; see `arm_report.add_parameters`.
         """
-        stops, data = stops_of(problem, self.robot), self.data(problem, fit, covariance, middles)
+        stops, data = stops_of(fit.problem, self.robot), self.data(fit, middles)
         heat, levels, found = self.at(stops).heat, self.kinematics, ArmReport()
         sections = ArmSections(arm=None if levels is None else levels.result)
         if data is not None and levels is not None:

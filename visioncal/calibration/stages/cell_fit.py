@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -14,7 +15,7 @@ from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.types import Corners, FloatArray, IntArray
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
-from visioncal.estimation.joint import ConvergedFit
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
@@ -66,19 +67,16 @@ class CellFit:
         inlier_fit = replace(self.inlier_fit, problem=replace(problem, poses=poses))
         return replace(self, inlier_fit=inlier_fit)
 
-    def with_joint_fit(self, fitted: ConvergedFit) -> Self:
+    def with_joint_fit(self, fitted: Fit) -> Self:
         """Takes over a joint fit of lenses, boards and frames."""
-        problem = self.full_problem(fitted.linearised).sized_at(fitted.fit.state)
-        inlier_fit = replace(self.inlier_fit, problem=problem, fit=fitted.fit)
+        problem = self.full_problem(fitted.linearised).sized_at(fitted.state)
+        inlier_fit = replace(self.inlier_fit, problem=problem, fit=fitted.solution)
         return replace(self, inlier_fit=inlier_fit, linearised_corners=fitted.linearised)
 
-    @property
-    def joint_fit(self) -> ConvergedFit | None:
-        """The fit of lenses and boards with the inliers; None without images."""
-        seen = self.linearised_corners
-        if seen is None:
-            return None
-        return ConvergedFit(seen, self.inlier_problem, self.inlier_fit.fit)
+    @cached_property
+    def fit(self) -> Fit:
+        """The fit of the inliers, with the covariance by noise and priors alone."""
+        return Fit(self.inlier_problem, self.inlier_fit.fit, self.linearised_corners)
 
     @property
     def residual_px(self) -> dict[str, float]:
@@ -162,23 +160,23 @@ class CellFit:
         effects = [seen.effect(rows), *self.other_effects, *arm_effects(self.arms)]
         return replace(problem, observations=observations).with_effects(effects)
 
-    def with_errors(self, fitted: ConvergedFit) -> Self:
+    def with_errors(self, fitted: Fit) -> Self:
         """Tests for errors of the arms that are not free yet."""
-        return replace(self, arms=with_link_errors(self.arms, fitted.problem, fitted.fit))
+        return replace(self, arms=with_link_errors(self.arms, fitted.problem, fitted.solution))
 
     @property
     def arms_without_joints(self) -> dict[str, RobotArm]:
         """The arms without joint angles."""
         return {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
 
-    def pose_errors(self, fitted: ConvergedFit) -> dict[str, ArmErrors]:
+    def pose_errors(self, fitted: Fit) -> dict[str, ArmErrors]:
         """Errors of the arms without joint angles beside a fit; see `find_pose_errors`."""
         problem, arms = fitted.problem, self.arms_without_joints
         for arm in arms.values():
             problem = arm.without_errors(problem)
         values, free = problem.start_values.copy(), len(fitted.linearised.free)
-        values[:free] = fitted.fit.state.values[:free]
-        fit = fit_problem(problem, State(fitted.fit.state.edges, values))
+        values[:free] = fitted.state.values[:free]
+        fit = fit_problem(problem, State(fitted.state.edges, values))
         found = {robot: find_pose_errors(problem, fit.state, fit.noise, robot) for robot in arms}
         return {robot: errors for robot, errors in found.items() if errors is not None}
 

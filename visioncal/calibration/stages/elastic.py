@@ -11,10 +11,8 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
 from visioncal.estimation.armpair import ArmData
-from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.normal_equations import normal_equations
-from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.problem_parts import Effect
 from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpring, Sag
 
 
@@ -73,20 +71,18 @@ def _payload_factor(arm: ArmData) -> Factor | None:
     are determined by the arm's own weight, and by the loads' differences between postures. None
     where there were no loads or they bend nothing.
     """
-    model, problem, loads = arm.model, arm.problem, arm.loads
+    model, loads, reported = arm.model, arm.loads, arm.fit.problem.poses[arm.robot]
     if not loads.any or not model.compliance.any():
         return None
     bent, robot = model.bent(arm.q, loads), model.robot
     load_torques = robot.load_torques(bent, loads) - robot.load_torques(bent)
-    flange_jacobian = np.zeros((len(problem.poses[arm.robot]), 6, 1))
+    flange_jacobian = np.zeros((len(reported), 6, 1))
     twists = np.einsum("mij,mj->mi", robot.axis_jacobian(bent), model.compliance * load_torques)
     flange_jacobian[arm.stops] = twists[:, :, None]
     flanges = {arm.robot: flange_jacobian}
     payload = Effect.free("payload", PriorInformation.flat(1), flange_jacobian=flanges)
-    widened = problem.with_effects([*problem.effects, payload])
-    widened_state = State(arm.state.edges, np.append(arm.state.values, 0.0))
-    information, gradient = normal_equations(widened, widened_state, arm.noise)
-    covariance = covariance_among(information, widened.moving)
+    widened = arm.fit.with_columns(payload)
+    covariance, (_, gradient) = widened.absorbed, widened.equations
     sigma = float(np.sqrt(covariance[-1, -1]))
     return Factor(1.0 - float(covariance[-1] @ gradient), sigma)
 

@@ -42,11 +42,12 @@ from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, apply_each, compose, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask, Need
-from visioncal.estimation.arm import ArmErrors, misfit_jacobian
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
-from visioncal.estimation.solve import Solution
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
+from visioncal.estimation.unknowns import BOARD
 from visioncal.results import NeedMet, Picker
 from visioncal.session.frames import object_name
 
@@ -180,21 +181,24 @@ def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) 
 class PickInputs:
     """Input for the prediction of picks."""
 
-    problem: Problem  # The n observations of the fit.
-    fit: Solution  # Their fit.
-    covariance: FloatArray  # (p, p) of the unknowns, all sources included.
+    fit: Fit  # The fit.
+    problem: Problem  # Its observations, or n of them.
     held_out: HeldOutResiduals  # The observations' residuals by fits without their stops.
     # (3,) of each target, in its frame [m]; of others, their origin.
     target_centres: Mapping[str, FloatArray]
     freedom: Mapping[str, float]  # Degrees of freedom of each robot's noise.
     arms: Mapping[str, RobotArm]  # The robots' arms, at the problem's stops.
-    board_columns: IntArray  # The problem's columns of boards' shapes.
-    # (3, b) Jacobian of each target's middle for these columns, by its frame [m].
+    # (3, b) Jacobian of each target's middle by the columns of boards, by its frame [m].
     centre_jacobians: Mapping[str, FloatArray]
     # Relative change of the focal length of each camera from image to image.
     jitters: Mapping[str, float]
     # (m, 2) turn [rad] and shift [m] of its views that were rejected, by camera; see `Picks`.
     strays: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def board_columns(self) -> IntArray:
+        """(b,) the columns of boards' shapes."""
+        return self.fit.unknowns.of_kinds(BOARD)
 
 
 def predict_picks(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
@@ -221,8 +225,7 @@ def _arm_bias(fitted: PickInputs, robot: str) -> FloatArray | None:
     arm = fitted.arms.get(robot)
     if arm is None or arm.model is not None or arm.errors is None or arm.errors.is_estimated:
         return None
-    state, noise = fitted.fit.state, fitted.fit.noise
-    return arm.errors.sigma * misfit_jacobian(fitted.problem, state, noise, robot, arm.errors)
+    return arm.errors.sigma * fitted.fit.bias(robot, arm.errors)
 
 
 def _subset(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:
@@ -259,7 +262,7 @@ def _picks(
         observations, at_m = _as_seen_by_base(fitted, base, in_base), apply_each(in_base, middles)
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
-    linearised, covariance, parts = observations.linear(state, ideal=True), fitted.covariance, {}
+    linearised, covariance, parts = observations.linear(state, ideal=True), fitted.fit.whole, {}
     to_base, column = adjoint(in_base), problem.robots.index(robot)
     level = pick_level = noise.robots[column]
     if as_noise is not None and bias is not None:
@@ -398,10 +401,9 @@ def _with_sensors(
     fitted: PickInputs, change: Callable[[FloatArray, Mask], FloatArray]
 ) -> tuple[Effect, ...]:
     """Effects whose (n, 6, k) actions on measured poses are changed; the mask is of boards."""
-    effects = []
+    effects, at = [], 6 * len(fitted.problem.unknown)
     for effect in fitted.problem.effects:
-        columns = fitted.problem.effect_columns[effect.name]
-        of_boards = np.isin(np.arange(columns.start, columns.stop), fitted.board_columns)
+        of_boards = np.isin(np.arange(at, at := at + len(effect)), fitted.board_columns)
         by_sensor = effect.by_sensor
         by_sensor = None if by_sensor is None else change(by_sensor, of_boards)
         effects.append(replace(effect, by_sensor=by_sensor))
@@ -491,7 +493,7 @@ def _excess_covariance(fitted: PickInputs) -> FloatArray:
     """(6, 6) excess of held-out residuals over their prediction, beyond chance."""
     problem, noise = fitted.problem, fitted.fit.noise
     linear = problem.linear(fitted.fit.state, ideal=True)
-    expected = linear.covariance(fitted.covariance) + problem.total_covariance(linear, noise)
+    expected = linear.covariance(fitted.fit.whole) + problem.total_covariance(linear, noise)
     held_out, excess = fitted.held_out, np.zeros((6, 6))
     for residuals, axes in (
         (held_out.residual_rad, slice(0, 3)),

@@ -9,11 +9,10 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import did_you_mean, figure
-from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.observability import SIGMA_LIMIT_M
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import FramePrior, State
+from visioncal.estimation.problem_parts import FramePrior
 from visioncal.estimation.tree import Tree
 from visioncal.session.document import PriorTable
 
@@ -60,14 +59,12 @@ class Component:
         )
 
 
-def components(
-    problem: Problem, state: State, covariance: FloatArray, priors: Sequence[FramePrior]
-) -> Iterator[Component]:
+def components(fit: Fit, priors: Sequence[FramePrior]) -> Iterator[Component]:
     """The measured components of priors, used or not, beside the observations' estimates."""
-    used = {(frame_prior.name, axis) for frame_prior in problem.priors for axis in frame_prior.axes}
+    used = {(item.name, axis) for item in fit.problem.priors for axis in item.axes}
     for prior in priors:
-        residuals, jacobian = problem.prior_rows(prior, state)
-        sigmas = np.sqrt(np.einsum("dp,pq,dq->d", jacobian, covariance, jacobian)) * prior.sigma_m
+        residuals, jacobian = fit.problem.prior_rows(prior, fit.state)
+        sigmas = np.sqrt(np.einsum("dp,pq,dq->d", jacobian, fit.whole, jacobian)) * prior.sigma_m
         # The position's rows follow those of the rotation, which are not reported.
         rows = slice(len(residuals) - len(prior.axes), len(residuals))
         residuals_m, known_m = (residuals[rows] * prior.sigma_m).tolist(), prior.sigma_m
@@ -123,18 +120,16 @@ def with_loose_positions(priors: Iterable[FramePrior]) -> tuple[FramePrior, ...]
     return tuple(replace(prior, sigma_m=max(prior.sigma_m, _LOOSE_M)) for prior in priors)
 
 
-def without_most_contradicted(
-    problem: Problem, state: State, covariance: FloatArray
-) -> tuple[FramePrior, ...] | None:
+def without_most_contradicted(fit: Fit) -> tuple[FramePrior, ...] | None:
     """The priors without the most contradicted component; None where none is contradicted."""
     found = [
         (component.contradiction, at, component.axis)
-        for at, prior in enumerate(problem.priors)
-        for component in components(problem, state, covariance, [prior])
+        for at, prior in enumerate(fit.problem.priors)
+        for component in components(fit, [prior])
     ]
     contradiction, worst, axis = max(found, default=(0.0, 0, 0))
     if contradiction <= CONTRADICTION:
         return None
-    kept = list(problem.priors)
+    kept = list(fit.problem.priors)
     kept[worst] = kept[worst].without(axis)
     return tuple(prior for prior in kept if prior.axes or prior.rotation is not None)

@@ -16,14 +16,15 @@ from visioncal.estimation.appearance import Appearance, LensBoardParameters, com
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import (
     FOLLOWS,
     UNEVEN_LINKS,
-    ConvergedFit,
     FrameModel,
     diverging,
     fit_jointly,
     moved_mahalanobis_sq,
+    others_of,
 )
 from visioncal.estimation.lens_field import LensLevels, LensSizes
 from visioncal.estimation.lens_levels import estimate_sizes
@@ -90,9 +91,7 @@ def refine_jointly(
         return after.with_joint_fit(fitted)
 
 
-def _beside_arms(
-    before: CellFit, after: CellFit, stated: ConvergedFit
-) -> tuple[ConvergedFit, CellFit]:
+def _beside_arms(before: CellFit, after: CellFit, stated: Fit) -> tuple[Fit, CellFit]:
     """The fit with errors of the arms, which may have passed for those of lenses and boards.
 
     Their sigma is that under the stated lenses and boards, where these show any: a board whose size
@@ -105,8 +104,8 @@ def _beside_arms(
 
 
 def with_sizes(
-    cell_fit: CellFit, fitted: ConvergedFit, posture: Mapping[str, ArmErrors] = MappingProxyType({})
-) -> tuple[ConvergedFit, Mapping[str, ArmErrors]]:
+    cell_fit: CellFit, fitted: Fit, posture: Mapping[str, ArmErrors] = MappingProxyType({})
+) -> tuple[Fit, Mapping[str, ArmErrors]]:
     """The fit with estimated sizes of the errors of lenses and boards; itself if that diverges.
 
     Args:
@@ -131,15 +130,13 @@ def with_sizes(
     return again or follows, posture
 
 
-def _follows(
-    model: FrameModel, fitted: ConvergedFit, sized: CameraParameters
-) -> ConvergedFit | None:
+def _follows(model: FrameModel, fitted: Fit, sized: CameraParameters) -> Fit | None:
     """A refit with other sizes; None where it diverges."""
 
     # Cameras that disagree about a stop agree once the board has shrunk to nothing, or the lenses
     # image nothing: such a fit may converge, but no corner is where it was seen.
-    def refitted(optics: CameraParameters) -> ConvergedFit:
-        return fit_jointly(optics, model, fitted.frames, fitted.others)
+    def refitted(optics: CameraParameters) -> Fit:
+        return fit_jointly(optics, model, fitted.frames, others_of(fitted))
 
     try:
         refit = refitted(sized)
@@ -153,7 +150,7 @@ def _follows(
     return refit if is_followed else None
 
 
-def _is_shrunk(fitted: ConvergedFit) -> bool:
+def _is_shrunk(fitted: Fit) -> bool:
     """Whether a board's size is farther from the stated one than any board's."""
     optics = fitted.camera_parameters
     scales = [float(optics.values[optics.shape_of(board)[0]]) for board in optics.printed]
@@ -161,19 +158,19 @@ def _is_shrunk(fitted: ConvergedFit) -> bool:
 
 
 def _estimated(
-    cell_fit: CellFit, fitted: ConvergedFit, posture: Mapping[str, ArmErrors]
+    cell_fit: CellFit, fitted: Fit, posture: Mapping[str, ArmErrors]
 ) -> CameraParameters:
     """Lenses and boards with the sizes of their errors, near a fit.
 
     `posture` are errors of arms without joint angles, by robot, beside which they are estimated.
     """
     optics = fitted.linearised.camera_parameters
-    seen, noise = replace(fitted.linearised, is_flat=True), fitted.fit.noise
+    seen, noise = replace(fitted.linearised, is_flat=True), fitted.noise
     # Priors may be wrong, which is tested later; without them, frames may be undetermined.
     problem = cell_fit.problem(seen)
     problem = replace(problem, priors=with_loose_positions(problem.priors))
     values = {
-        effect.name: fitted.problem.values_of(effect.name, fitted.fit.state)
+        effect.name: fitted.problem.values_of(effect.name, fitted.state)
         for effect in problem.effects[1:]
     } | {LENSES: np.append(optics.values, np.zeros(sum(seen.field_sizes)))}
     for robot, errors in posture.items():
@@ -186,7 +183,7 @@ def _estimated(
             robots[problem.robots.index(robot)] = errors.white
             noise = replace(noise, robots=robots)
     in_order = [values[effect.name] for effect in problem.effects]
-    state = State(fitted.fit.state.edges, np.concatenate(in_order))
+    state = State(fitted.state.edges, np.concatenate(in_order))
     problem = problem.sized_at(state)
     levels, lenses, boards = dict[str, LensLevels](), dict[str, LensSizes](), optics.board_sizes
     for name in optics.problems:
@@ -201,14 +198,15 @@ def _estimated(
     return fitted.camera_parameters.with_sizes(levels, lenses, boards, holds_scales=holds)
 
 
-def _have_other_sizes(fitted: ConvergedFit) -> bool:
+def _have_other_sizes(fitted: Fit) -> bool:
     """Whether all boards have free scales, which differ from the stated ones beside arm errors."""
-    optics = fitted.camera_parameters
-    places = np.array([optics.shape_of(board)[0] for board in optics.printed], dtype=np.int64)
-    if not len(places) or not np.isin(places, fitted.linearised.free).all():
+    seen = fitted.linearised
+    scales = seen.camera_parameters.scales
+    if not len(scales) or not np.isin(scales, seen.free).all():
         return False
-    limit = UNEVEN_LINKS**2 * chi2_limit(FALSE_ALARM, len(places))
-    return bool(moved_mahalanobis_sq(fitted, places) > limit)
+    limit = UNEVEN_LINKS**2 * chi2_limit(FALSE_ALARM, len(scales))
+    columns = fitted.lens_columns.start + np.searchsorted(seen.free, scales)
+    return bool(moved_mahalanobis_sq(fitted, columns) > limit)
 
 
 def recompute_poses(

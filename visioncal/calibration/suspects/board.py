@@ -16,15 +16,14 @@ from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Target
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
-from visioncal.estimation.joint import (
-    ConvergedFit,
-    MeasuredScale,
-    measured_scale,
-    scale_by_stated_arms,
-)
+from visioncal.estimation.appearance import ASPECT, SCALE, SHEAR, shape_basis
+from visioncal.estimation.fit import Fit
+from visioncal.estimation.joint import MeasuredScale, measured_scale, scale_by_stated_arms
+from visioncal.estimation.unknowns import BOARD, LENS
 from visioncal.session import Session
 from visioncal.session.frames import frame_name
 from visioncal.vision.boards import kind_of
+from visioncal.vision.targets import corner_positions
 
 # Manufacturing accuracy of rigs, as a share of their size.
 _SAME_SIZE = 5e-4
@@ -36,8 +35,8 @@ _LEAST_BEND_M = 1e-5
 
 def _found(run: RunState) -> Iterator[Finding]:
     """Boards of another size by the robot's motion, or of another shape; notes where allowed."""
-    cell_fit, covariance = run.cell_fit, run.assessment.covariance
-    if (fitted := cell_fit.joint_fit) is None:
+    cell_fit, fitted = run.cell_fit, run.assessment.fit
+    if not fitted.unknowns.of(LENS):
         yield from _of_measured_poses(run)
         return
     stated = None
@@ -45,27 +44,21 @@ def _found(run: RunState) -> Iterator[Finding]:
         stated = cell_fit.inlier_problem
         for arm in cell_fit.arms.values():
             stated = arm.without_errors(stated)
-    optics = fitted.camera_parameters
-    scene = next(iter(optics.problems.values())).scene
-    for board, target in enumerate(scene.targets):
-        called = f"board {scene.names[board]}".strip()
-        frame = frame_name("target", scene.names[board])
-        measured = measured_scale(cell_fit, fitted, frame, board)
-        if board not in optics.printed:
+    for name, target in run.session.boards.items():
+        called, frame, board = f"board {name}".strip(), frame_name("target", name), (BOARD, name)
+        measured = measured_scale(cell_fit, fitted, frame, name, target)
+        if target.is_rig:
             if stated is not None:
                 measured = scale_by_stated_arms(fitted, stated, frame) or measured
-            yield from _point_findings(target, optics.values[optics.shape_of(board)])
+            yield from _point_findings(target, fitted.values(board))
             if measured.is_another and abs(measured.scale) >= _SAME_SIZE:
                 yield scale_finding(f"target {target.name}", target, measured, measured)
             continue
-        place = optics.shape_of(board)[0]
-        if measured.is_another and place in fitted.linearised.moving:
-            (at,) = fitted.columns_of(np.array([place]))
-            sigma = float(covariance[at, at] ** 0.5)
-            written = replace(measured, scale=float(optics.values[place]), sigma=sigma)
-            own = (run.session, scene.names[board])
-            yield scale_finding(called, target, measured, written, own)
-        yield from _shape_findings(fitted, board, called)
+        if measured.is_another and SCALE in fitted.unknowns.values_of(board, moved=True):
+            scale, sigma = float(fitted.values(board)[SCALE]), float(fitted.sigmas(board)[SCALE])
+            written = replace(measured, scale=scale, sigma=sigma)
+            yield scale_finding(called, target, measured, written, (run.session, name))
+        yield from _shape_findings(fitted, name, target, called)
 
 
 def _of_prints(run: RunState) -> Iterator[Finding]:
@@ -151,27 +144,33 @@ def scale_finding(
     return Finding("board_size", words, Remedy(do, command or CALIBRATE), mahalanobis_sq=square)
 
 
-def _shape_findings(fitted: ConvergedFit, board: int, called: str) -> Iterator[Finding]:
+def _shape_findings(fitted: Fit, name: str, target: Target, called: str) -> Iterator[Finding]:
     """Finding on a bent, stretched or sheared board, beyond the accuracy of printing."""
-    optics = fitted.camera_parameters
-    shape = optics.shape_of(board)[1:]
-    aspect, *bends, shear = shape
-    drawn = optics.with_values(shape, np.zeros(len(shape))).corners[board]
-    off_m = np.linalg.norm(optics.corners[board] - drawn, axis=1).max()
-    if not has_changed(fitted, shape) or off_m < _LEAST_BEND_M:
+    board = (BOARD, name)
+    shape = fitted.values(board)
+    columns, values = fitted.unknowns.columns(board), fitted.unknowns.values_of(board)
+
+    def has_moved(*chosen: int) -> bool:
+        return has_changed(fitted, columns[np.isin(values, chosen)])
+
+    drawn = np.where(np.arange(len(shape)) == SCALE, shape, 0.0)
+    corners, even = (corner_positions(target) + shape_basis(target) @ at for at in (shape, drawn))
+    off_m = np.linalg.norm(corners - even, axis=1).max()
+    bends = np.setdiff1d(np.arange(len(shape)), [SCALE, ASPECT, SHEAR])
+    if not has_moved(ASPECT, *bends, SHEAR) or off_m < _LEAST_BEND_M:
         return
     parts = []
-    if has_changed(fitted, np.array([aspect])):
-        longer = float(optics.values[aspect])
+    if has_moved(ASPECT):
+        longer = float(shape[ASPECT])
         far, near = ("y", "x") if longer > 0 else ("x", "y")
         parts.append(
             f"longer along its {far} than along its {near}, by {figure(100 * abs(longer))} %"
         )
-    if has_changed(fitted, np.array([shear])):
-        corner_deg = 90.0 - np.rad2deg(float(optics.values[shear]))
+    if has_moved(SHEAR):
+        corner_deg = 90.0 - np.rad2deg(float(shape[SHEAR]))
         parts.append(f"sheared: its rows and columns meet at {corner_deg:.3f} deg")
-    if has_changed(fitted, np.array(bends)) or not parts:
-        depth = figure(1e3 * float(np.ptp(optics.corners[board][:, 2])))
+    if has_moved(*bends) or not parts:
+        depth = figure(1e3 * float(np.ptp(corners[:, 2])))
         parts.insert(0, f"not flat: its corners lie within {depth} mm of depth")
     words = f"The {called} is {', and '.join(parts)}. Its shape was estimated with the rest."
     flat = "Put the board on a stiff, flat plate, or print it on another printer, and record again."

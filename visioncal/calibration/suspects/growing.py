@@ -14,17 +14,15 @@ from visioncal.estimation.effects.random_effect import RandomEffect
 
 
 def _found(effect: RandomEffect, run: RunState) -> Iterator[Finding]:
-    problem, covariance = run.cell_fit.inlier_problem, run.assessment.covariance
-    for name, columns in problem.effect_columns.items():
-        kind, _, owner = name.partition(" of ")
-        if kind != effect.kind:
-            continue
-        values = problem.values_of(name, run.assessment.state)
-        squared = float(values @ np.linalg.solve(covariance[columns, columns], values))
+    fit = run.assessment.fit
+    for owner in fit.unknowns.of(effect.kind):
+        values = fit.values((effect.kind, owner))
+        covariance = fit.covariance((effect.kind, owner))
+        squared = float(values @ np.linalg.solve(covariance, values))
         if squared > chi2_limit(FALSE_ALARM, len(values)):
             do = Remedy(effect.do)
             found = Finding(effect.kind, effect.says(values), do, mahalanobis_sq=squared)
-            yield found.of(owner if len(problem.robots) > 1 else "")
+            yield found.of(owner if len(fit.noise.robots) > 1 else "")
 
 
 GROWING = tuple(

@@ -11,11 +11,12 @@ from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
-from visioncal.estimation.joint import ConvergedFit, moved_mahalanobis_sq
+from visioncal.estimation import unknowns
+from visioncal.estimation.fit import Fit
+from visioncal.estimation.joint import moved_mahalanobis_sq
 from visioncal.estimation.lens_levels import SIGNIFICANT
 from visioncal.estimation.scene import ONLY_CAMERA
-from visioncal.estimation.solve import covariance_of, held_shift
-from visioncal.vision.camera import normalise, project
+from visioncal.vision.camera import intrinsics, normalise, project
 
 # Changes of intrinsics or corners below this show in no image [px].
 _LEAST_MOVE_PX = 0.1
@@ -28,24 +29,23 @@ _NEW_LENS = Remedy(
 
 def _stated(run: RunState) -> Iterator[Finding]:
     """Stated intrinsics and noise of corners that the corners contradict."""
-    fitted = run.cell_fit.joint_fit
-    if fitted is None:
-        return
-    for camera in fitted.camera_parameters.problems:
+    fitted = run.assessment.fit
+    for camera in fitted.unknowns.of(unknowns.LENS):
         for finding in _of_camera(fitted, camera):
             yield finding.of("" if camera == ONLY_CAMERA else camera)
 
 
-def _of_camera(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
-    optics, seen = fitted.camera_parameters, fitted.linearised
-    problem, lens = optics.problems[camera], optics.lens_of(camera)
+def _of_camera(fitted: Fit, camera: str) -> Iterator[Finding]:
+    optics, seen, lens = fitted.camera_parameters, fitted.linearised, (unknowns.LENS, camera)
+    problem, columns = optics.problems[camera], fitted.unknowns.columns(lens)
+    moving = fitted.unknowns.moved[columns]
     stack, compressed = problem.stack, seen.compressed[[*optics.problems].index(camera)]
-    unknowns, stated_px = problem.unknowns(compressed), stack.stated_px
-    shown_px = stack.shown_px(compressed.residuals, unknowns)
+    count, stated_px = problem.unknowns(compressed), stack.stated_px
+    shown_px = stack.shown_px(compressed.residuals, count)
     if (
         stated_px is not None
         and shown_px > stated_px
-        and stack.contradicts(compressed.residuals, unknowns)
+        and stack.contradicts(compressed.residuals, count)
     ):
         yield Finding(
             "corner_noise",
@@ -56,8 +56,7 @@ def _of_camera(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
                 "Look for errors of the detector, the lens or the target that sigma_px leaves out."
             ),
         )
-    free = np.intersect1d(lens, seen.moving)
-    if problem.scene.mode == "refine" and not len(free):
+    if problem.scene.mode == "refine" and not moving.any():
         views = counted(len(stack.views), "view", ("leaves", "leave"))
         yield Finding(
             "remark",
@@ -68,8 +67,9 @@ def _of_camera(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
                 "fx, fy, cx, cy are known."
             ),
         )
-    if not problem.scene.estimated and has_changed(fitted, free):
-        moves, sigmas_px = (optics.values - optics.stated)[lens[:4]], problem.stated_sigma[:4]
+    if not problem.scene.estimated and has_changed(fitted, columns):
+        moves = (fitted.values(lens) - intrinsics(problem.scene.camera))[:4]
+        sigmas_px = problem.stated_sigma[:4]
         moved = f"fx, fy, cx, cy moved by {_px(moves)} px."
         rays = normalise(problem.scene.camera, stack.px)
         rays = np.column_stack([rays, np.ones(len(rays))])
@@ -83,11 +83,10 @@ def _of_camera(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
         else:
             allowed = "within what is stated, or by less than images show"
             yield Finding(NOTE, f"The given intrinsics were refined {allowed}: {moved}")
-    if np.isin(lens, seen.free[seen.held]).any():
-        at = fitted.columns_of(lens[:4])
-        moves = held_shift(fitted.problem, fitted.fit)[at]
-        covariance = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]
-        squared = float(moves @ np.linalg.solve(covariance, moves))
+    if not moving.all():
+        at = columns[fitted.unknowns.values_of(lens) < 4]
+        moves = fitted.shift[at]
+        squared = float(moves @ np.linalg.solve(fitted.by_noise[np.ix_(at, at)], moves))
         if np.abs(moves).max() > _LEAST_MOVE_PX and squared > chi2_limit(FALSE_ALARM, len(at)):
             yield Finding(
                 "lens",
@@ -99,12 +98,12 @@ def _of_camera(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
             )
 
 
-def has_changed(fitted: ConvergedFit, places: IntArray) -> bool:
-    """Whether values of lenses and boards differ significantly from the stated ones."""
-    free = np.intersect1d(places, fitted.linearised.moving)
-    if not len(free):
+def has_changed(fitted: Fit, columns: IntArray) -> bool:
+    """Whether what a fit moved of lens and board values differs significantly from the stated."""
+    moved = columns[fitted.unknowns.moved[columns]]
+    if not len(moved):
         return False
-    return bool(moved_mahalanobis_sq(fitted, free) > chi2_limit(FALSE_ALARM, len(free)))
+    return bool(moved_mahalanobis_sq(fitted, moved) > chi2_limit(FALSE_ALARM, len(moved)))
 
 
 def _px(values: FloatArray) -> str:

@@ -42,8 +42,7 @@ def _outliers(run: RunState) -> Iterator[Finding]:
 
 
 def _contradicted(run: RunState) -> Iterator[Finding]:
-    answer, priors = run.assessment, run.cell_fit.cell.priors
-    for component in components(answer.problem, answer.state, answer.covariance, priors):
+    for component in components(run.assessment.fit, run.cell_fit.cell.priors):
         yield component.finding
 
 

@@ -12,12 +12,13 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
-from visioncal.estimation.appearance import Appearance, Compressed, compress
+from visioncal.estimation.appearance import Appearance, Compressed, compress, shape_slices
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.lens_field import LensLevels, LensSizes
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.scene import BoardSizes, CornerProblem
+from visioncal.estimation.unknowns import BOARD, LENS, Unknown
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
 # The effect's name in a problem.
@@ -58,6 +59,15 @@ class CameraParameters:
             places[name] = slice(at, at + len(problem.lens))
             at += len(problem.lens)
         return places
+
+    @cached_property
+    def parts(self) -> Mapping[Unknown, slice]:
+        """Slice of each lens and each board among the values."""
+        scene = self._one.scene
+        shapes = zip(scene.names, shape_slices(scene.targets, self.boards.start), strict=True)
+        return {Unknown(LENS, name): at for name, at in self.lenses.items()} | {
+            Unknown(BOARD, name): at for name, at in shapes
+        }
 
     @property
     def boards(self) -> slice:

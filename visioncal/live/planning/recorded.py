@@ -19,6 +19,7 @@ from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import fisher_information, normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
+from visioncal.estimation.unknowns import EDGE
 from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.information import RecordedStops
 from visioncal.session import Session, frame_name
@@ -143,18 +144,16 @@ def _recorded_stops(
     if assessment is None:
         return recorded
     # Gradient at held parameters of lens and boards.
-    problem = assessment.problem
-    gradient = normal_equations(problem, assessment.state, assessment.noise)[1]
-    gradient = gradient * (problem.counted & ~problem.moving)
-    columns = [problem.effect_columns[effect.name] for effect in start.problem.effects]
-    held = np.concatenate([np.zeros(0), *(gradient[part.start : part.stop] for part in columns)])
+    fit = assessment.fit
+    gradient = fit.equations[1] * (fit.problem.counted & ~fit.unknowns.moved)
+    columns = [fit.problem.effect_columns[effect.name] for effect in start.problem.effects]
+    held = np.concatenate([np.zeros(0), *(gradient[part] for part in columns)])
     recorded = replace(recorded, held=held[:, None])
-    by_arm = assessment.covariance_by_source.get("arm")
+    by_arm = fit.beside.get("arm")
     if arm.is_modelled or by_arm is None:
         return recorded
     # Errors of an arm without joint angles.
-    columns = [problem.edge_columns(name) for name in tuple(start.problem.unknown)[:2]]
-    index = np.concatenate([np.arange(part.start, part.stop) for part in columns])
+    index = fit.unknowns.columns(*((EDGE, name) for name in [*start.problem.unknown][:2]))
     values, vectors = np.linalg.eigh(by_arm[np.ix_(index, index)])
     root = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0]
     return replace(recorded, edge_error_root=root)

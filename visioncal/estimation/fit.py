@@ -1,0 +1,182 @@
+"""The fit of a cell, as all that reports, judges, verifies, plans and picks from it reads it.
+
+Readers ask by the names of `unknowns`: which values there are, what they are, how their errors
+are correlated, and what a forward model of them errs by (`predicted`). What they must not know is
+how the fit was made: `problem`, `solution` and `corners` are of the engine, and only its own
+modules, searches and tests of residuals read them. Another engine stands behind the same door if
+it gives
+
+    unknowns, frames, values, camera, noise   what there is, and its estimates
+    absorbed, by_noise, beside                (p, p) covariances, by name of the source
+    shift                                     what held values would have moved the others by
+
+Everything else here follows from these.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.core.types import Camera, FloatArray, IntArray
+from visioncal.estimation.arm import ArmErrors
+from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.normal_equations import normal_equations
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.solve import Solution, covariance_of, held_shift
+from visioncal.estimation.unknowns import EDGE, LENS, LENS_ERRORS, Unknown, Unknowns
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Estimates of all unknowns, from the observations that agree, with their covariance."""
+
+    problem: Problem  # The observations that agree, with everything that is unknown.
+    solution: Solution  # Its unknowns and noise levels.
+    # All corners, linearised in poses, lenses and boards; None without images.
+    corners: LinearisedCorners | None = None
+    # (p, p) covariances from sources other than noise and priors, by source.
+    beside: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def state(self) -> State:
+        """Estimated unknowns, as the engine orders them."""
+        return self.solution.state
+
+    @property
+    def noise(self) -> Noise:
+        """Noise levels: of the robots in the order of `problem.robots`, and of the sensors."""
+        return self.solution.noise
+
+    @property
+    def linearised(self) -> LinearisedCorners:
+        """The corners of a fit with images."""
+        if self.corners is None:
+            raise RuntimeError("a fit without images has no lens")
+        return self.corners
+
+    @cached_property
+    def unknowns(self) -> Unknowns:
+        """The unknowns with their p columns."""
+        problem, parts, uncertain = self.problem, dict[Unknown, slice](), dict[Unknown, IntArray]()
+        parts |= {Unknown(EDGE, frame): problem.edge_columns(frame) for frame in problem.unknown}
+        if self.corners is not None:
+            free, first = self.corners.free, self.lens_columns.start
+            for unknown, values in self.corners.camera_parameters.parts.items():
+                low, high = np.searchsorted(free, [values.start, values.stop]).tolist()
+                parts[unknown] = slice(first + low, first + high)
+                uncertain[unknown] = free[low:high] - values.start
+            at = first + len(free)
+            cameras = self.corners.camera_parameters.problems
+            for camera, size in zip(cameras, self.corners.field_sizes, strict=True):
+                parts[Unknown(LENS_ERRORS, camera)] = slice(at, at + size)
+                at += size
+        for name, columns in problem.effect_columns.items():
+            if name != LENSES:
+                parts[Unknown.of_effect(name)] = columns
+        return Unknowns(parts, uncertain, problem.moving)
+
+    @property
+    def lens_columns(self) -> slice:
+        """Columns of the uncertain values of lenses and boards together."""
+        first = 6 * len(self.problem.unknown)
+        return slice(first, first + (0 if self.corners is None else len(self.corners.free)))
+
+    @cached_property
+    def camera_parameters(self) -> CameraParameters:
+        """Lenses and boards as fitted; exact values are the stated ones."""
+        free = self.linearised.free
+        return self.linearised.camera_parameters.with_values(free, self.state.values[: len(free)])
+
+    @property
+    def sigmas_px(self) -> dict[str, float]:
+        """Noise of a corner's coordinate, by camera [px]; empty without images."""
+        sigmas = () if self.corners is None else self.corners.sigmas_px
+        return dict(zip(self.unknowns.of(LENS), sigmas, strict=True))
+
+    @property
+    def frames(self) -> dict[str, FloatArray]:
+        """Poses (4, 4) `parent_from_frame` of the unknown frames."""
+        return self.problem.frames(self.state)
+
+    def camera(self, name: str) -> Camera:
+        """A camera with the fitted lens."""
+        return self.camera_parameters.camera(name)
+
+    def values(self, unknown: tuple[str, str]) -> FloatArray:
+        """(k,) all values of an unknown but an edge, exact ones included; empty if there is none.
+
+        Those of arms, times and what grows are the change from what the problem was built with.
+        """
+        if self.corners is not None:
+            optics = self.camera_parameters
+            if (part := optics.parts.get(Unknown(*unknown))) is not None:
+                return optics.values[part]
+        at, first = self.unknowns[unknown], 6 * len(self.problem.unknown)
+        columns = slice(max(at.start - first, 0), max(at.stop - first, 0))
+        return np.asarray((self.state.values - self.problem.start_values)[columns])
+
+    @cached_property
+    def equations(self) -> tuple[FloatArray, FloatArray]:
+        """Information (p, p) on the unknowns, and half the gradient (p,) of the squared error."""
+        return normal_equations(self.problem, self.state, self.noise)
+
+    @cached_property
+    def absorbed(self) -> FloatArray:
+        """(p, p) covariance that the fit absorbed of the residuals'; zero for held unknowns."""
+        return covariance_among(self.equations[0], self.problem.moving)
+
+    def with_columns(self, *effects: Effect) -> "Fit":
+        """The same with more unknowns, still where they were linearised: for score tests."""
+        values = [self.state.values, *(effect.values for effect in effects)]
+        state = State(self.state.edges, np.concatenate(values))
+        problem = self.problem.with_effects([*self.problem.effects, *effects])
+        return replace(
+            self, problem=problem, solution=replace(self.solution, state=state), beside={}
+        )
+
+    @cached_property
+    def by_noise(self) -> FloatArray:
+        """(p, p) covariance of the unknowns by noise and priors, held ones by their prior."""
+        return covariance_of(self.problem, self.solution)
+
+    @cached_property
+    def whole(self) -> FloatArray:
+        """(p, p) covariance of the unknowns from all sources."""
+        return np.asarray(sum(self.beside.values(), self.by_noise))
+
+    @cached_property
+    def shift(self) -> FloatArray:
+        """(p,) shift of the unknowns, to first order, if the held ones were estimated as well."""
+        return held_shift(self.problem, self.solution)
+
+    def bias(self, robot: str, errors: ArmErrors) -> FloatArray:
+        """(p, q) Jacobian of the estimates by q errors of an arm that the fit takes for noise."""
+        information, size = self.with_columns(errors.effect(robot)).equations[0], self.problem.size
+        fitted = covariance_among(information[:size, :size], self.problem.moving)
+        return np.asarray(fitted @ information[:size, size:])
+
+    def covariance(self, *unknowns: tuple[str, str]) -> FloatArray:
+        """(c, c) covariance of some unknowns from all sources, in their order."""
+        at = self.unknowns.columns(*unknowns)
+        return self.whole[np.ix_(at, at)]
+
+    def sigmas(self, unknown: tuple[str, str]) -> FloatArray:
+        """(c,) standard deviations of an unknown's uncertain values, from all sources."""
+        return np.asarray(np.sqrt(np.diag(self.whole)[self.unknowns[unknown]]))
+
+    def by_columns(self, parts: Mapping[tuple[str, str], FloatArray]) -> FloatArray:
+        """(..., p) Jacobian of a forward model, from its (..., c) Jacobians by some unknowns."""
+        shape = next(iter(parts.values())).shape[:-1]
+        jacobian = np.zeros((*shape, len(self.unknowns.moved)))
+        for unknown, part in parts.items():
+            jacobian[..., self.unknowns[unknown]] = part
+        return jacobian
+
+    def predicted(self, parts: Mapping[tuple[str, str], FloatArray]) -> FloatArray:
+        """(..., m, m) covariance J C J' of a forward model with Jacobians (..., m, c)."""
+        jacobian = self.by_columns(parts)
+        return np.asarray(jacobian @ self.whole @ jacobian.mT)
