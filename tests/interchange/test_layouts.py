@@ -438,6 +438,51 @@ def dense_log(folder):
     write(folder / "robot.tum", "\n".join(lines))
 
 
+def two_sessions(folder):
+    """Parallel lists in two groups, whose pictures have the same names in two folders."""
+    groups = []
+    for group, rows in (("matin", range(5)), ("soir", range(5, 9))):
+        (folder / group).mkdir(parents=True)
+        for at in rows:
+            cv2.imwrite(str(folder / f"{group}/p{at % 5}.png"), world()[1][at])
+        numbers = [seven(world()[0][at]) for at in rows]
+        poses = [[each[:3], [each[6], *each[3:6]]] for each in numbers]
+        names = [f"p{at % 5}.png" for at in rows]
+        groups.append({"nom": group, "images": names, "poses": poses})
+    document = {"config": {"repos": [[0.3, 0.0, 0.5], [0.0, 1.0, 0.0, 0.0]]}, "seances": groups}
+    write(folder / "releve.json", document)
+
+
+def several_bodies(folder):
+    """A row a body and frame of a tracker, and a table that says in which frame a picture is."""
+    shoot(folder / "shots", "DSC_77{:02d}.png")
+    rng, lines = np.random.default_rng(2), ["frame,body,x,y,z,qx,qy,qz,qw,residual"]
+    for frame in range(27):
+        rig = world()[0][frame // 3] if frame % 3 == 0 else world()[0][4]
+        table = [0.05, 1.1, 1.2, *Rotation.from_euler("x", 70, degrees=True).as_quat()]
+        wand = [*rng.normal(size=3), *Rotation.random(random_state=frame).as_quat()]
+        for body, numbers in ((31, wand), (4, table), (12, seven(rig))):
+            cells = [*(1e3 * np.array(numbers[:3])), *numbers[3:]]
+            lines.append(
+                ",".join([f"{19500 + frame},{body}", *(f"{n:.12f}" for n in cells), "0.1"])
+            )
+    write(folder / "tracking.csv", "\n".join(["# export 6dof, 120 Hz", "# units: mm", *lines]))
+    order = [4 * k % 9 for k in range(9)]
+    shots = [f"DSC_77{at:02d}.png,{19500 + 3 * at}" for at in order]
+    write(folder / "shots.csv", "\n".join(["photo,trigger_frame", *shots]))
+
+
+def sentence_above(folder):
+    """A comment of as many words as there are columns, above a number and a 3 x 4 matrix."""
+    shoot(folder / "img", "{}7.png")
+    lines = [
+        " ".join([f"{at}7", *map(repr, np.linalg.inv(pose)[:3].ravel().tolist())])
+        for at, pose in enumerate(world()[0])
+    ]
+    sentence = "# frame   T (3x4, row by row), robot base seen from the flange, m"
+    write(folder / "poses.txt", "\n".join([sentence, *lines]))
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -446,6 +491,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         program_beside, times_and_names, failed_rows, two_of_a_language, old_results,
         later_names, quaternion_first, three_deep, two_lists, poses_as_texts, keys_are_names,
         another_order, comment_above, beside_a_decoy, matlab, dense_log,
+        two_sessions, several_bodies, sentence_above,
     )
 }  # fmt: skip
 

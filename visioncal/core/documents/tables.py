@@ -215,5 +215,7 @@ def _header_in_comments(
         return None
     names = comment.lstrip("#%/ ").rpartition(":")[2]
     words = names.replace(separator, " ").replace(",", " ").split()
-    fits = len(words) == width and not any(is_number(word) for word in words)
+    # A sentence may have as many words.
+    is_whole = all(sum(map(word.count, "([")) == sum(map(word.count, ")]")) for word in words)
+    fits = is_whole and len(words) == width and not any(is_number(word) for word in words)
     return tuple(words) if fits else None

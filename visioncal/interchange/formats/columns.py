@@ -231,8 +231,20 @@ def _images(
     groups = found if asked is None else asked
     name = fields.find(requested.image) if requested.image else _image_name(fields, groups, taken)
     if name in fields.texts:
-        return Pairing(images_named(fields.texts[name], fields.folder, found, asked)), name
+        cells = _with_folders(fields, name, groups)
+        return Pairing(images_named(cells, fields.folder, found, asked)), name
     return paired(fields, groups) if groups else Pairing(()), ""
+
+
+def _with_folders(fields: Fields, name: str, groups: Sequence[FileGroup]) -> tuple[str, ...]:
+    """Names of images, those of the same name with the folder that another column says."""
+    cells = fields.texts[name]
+    filled = [cell for cell in cells if cell]
+    if len({*filled}) == len(filled):
+        return cells
+    folders = {file.parent.name for group in groups for file in group.files}
+    said = next((each for each in fields.texts.values() if {*each} <= folders), None)
+    return tuple(map("{}/{}".format, said, cells)) if said else cells
 
 
 def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[str]) -> str:

@@ -432,20 +432,42 @@ def joined(
     """
     # Each with its row for every row of the first.
     clusters: list[list[tuple[Fields, IntArray]]] = []
-    for part in sorted(parts, key=lambda item: (not holds_pose(item), -len(item))):
-        own = keys_of(part)
+    each = (piece for part in parts for piece in _by_category(part))
+    for part in sorted(each, key=lambda item: (not holds_pose(item), -len(item))):
+        own, is_alone = keys_of(part), True
         for cluster in clusters:
             main = cluster[0][0]
             match = matched(keys_of(main), own) if main.form == part.form else None
-            if match is not None:
+            # What names pictures may do so for several.
+            if match is not None and (is_alone or match.how != HOW[-1]):
                 cluster.append((part, match.rows))
-                break
-        else:
+                is_alone = False
+                if holds_pose(part):
+                    break
+        if is_alone:
             clusters.append([(part, np.arange(len(part)))])
     return [
         cluster[0][0] if len(cluster) == 1 else _merged(cluster, name, folder, prefixed=prefixed)
         for cluster in clusters
     ]
+
+
+def _by_category(fields: Fields) -> list[Fields]:
+    """The rows of each of several bodies, where a column names these and another counts them."""
+    whole = [cells for cells in fields.texts.values() if "." not in "".join(cells)]
+    for cells in whole:
+        kinds = [*dict.fromkeys(cells)]
+        if not 1 < len(kinds) < 9 or len(cells) < 3 * len(kinds) or "" in kinds:
+            continue
+        for count in whole:
+            is_key = len({*zip(cells, count, strict=True)}) == len(cells)
+            if is_key and len({*count}) * 2 <= len(cells) < len({*count}) * len(kinds) + 1:
+                rows = ([at for at, cell in enumerate(cells) if cell == kind] for kind in kinds)
+                return [
+                    replace(fields.rows(chosen), name=f"{fields.name}.{kind}")
+                    for kind, chosen in zip(kinds, rows, strict=True)
+                ]
+    return [fields]
 
 
 def _merged(

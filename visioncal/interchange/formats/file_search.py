@@ -258,7 +258,12 @@ def images_named(
     """
     files = [file for group in found if asked is None for file in group.files]
     files += [file for group in asked or () for file in group.files]
-    by_name = {item.stem: item for item in files} | {item.name: item for item in files}
+    by_name = {
+        (folder, word): file
+        for file in files
+        for folder in ("", file.parent.name)
+        for word in (file.stem, file.name)
+    }
     numbers = [number_in(name) for name in names if name]
     is_unique = asked is not None and len(set(numbers)) == len(numbers)
     by_number = {number_in(file.name): file for file in files} if is_unique else {}
@@ -267,8 +272,9 @@ def images_named(
     for name in names:
         path: Path | None = None
         if name:
-            plain = name.replace("\\", "/").rsplit("/", 1)[-1]
-            known = by_name.get(plain) or by_number.get(number_in(plain))
+            *_, folder, plain = ("", *name.replace("\\", "/").split("/"))
+            folder = folder if any(folder == known for known, _ in by_name) else ""
+            known = by_name.get((folder, plain)) or by_number.get(number_in(plain))
             is_elsewhere = asked is not None or not is_inside(base / name, base)
             path = known if is_elsewhere else None
             path = path or path_inside(base, name if asked is None else plain)

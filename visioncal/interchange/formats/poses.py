@@ -203,7 +203,11 @@ def column_groups(fields: Fields, taken: Collection[str] = ()) -> dict[str, tupl
     groups: dict[str, tuple[str, ...]] = defaultdict(tuple)
     for name, numbers in fields.numbers.items():
         parent, _, last = name.rpartition(".")
-        if numbers.ndim == 1 and name not in taken and last.lower() not in _COUNTED:
+        if numbers.ndim != 1 or name in taken:
+            continue
+        steps = np.diff(numbers[np.isfinite(numbers)])
+        is_count = not (numbers[np.isfinite(numbers)] % 1).any() or bool((steps > 0).all())
+        if not (is_count and last.lower() in _COUNTED):
             groups[parent] += (name,)
     return groups
 

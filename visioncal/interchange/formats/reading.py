@@ -266,6 +266,7 @@ def _row_lists(
         # A list of one entry is a wrapper, unless there is nothing in it.
         inner = [*_row_lists(rows[0], name)] if len(rows) == 1 else []
         yield from inner or [(name, rows, ())]
+        yield from _opened(rows, name)
     elif isinstance(document, Mapping):
         values = [*document.values()]
         arrays = _arrays_of(values)
@@ -279,10 +280,34 @@ def _row_lists(
             and set[object].intersection(*({*value} for value in values))
         ):
             yield name, values, tuple(map(str, document))
+            yield from _opened(values, name)
             if len(values) > 3:
                 return
         for key, value in document.items():
             yield from _row_lists(value, f"{name}.{key}" if name else str(key))
+
+
+def _opened(
+    groups: Sequence[object], name: str
+) -> Iterator[tuple[str, list[object], tuple[str, ...]]]:
+    """The rows in lists of several groups, each with what stands beside the lists of its group."""
+    rows = list[object]()
+    for group in groups if isinstance(groups[0], Mapping) else ():
+        if not isinstance(group, Mapping):
+            return
+        lists = {key: each for key, each in group.items() if isinstance(each, list)}
+        longest = max(map(len, lists.values()), default=0)
+        parallel = {key: each for key, each in lists.items() if len(each) == longest > 1}
+        beside = {key: each for key, each in group.items() if key not in lists}
+        is_inner = any(
+            isinstance(cell, list | Mapping) for each in parallel.values() for cell in each
+        )
+        if not is_inner:
+            return
+        for cells in zip(*parallel.values(), strict=True):
+            rows.append({**beside, **dict(zip(parallel, cells, strict=True))})
+    if len(rows) > len(groups):
+        yield name, rows, ()
 
 
 def _arrays_of(values: Sequence[object]) -> FloatArray | None:
