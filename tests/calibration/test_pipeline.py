@@ -238,7 +238,7 @@ def mahalanobis_sq(cell, known):
 
 def is_refined(known):
     """Whether the fit moves the intrinsics."""
-    lens = known.cell_fit.camera_parameters.lens_of("cam")
+    lens = known.cell_fit.fit.camera_parameters.lens_of("cam")
     return np.isin(lens, known.cell_fit.linearised_corners.moving).any()
 
 
@@ -295,7 +295,7 @@ def test_a_stated_lens_counts_by_its_prior_and_is_refined_where_that_helps(
         assert is_refined(known) == (is_refined(known) if refined is None else refined)
         assert known.verdict.status == (status or known.verdict.status), known.verdict.reasons
         if refined:
-            camera = known.cell_fit.camera_parameters.camera("cam")
+            camera = known.cell_fit.fit.camera_parameters.camera("cam")
             sigma = np.sqrt(np.diag(known.assessment.fit.whole))[12:16]
             # Chi-square of four under 23.5 in all but one case of ten thousand.
             assert np.all(np.abs(camera.matrix - options.camera.matrix) < 4.5 * sigma)
@@ -317,7 +317,7 @@ def test_a_fisheye_camera_goes_the_whole_way():
         options = CellOptions(camera=CAMERAS["fisheye"], state_intrinsics=False, seed=seed)
         known = calibrated(cell := simulate(options))
         assert known.used == tuple(range(20))
-        assert len(known.cell_fit.camera_parameters.lens_of("cam")) == 8
+        assert len(known.cell_fit.fit.camera_parameters.lens_of("cam")) == 8
         surprises.append(mahalanobis_sq(cell, known))
     # Mean of 2 chi-square of 12 over 12: beyond this in one case of a thousand.
     assert np.mean(surprises) < 2.13

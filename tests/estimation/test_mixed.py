@@ -229,7 +229,7 @@ LEVELS = LensLevels(field=1.5, length=0.35, breathing=0.05, jitter=0.01)
 @pytest.fixture(scope="module")
 def corners():
     """The corners of one camera as the fit has them, with their poses."""
-    looks = calibrated(simulate(FINE), joints=False).cell_fit.camera_parameters
+    looks = calibrated(simulate(FINE), joints=False).cell_fit.fit.camera_parameters
     (problem,) = looks.problems.values()
     return replace(problem.with_levels(LEVELS), levels=LEVELS), looks
 
@@ -285,7 +285,7 @@ def test_a_focus_that_is_fixed_neither_breathes_nor_jitters():
     fixed = calibrated(
         cell, joints=False, session=replace(session, document=session.document | {"camera": camera})
     )
-    (problem,) = fixed.cell_fit.camera_parameters.problems.values()
+    (problem,) = fixed.cell_fit.fit.camera_parameters.problems.values()
     levels = problem.levels
     assert (levels.breathing, levels.jitter) == (0.0, 0.0)
 

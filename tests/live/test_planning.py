@@ -86,7 +86,7 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
     cell = replace(true_cell(options), noise=Noise.of_robot(5e-5, 3e-5), pixel_px=0.05)
     q = simulate(options).robot.joints
     factors = stop_factors(cell, HAND_EYE, q)
-    problem = seen.cell_fit.inlier_problem
+    problem = seen.cell_fit.fit.problem
     # The same corners at the plan's noise; exact ones count as seen to a millionth of a pixel.
     scale = (0.05 / max(seen.pixel_px, 1e-6)) ** 2
     in_view = replace(problem.observations, covariance=scale * problem.observations.covariance)

@@ -51,6 +51,10 @@ class Fit:
         """Noise levels: of the robots in the order of `problem.robots`, and of the sensors."""
         return self.solution.noise
 
+    def at(self, state: State) -> "Fit":
+        """The same with other values of the unknowns."""
+        return replace(self, solution=replace(self.solution, state=state))
+
     @property
     def linearised(self) -> LinearisedCorners:
         """The corners of a fit with images."""
@@ -97,6 +101,15 @@ class Fit:
         sigmas = () if self.corners is None else self.corners.sigmas_px
         return dict(zip(self.unknowns.of(LENS), sigmas, strict=True))
 
+    def shown_px(self, camera: str) -> float | None:
+        """Scatter of a camera's corner coordinates [px]; None without images of it."""
+        cameras = self.unknowns.of(LENS)
+        if camera not in cameras:
+            return None
+        problem = self.linearised.camera_parameters.problems[camera]
+        compressed = self.linearised.compressed[cameras.index(camera)]
+        return problem.stack.shown_px(compressed.residuals, problem.unknowns(compressed))
+
     @property
     def frames(self) -> dict[str, FloatArray]:
         """Poses (4, 4) `parent_from_frame` of the unknown frames."""
@@ -134,9 +147,7 @@ class Fit:
         values = [self.state.values, *(effect.values for effect in effects)]
         state = State(self.state.edges, np.concatenate(values))
         problem = self.problem.with_effects([*self.problem.effects, *effects])
-        return replace(
-            self, problem=problem, solution=replace(self.solution, state=state), beside={}
-        )
+        return replace(self.at(state), problem=problem, beside={})
 
     @cached_property
     def by_noise(self) -> FloatArray:

@@ -19,7 +19,6 @@ from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.solve import Solution
 from visioncal.estimation.steps import DRIFT, FRAME, SIZE, Step, with_step
 from visioncal.estimation.unknowns import ARM
 
@@ -106,20 +105,18 @@ def misfit_covariance(fit: Fit, robot: str, errors: ArmErrors) -> FloatArray:
 
 def change_each(
     arms: Mapping[str, RobotArm],
-    problem: Problem,
-    fit: Solution,
+    fit: Fit,
     change: Callable[[RobotArm, Problem, State], RobotArm],
 ) -> dict[str, RobotArm]:
     """Changes one arm after the other, with the errors of the others in the problem.
 
     Args:
         arms: The arms.
-        problem: The observations, with the errors of all arms.
-        fit: Their fit.
+        fit: The fit, with the errors of all arms.
         change: Computes the changed arm from the arm, the problem with that arm nominal, and the
             initial state of that problem.
     """
-    changed = dict(arms)
+    changed, problem = dict(arms), fit.problem
     values = {effect: problem.values_of(effect.name, fit.state) for effect in problem.effects}
     for name, arm in arms.items():
         nominal, state = arm.without_errors(problem), fit.state
@@ -131,9 +128,7 @@ def change_each(
     return changed
 
 
-def with_drifts(
-    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, level: str
-) -> dict[str, RobotArm]:
+def with_drifts(arms: Mapping[str, RobotArm], fit: Fit, level: str) -> dict[str, RobotArm]:
     """Estimates drift with temperature, one arm after the other, where the session determines it.
 
     Raises:
@@ -151,23 +146,21 @@ def with_drifts(
             refused.append(error.within(f"robot {arm.robot}"))
             return arm
 
-    changed = change_each(arms, problem, fit, with_drift)
+    changed = change_each(arms, fit, with_drift)
     if level == LEVEL and refused and len(refused) == len(changed):
         raise refused[0]
     return changed
 
 
-def with_pose_errors(
-    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
-) -> dict[str, RobotArm]:
+def with_pose_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotArm]:
     """Estimates pose-dependent errors of arms without joint angles."""
 
     def found(name: str) -> ArmErrors | None:
-        errors = find_pose_errors(problem, fit.state, fit.noise, name)
+        errors = find_pose_errors(fit.problem, fit.state, fit.noise, name)
         if errors is None or errors.white is None:
             return errors
         # What grows with time, reach or gravity is another at a pick, and in another session.
-        varies = random_effect_rms(problem, fit.state, name)
+        varies = random_effect_rms(fit.problem, fit.state, name)
         return replace(errors, white=np.hypot(errors.white, varies))
 
     return {
@@ -177,10 +170,10 @@ def with_pose_errors(
 
 
 def with_errors_beside_step(
-    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, steps: Sequence[Step]
+    arms: Mapping[str, RobotArm], fit: Fit, steps: Sequence[Step]
 ) -> Mapping[str, RobotArm]:
     """Estimates pose-dependent errors again beside a sudden step, which they would also explain."""
     is_modelled = all(arm.is_modelled for arm in arms.values())
     if not steps or steps[0].kind not in (FRAME, SIZE) or is_modelled:
         return arms
-    return with_pose_errors(arms, *with_step(problem, fit, steps[0]))
+    return with_pose_errors(arms, Fit(*with_step(fit.problem, fit.solution, steps[0])))

@@ -41,7 +41,7 @@ from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fit_problem
 from visioncal.estimation.steps import Step
-from visioncal.estimation.unknowns import EDGE, Unknown
+from visioncal.estimation.unknowns import EDGE, LENS, Unknown
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
 from visioncal.results.sections import ClockResult, Intervals
 
@@ -158,7 +158,7 @@ def assess_fit(
     if not observed.misread:
         converged = fit.solution if is_fit else fit_problem(fit.problem, fit.state)
         steps = likely_steps(fit.problem, converged, errors, joint_offsets(cell_fit.arms))
-        arms = with_errors_beside_step(cell_fit.arms, fit.problem, fit.solution, steps)
+        arms = with_errors_beside_step(cell_fit.arms, fit, steps)
         cell_fit = replace(cell_fit, arms=arms)
     beside = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)
     fit = replace(fit, beside=beside)
@@ -210,7 +210,7 @@ class SeenRows:
         Those of one camera and one robot are the distances of the target, as each view places it,
         from its mean over the inliers.
         """
-        problem, part, state = self.problem, cell_fit.inlier_problem, cell_fit.inlier_fit.fit.state
+        problem, part, state = self.problem, cell_fit.fit.problem, cell_fit.fit.state
         predicted = problem.predicted(state)
         away_m, away_rad = pose_residuals(problem, state, predicted)
         if cell_fit.cell.mount is not None:
@@ -235,12 +235,12 @@ def seen_rows(cell_fit: CellFit, observed: Observed) -> Iterator[SeenRows]:
     cell_fit = replace(cell_fit, cell=replace(cell, rows=tuple(rows)))
     views = [observed.poses[row.view] for row in rows]
     first = _problem(cell_fit, observed, [view.chosen(0, None) for view in views])
-    optics, targets = cell_fit.camera_parameters, targets_of(cell)
+    fit, targets = cell_fit.fit, targets_of(cell)
     for at, (row, pose) in enumerate(zip(rows, first.predicted(state), strict=True)):
         view = views[at].nearest(pose, targets.get(row.seen))
-        if optics is not None and view.corners is not None and row.seer in optics.problems:
-            stack = CornerStack.of({row.view: view.corners}, optics.points)
-            poses = fit_poses(stack, optics.camera(row.seer), view.cam_from_target)
+        if view.corners is not None and row.seer in fit.unknowns.of(LENS):
+            stack = CornerStack.of({row.view: view.corners}, fit.camera_parameters.points)
+            poses = fit_poses(stack, fit.camera(row.seer), view.cam_from_target)
             view = replace(view, cam_from_target=poses.cam_from_target)
         views[at] = view
     problem = _problem(cell_fit, observed, views)

@@ -29,7 +29,7 @@ _OPTICAL = {LENS_ERRORS: "lens_field", LENS: "intrinsics", BOARD: "board"}
 
 def left_out(cell_fit: CellFit) -> HeldOutResiduals:
     """Residuals of the inliers, each by a fit without its stop, to first order."""
-    fit, part, mount = cell_fit.inlier_fit.fit, cell_fit.inlier_problem, cell_fit.cell.mount
+    fit, part, mount = cell_fit.fit.solution, cell_fit.fit.problem, cell_fit.cell.mount
     used = np.flatnonzero(cell_fit.inlier_fit.used)
     stops = np.unique(part.observations.stops, return_inverse=True)[1]
     needed, count = needed_frames(part), int(stops.max()) + 1

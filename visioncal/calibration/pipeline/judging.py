@@ -211,7 +211,7 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
                 used=sum(view.used for view in mine),
                 lost=[Rejection(view.view, view.reason) for view in unused],
                 outliers=[v.view for v in mine if _is_outlier(v) or v.view in undone],
-                pixel_px=run.cell_fit.residual_px.get(seer),
+                pixel_px=run.cell_fit.fit.shown_px(seer),
                 spared=sum(view.view in run.spared for view in mine),
                 name=seer if len(seers) > 1 else "",
             )

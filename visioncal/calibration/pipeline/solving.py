@@ -104,8 +104,7 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     cell_fit = _fit_with_inliers(initial, observed)
     if cell_fit.inlier_fit.problem.is_combined and not observed.scenes:
         cell_fit = _with_likelier_noise(cell_fit, observed)
-    problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
-    cell_fit = replace(cell_fit, arms=with_drifts(cell_fit.arms, problem, fit, level))
+    cell_fit = replace(cell_fit, arms=with_drifts(cell_fit.arms, cell_fit.fit, level))
     if any(arm.drift is not None for arm in cell_fit.arms.values()):
         cell_fit = _fit_with_inliers(cell_fit, observed)
     corners = cell_fit.linearised_corners
@@ -122,8 +121,7 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         if any(arms[name] is not arm for name, arm in cell_fit.arms.items()):
             cell_fit = _converge_arms(replace(cell_fit, arms=arms))
     cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
-    problem, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
-    return replace(cell_fit, arms=with_pose_errors(cell_fit.arms, problem, fit))
+    return replace(cell_fit, arms=with_pose_errors(cell_fit.arms, cell_fit.fit))
 
 
 def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
@@ -133,7 +131,7 @@ def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
         views = _views_by_camera(observed, cell_fit.poses)
         corners = cell_fit.stated_parameters(observed.scenes, views).linearised()
         problem = cell_fit.problem(corners)
-        start, noise = problem.start(cell_fit.frames), cell_fit.inlier_fit.fit.noise
+        start, noise = problem.start(cell_fit.frames), cell_fit.noise
         state = solve_problem(problem, start, noise)[0]
         fit = Solution(state, estimate_noise(problem, state, noise))
         return cell_fit.with_joint_fit(Fit(problem, fit, corners))
@@ -195,7 +193,7 @@ def _calibrate_arms(
     Returns:
         The fit, and its noise without errors that repeated views share.
     """
-    noise = cell_fit.inlier_fit.fit.noise
+    noise = cell_fit.noise
     for iteration in range(_ROUNDS + 1):
         if observed.progress is not None:
             observed.progress("arms", iteration, _ROUNDS + 1)
@@ -229,7 +227,7 @@ def _calibrate_arms(
 
 def _by_closed_form(cell_fit: CellFit, solver: str) -> CellFit:
     """Replaces the edges by those of a closed form, and the noise by that of its residuals."""
-    inliers, part, mount = cell_fit.inlier_fit, cell_fit.inlier_problem, cell_fit.cell.mount
+    inliers, part, mount = cell_fit.inlier_fit, cell_fit.inlier_fit.part, cell_fit.cell.mount
     if mount is None:
         raise RuntimeError("closed forms are for one robot and one camera")
     state = closed_form_state(part, solver, inliers.fit.state, mount)
@@ -272,7 +270,7 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
     cell_fit = replace(cell_fit, linearised_corners=None)
     if drifts := tuple(arm_effects(cell_fit.arms)):
         cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, drifts))
-    arms = with_link_errors(cell_fit.arms, cell_fit.inlier_problem, cell_fit.inlier_fit.fit)
+    arms = with_link_errors(cell_fit.arms, cell_fit.fit)
     cell_fit = replace(cell_fit, arms=arms)
     if effects := (*cell_fit.other_effects, *arm_effects(arms)):
         cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
@@ -283,7 +281,7 @@ def _choose_levels(
     cell_fit: CellFit, noise: Noise, *, functions: bool = False
 ) -> dict[str, RobotArm]:
     """Selects the errors of each arm; functions of its joints only where asked for."""
-    part, fit = cell_fit.inlier_problem, cell_fit.inlier_fit.fit
+    fit = cell_fit.fit
     views = [cell_fit.cell.rows[index].view for index in np.flatnonzero(cell_fit.inlier_fit.used)]
 
     def with_level(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
@@ -294,11 +292,11 @@ def _choose_levels(
         # out.
         if not (gain := found.function_gain):
             return arm
-        joints = joints_of(part, joint_offsets({arm.robot: arm}))
-        slips = any(step.gain > gain for step in find_steps(part, fit, joints))
+        joints = joints_of(fit.problem, joint_offsets({arm.robot: arm}))
+        slips = any(step.gain > gain for step in find_steps(fit.problem, fit.solution, joints))
         return arm if slips else found
 
-    return change_each(cell_fit.arms, part, fit, with_level)
+    return change_each(cell_fit.arms, fit, with_level)
 
 
 def _converge_arms(cell_fit: CellFit) -> CellFit:
@@ -321,8 +319,7 @@ def _converge_arms(cell_fit: CellFit) -> CellFit:
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
                 fitted, _ = with_sizes(cell_fit, fitted)
             cell_fit = cell_fit.with_joint_fit(fitted)
-        problem, state = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.fit.state
-        moved = {name: arm.relinearised(problem, state) for name, arm in cell_fit.arms.items()}
+        moved = {name: arm.relinearised(cell_fit.fit) for name, arm in cell_fit.arms.items()}
         cell_fit = replace(cell_fit, arms={name: arm for name, (arm, _) in moved.items()})
         if max(step for _, step in moved.values()) < _CONVERGED_RAD:
             break

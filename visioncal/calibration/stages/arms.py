@@ -36,7 +36,6 @@ from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
-from visioncal.estimation.solve import Solution
 from visioncal.estimation.unknowns import ARM, EDGE
 from visioncal.results.arm import ArmErrorsResult, ArmSections
 from visioncal.robot import Loads
@@ -324,17 +323,15 @@ class RobotArm:
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
 
-    def relinearised(self, problem: Problem, state: State) -> tuple[Self, float]:
+    def relinearised(self, fit: Fit) -> tuple[Self, float]:
         """Relinearises the calibrated arm at a fit.
 
         Returns:
             The arm, and the largest step of its errors [rad].
         """
-        name = f"arm of {self.robot}"
-        start = [effect.values for effect in problem.effects if effect.name == name]
-        if self.model is None or not start:
+        step = fit.values((ARM, self.robot))
+        if self.model is None or not len(step):
             return self, 0.0
-        step = problem.values_of(name, state) - start[0]
         return self._with_model(self.model.moved(step)), float(np.abs(step).max())
 
     def _with_model(self, model: ArmModel) -> Self:
@@ -372,15 +369,13 @@ def arm_effects(arms: Mapping[str, RobotArm]) -> Iterator[Effect]:
         yield from arm.effects()
 
 
-def with_link_errors(
-    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
-) -> dict[str, RobotArm]:
+def with_link_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotArm]:
     """Looks for errors of the links of the arms whose errors are not free yet."""
-    likelihood = robot_likelihood(problem, fit.state, fit.noise)
+    likelihood = robot_likelihood(fit.problem, fit.state, fit.noise)
     return {
         name: arm
         if arm.has_free_errors
-        else arm.with_errors(likelihood, problem.robots.index(name))
+        else arm.with_errors(likelihood, fit.problem.robots.index(name))
         for name, arm in arms.items()
     }
 

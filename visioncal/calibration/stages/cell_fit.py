@@ -14,7 +14,7 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.types import Corners, FloatArray, IntArray
 from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
+from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.pose_errors import find_pose_errors
@@ -41,11 +41,6 @@ class CellFit:
     solver: str = "joint"  # The solver of the edges.
 
     @property
-    def inlier_problem(self) -> Problem:
-        """The problem of the inliers."""
-        return self.inlier_fit.part
-
-    @property
     def noise(self) -> Noise:
         """Noise levels of robots and sensors, from which another fit starts."""
         return self.inlier_fit.fit.noise
@@ -58,7 +53,7 @@ class CellFit:
     @property
     def frames(self) -> dict[str, FloatArray]:
         """Poses (4, 4) of the unknown frames in their parents."""
-        return self.inlier_fit.problem.frames(self.inlier_fit.fit.state)
+        return self.fit.frames
 
     def with_arm_poses(self) -> Self:
         """Replaces the robots' poses by those of their arms."""
@@ -76,33 +71,7 @@ class CellFit:
     @cached_property
     def fit(self) -> Fit:
         """The fit of the inliers, with the covariance by noise and priors alone."""
-        return Fit(self.inlier_problem, self.inlier_fit.fit, self.linearised_corners)
-
-    @property
-    def residual_px(self) -> dict[str, float]:
-        """Standard deviation of corner residuals of each camera, per axis [px]."""
-        if self.linearised_corners is None:
-            return {}
-        optics, sigmas_px = self.linearised_corners.camera_parameters, {}
-        for (camera, problem), corners in zip(
-            optics.problems.items(), self.linearised_corners.compressed, strict=True
-        ):
-            unknowns = problem.unknowns(corners)
-            sigmas_px[camera] = problem.stack.shown_px(corners.residuals, unknowns)
-        return sigmas_px
-
-    @property
-    def camera_parameters(self) -> CameraParameters | None:
-        """Estimated lenses and boards; None without images."""
-        return self.camera_parameters_at(self.inlier_fit.fit.state)
-
-    def camera_parameters_at(self, state: State) -> CameraParameters | None:
-        """Lenses and boards at a state; None without images."""
-        if self.linearised_corners is None:
-            return None
-        free = self.linearised_corners.free
-        values = self.inlier_fit.problem.values_of(LENSES, state)[: len(free)]
-        return self.linearised_corners.camera_parameters.with_values(free, values)
+        return Fit(self.inlier_fit.part, self.inlier_fit.fit, self.linearised_corners)
 
     def pixels(
         self,
@@ -112,29 +81,12 @@ class CellFit:
         state: State,
     ) -> FloatArray:
         """Reprojection errors (m,) [px] of views, given (m, 4, 4) poses of their targets."""
-        optics = self.camera_parameters_at(state)
-        if optics is None:
+        if self.linearised_corners is None:
             return np.full(len(rows), np.nan)
-        lenses = {problem: optics.camera(problem) for problem in optics.problems}
+        optics = self.fit.at(state).camera_parameters
+        lenses = {name: optics.camera(name) for name in optics.problems}
         cameras = [lenses.get(row.seer) for row in rows]
         return chain_rms_px([view.corners for view in views], poses, cameras, optics.points)
-
-    @property
-    def lens_columns(self) -> slice:
-        """The problem's columns of lenses and boards, and of lens errors beyond their models."""
-        return self.inlier_fit.problem.effect_columns.get(LENSES, slice(0, 0))
-
-    @property
-    def field_columns(self) -> IntArray:
-        """The problem's columns of lens errors beyond their models."""
-        columns, corners = self.lens_columns, self.linearised_corners
-        free = 0 if corners is None else len(corners.free)
-        return np.arange(columns.start + free, columns.stop)
-
-    def columns_of(self, indices: IntArray) -> IntArray:
-        """The problem's columns of free values of lenses and boards, given their indices."""
-        free = np.zeros(0) if self.linearised_corners is None else self.linearised_corners.free
-        return np.asarray(self.lens_columns.start + np.searchsorted(free, indices))
 
     def problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of the inliers, repeated ones sharing an error."""
@@ -162,7 +114,7 @@ class CellFit:
 
     def with_errors(self, fitted: Fit) -> Self:
         """Tests for errors of the arms that are not free yet."""
-        return replace(self, arms=with_link_errors(self.arms, fitted.problem, fitted.solution))
+        return replace(self, arms=with_link_errors(self.arms, fitted))
 
     @property
     def arms_without_joints(self) -> dict[str, RobotArm]:
@@ -206,8 +158,3 @@ class CellFit:
         # Errors of a lens, a print or a detector in one of them are the same in all.
         counts = Counter(repeated.values())
         return {view: 1.0 / counts[key] for view, key in repeated.items()}
-
-
-def within(indices: IntArray, part: slice) -> IntArray:
-    """Those of ascending indices that lie in a slice."""
-    return np.asarray(indices[(indices >= part.start) & (indices < part.stop)])

@@ -41,7 +41,7 @@ def _found(run: RunState) -> Iterator[Finding]:
         return
     stated = None
     if any(arm.model is not None for arm in cell_fit.arms.values()):
-        stated = cell_fit.inlier_problem
+        stated = fitted.problem
         for arm in cell_fit.arms.values():
             stated = arm.without_errors(stated)
     for name, target in run.session.boards.items():

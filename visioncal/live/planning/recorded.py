@@ -176,11 +176,10 @@ def _start_from_fit(run: RunState, cell_fit: CellFit) -> _RecordedStart:
     """Recorded stops of a session with a fit, even if that leaves a direction undetermined."""
     if cell_fit.linearised_corners is None:
         raise _missing_input_error(run)
-    part, arm = cell_fit.inlier_problem, run.robot_arm
+    part, arm = cell_fit.fit.problem, run.robot_arm
     observed = part.observations.observed
     planned = max(dict.fromkeys(observed), key=observed.count)
     stops, first, of = np.unique(part.observations.stops, return_index=True, return_inverse=True)
-    frames = part.frames(cell_fit.inlier_fit.fit.state)
     # Errors of the arm are added again with the purpose's priors.
     bare = part.with_effects(
         [effect for effect in part.effects if effect.name != f"arm of {arm.robot}"]
@@ -196,10 +195,10 @@ def _start_from_fit(run: RunState, cell_fit: CellFit) -> _RecordedStart:
         observations=replace(part.observations, stops=of),
         effects=tuple(effect.of_stops(kept_stops) for effect in bare.effects),
     )
-    noise = cell_fit.inlier_fit.fit.noise
+    noise = cell_fit.noise
     return _RecordedStart(
         problem,
-        problem.start(frames),
+        problem.start(cell_fit.frames),
         replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
         free_parameters_of_camera(cell_fit.linearised_corners),
         arm.at(stops),
