@@ -20,14 +20,21 @@ from support.rendered import Shot, photograph
 import visioncal
 from visioncal.calibration.pipeline.checkup import to_document as checkup_document
 from visioncal.calibration.run import run
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import NOTE
 from visioncal.interchange.formats import load_for_rereading
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 from visioncal.session.columns import POSE, pose_row
-from visioncal.simulation import BOARDS, CellOptions, read_truth, simulate, write_session
+from visioncal.simulation import (
+    BOARDS,
+    CellOptions,
+    cell_session,
+    read_truth,
+    simulate,
+    write_session,
+)
 
 
 @pytest.fixture(scope="module")
@@ -308,6 +315,33 @@ def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
     done = command("doctor", folder, "--json")
     assert done.status == 3
     assert json.loads(done.out) == checkup_document(found)
+
+
+# Turns by up to two degrees.
+SLIGHT = {"tilt_rad": (0.0, 0.015), "roll_rad": 0.015}
+
+
+@pytest.mark.parametrize(
+    ("mount", "motion"),
+    [
+        ("eye-in-hand", {"motion": "one_axis"}),
+        ("eye-to-hand", {"motion": "one_axis"}),
+        ("eye-to-hand", {"motion": "translation"}),
+        ("eye-in-hand", SLIGHT),
+    ],
+)
+def test_a_motion_that_determines_too_little_is_named_as_calibrate_names_it(mount, motion):
+    cell = simulate(CellOptions(mount=mount, views=12, **motion))
+    session = cell_session(cell, "poor", seen="corners")
+    refused = raised(DegenerateError, "hand-eye", visioncal.calibrate, session)
+    (found,) = visioncal.doctor(session).findings
+    assert found.kind == "motion"
+    said = f"hand-eye: the camera's offset {'from' if 'translation' in str(motion) else 'along'}"
+    assert found.words.startswith(said)
+    assert refused.message.startswith(said)
+    # How the views turn, which is of their poses alone.
+    assert found.words.rpartition(": ")[2] == refused.message.rpartition(": ")[2]
+    assert str(found.do) == refused.next_step
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -13,6 +13,7 @@ from support.refusals import raised
 from support.slopes import twists
 from support.whole_cells import OPTIONS, recorded
 
+from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert
@@ -369,6 +370,11 @@ def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
     caught = raised(DegenerateError, words, calibrate, turned(0.3)[1])
     assert "base_b's offset along the cell's z" in caught.culprits
     assert "all 14 stops of robot b turn about base_b's z to within 0." in caught.message
+    (found,) = doctor(turned(0.3)[1]).findings
+    assert found.kind == "motion"
+    assert found.words.startswith("cell: base_b's offset along the cell's z has a predicted sigma")
+    assert found.do.words == caught.next_step
+    assert doctor(turned(35.0)[1]).is_sound
 
 
 def test_noise_refuses_nothing():

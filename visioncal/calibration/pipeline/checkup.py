@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from visioncal.calibration.pipeline.explaining import more_views
+from visioncal.calibration.pipeline.judging import words_of
 from visioncal.calibration.pipeline.run_state import RunState, initial_state
-from visioncal.calibration.pipeline.solving import first_inliers
+from visioncal.calibration.pipeline.solving import initial_inliers
+from visioncal.calibration.pipeline.starting import find_start
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.image_checks import unseen_cause
@@ -20,8 +23,10 @@ from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Mount, Progress
+from visioncal.core.types import Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
+from visioncal.estimation.observability import check_determined
+from visioncal.estimation.solve import starting_noise
 from visioncal.robot.model import REPEATABILITY
 from visioncal.session import Session
 
@@ -123,8 +128,8 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
     ]
     yield from sorted(warnings, key=lambda value: value.do is None)
     if error is None:
-        if not hint and run.mount is not None:
-            yield from _motion(run, run.mount)
+        if not hint:
+            yield from _motion(run)
         # Views that cannot be used, but for those that warnings name already.
         named = {view for warning in run.warnings for view in warning.views}
         lost = {view: why for view, why in run.reasons.items() if view not in named}
@@ -133,16 +138,26 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
             yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", do)
 
 
-def _refused(kind: str, error: VisioncalError) -> Finding:
-    return Finding(kind, error.message, Remedy(error.next_step) if error.next_step else None)
+def _refused(kind: str, error: VisioncalError, more: Remedy | None = None) -> Finding:
+    if more is None and error.next_step:
+        more = Remedy(error.next_step)
+    return Finding(kind, error.message, more)
 
 
-def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
-    """Findings on too poor motion, on outliers, and on what all views disagree by."""
+def _motion(run: RunState) -> Iterator[Finding]:
+    """Findings on too poor motion; of one camera and one robot on outliers and scatter, too."""
     try:
-        cell, inliers = first_inliers(read_cell(run), run, mount)
+        start = find_start(read_cell(run), run)
+        cell, problem = start.cell, start.problem
+        check_determined(
+            problem, start.state, starting_noise(problem), words_of(cell, problem),
+            {frame: look.pixel_px for frame, look in run.cameras.items() if look.pixel_px},
+        )  # fmt: skip
+        if cell.mount is None:
+            return
+        inliers = initial_inliers(start)
     except VisioncalError as error:
-        yield _refused("motion", error)
+        yield _refused("motion", error, more_views(error, run))
         return
     views = tuple(cell.rows[at].view for at in np.flatnonzero(~inliers.used).tolist())
     if views:

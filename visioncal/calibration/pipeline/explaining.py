@@ -7,6 +7,7 @@ from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.misread_poses import with_misreading
 from visioncal.calibration.suspects.ranking import add_views_remedy
 from visioncal.core.errors import DegenerateError, VisioncalError
+from visioncal.core.verdict import Remedy
 
 
 def explained(
@@ -28,9 +29,19 @@ def explained(
     for misread in state.misread or ():
         # Directions that are undetermined with misread poses mean nothing.
         return type(error)(misread.words, next_step=str(misread.do))
-    can = is_pair and bool(state.scenes) and (state.robot is None or state.robot.can_tilt)
+    plan = more_views(error, state)
+    return (
+        error
+        if plan is None
+        else type(error)(error.message, culprits=error.culprits, next_step=str(plan))
+    )
+
+
+def more_views(error: VisioncalError, state: RunState) -> Remedy | None:
+    """The command for more views where these determine too little; None where it has none."""
+    can = state.mount is not None and bool(state.scenes)
+    can &= state.robot is None or state.robot.can_tilt
     if not (can and isinstance(error, DegenerateError)):
-        return error
+        return None
     purpose = "" if state.level in ("auto", "hand-eye") else " --for kinematics"
-    plan = add_views_remedy(error.next_step, modelled=state.robot is not None, purpose=purpose)
-    return DegenerateError(error.message, culprits=error.culprits, next_step=str(plan))
+    return add_views_remedy(error.next_step, modelled=state.robot is not None, purpose=purpose)

@@ -32,6 +32,7 @@ from visioncal.estimation.observability import (
     edge_directions,
     too_little_motion,
 )
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
 from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
 from visioncal.robot.model import REPEATABILITY
@@ -268,15 +269,16 @@ def check_answer(run: RunState) -> None:
         return
     fit = run.cell_fit.fit
     is_estimated = bool(fit.sigmas_px) and any(scene.estimated for scene in run.scenes.values())
-    words = chain_words(fit.problem, run.mount) if run.mount is not None else _words_of(run)
+    words = words_of(run.cell_fit.cell, fit.problem)
     check_determined(
         *(fit.problem, fit.state, fit.noise, words, fit.sigmas_px), with_first_effect=is_estimated
     )
 
 
-def _words_of(run: RunState) -> CellWords:
-    """What is wrong with the motion of a cell that leaves a frame undetermined, and what to do."""
-    cell, part = run.cell_fit.cell, run.cell_fit.fit.problem
+def words_of(cell: Cell, part: Problem) -> CellWords:
+    """What is wrong with a motion that leaves a frame undetermined, and what to do."""
+    if cell.mount is not None:
+        return chain_words(part, cell.mount)
 
     def advice(frame: str, _: str) -> str:
         frame = frame.partition("@")[0]

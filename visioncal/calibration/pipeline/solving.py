@@ -28,7 +28,7 @@ from visioncal.calibration.stages.refine import PRINTED_SCALE, refine_jointly, w
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.limits import CONTRADICTION
-from visioncal.core.types import Mask, Mount
+from visioncal.core.types import Mask
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import fit_jointly, target_sizes
@@ -341,21 +341,6 @@ def _with_effects(inliers: InlierFit, effects: Sequence[Effect]) -> InlierFit:
     problem = inliers.problem.with_effects(effects)
     state = State(inliers.fit.state.edges, problem.start_values)
     return replace(inliers, problem=problem, fit=replace(inliers.fit, state=state)).refitted()
-
-
-def first_inliers(cell: Cell, observed: Observed, mount: Mount) -> tuple[Cell, InlierFit]:
-    """Inliers of one robot and one camera before lens, board and arm are fitted.
-
-    Returns:
-        The cell, its rows in the order of the fit, and the inliers.
-
-    Raises:
-        DegenerateError: The geometry of the motion alone does not determine the result.
-    """
-    start = find_start(cell, observed)
-    words = chain_words(start.problem, mount)
-    check_determined(start.problem, start.state, starting_noise(start.problem), words)
-    return start.cell, initial_inliers(start)
 
 
 def initial_inliers(start: Start) -> InlierFit:
