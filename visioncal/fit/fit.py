@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -24,6 +25,18 @@ class LeftOut:
     predicted: FloatArray  # (n, 6, 6) covariance of the prediction.
     own: FloatArray  # (n, 6, 6) covariance of the sighting's own pose.
     directions: IntArray  # (n,) how many of the six it has: three last of a place.
+
+    @classmethod
+    def of_none(cls, cell: Cell) -> Self:
+        """The deviations of a cell's n sightings, to be `put`."""
+        count = len(cell.sightings)
+        places = [isinstance(sighting.evidence, MeasuredPlace) for sighting in cell.sightings]
+        blocks = np.zeros((count, 6, 6))
+        return cls(np.zeros((count, 6)), blocks, blocks.copy(), np.where(places, 3, 6))
+
+    def put(self, rows: IntArray, found: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+        """Fills in `away`, `predicted` and `own` of some sightings."""
+        self.away[rows], self.predicted[rows], self.own[rows] = found
 
     @cached_property
     def squares(self) -> FloatArray:
@@ -120,21 +133,10 @@ class Fit:
         z, the estimate without them is (1 - C H)^-1 (z - C g), with covariance (1 - C H)^-1 C: it
         follows from the fit alone, nothing is fitted again (cf. Cook and Weisberg 1982, 2.2).
         """
-        count = len(self.used)
-        away, covariance, own = (
-            np.zeros((count, 6)),
-            np.zeros((count, 6, 6)),
-            np.zeros((count, 6, 6)),
-        )
-        directions = np.full(count, 6)
+        found = LeftOut.of_none(self.cell)
         for gram in self.grams if grams is None else grams:
-            places = [
-                i for i in gram.rows if isinstance(self.cell.sightings[i].evidence, MeasuredPlace)
-            ]
-            directions[places] = 3
-            at = gram.rows
-            away[at], covariance[at], own[at] = self._left_out(gram)
-        return LeftOut(away, covariance, own, directions)
+            found.put(gram.rows, self._left_out(gram))
+        return found
 
     def _left_out(self, gram: Gram) -> tuple[FloatArray, FloatArray, FloatArray]:
         weighted, spread, f = (
@@ -165,16 +167,71 @@ class Fit:
         without = np.linalg.inv(np.eye(gram.local) - part * covariance @ information)
         pulled = (covariance @ pull[:, :, None])[:, :, 0]
         values = (without @ (values - part[:, :, 0] * pulled)[:, :, None])[:, :, 0]
-        covariance = without @ covariance
-        # The pose that the sighting's rows alone have, given what else its rows depend on.
-        pose = information[:, :6, :6]
-        scale = np.maximum(np.trace(pose, axis1=1, axis2=2), 1.0)
-        diagonal = np.diagonal(pose, axis1=1, axis2=2) + 1e-3 * scale[:, None]
-        alone = np.linalg.inv(pose + _RIDGE * diagonal[:, :, None] * np.eye(6))
-        other = alone @ information[:, :6, 6:]
-        mapped = np.concatenate([np.tile(np.eye(6), (len(other), 1, 1)), other], axis=2)
-        away = (alone @ pull[:, :6, None])[:, :, 0] - (mapped @ values[:, :, None])[:, :, 0]
-        return away, mapped @ covariance @ np.swapaxes(mapped, 1, 2), alone
+        return _off(weighted, values, without @ covariance)
+
+    def stops_left_out(self) -> LeftOut:
+        """Leaves each stop out in turn: no sighting at a stop tells where the others there are.
+
+        As `left_out`, but that all rows at a stop are removed from the common unknowns' information
+        at once, and its flanges err by what all others say of their noise.
+        """
+        found, seen = LeftOut.of_none(self.cell), dict[int, list[tuple[int, int]]]()
+        weighted = [gram.weighted(self.estimate.logs) for gram in self.grams]
+        full = [gram.in_common(own) for gram, own in zip(self.grams, weighted, strict=True)]
+        for index, gram in enumerate(self.grams):
+            for row, stop in enumerate(gram.stops.tolist()):
+                seen.setdefault(stop, []).append((index, row))
+        for stop, sightings in seen.items():
+            columns = np.unique(np.concatenate([self.grams[at].columns for at, _ in sightings]))
+            added = np.zeros((len(columns) + 1, len(columns) + 1))
+            for at, row in sightings:
+                gram = self.grams[at]
+                if self.used[gram.rows[row]]:
+                    own = np.append(np.searchsorted(columns, gram.columns), len(columns))
+                    f = 6 * len(gram.flanges)
+                    added[own[:, None], own] += full[at][row, f:, f:]
+            values, covariance = self._without_stop(stop, columns, added)
+            for at, row in sightings:
+                gram = self.grams[at].take(np.arange(len(self.grams[at].rows)) == row)
+                own = np.searchsorted(columns, gram.columns)
+                sigmas = [self.sizes[f"{u} {name}"] for name in gram.flanges for u in ("rad", "m")]
+                past = [-self.linearised.errors[name][stop] for name in gram.flanges]
+                spread, f = gram.spread(), 6 * len(gram.flanges)
+                by_errors, by_columns = spread[:, :, :f], spread[:, :, f:]
+                local = by_columns @ values[own] + by_errors @ np.concatenate([np.zeros(0), *past])
+                own_noise = by_errors * np.repeat(sigmas, 3) ** 2
+                both = np.concatenate(
+                    [own_noise, by_columns @ covariance[own[:, None], own]], axis=2
+                )
+                within = both @ np.swapaxes(spread, 1, 2)
+                found.put(gram.rows, _off(weighted[at][row : row + 1], local, within))
+        return found
+
+    def _without_stop(
+        self, stop: int, columns: IntArray, added: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Estimate (c,) and covariance (c, c) of columns without the rows at a stop.
+
+        Args:
+            stop: The stop.
+            columns: (c,) all on which its sightings depend.
+            added: (c + 1, c + 1) Gram matrix of its used sightings by these, and the residual.
+        """
+        for body, solved in zip(self.mixed.bodies, self.estimate.bodies, strict=True):
+            unit = int(np.searchsorted(body.stops, stop))
+            if unit == len(body.stops) or body.stops[unit] != stop:
+                continue
+            at = np.isin(body.columns, columns)
+            own = np.append(np.searchsorted(columns, body.columns[at]), len(columns))
+            # By errors at zero of the unknowns.
+            response = solved.response[unit]
+            none = solved.errors[unit] - response @ self.estimate.values[body.columns]
+            by = np.column_stack([-response[:, at], none])
+            added[own[:, None], own] -= by.T @ np.linalg.solve(solved.own[unit], by)
+        covariance = self.estimate.covariance[columns[:, None], columns]
+        values = self.estimate.values[columns] - covariance @ added[:-1, -1]
+        without = np.linalg.inv(np.eye(len(columns)) - covariance @ added[:-1, :-1])
+        return without @ values, without @ covariance
 
     def predict(self, seer: str, seen: str, moments: Moments) -> Prediction:
         """Predicts where a frame will be in another, with covariance.
@@ -215,3 +272,25 @@ class Fit:
         path, moments = self.cell.tree.path(*sighting.pair), self.cell.moments.take(stop)
         at = predicted(self.cell, self.unknowns, self.state, path, moments, errors)
         return np.asarray(at.poses[0])
+
+
+def _off(
+    weighted: FloatArray, values: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How far poses by the own rows of k sightings are from predictions, and both covariances.
+
+    Args:
+        weighted: (k, d + 1, d + 1) Gram matrices of the sightings.
+        values: (k, d) predicted local columns.
+        covariance: (k, d, d) theirs.
+    """
+    information, pull = weighted[:, :-1, :-1], weighted[:, :-1, -1]
+    # The pose that the sighting's rows alone have, given what else its rows depend on.
+    pose = information[:, :6, :6]
+    scale = np.maximum(np.trace(pose, axis1=1, axis2=2), 1.0)
+    diagonal = np.diagonal(pose, axis1=1, axis2=2) + 1e-3 * scale[:, None]
+    alone = np.linalg.inv(pose + _RIDGE * diagonal[:, :, None] * np.eye(6))
+    other = alone @ information[:, :6, 6:]
+    mapped = np.concatenate([np.tile(np.eye(6), (len(other), 1, 1)), other], axis=2)
+    away = (alone @ pull[:, :6, None])[:, :, 0] - (mapped @ values[:, :, None])[:, :, 0]
+    return away, mapped @ covariance @ np.swapaxes(mapped, 1, 2), alone
