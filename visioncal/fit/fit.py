@@ -96,6 +96,19 @@ class Fit:
         return {size.name: at for size, at in zip(self.unknowns.sizes, values, strict=True)}
 
     @cached_property
+    def freedom(self) -> float:
+        """Degrees of freedom by which the flanges' noise is known."""
+        stops = len({self.cell.sightings[at].stop for at in np.flatnonzero(self.used)})
+        return max(6.0 * stops - self.unknowns.count / 2, 6.0)
+
+    @cached_property
+    def of_corners(self) -> float:
+        """Degrees of freedom by which the corners' noise is known."""
+        corners = (self.cell.sightings[at].corners for at in np.flatnonzero(self.used))
+        rows = sum(2.0 * len(at.ids) - 6.0 for at in corners if at is not None)
+        return max(rows - self.unknowns.count, 6.0)
+
+    @cached_property
     def whole(self) -> FloatArray:
         """(p, p) covariance of the unknowns, in units of their columns."""
         added = 0.0 if self.considered is None else self.considered

@@ -10,6 +10,7 @@ grows with the number of corners.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -33,8 +34,11 @@ class Gram:
     are `picked`.
     """
 
+    pair: tuple[str, str]  # Seer and seen.
     rows: IntArray  # (k,) indices of the sightings.
     stops: IntArray  # (k,)
+    moments: Moments  # (k) theirs.
+    distances: FloatArray  # (k,) of the board's middle along the camera's axis [m]; ones elsewhere.
     # By size (-1 for none): (k, d + 1, d + 1) Gram matrices, and (k,) numbers of rows.
     parts: tuple[tuple[int, FloatArray, FloatArray], ...]
     flanges: tuple[str, ...]  # Those in the path that err.
@@ -43,7 +47,7 @@ class Gram:
     units: FloatArray  # (n,) what one unit of these is.
     columns: IntArray  # (c + n,) of the unknowns.
     poses: FloatArray  # (k, 4, 4) `seer_from_seen` as predicted.
-    slopes: Mapping[str, FloatArray]  # (k, 6, 6) of the pose by each edge's right perturbation.
+    by_effects: Mapping[str, FloatArray]  # (k, 6, 6) of the pose by effects on each edge.
 
     @property
     def local(self) -> int:
@@ -83,9 +87,10 @@ class Gram:
         return replace(
             self,
             rows=self.rows[mask], stops=self.stops[mask], moves=self.moves[mask],
+            moments=self.moments.take(np.flatnonzero(mask)), distances=self.distances[mask],
             parts=tuple((size, grams[mask], counts[mask]) for size, grams, counts in self.parts),
             poses=self.poses[mask],
-            slopes={name: slope[mask] for name, slope in self.slopes.items()},
+            by_effects={name: slope[mask] for name, slope in self.by_effects.items()},
         )  # fmt: skip
 
 
@@ -138,6 +143,13 @@ class Pair:
             for at in self.corners
         ]
         return np.concatenate(each)
+
+    def padded(self, rows: FloatArray) -> FloatArray:
+        """(k, most corners, ...) of (n, ...) rows of corners; zeros where there are fewer."""
+        within = np.arange(len(rows)) - (np.cumsum(self.counts) - self.counts)[self.owner]
+        found = np.zeros((len(self.rows), int(self.counts.max()), *rows.shape[1:]))
+        found[self.owner, within] = rows
+        return found
 
     @cached_property
     def basis(self) -> FloatArray:
@@ -227,14 +239,16 @@ def linearised(
 def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gram:
     errors = {name: errors[pair.stops] for name, errors in state.errors.items()}
     at = predicted(cell, unknowns, state, pair.path, pair.moments, errors)
+    distances, own = np.ones(len(at.poses)), dict[Key, IntArray]()
     if pair.corners:
-        parts, own, distances = _corner_parts(unknowns, state, pair, at.poses)
+        distances = at.poses[:, 2, 3] + at.poses[:, 2, :3] @ pair.points.mean(axis=0)
+        rows, own = corner_rows(unknowns, state, pair, at.poses, distances)
+        padded = pair.padded(rows).reshape(len(pair.rows), -1, rows.shape[2])
+        grams: FloatArray = np.swapaxes(padded, 1, 2) @ padded
+        size, counts = unknowns.size_of(f"px {pair.names[0]}"), np.asarray(2.0 * pair.counts)
+        parts: _Parts = ((size, grams, counts),)
     else:
-        parts, own, distances = (
-            _measured_parts(unknowns, pair, at.poses),
-            {},
-            np.ones(len(at.poses)),
-        )
+        parts = _measured_parts(unknowns, pair, at.poses)
     seer, _ = pair.names
     frames = [step.frame for step in pair.path]
     flanges = tuple(name for name in unknowns.erring if name in frames)
@@ -259,21 +273,21 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
     free = {key: places for key, places in own.items() if key in unknowns}
     kept = {key: places[: unknowns[key].count] for key, places in free.items()}
     return Gram(
-        pair.rows, pair.stops, parts, flanges, moves,
+        pair.names, pair.rows, pair.stops, pair.moments, distances, parts, flanges, moves,
         np.concatenate([np.zeros(0, int), *kept.values()]).astype(np.int64),
         np.concatenate([np.zeros(0), *(unknowns[key].units for key in kept)]),
         np.concatenate([np.zeros(0, int), *columns, *(unknowns.columns(*key) for key in kept)]),
-        at.poses, at.slopes,
+        at.poses, at.by_effects,
     )  # fmt: skip
 
 
-_Parts = tuple[tuple[int, FloatArray, FloatArray], ...]
+_Parts: TypeAlias = tuple[tuple[int, FloatArray, FloatArray], ...]
 
 
-def _corner_parts(
-    unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray
-) -> tuple[_Parts, dict[Key, IntArray], FloatArray]:
-    """Gram matrices of corners, the local columns of what is their own, and relative distances."""
+def corner_rows(
+    unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray, distances: FloatArray
+) -> tuple[FloatArray, dict[Key, IntArray]]:
+    """Rows (n, 2, d + 1) of corners, and the local columns of what is their own."""
     seer, seen = pair.names
     lens, owner, basis = unknowns.camera(state, seer), pair.owner, pair.basis[pair.ids]
     points = pair.points[pair.ids] + basis @ state.values["shape", seen]
@@ -281,9 +295,6 @@ def _corner_parts(
     in_camera = (turns @ points[:, :, None])[:, :, 0] + poses[owner, :3, 3]
     found = project_with_jacobian(lens, in_camera)
     by_point = found.jacobian_point @ turns
-    middle = pair.points.mean(axis=0)
-    far = poses[:, 2, 3] + poses[:, 2, :3] @ middle
-    distances = far / np.median(far)
     columns: dict[Key, FloatArray] = {
         ("lens", seer): found.jacobian_intrinsics,
         ("shape", seen): by_point @ basis,
@@ -293,20 +304,17 @@ def _corner_parts(
         if effect.place == "lens" and effect.frame == seer:
             moved = effect.columns(pair.moments, distances) @ state.values["effect", effect.name]
             residual = residual - (found.jacobian_intrinsics @ moved[owner, :, None])[:, :, 0]
+    if seer in unknowns.fields:
+        # Where corners are predicted: at those seen, a field could explain their noise.
+        columns["field", seer] = field = unknowns.fields[seer].at(found.px)
+        residual = residual - field @ state.values["field", seer]
     lines = [by_point @ -skew(points), by_point, *columns.values(), residual[:, :, None]]
     rows = np.concatenate(lines, axis=2)
     # Corners behind the camera say nothing.
     rows = np.where(np.isfinite(rows).all(axis=(1, 2), keepdims=True), rows, 0.0)
     rows *= pair.weights[:, None, None]
-    within = np.arange(len(owner)) - (np.cumsum(pair.counts) - pair.counts)[owner]
-    padded = np.zeros((len(pair.rows), int(pair.counts.max()), *rows.shape[1:]))
-    padded[owner, within] = rows
-    padded = padded.reshape(len(pair.rows), -1, rows.shape[2])
     ends = 6 + np.cumsum([0, *(value.shape[2] for value in columns.values())])
-    own = {key: np.arange(ends[at], ends[at + 1]) for at, key in enumerate(columns)}
-    grams: FloatArray = np.swapaxes(padded, 1, 2) @ padded
-    part = unknowns.size_of(f"px {seer}"), grams, np.asarray(2.0 * pair.counts)
-    return (part,), own, np.asarray(distances)
+    return rows, {key: np.arange(ends[at], ends[at + 1]) for at, key in enumerate(columns)}
 
 
 def _measured_parts(unknowns: Unknowns, pair: Pair, poses: FloatArray) -> _Parts:

@@ -50,9 +50,15 @@ class Search:
         """The search of others."""
         return replace(self, unknowns=unknowns)
 
-    def run(self, state: State, used: Mask) -> tuple[Fit, LeftOut]:
-        """The fit of the sightings that agree, from a state and a first guess of these."""
-        fit, left_out = self._agreeing(self._sized(state, used, None))
+    def run(self, state: State, used: Mask, known: Fit | None = None) -> tuple[Fit, LeftOut]:
+        """The fit of the sightings that agree.
+
+        Args:
+            state: Where to start.
+            used: (n,) first guess of the sightings that agree.
+            known: A fit with other unknowns, whose sizes are the first ones.
+        """
+        fit, left_out = self._agreeing(self._sized(state, used, known))
         for _ in range(_ROUNDS):
             before = fit.used
             fit, left_out = self._agreeing(self._sized(fit.state, before, fit))
@@ -67,15 +73,20 @@ class Search:
         grams = linearised(self.cell, self.unknowns, state, self.pairs)
         self.effort.linearisations += 1
         mixed = mixed_model(self.cell, self.unknowns, state, grams, used)
-        closed = self.unknowns.closed if last is None else last.unknowns.closed
-        unknowns = self.unknowns.closing(closed)
+        unknowns = self.unknowns if last is None else self.unknowns.closing(last.unknowns.closed)
         starts, (low, high) = unknowns.starts(), unknowns.bounds()
-        begin = starts if last is None else np.clip(last.estimate.logs, low + 2.0, high)
+        begin = starts.copy()
+        for name, value in () if last is None else last.sizes.items():
+            at = unknowns.size_of(name)
+            # Not from a bound: there, a size has no slope.
+            begin[at] = np.clip(np.log(value), low[at] + 2.0, high[at])
         found = most_likely(mixed, begin, low, high)
         random = {size for size, *_ in unknowns.priors() if size >= 0}
         found, more = significant(mixed, found, starts, low, high, sorted(random))
         names = {unknowns.sizes[size].name for size in more}
-        return self._fit(state, grams, used, unknowns.closing(closed | names), mixed, found)
+        return self._fit(
+            state, grams, used, unknowns.closing(unknowns.closed | names), mixed, found
+        )
 
     def _fit(
         self, state: State, grams: tuple[Gram, ...], used: Mask, unknowns: Unknowns, mixed: Mixed,

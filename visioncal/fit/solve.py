@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
+from visioncal.fit.candidates import opened
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.search import Effort, Search, nearest
 from visioncal.fit.start import Start, start_of
@@ -30,6 +31,8 @@ from visioncal.vision.camera import intrinsics
 _SPARE = 10
 # Stops that determine errors of an arm's links.
 _FEWEST_STOPS = 8
+# Most effects that are opened, one after the other.
+_OPENED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +54,14 @@ def solve(cell: Cell) -> Solved:
     """Fits a cell."""
     start = start_of(cell)
     effects = effects_of(start.cell)
-    unknowns = unknowns_of(start, effects)
-    search = Search.of(start.cell, unknowns)
+    search = Search.of(start.cell, unknowns_of(start, effects))
     fit, left_out = search.run(state_of(start, effects), nearest(start))
+    for _ in range(_OPENED):
+        wider = opened(fit, search.pairs)
+        if wider is None:
+            break
+        search = search.with_unknowns(wider[0])
+        fit, left_out = search.run(wider[1], fit.used, fit)
     return Solved(fit, left_out, start, search.effort)
 
 
@@ -107,7 +115,7 @@ def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
         noise += [Size(f"rad {name}", 3e-3, 1e-8, 0.3), Size(f"m {name}", 2e-3, 1e-8, 0.3)]
         ratios.append((f"rad {name}", f"m {name}"))
     return Unknowns(
-        tuple(members), tuple(effects), start.lenses, erring, tuple(noise), tuple(ratios)
+        tuple(members), tuple(effects), start.lenses, erring, tuple(noise), ratios=tuple(ratios)
     )
 
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Target
+from visioncal.fit.lens_field import Field, by_lens
 from visioncal.model.boards import BEND, PLANE, SHAPES, SIZE
 from visioncal.model.effects import Effect, Size
-from visioncal.vision.camera import intrinsics, project_with_jacobian, with_intrinsics
+from visioncal.vision.camera import intrinsics, with_intrinsics
 
 Kind: TypeAlias = Literal["edge", "lens", "shape", "effect", "field"]
 Key: TypeAlias = tuple[Kind, str]
@@ -124,6 +125,7 @@ class Unknowns:
     # Flanges that err at each stop: sizes `rad NAME` and `m NAME`.
     erring: tuple[str, ...]
     noise: tuple[Size, ...]  # Of sightings and flanges.
+    fields: Mapping[str, Field] = field(default_factory=dict)  # Of lenses with one, by camera.
     # Pairs of sizes [rad], [m], whose ratio has a prior.
     ratios: tuple[tuple[str, str], ...] = ()
     closed: frozenset[str] = frozenset()  # Sizes that are held at their lower bounds.
@@ -267,14 +269,15 @@ def random_effect(effect: Effect) -> Vector:
     return Vector(("effect", effect.name), (prior,), none, np.ones(effect.count))
 
 
+def lens_field(frame: str, at: Field, size_px: float) -> Vector:
+    """The field of a lens, whose size is near some value [px]."""
+    size, count = Size(f"field {frame}", size_px, 1e-4, 5.0), 2 * len(at.sigmas)
+    prior = Prior(np.arange(count), size)
+    return Vector(("field", frame), (prior,), np.zeros(count), np.ones(count))
+
+
 def flange_noise(flanges: Sequence[str]) -> tuple[Size, ...]:
     """Sizes of what each arm errs by from stop to stop [rad], [m]."""
     return tuple(
         Size(f"{unit} {name}", 1e-3, 1e-8, 0.3) for name in flanges for unit in ("rad", "m")
     )
-
-
-def by_lens(lens: Camera, px: FloatArray) -> FloatArray:
-    """Derivatives (n, 2, q) of (n, 2) corners by the intrinsics, near the lens's own rays."""
-    rays = np.column_stack([(px - lens.matrix[2:]) / lens.matrix[:2], np.ones(len(px))])
-    return np.nan_to_num(project_with_jacobian(lens, rays).jacobian_intrinsics)

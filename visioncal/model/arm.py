@@ -34,12 +34,14 @@ class Moments:
     joints: Mapping[str, FloatArray]  # (k, n) joint angles [rad] of arms whose links are known.
     # (k,) share of the session: -1 at its first stop, 0 at its last. Picks come after it.
     progress: FloatArray
+    stops: IntArray  # (k,) indices of the cell's stops; -1 of other moments.
 
     @classmethod
     def of(cls, arms: Mapping[str, Arm], progress: FloatArray) -> Self:
         """The moments of all stops."""
         known = {name: arm.joints for name, arm in arms.items() if arm.joints is not None}
-        return cls({name: arm.poses for name, arm in arms.items()}, known, progress)
+        poses = {name: arm.poses for name, arm in arms.items()}
+        return cls(poses, known, progress, np.arange(len(progress)))
 
     def take(self, stops: IntArray) -> Self:
         """Some of them, in an order."""
@@ -47,6 +49,7 @@ class Moments:
             {name: poses[stops] for name, poses in self.poses.items()},
             {name: joints[stops] for name, joints in self.joints.items()},
             self.progress[stops],
+            self.stops[stops],
         )
 
     def __len__(self) -> int:

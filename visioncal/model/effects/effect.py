@@ -59,6 +59,6 @@ class Effect(ABC):
 
         Args:
             moments: The k moments.
-            distances: (k,) distance of what is seen from the camera along its axis, over the
-                session's median one.
+            distances: (k,) distance of what is seen from the camera along its axis [m]; ones
+                where a frame moves.
         """

@@ -1,0 +1,90 @@
+"""What more columns would explain, beside what they do explain once they are there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_cells import TABLE, made
+
+from visioncal.fit.assemble import mixed_model
+from visioncal.fit.candidates import effects_of_lenses
+from visioncal.fit.lens_field import field_of_length, waves
+from visioncal.fit.linearise import linearised, pairs_of
+from visioncal.fit.score import of_effect, of_waves
+from visioncal.fit.solve import solve
+from visioncal.fit.unknowns import State, lens_field, random_effect
+
+
+def gain_with(fit, member, size, **changes):
+    """-2 log L of a fit with more unknowns of one size, less that with a size of next to none."""
+    unknowns = replace(fit.unknowns.with_members(member), **changes)
+    values = {**fit.linearised.values, member.key: np.zeros(member.count)}
+    state = State(values, fit.linearised.errors)
+    grams = linearised(fit.cell, unknowns, state, pairs_of(fit.cell))
+    mixed = mixed_model(fit.cell, unknowns, state, grams, fit.used)
+    logs = unknowns.starts()
+    for name, value in fit.sizes.items():
+        logs[unknowns.size_of(name)] = np.log(value)
+    found = []
+    for one in (size, 1e-6 * size):
+        logs[unknowns.size_of(member.priors[0].size.name)] = np.log(one)
+        found.append(mixed.at(logs, is_sloped=False).value)
+    return found[1] - found[0]
+
+
+def expected(score, sigmas):
+    within = np.eye(len(sigmas)) + np.outer(sigmas, sigmas) * score.information
+    pull = sigmas * score.pull
+    return pull @ np.linalg.solve(within, pull) - np.linalg.slogdet(within)[1]
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return solve(made(stops=10, cameras=2).cell).fit
+
+
+def test_a_score_is_the_likelihood_that_an_effect_gains(fit):
+    effects = list(effects_of_lenses(fit))
+    assert {effect.name for effect in effects} >= {"breathing cam", "focus jitter cam_1"}
+    for effect in effects:
+        score = of_effect(fit, effect)
+        changes = {"effects": (*fit.unknowns.effects, effect)}
+        for size in (1e-4, 2e-3):
+            found = gain_with(fit, random_effect(effect), size, **changes)
+            sizes = np.full(effect.count, size)
+            # Values of 1e4, in whose difference 1e-10 of each is rounding.
+            assert found == pytest.approx(expected(score, sizes), rel=1e-3, abs=2e-3)
+
+
+def test_a_score_is_the_likelihood_that_a_field_gains(fit):
+    pairs = pairs_of(fit.cell)
+    px = np.concatenate([pair.px for pair in pairs if pair.names[0] == "cam"])
+    field = field_of_length(0.4, TABLE.resolution[0], px)
+    score = of_waves(fit, pairs, "cam")
+    for size in (0.02, 0.2):
+        found = gain_with(fit, lens_field("cam", field, size), size, fields={"cam": field})
+        wanted = expected(score, size * np.tile(field.sigmas, 2))
+        assert found == pytest.approx(wanted, rel=1e-3, abs=2e-3)
+
+
+def test_a_score_finds_the_size_that_the_likelihood_has(fit):
+    grows = next(e for e in effects_of_lenses(fit) if e.name == "lens grows cam")
+    score = of_effect(fit, grows)
+    size, _ = score.best(np.ones(grows.count), 1e-7, 0.1)
+    around = [expected(score, np.full(grows.count, size * factor)) for factor in (0.4, 1.0, 2.5)]
+    assert around[1] >= max(around[0], around[2]) - 0.2  # sizes are tried in steps of e^0.5
+
+
+def test_waves_have_the_covariance_of_a_smooth_field():
+    rng = np.random.default_rng(0)
+    px = rng.uniform([0, 0], TABLE.resolution, (300, 2))
+    field = field_of_length(0.18, TABLE.resolution[0], px)
+    each = waves(px, field.width, field.orders) * field.sigmas
+    found = each @ each.T
+    squared = np.sum((px[:, None] - px) ** 2, axis=2) / (0.18 * TABLE.resolution[0]) ** 2
+    kernel = np.exp(-0.5 * squared)
+    # Waves end a fifth of the width beyond the image, where they have no slope: as if the field had
+    # a mirror image there, 0.4 widths from its margin, with a covariance of exp(-0.4^2 / 2 0.18^2).
+    assert np.abs(found - kernel).max() < 0.12
+    middle = np.abs(px / TABLE.resolution - 0.5).max(axis=1) < 0.3
+    assert np.abs(found - kernel)[np.ix_(middle, middle)].max() < 0.03

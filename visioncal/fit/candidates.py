@@ -1,0 +1,82 @@
+"""What may act beside noise: opened one at a time, where the score of a fit without it is clear."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.fit.fit import Fit
+from visioncal.fit.lens_field import Field
+from visioncal.fit.linearise import Pair
+from visioncal.fit.score import best_field, of_effect
+from visioncal.fit.sizes import SIGNIFICANT
+from visioncal.fit.unknowns import State, Unknowns, Vector, lens_field, random_effect
+from visioncal.model.effects import Breathing, Effect, FocusJitter, LensGrows
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Something that may be opened."""
+
+    gain: float  # Of the log-likelihood, at its most likely size.
+    member: Vector  # Its unknowns, whose size starts there.
+    effect: Effect | None = None
+    field: Field | None = None
+
+
+def opened(fit: Fit, pairs: Sequence[Pair]) -> tuple[Unknowns, State] | None:
+    """Unknowns with the candidate that explains most, and their state; None where none is clear."""
+    found = max(candidates(fit, pairs), key=lambda one: one.gain, default=None)
+    if found is None or 2.0 * found.gain < SIGNIFICANT:
+        return None
+    unknowns = fit.unknowns.with_members(found.member)
+    if found.effect is not None:
+        unknowns = replace(unknowns, effects=(*unknowns.effects, found.effect))
+    if found.field is not None:
+        camera = found.member.key[1]
+        unknowns = replace(unknowns, fields={**unknowns.fields, camera: found.field})
+    values = {**fit.state.values, found.member.key: np.zeros(found.member.count)}
+    return unknowns, State(values, fit.state.errors)
+
+
+def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
+    """All that are not open yet, with their scores."""
+    known = {effect.name for effect in fit.unknowns.effects}
+    for effect in effects_of_lenses(fit):
+        if effect.name not in known:
+            bounds = effect.size
+            size, gain = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
+            yield Candidate(gain, starting_at(random_effect(effect), size), effect)
+    for camera, lens in fit.unknowns.lenses.items():
+        own = [pair for pair in pairs if pair.names[0] == camera and pair.corners]
+        if ("lens", camera) not in fit.unknowns or camera in fit.unknowns.fields or not own:
+            continue
+        field, size, gain = best_field(fit, own, camera)
+        if fit.cell.cameras[camera].stated is None:
+            field = field.beside(lens, np.concatenate([pair.px for pair in own]))
+        yield Candidate(gain, lens_field(camera, field, size), None, field)
+
+
+def starting_at(member: Vector, size: float) -> Vector:
+    """An unknown whose sizes start at a value."""
+    priors = tuple(
+        replace(prior, size=replace(prior.size, start=size)) if prior.size else prior
+        for prior in member.priors
+    )
+    return replace(member, priors=priors)
+
+
+def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
+    """Effects that a lens may have."""
+    stops = len(fit.cell.moments)
+    for camera, lens in fit.unknowns.lenses.items():
+        if ("lens", camera) not in fit.unknowns:
+            continue
+        fx, fy = lens.matrix[:2].tolist()
+        q = 4 + len(lens.distortion)
+        distances = [gram.distances for gram in fit.grams if gram.pair[0] == camera]
+        middle = float(np.median(np.concatenate(distances)))
+        yield LensGrows(camera, (fx, fy), q)
+        if fit.cell.cameras[camera].focus == "auto":
+            yield Breathing(camera, (fx, fy), q, middle)
+            yield FocusJitter(camera, (fx, fy), q, stops)

@@ -1,0 +1,178 @@
+"""What more columns would explain, from the factorisation of a fit: nothing is fitted again.
+
+With the columns A, and P what the fit leaves of the rows' information, A'P y is the score of their
+values and A'P A their information; the likelihood of values ~ N(0, s^2) at the fit's other sizes
+follows for any s (Rao 1948; for variances Verbeke and Molenberghs 2003).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.types import FloatArray
+from visioncal.fit.fit import Fit
+from visioncal.fit.lens_field import LENGTHS, Field, field_of_length, orders_of_waves, waves
+from visioncal.fit.linearise import Gram, Pair, corner_rows
+from visioncal.model.effects import Effect
+
+# Sizes that are tried, over one that the data would just show.
+_TRIED = np.exp(np.linspace(-3.0, 5.0, 17))
+# Least size of a wave, over the uncertainty of a mean of all corners.
+_SEEN = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Added:
+    """c more columns on the rows of some sightings, which the fit uses."""
+
+    gram: Gram
+    local: FloatArray  # (k, c, d + 1) products with the sightings' local columns and residual.
+    own: FloatArray  # (c, c) of the columns with each other, summed over the sightings.
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """What the rows say of c more columns."""
+
+    pull: FloatArray  # (c,) A'P y.
+    information: FloatArray  # (c, c) A'P A.
+    freedom: float  # Of the residuals by which noise is known.
+
+    def gain(self, sigmas: FloatArray) -> float:
+        """Log Bayes factor of values with (c,) standard deviations, against none.
+
+        The level of the noise is integrated out: found without the columns, it is too large where
+        they act.
+        """
+        pull = sigmas * self.pull
+        within = np.eye(len(pull)) + np.outer(sigmas, sigmas) * self.information
+        square = float(pull @ np.linalg.solve(within, pull))
+        student = -0.5 * self.freedom * np.log1p(-min(square / self.freedom, 0.999))
+        return float(student - 0.5 * np.linalg.slogdet(within)[1])
+
+    def best(self, sigmas: FloatArray, low: float, high: float) -> tuple[float, float]:
+        """The most likely of some sizes of columns with (c,) relative sigmas, and its gain."""
+        scaled = self.information * np.outer(sigmas, sigmas)
+        values, vectors = np.linalg.eigh(scaled)
+        values, pull = np.maximum(values, 0.0), vectors.T @ (sigmas * self.pull)
+        # A size of which one direction is as large as its uncertainty.
+        unit = 1.0 / np.sqrt(max(float(values.max(initial=0.0)), 1e-300))
+        sizes = np.unique(np.clip(unit * _TRIED, low, high))
+        within = 1.0 + sizes[:, None] ** 2 * values
+        squares = np.sum(sizes[:, None] ** 2 * pull**2 / within, axis=1)
+        student = -0.5 * self.freedom * np.log1p(-np.minimum(squares / self.freedom, 0.999))
+        gains = student - 0.5 * np.log(within).sum(axis=1)
+        return float(sizes[gains.argmax()]), float(gains.max())
+
+
+def score(fit: Fit, added: Sequence[Added], count: int, freedom: float) -> Score:
+    """The score of `count` more columns, on rows whose noise is known by so many residuals."""
+    p, estimate = fit.unknowns.count, fit.estimate
+    pull, own, with_common = np.zeros(count), np.zeros((count, count)), np.zeros((p, count))
+    with_errors = [np.zeros((len(body.stops), body.width, count)) for body in fit.mixed.bodies]
+    for part in added:
+        gram, f = part.gram, 6 * len(part.gram.flanges)
+        full = np.swapaxes(part.local[:, :, :-1] @ gram.spread(), 1, 2)
+        pull += part.local[:, :, -1].sum(axis=0)
+        own += part.own
+        np.add.at(with_common, gram.columns, full[:, f:].sum(axis=0))
+        if f:
+            at = next(i for i, b in enumerate(fit.mixed.bodies) if gram.flanges[0] in b.flanges)
+            body = fit.mixed.bodies[at]
+            places = [6 * body.flanges.index(name) + np.arange(6) for name in gram.flanges]
+            units = np.searchsorted(body.stops, gram.stops)
+            np.add.at(with_errors[at], (units[:, None], np.concatenate(places)), full[:, :f])
+    pull -= with_common.T @ estimate.values
+    reduced = with_common.copy()
+    for body, solved, cross in zip(fit.mixed.bodies, estimate.bodies, with_errors, strict=True):
+        pull -= np.einsum("umc,um->c", cross, solved.errors)
+        flat = cross.reshape(-1, count)
+        own -= flat.T @ (solved.own @ cross).reshape(-1, count)
+        reduced[body.columns] += solved.response.reshape(len(flat), -1).T @ flat
+    information = own - reduced.T @ estimate.covariance @ reduced
+    return Score(pull, (information + information.T) / 2, freedom)
+
+
+def of_effect(fit: Fit, effect: Effect) -> Score:
+    """The score of an effect that is not among the unknowns."""
+    added = []
+    for gram in _used(fit):
+        if effect.place == "edge" and effect.frame in gram.by_effects:
+            columns = effect.columns(gram.moments, np.ones(len(gram.rows)))
+            first, moves = 0, gram.by_effects[effect.frame] @ columns
+        elif effect.place == "lens" and effect.frame == gram.pair[0] and gram.local > 6:
+            first, moves = 6, effect.columns(gram.moments, gram.distances)
+        else:
+            continue
+        weighted = gram.weighted(fit.estimate.logs)
+        rows = slice(first, first + moves.shape[1])
+        local = np.swapaxes(moves, 1, 2) @ weighted[:, rows]
+        own = (local[:, :, rows] @ moves).sum(axis=0)
+        added.append(Added(gram, local, own))
+    freedom = fit.freedom if effect.place == "edge" else fit.of_corners
+    return score(fit, added, effect.count, freedom)
+
+
+def of_unknown(fit: Fit, kind_and_name: tuple[str, str], maps: FloatArray) -> Score:
+    """The score of an unknown's columns (d) that differ by (s, d, c) from stop to stop."""
+    added = []
+    own = next(fit.unknowns.columns(*key) for key in fit.unknowns.slices if key == kind_and_name)
+    for gram in _used(fit):
+        if not np.isin(own, gram.columns).all():
+            continue
+        places = 6 * len(gram.flanges) + np.array([np.argmax(gram.columns == c) for c in own])
+        moves = gram.spread()[:, :, places] @ maps[gram.stops]
+        local = np.swapaxes(moves, 1, 2) @ gram.weighted(fit.estimate.logs)[:, :-1]
+        added.append(Added(gram, local, (local[:, :, :-1] @ moves).sum(axis=0)))
+    return score(fit, added, maps.shape[2], fit.freedom)
+
+
+def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
+    """The score of all waves of a lens's field, along both axes."""
+    orders, added = orders_of_waves(), []
+    width, count = float(fit.unknowns.lenses[camera].resolution[0]), len(orders)
+    own = [pair for pair in pairs if pair.names[0] == camera and pair.corners]
+    for gram in fit.grams:
+        pair = next((one for one in own if np.array_equal(one.rows, gram.rows)), None)
+        kept = fit.used[gram.rows]
+        if pair is None or not kept.any():
+            continue
+        rows, _ = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, gram.distances)
+        predicted = pair.px - rows[:, :, -1] / pair.weights[:, None]
+        each = waves(predicted, width, orders) * pair.weights[:, None]
+        padded, of_rows = np.swapaxes(pair.padded(each), 1, 2), pair.padded(rows)
+        local = np.concatenate([padded @ of_rows[:, :, axis] for axis in (0, 1)], axis=1)
+        inner = each[kept[pair.owner]]
+        weight = _weight(fit, gram)
+        product = weight * np.kron(np.eye(2), inner.T @ inner)
+        taken = gram if kept.all() else gram.take(kept)
+        added.append(Added(taken, weight * local[kept], np.asarray(product)))
+    return score(fit, added, 2 * count, fit.of_corners)
+
+
+def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, float, float]:
+    """The most likely field of a lens, its size [px], and its log-likelihood against none."""
+    found, options = of_waves(fit, pairs, camera), list[tuple[float, float, Field]]()
+    px = np.concatenate([p.px for p in pairs if p.names[0] == camera and p.corners])
+    weight = max(_weight(fit, gram) for gram in fit.grams if gram.pair[0] == camera)
+    for length in LENGTHS:
+        field = field_of_length(length, float(fit.unknowns.lenses[camera].resolution[0]), px)
+        size, gain = found.best(np.tile(field.sigmas, 2), 1e-4, 5.0)
+        # Of a wave below this, all corners together show nothing.
+        field = field.above(_SEEN / (size * np.sqrt(weight * len(px))))
+        options.append((gain, size, field))
+    gain, size, field = max(options, key=lambda option: option[0])
+    return field, size, gain
+
+
+def _weight(fit: Fit, gram: Gram) -> float:
+    """Inverse variance of the noise of some sightings' rows."""
+    size = gram.parts[0][0]
+    return float(np.exp(-2.0 * fit.estimate.logs[size])) if size >= 0 else 1.0
+
+
+def _used(fit: Fit) -> list[Gram]:
+    """The sightings that the fit uses."""
+    kept = [(gram, fit.used[gram.rows]) for gram in fit.grams]
+    return [gram if mask.all() else gram.take(mask) for gram, mask in kept if mask.any()]
