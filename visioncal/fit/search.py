@@ -13,6 +13,7 @@ from visioncal.fit.mixed import Mixed
 from visioncal.fit.sizes import Found, most_likely, significant
 from visioncal.fit.start import Start
 from visioncal.fit.unknowns import State, Unknowns
+from visioncal.fit.weights import weighed
 from visioncal.model import Cell
 
 # Chance that a sound session loses a sighting.
@@ -39,12 +40,14 @@ class Search:
     cell: Cell
     unknowns: Unknowns
     pairs: tuple[Pair, ...]
+    sound: Mask  # (n,) sightings that may agree.
     effort: Effort = field(default_factory=Effort)
 
     @classmethod
-    def of(cls, cell: Cell, unknowns: Unknowns) -> "Search":
-        """A search of some unknowns of a cell."""
-        return cls(cell, unknowns, pairs_of(cell))
+    def of(cls, cell: Cell, unknowns: Unknowns, sound: Mask | None = None) -> "Search":
+        """A search of some unknowns of a cell, of whose n sightings those in a mask may agree."""
+        may = np.ones(len(cell.sightings), bool) if sound is None else sound
+        return cls(cell, unknowns, pairs_of(cell), may)
 
     def with_unknowns(self, unknowns: Unknowns) -> "Search":
         """The search of others."""
@@ -58,7 +61,7 @@ class Search:
             used: (n,) first guess of the sightings that agree.
             known: A fit with other unknowns, whose sizes are the first ones.
         """
-        fit, left_out = self._agreeing(self._sized(state, used, known))
+        fit, left_out = self._agreeing(self._sized(state, used & self.sound, known))
         for _ in range(_ROUNDS):
             before = fit.used
             fit, left_out = self._agreeing(self._sized(fit.state, before, fit))
@@ -67,6 +70,14 @@ class Search:
             if is_settled and np.array_equal(before, fit.used):
                 break
         return fit, left_out
+
+    def weighed(self, fit: Fit) -> "Search | None":
+        """The search with corners judged by a fit; None where these are as sure as they were."""
+        found = weighed(self.cell, fit.unknowns, fit.state, self.pairs, fit.used)
+        if not found.changed:
+            return None
+        sound = self.sound & found.sound
+        return replace(self, cell=found.cell, pairs=pairs_of(found.cell), sound=sound)
 
     def _sized(self, state: State, used: Mask, last: Fit | None) -> Fit:
         """The fit at a linearisation, with the most likely sizes."""
@@ -97,7 +108,7 @@ class Search:
 
     def _agreeing(self, fit: Fit) -> tuple[Fit, LeftOut]:
         """The fit of the sightings within the reach of noise; steps at one linearisation."""
-        count, fewest = len(fit.used), max(len(fit.used) // 2, 5)
+        count, fewest = len(fit.used), max(int(self.sound.sum()) // 2, 5)
         for turn in range(_WIDENED + count):
             left_out = fit.left_out()
             squares = left_out.squares
@@ -105,7 +116,7 @@ class Search:
             limits = left_out.directions * f_limit(_FALSE / count, left_out.directions, freedom)
             # The median of chi-square of six degrees is 5.35.
             scale = max(float(np.median(squares[fit.used])) / 5.35, 1.0) if turn < _SCALED else 1.0
-            inside = squares < limits * scale
+            inside = self.sound & (squares < limits * scale)
             if turn < _WIDENED and (inside & ~fit.used).any():
                 after = fit.used | inside
             elif (fit.used & ~inside).any() and fit.used.sum() > fewest:
@@ -129,6 +140,7 @@ def nearest(start: Start) -> Mask:
     near = start.distances
     limit = max(4.0 * float(np.median(near)), float(np.sort(near)[min(len(near) - 1, 6)]))
     used: Mask = near <= limit
+    near = np.where(start.sound, near, np.inf)
     for rows in map(np.array, start.cell.pairs.values()):
         used[rows[near[rows].argsort()][: len(rows) // 2 + 1]] = True
-    return used
+    return np.asarray(used & start.sound)

@@ -54,7 +54,7 @@ def solve(cell: Cell) -> Solved:
     """Fits a cell."""
     start = start_of(cell)
     effects = effects_of(start.cell)
-    search = Search.of(start.cell, unknowns_of(start, effects))
+    search = Search.of(start.cell, unknowns_of(start, effects), start.sound)
     fit, left_out = search.run(state_of(start, effects), nearest(start))
     for _ in range(_OPENED):
         wider = opened(fit, search.pairs)
@@ -62,6 +62,9 @@ def solve(cell: Cell) -> Solved:
             break
         search = search.with_unknowns(wider[0])
         fit, left_out = search.run(wider[1], fit.used, fit)
+    again = search.weighed(fit)
+    if again is not None:
+        fit, left_out = again.run(fit.state, fit.used, fit)
     return Solved(fit, left_out, start, search.effort)
 
 

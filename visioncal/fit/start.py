@@ -19,7 +19,8 @@ from visioncal.core.transforms import (
     nearest_rotation,
     rotation_angle,
 )
-from visioncal.core.types import Camera, Corners, FloatArray, IntArray
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
+from visioncal.fit.weights import by_homography, first_weighed
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
 from visioncal.model.effects.effect import LEVER_M
 from visioncal.vision.camera import normalise, project
@@ -31,6 +32,8 @@ _IMAGES, _PAIRS = 40, 800
 _SETS, _BEST = 200, 5
 # The second pose of a flat board stays where it fits within this factor and addition [px].
 _ALIKE, _ALIKE_PX = 2.0, 0.3
+# Distortion moves corners off a homography by this and more [px].
+_LEAST_PX = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,19 +48,24 @@ class Candidates:
 class Start:
     """Where a fit starts."""
 
-    cell: Cell  # With the sightings that have a pose; turned boards are numbered as they lie.
+    # With the sightings that have a pose, by corners that agree within their views; turned boards
+    # are numbered as they lie.
+    cell: Cell
     lenses: Mapping[str, Camera]
     edges: Mapping[str, FloatArray]  # (4, 4) `parent_from_frame` of the unknown edges.
     distances: FloatArray  # (n,) of the sightings from what the edges predict [m].
     rivals: tuple[FloatArray, ...]  # Other poses (j, 4, 4) that each sighting may have.
+    sound: Mask  # (n,) sightings that may agree: most of their own corners do.
 
 
 def start_of(cell: Cell) -> Start:
     """Starts a fit; sightings without a pose, or whose frames are not connected, are left out."""
     lenses = start_lenses(cell)
+    weighed = first_weighed(cell, lenses)
+    cell, sound = weighed.cell, weighed.sound
     options = [candidates(cell, lenses, sighting) for sighting in cell.sightings]
     kept = [at for at, option in enumerate(options) if option is not None]
-    cell = cell.with_sightings([cell.sightings[at] for at in kept])
+    cell, sound = cell.with_sightings([cell.sightings[at] for at in kept]), sound[kept]
     known = [option for option in options if option is not None]
     places = _Places(cell)
     places.join_all(known)
@@ -66,6 +74,7 @@ def start_of(cell: Cell) -> Start:
         cell.with_sightings([cell.sightings[at] for at in joined]),
         [known[at] for at in joined],
     )
+    sound = sound[joined]
     edges = {name: places.edge(name) for name in cell.unknown}
     sightings, distances, rivals = list(cell.sightings), np.zeros(len(known)), []
     for at, (sighting, option) in enumerate(zip(cell.sightings, known, strict=True)):
@@ -82,7 +91,7 @@ def start_of(cell: Cell) -> Start:
             sightings[at] = replace(sighting, evidence=replace(sighting.evidence, ids=ids))
         others = np.flatnonzero((option.turns == turn) & (np.arange(len(off)) != best))
         rivals.append(option.poses[[best, *others]])
-    return Start(cell.with_sightings(sightings), lenses, edges, distances, tuple(rivals))
+    return Start(cell.with_sightings(sightings), lenses, edges, distances, tuple(rivals), sound)
 
 
 def start_lenses(cell: Cell) -> dict[str, Camera]:
@@ -95,12 +104,13 @@ def start_lenses(cell: Cell) -> dict[str, Camera]:
             continue
         seen = [s for s in cell.sightings if s.seer == frame and s.corners is not None]
         seen = [seen[at] for at in _spread(len(seen), _IMAGES)]
-        px = [s.corners.px.astype(np.float32)[:, None] for s in seen if s.corners is not None]
-        points = [
-            corner_positions(cell.boards[s.seen])[s.corners.ids].astype(np.float32)[:, None]
-            for s in seen
-            if s.corners is not None
-        ]
+        px, points = [], []
+        for sighting in seen:
+            if (corners := sighting.corners) is not None:
+                board = corner_positions(cell.boards[sighting.seen])[corners.ids]
+                agrees = by_homography(board, corners.px, least_px=_LEAST_PX).agreeing
+                px.append(corners.px[agrees].astype(np.float32)[:, None])
+                points.append(board[agrees].astype(np.float32)[:, None])
         most = np.max([at.max(axis=(0, 1)) for at in px], axis=0)
         size = table.size or (int(most[0]) + 1, int(most[1]) + 1)
         if table.model == "fisheye":
