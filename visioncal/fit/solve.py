@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.candidates import opened
 from visioncal.fit.fit import Fit, LeftOut
+from visioncal.fit.processes import boards_of, consider
 from visioncal.fit.search import Effort, Search, nearest
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import (
@@ -31,6 +32,8 @@ from visioncal.vision.camera import intrinsics
 _SPARE = 10
 # Stops that determine errors of an arm's links.
 _FEWEST_STOPS = 8
+# Log-odds of boards of another size that free it.
+_CLEAR = 7.0
 # Most effects that are opened, one after the other.
 _OPENED = 5
 
@@ -64,8 +67,28 @@ def solve(cell: Cell) -> Solved:
         fit, left_out = search.run(wider[1], fit.used, fit)
     again = search.weighed(fit)
     if again is not None:
-        fit, left_out = again.run(fit.state, fit.used, fit)
+        search = again
+        fit, left_out = search.run(fit.state, fit.used, fit)
+    bare = [name for name in fit.unknowns.erring if not start.cell.arms[name].has_joints]
+    found = {name: consider(fit, name) for name in bare}
+    if any(one is not None and one.board_odds > _CLEAR for one in found.values()):
+        # Boards of another size, which no error of an arm's posture explains.
+        search = search.with_unknowns(with_free_boards(fit))
+        fit, left_out = search.run(fit.state, fit.used, fit)
+        found = {name: consider(fit, name) for name in bare}
+    for one in found.values():
+        fit = fit if one is None else fit.considering(one.covariance)
     return Solved(fit, left_out, start, search.effort)
+
+
+def with_free_boards(fit: Fit) -> Unknowns:
+    """The unknowns of a fit, with the sizes of boards that are held freed."""
+    freed = []
+    for key in boards_of(fit):
+        member, board = fit.unknowns[key], fit.cell.boards[key[1]]
+        has_shape = member.count > 1
+        freed.append(printed_board(key[1], board, has_shape=has_shape, is_sized=True))
+    return fit.unknowns.replacing(*freed)
 
 
 def effects_of(cell: Cell) -> tuple[Effect, ...]:

@@ -215,6 +215,11 @@ class Unknowns:
         kept = (member for member in self.members if member.key not in keys)
         return replace(self, members=(*kept, *more))
 
+    def replacing(self, *others: Unknown) -> "Unknowns":
+        """The unknowns with others in the places of those of their names."""
+        found = {member.key: member for member in others}
+        return replace(self, members=tuple(found.get(m.key, m) for m in self.members))
+
     def closing(self, names: Iterable[str]) -> "Unknowns":
         """The unknowns with some sizes held at their lower bounds."""
         return replace(self, closed=frozenset(names))

@@ -1,0 +1,86 @@
+"""Errors of arms that last: what each stop alone says, and honesty under them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_cells import ROBOT_M, ROBOT_RAD, made, pose
+from support.whole_cells import OPTIONS, recorded
+
+from visioncal.core.transforms import invert, log
+from visioncal.fit.processes import _alone, consider, processes
+from visioncal.fit.solve import solve
+from visioncal.model import read_cell
+from visioncal.simulation import simulate
+
+
+def two_arms():
+    session = recorded(simulate(OPTIONS))
+    return read_cell(session, session.corners)
+
+
+@pytest.mark.parametrize("cell", [made(stops=10, cameras=2).cell, two_arms()])
+def test_what_stops_say_alone_is_together_what_the_fit_says(cell):
+    fit, p = solve(cell).fit, None
+    for flange in fit.unknowns.erring:
+        alone = _alone(fit, flange)
+        p = fit.unknowns.count
+        total = alone.rest.copy()
+        noise = np.linalg.inv(alone.known + np.diag(alone.levels**2))
+        total += np.einsum("uia,uij,ujb->ab", alone.rows, noise, alone.rows)
+        covariance = np.linalg.inv(total[:p, :p])
+        scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+        # Stops that say nothing of the flange are left out: they are none of these cells'.
+        assert np.abs((covariance - fit.estimate.covariance) / scale).max() < 1e-4
+        sigmas = np.sqrt(np.diag(covariance))
+        assert covariance @ total[:p, p] == pytest.approx(
+            fit.estimate.values, abs=1e-3 * sigmas.min()
+        )
+
+
+def test_a_process_through_gains_is_its_covariance():
+    rng = np.random.default_rng(0)
+    poses, gains = made(stops=9).cell.arms["flange"].poses, rng.normal(size=(9, 6, 4))
+    levels, flat = np.repeat([1e-4, 5e-5], 3), gains.reshape(54, 4)
+    for process in processes(poses, levels):
+        whole = process.covariance(np.arange(9))
+        assert np.allclose(process.through(gains), flat.T @ whole @ flat)
+        assert np.linalg.eigvalsh(whole).min() > -1e-9 * np.trace(whole)
+
+
+def lasting(seed, share):
+    """A cell whose arm's errors remember those of the stop before by a share."""
+    small, rng = made(seed, stops=20), np.random.default_rng([seed, 7])
+    errors = rng.normal(size=(20, 2, 3)) * np.array([ROBOT_RAD, ROBOT_M])[:, None] * 3.0
+    for stop in range(1, 20):
+        errors[stop] = share * errors[stop - 1] + np.sqrt(1 - share**2) * errors[stop]
+    arm = small.cell.arms["flange"]
+    moved = np.array([at @ pose(*step) for at, step in zip(arm.poses, errors, strict=True)])
+    arms = {"flange": replace(arm, poses=moved)}
+    moments = replace(small.cell.moments, poses={"flange": moved})
+    return replace(small, cell=replace(small.cell, arms=arms, moments=moments))
+
+
+def test_errors_that_last_are_in_the_covariance():
+    squares = {True: [], False: []}
+    for seed in range(30):
+        small = lasting(seed, 0.95)
+        fit = solve(small.cell).fit
+        away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
+        for is_considered, one in ((True, fit), (False, replace(fit, considered=None))):
+            covariance = one.covariance(("edge", "cam"))
+            squares[is_considered].append(away @ np.linalg.solve(covariance, away) / 6)
+    # Independent errors would be claimed to leave less than a third of it.
+    assert np.mean(squares[False]) > 2.0
+    assert 0.3 < np.mean(squares[True]) < 1.6
+
+
+def test_boards_that_are_larger_are_found_beside_errors_of_the_arm():
+    small = made(stops=16)
+    cell = replace(
+        small.cell, boards={"target": replace(small.cell.boards["target"], square_m=0.0402)}
+    )
+    fit = solve(cell).fit
+    scale = fit.state.values["shape", "target"][0]
+    assert scale == pytest.approx(0.04 / 0.0402 - 1, abs=5e-4)
+    assert abs(consider(solve(small.cell).fit, "flange").board_odds) < 7.0

@@ -1,0 +1,223 @@
+"""Errors of arms that last from stop to stop: they count in the covariance, not in the estimate.
+
+Without joint angles, an arm's errors are functions of its posture and of time that nobody knows.
+The estimate stays that of independent errors, which is nearly as good and rejects no sound view;
+what it would be off by is averaged over processes by posture and by time, each over a grid of sizes
+and of levels of what is independent, by their restricted likelihood (Hoeting, Madigan, Raftery and
+Volinsky 1999). What each stop alone says of its flange follows from the factorisation.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.fit.fit import Fit
+from visioncal.fit.unknowns import Key
+from visioncal.model.effects.effect import TWIST
+
+# Lengths of processes by posture [rad], of which one is half a metre, and by time [stops].
+_RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
+_REACH_M = 0.5
+# Sizes of a process, and of what is independent beside it, over the level of the noise.
+_SIZES, _WHITE = (0.3, 0.6, 1.2, 2.5, 5.0), (1.0, 0.7, 0.4, 0.15)
+# Stops that are needed; of more than the most, some stand for all in the likelihood.
+_FEWEST, _MOST = 8, 40
+# Size of a board that is not as stated, as a share.
+_LOOSE = 0.01
+# Shares of evidence that do not count.
+_LITTLE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Considered:
+    """What an arm's lasting errors add."""
+
+    covariance: FloatArray  # (p, p) beyond that of independent errors, in units of the columns.
+    # Log-odds of boards of any size against boards as stated; zero where their size is free.
+    board_odds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """A Gaussian process over s stops: `kernel_ij * basis_i basis_j'`, at a size of one."""
+
+    prior: float
+    kernel: FloatArray  # (s, s).
+    basis: FloatArray  # (s, 6, r) right perturbations of the flange [rad, m].
+
+    def covariance(self, at: IntArray) -> FloatArray:
+        """(6 k, 6 k) at some stops."""
+        basis = self.basis[at]
+        products = np.einsum("iar,jbr->iajb", basis, basis, optimize=True)
+        full = self.kernel[at[:, None], at][:, None, :, None] * products
+        return np.asarray(full.reshape(6 * len(at), 6 * len(at)))
+
+    def through(self, gains: FloatArray) -> FloatArray:
+        """(p, p) covariance of sums of the stops' errors with (s, 6, p) gains."""
+        each = np.swapaxes(self.basis, 1, 2) @ gains
+        total = np.zeros((gains.shape[2], gains.shape[2]))
+        for part in np.swapaxes(each, 0, 1):
+            total += part.T @ (self.kernel @ part)
+        return total
+
+
+def processes(poses: FloatArray, levels: FloatArray) -> Iterator[Process]:
+    """Processes at (s, 4, 4) flanges, in units of the (6,) levels of the noise."""
+    count, order = len(poses), np.arange(len(poses))
+    size = np.sqrt(np.mean((levels / TWIST) ** 2))
+    flange = np.broadcast_to(np.diag(levels), (count, 6, 6))
+    of_base = size * adjoint(invert(poses)) * TWIST
+    both = np.concatenate([flange, of_base], axis=2)
+    factors = np.concatenate([poses[:, :3, 3] / 0.6, poses[:, :3, 2]], axis=1).T
+    varying = [of_base * factor[:, None, None] for factor in factors]
+    constant = np.broadcast_to(size * np.diag(TWIST), of_base.shape)
+    smooth = np.concatenate([constant, of_base, *varying], axis=2)
+    yield Process(1 / 4, np.ones((count, count)), smooth)
+    turns = poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
+    places = np.concatenate([poses[:, :3, 3] / _REACH_M, turns], axis=1)
+    squared = np.sum((places[:, None] - places) ** 2, axis=2)
+    for length in _RANGES:
+        yield Process(1 / 4 / len(_RANGES), np.exp(-squared / (2.0 * length**2)), both)
+    apart = np.abs(order[:, None] - order)
+    for memory in _MEMORIES:
+        yield Process(1 / 8 / len(_MEMORIES), np.exp(-apart / memory), flange)
+    ramp = (order - order.mean()) / order.std()
+    yield Process(1 / 16, np.outer(ramp, ramp), both)
+
+
+@dataclass(frozen=True, eq=False)
+class _Alone:
+    """What each stop alone says of one flange's errors, as rows in the common unknowns."""
+
+    stops: IntArray  # (s,)
+    levels: FloatArray  # (6,) of its noise.
+    known: FloatArray  # (s, 6, 6) covariance.
+    rows: FloatArray  # (s, 6, p + 1) by the unknowns, and the error itself.
+    rest: FloatArray  # (p + 1, p + 1) information of all else.
+
+
+def consider(fit: Fit, flange: str) -> Considered | None:
+    """What lasting errors of one arm add; None where too few stops show any."""
+    alone = _alone(fit, flange)
+    if alone is None:
+        return None
+    stops, levels, p = len(alone.stops), alone.levels, fit.unknowns.count
+    poses = fit.cell.arms[flange].poses[alone.stops]
+    some = np.unique(np.linspace(0, stops - 1, min(stops, _MOST)).astype(np.int64))
+    boards = _held_boards(fit)
+    none = (np.log(1 / 4), *_likelihoods(alone, some, 0.0, 1.0, boards))
+    found, kinds = [none], list[tuple[Process, float, float]]()
+    for process in processes(poses, levels):
+        covariance = process.covariance(some)
+        weight = np.log(process.prior / len(_SIZES) / len(_WHITE))
+        for size in _SIZES:
+            for white in _WHITE:
+                each = _likelihoods(alone, some, size**2 * covariance, white, boards)
+                found.append((weight, *each))
+                kinds.append((process, size, white))
+    prior, as_stated, of_any_size = np.array(found).T
+    logs, free = prior + as_stated, prior + of_any_size
+    odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs)) if len(boards) else 0.0
+    shares = np.exp(logs - np.logaddexp.reduce(logs))[1:]
+    # The estimate's response to an error at each stop, which it takes for independent.
+    gains = np.linalg.inv(alone.known + np.diag(levels**2)) @ alone.rows[:, :, :p]
+    independent = np.einsum("uia,i,uib->ab", gains, levels**2, gains, optimize=True)
+    excess = np.zeros((p, p))
+    for share, (process, size, white) in zip(shares, kinds, strict=True):
+        if share > _LITTLE:
+            through = process.through(gains)
+            excess += share * (size**2 * through - (1.0 - white**2) * independent)
+    covariance = fit.estimate.covariance
+    return Considered(covariance @ excess @ covariance, odds)
+
+
+def _alone(fit: Fit, flange: str) -> _Alone | None:
+    """What each stop alone says; None where too few say anything."""
+    at = next((i for i, body in enumerate(fit.mixed.bodies) if flange in body.flanges), None)
+    if at is None:
+        return None
+    body, p = fit.mixed.bodies[at], fit.unknowns.count
+    own = 6 * body.flanges.index(flange) + np.arange(6)
+    others = np.setdiff1d(np.arange(body.width), own)
+    levels = np.repeat([fit.sizes[f"rad {flange}"], fit.sizes[f"m {flange}"]], 3)
+    units, rest = fit.mixed.assembled(fit.estimate.logs)
+    past = fit.linearised.errors[flange][body.stops]
+    for other, (errors, cross) in enumerate(units):
+        if other != at:
+            columns = np.append(fit.mixed.bodies[other].columns, p)
+            solved = np.linalg.solve(errors, cross)
+            rest[columns[:, None], columns] -= np.einsum("uma,umb->ab", cross, solved)
+    errors, cross = units[at]
+    errors[:, own, own] -= levels**-2.0
+    cross[:, own, -1] += past * levels**-2.0
+    columns = np.append(body.columns, p)
+    if len(others):
+        inner, between = errors[:, others[:, None], others], errors[:, own[:, None], others]
+        solved = np.linalg.solve(inner, cross[:, others])
+        rest[columns[:, None], columns] -= np.einsum("uma,umb->ab", cross[:, others], solved)
+        cross = cross[:, own] - between @ solved
+        errors = errors[:, own[:, None], own] - between @ np.linalg.solve(
+            inner, np.swapaxes(between, 1, 2)
+        )
+    seen = np.flatnonzero(np.linalg.eigvalsh(errors)[:, 0] * levels.min() ** 2 > 1e-6)
+    if len(seen) < _FEWEST:
+        return None
+    known = np.asarray(np.linalg.inv(errors[seen]), dtype=float)
+    rows = np.zeros((len(seen), 6, p + 1))
+    rows[:, :, columns] = known @ cross[seen]
+    rest[columns[:, None], columns] -= np.einsum(
+        "uma,umb->ab", cross[seen], rows[:, :, columns], optimize=True
+    )
+    # From what is reported, not from where it was linearised.
+    rows[:, :, p] += past[seen]
+    return _Alone(body.stops[seen], levels, known, rows, rest)
+
+
+def _held_boards(fit: Fit) -> list[tuple[int, float]]:
+    """Columns of the sizes of boards that are held, and the information of each prior."""
+    found = []
+    for member in fit.unknowns.members:
+        size = member.priors[0].size if member.key[0] == "shape" else None
+        if size is not None and size.high <= size.low:
+            found.append((fit.unknowns.slices[member.key].start, size.low**-2.0))
+    return found
+
+
+def _likelihoods(
+    alone: _Alone,
+    some: IntArray,
+    added: FloatArray | float,
+    white: float,
+    boards: list[tuple[int, float]],
+) -> tuple[float, float]:
+    """Restricted log-likelihoods at some stops: with boards as stated, and of any size."""
+    p, count = alone.rows.shape[2] - 1, len(some)
+    covariance = np.zeros((6 * count, 6 * count))
+    blocks = covariance.reshape(count, 6, count, 6)
+    own = alone.known[some] + np.diag(white**2 * alone.levels**2)
+    blocks[np.arange(count), :, np.arange(count)] = own
+    root = np.linalg.cholesky(covariance + added)
+    solved = np.linalg.solve(root, alone.rows[some].reshape(-1, p + 1))
+    total = solved.T @ solved + alone.rest
+    total[np.arange(p), np.arange(p)] *= 1.0 + 1e-9
+    values = []
+    loosened = np.zeros(p + 1)
+    for places in ([], boards):
+        for column, held in places:
+            loosened[column] = held - _LOOSE**-2.0
+        inner = (total - np.diag(loosened))[:p, :p]
+        factor = np.linalg.cholesky(inner)
+        pull = np.linalg.solve(factor, total[:p, p])
+        value = -np.log(np.diag(root)).sum() - np.log(np.diag(factor)).sum()
+        prior = sum(-0.5 * np.log(held * _LOOSE**2) for _, held in places)
+        values.append(float(value - 0.5 * (total[p, p] - pull @ pull) + prior))
+    return values[0], values[1]
+
+
+def boards_of(fit: Fit) -> list[Key]:
+    """Boards whose size is held."""
+    columns = {column for column, _ in _held_boards(fit)}
+    return [key for key, at in fit.unknowns.slices.items() if at.start in columns]
