@@ -11,7 +11,7 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.fit.linearise import Gram, predicted
 from visioncal.fit.mixed import Estimate, Mixed
 from visioncal.fit.unknowns import Key, State, Unknowns
-from visioncal.model import Cell, MeasuredPlace, Moments
+from visioncal.model import Cell, Moments
 
 # Added to information that determines nothing, over its diagonal.
 _RIDGE = 1e-9
@@ -24,15 +24,15 @@ class LeftOut:
     away: FloatArray  # (n, 6) as a right perturbation of `seer_from_seen`.
     predicted: FloatArray  # (n, 6, 6) covariance of the prediction.
     own: FloatArray  # (n, 6, 6) covariance of the sighting's own pose.
-    directions: IntArray  # (n,) how many of the six it has: three last of a place.
+    directions: IntArray  # (n,) how many of the six it has; in others its covariance is large.
 
     @classmethod
     def of_none(cls, cell: Cell) -> Self:
         """The deviations of a cell's n sightings, to be `put`."""
         count = len(cell.sightings)
-        places = [isinstance(sighting.evidence, MeasuredPlace) for sighting in cell.sightings]
+        directions = np.array([sighting.directions for sighting in cell.sightings], np.int64)
         blocks = np.zeros((count, 6, 6))
-        return cls(np.zeros((count, 6)), blocks, blocks.copy(), np.where(places, 3, 6))
+        return cls(np.zeros((count, 6)), blocks, blocks.copy(), directions)
 
     def put(self, rows: IntArray, found: tuple[FloatArray, FloatArray, FloatArray]) -> None:
         """Fills in `away`, `predicted` and `own` of some sightings."""
@@ -41,13 +41,8 @@ class LeftOut:
     @cached_property
     def squares(self) -> FloatArray:
         """(n,) squared Mahalanobis lengths."""
-        found = np.zeros(len(self.away))
-        for count in np.unique(self.directions):
-            rows = np.flatnonzero(self.directions == count)
-            away = self.away[rows, 6 - count :]
-            both = (self.predicted + self.own)[rows, 6 - count :, 6 - count :]
-            found[rows] = np.sum(away * np.linalg.solve(both, away[:, :, None])[:, :, 0], axis=1)
-        return found
+        solved = np.linalg.solve(self.predicted + self.own, self.away[:, :, None])[:, :, 0]
+        return np.asarray(np.sum(self.away * solved, axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,14 +7,22 @@ of Triggs, McLauchlan, Hartley and Fitzgibbon 2000, section 6), and nothing beyo
 grows with the number of corners.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 
-from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log, skew
+from visioncal.core.transforms import (
+    adjoint,
+    compose,
+    exp,
+    inverse_right_jacobian,
+    invert,
+    log,
+    skew,
+)
 from visioncal.core.types import Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.tree import PathStep
 from visioncal.fit.unknowns import Key, State, Unknowns
@@ -29,9 +37,9 @@ class Gram:
     """The k sightings of one frame by another.
 
     Local columns are (pose: 6, lens: q, shape: 10, field: e), then the residual: d + 1 in all;
-    poses and places that were measured have the pose alone. Common ones are the c that act on the
-    pose or the lens through `moves`, of which the first f are errors of flanges, then those that
-    are `picked`.
+    poses and places that were measured have the pose alone, and a board's size. Common ones are the
+    c that act on the pose or the lens through `moves`, of which the first f are errors of flanges,
+    then those that are `picked`.
     """
 
     pair: tuple[str, str]  # Seer and seen.
@@ -151,6 +159,11 @@ class Pair:
         found[self.owner, within] = rows
         return found
 
+    @property
+    def middle(self) -> FloatArray:
+        """(3,) middle of the board; its origin where its corners are not known [m]."""
+        return self.points.mean(axis=0) if len(self.points) else np.zeros(3)
+
     @cached_property
     def basis(self) -> FloatArray:
         """(c, 3, 10) derivatives of the board's corners by its shape [m]."""
@@ -161,14 +174,14 @@ def pairs_of(cell: Cell) -> tuple[Pair, ...]:
     """All sightings of a cell, by what they are of; those measured and those in images apart."""
     found = []
     for names, indices in cell.pairs.items():
-        kinds: dict[type, list[int]] = {}
+        kinds: dict[tuple[type, bool], list[int]] = {}
         for index in indices:
-            kinds.setdefault(type(cell.sightings[index].evidence), []).append(index)
-        for kind, rows in kinds.items():
+            sighting = cell.sightings[index]
+            kinds.setdefault((type(sighting.evidence), sighting.is_stated), []).append(index)
+        for rows in kinds.values():
             stops = np.array([cell.sightings[row].stop for row in rows])
-            points = (
-                corner_positions(cell.boards[names[1]]) if kind is Corners else np.zeros((0, 3))
-            )
+            board = cell.boards.get(names[1])
+            points = np.zeros((0, 3)) if board is None else corner_positions(board)
             pair = Pair(
                 np.array(rows), stops, tuple(cell.sightings[row] for row in rows),
                 cell.tree.path(*names), cell.moments.take(stops), points,
@@ -241,14 +254,14 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
     at = predicted(cell, unknowns, state, pair.path, pair.moments, errors)
     distances, own = np.ones(len(at.poses)), dict[Key, IntArray]()
     if pair.corners:
-        distances = at.poses[:, 2, 3] + at.poses[:, 2, :3] @ pair.points.mean(axis=0)
+        distances = at.poses[:, 2, 3] + at.poses[:, 2, :3] @ pair.middle
         rows, own = corner_rows(unknowns, state, pair, at.poses, distances)
         padded = pair.padded(rows).reshape(len(pair.rows), -1, rows.shape[2])
         grams: FloatArray = np.swapaxes(padded, 1, 2) @ padded
         size, counts = unknowns.size_of(f"px {pair.names[0]}"), np.asarray(2.0 * pair.counts)
         parts: _Parts = ((size, grams, counts),)
     else:
-        parts = _measured_parts(unknowns, pair, at.poses)
+        parts, own = _measured_parts(unknowns, state, pair, at.poses)
     seer, _ = pair.names
     frames = [step.frame for step in pair.path]
     flanges = tuple(name for name in unknowns.erring if name in frames)
@@ -272,16 +285,23 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
         moves[:, :6, : old.shape[2]], moves[:, 6:, old.shape[2] :] = old, lens
     free = {key: places for key, places in own.items() if key in unknowns}
     kept = {key: places[: unknowns[key].count] for key, places in free.items()}
+    units = [unknowns[key].units[: len(places)] for key, places in kept.items()]
+    columns += [unknowns.columns(*key)[: len(places)] for key, places in kept.items()]
     return Gram(
         pair.names, pair.rows, pair.stops, pair.moments, distances, parts, flanges, moves,
         np.concatenate([np.zeros(0, int), *kept.values()]).astype(np.int64),
-        np.concatenate([np.zeros(0), *(unknowns[key].units for key in kept)]),
-        np.concatenate([np.zeros(0, int), *columns, *(unknowns.columns(*key) for key in kept)]),
+        np.concatenate([np.zeros(0), *units]),
+        np.concatenate([np.zeros(0, int), *columns]),
         at.poses, at.by_effects,
     )  # fmt: skip
 
 
 _Parts: TypeAlias = tuple[tuple[int, FloatArray, FloatArray], ...]
+
+# Noise of measured poses and places by the rows that have it, turns first.
+_NOISES = (
+    ("rad", slice(0, 2)), ("roll", slice(2, 3)), ("m", slice(3, 5)), ("depth", slice(5, 6)),
+)  # fmt: skip
 
 
 def corner_rows(
@@ -317,24 +337,64 @@ def corner_rows(
     return rows, {key: np.arange(ends[at], ends[at + 1]) for at, key in enumerate(columns)}
 
 
-def _measured_parts(unknowns: Unknowns, pair: Pair, poses: FloatArray) -> _Parts:
-    """Gram matrices of measured poses and places."""
-    count, seer = len(pair.rows), pair.names[0]
-    rows, sigmas = np.zeros((count, 6, 7)), np.ones((count, 6))
-    for at, sighting in enumerate(pair.sightings):
+def _measured_parts(
+    unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray
+) -> tuple[_Parts, dict[Key, IntArray]]:
+    """Gram matrices of measured poses and places, and the local column of a board's size.
+
+    Who measured poses by an image of a board that is larger by a share s than was said made their
+    distances shorter: they are divided by 1 + s.
+    """
+    (seer, seen), rows = pair.names, np.zeros((len(pair.rows), 6, 8))
+    first, size = pair.sightings[0].evidence, 1.0
+    is_of_board = isinstance(first, MeasuredPose) and first.is_of_board
+    place_m = first.sigma_m if isinstance(first, MeasuredPlace) else None
+    if is_of_board:
+        size += float(state.values["shape", seen][0])
+    for at, (pose, sighting) in enumerate(zip(poses, pair.sightings, strict=True)):
         evidence = sighting.evidence
         if isinstance(evidence, MeasuredPose):
-            residual = log(invert(poses[at]) @ evidence.matrix)
-            rows[at] = np.column_stack([inverse_right_jacobian(-residual), residual])
-            sigmas[at] = np.repeat(evidence.sigmas or (1.0, 1.0), 3)
+            found = compose(pose[:3, :3], pose[:3, 3] / size)
+            residual = log(invert(found) @ evidence.matrix)
+            by_size = np.append(np.zeros(3), -found[:3, :3].T @ found[:3, 3] / size)
+            columns = np.column_stack([np.diag(np.repeat([1.0, 1.0 / size], 3)), by_size])
+            rows[at] = np.column_stack([inverse_right_jacobian(-residual) @ columns, residual])
+            rows[at] /= np.repeat([sigma or 1.0 for sigma in evidence.sigmas], 3)[:, None]
         elif isinstance(evidence, MeasuredPlace):
-            rows[at, 3:, 3:6] = poses[at, :3, :3]
-            rows[at, 3:, 6] = evidence.place_m - poses[at, :3, 3]
-            sigmas[at] = evidence.sigma_m or 1.0
-    rows /= sigmas[:, :, None]
+            rows[at, 3:, 3:6], rows[at, 3:, 7] = pose[:3, :3], evidence.place_m - pose[:3, 3]
+            rows[at] /= evidence.sigma_m or 1.0
+            rows[at, [3 + axis for axis in range(3) if axis not in evidence.axes]] = 0.0
+    noises: Sequence[tuple[str, slice]] = _NOISES
+    if is_of_board:
+        rows = _by_sight(rows, poses, pair.middle)
+    else:
+        rows = np.delete(rows, 6, axis=2)
+        sigmas = first.sigmas if isinstance(first, MeasuredPose) else (1.0, place_m)
+        noises = [
+            (name if sigma is None else "", slice(at, at + 3))
+            for name, sigma, at in zip(("rad", "m"), sigmas, (0, 3), strict=True)
+        ]
     parts = []
-    for name, part in (("rad", rows[:, :3]), ("m", rows[:, 3:])):
-        number = np.full(count, 3.0 * part.any())
+    for name, own in noises:
+        part = rows[:, own]
         grams = np.swapaxes(part, 1, 2) @ part
-        parts.append((unknowns.size_of(f"{name} {seer}"), grams, number))
-    return tuple(parts)
+        index = unknowns.size_of(f"{name} {seer}") if name else -1
+        parts.append((index, grams, 1.0 * part.any(axis=2).sum(axis=1)))
+    return tuple(parts), {("shape", seen): np.arange(6, 7)} if is_of_board else {}
+
+
+def _by_sight(rows: FloatArray, poses: FloatArray, middle: FloatArray) -> FloatArray:
+    """Rows (k, 6, w) of poses about a board's middle, in axes of which the last is along the sight.
+
+    An image tells tilt and distance worse than the turn about the line of sight and what is across
+    it, and all of it worse from afar: by the size of the board in it.
+    """
+    rows = adjoint(invert(compose(np.eye(3), middle))) @ rows
+    places = poses[:, :3, :3] @ middle + poses[:, :3, 3]
+    far = np.linalg.norm(places, axis=1)
+    along = places / far[:, None]
+    across = np.cross([0.0, 1.0, 0.0], along)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    axes = np.stack([across, np.cross(along, across), along], axis=1) @ poses[:, :3, :3]
+    turned = axes[:, None] @ rows.reshape(len(rows), 2, 3, -1)
+    return np.asarray(turned.reshape(rows.shape))

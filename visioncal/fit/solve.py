@@ -8,12 +8,14 @@ import numpy as np
 from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.candidates import opened
 from visioncal.fit.fit import Fit, LeftOut
+from visioncal.fit.held import with_held_lenses
 from visioncal.fit.processes import boards_of, consider
 from visioncal.fit.search import Effort, Search, nearest
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import (
     Edge,
     Key,
+    Prior,
     State,
     Unknown,
     Unknowns,
@@ -23,7 +25,7 @@ from visioncal.fit.unknowns import (
     printed_board,
     random_effect,
 )
-from visioncal.model import Cell, MeasuredPlace, MeasuredPose
+from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
 from visioncal.model.boards import SHAPES
 from visioncal.model.effects import Effect, Links, Size
 from visioncal.vision.camera import intrinsics
@@ -36,6 +38,8 @@ _FEWEST_STOPS = 8
 _CLEAR = 7.0
 # Most effects that are opened, one after the other.
 _OPENED = 5
+# Sigma of what is held [rad].
+_HELD = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,14 +82,14 @@ def solve(cell: Cell) -> Solved:
         found = {name: consider(fit, name) for name in bare}
     for one in found.values():
         fit = fit if one is None else fit.considering(one.covariance)
-    return Solved(fit, left_out, start, search.effort)
+    return Solved(with_held_lenses(fit), left_out, start, search.effort)
 
 
 def with_free_boards(fit: Fit) -> Unknowns:
     """The unknowns of a fit, with the sizes of boards that are held freed."""
     freed = []
     for key in boards_of(fit):
-        member, board = fit.unknowns[key], fit.cell.boards[key[1]]
+        member, board = fit.unknowns[key], fit.cell.boards.get(key[1])
         has_shape = member.count > 1
         freed.append(printed_board(key[1], board, has_shape=has_shape, is_sized=True))
     return fit.unknowns.replacing(*freed)
@@ -106,7 +110,8 @@ def state_of(start: Start, effects: Sequence[Effect]) -> State:
     """The state at a start: nothing errs, lenses and boards are as stated or found."""
     values: dict[Key, FloatArray] = {("edge", name): matrix for name, matrix in start.edges.items()}
     values |= {("lens", name): intrinsics(lens) for name, lens in start.lenses.items()}
-    values |= {("shape", name): np.zeros(SHAPES) for name in start.cell.boards}
+    boards = {*start.cell.boards, *(s.seen for s in start.cell.sightings if _is_of_board(s))}
+    values |= {("shape", name): np.zeros(SHAPES) for name in boards}
     values |= {("effect", effect.name): np.zeros(effect.count) for effect in effects}
     stops = len(start.cell.moments)
     return State(values, {name: np.zeros((stops, 6)) for name in start.cell.arms})
@@ -115,21 +120,32 @@ def state_of(start: Start, effects: Sequence[Effect]) -> State:
 def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
     """What is estimated of a cell."""
     cell = start.cell
-    members: list[Unknown] = [Edge(("edge", name)) for name in cell.unknown]
+    # The turn of a frame of which places alone are known is a convention.
+    held = (Prior(np.arange(3), sigma=_HELD),)
+    points = _points(cell)
+    members: list[Unknown] = [
+        Edge(("edge", name), held if name in points else ()) for name in cell.unknown
+    ]
     corners = sum(2 * len(s.corners.ids) - 6 for s in cell.sightings if s.corners is not None)
     sought = sum(len(intrinsics(lens)) + SHAPES for lens in start.lenses.values())
     has_shape = corners >= _SPARE * sought
     for name, lens in start.lenses.items():
-        if cell.cameras[name].stated is None:
+        table = cell.cameras[name]
+        if table.stated is None:
             members.append(estimated_lens(name, lens))
-        elif has_shape:
-            members.append(given_lens(name, lens, _corners_px(cell, name)))
+        elif table.intrinsics != "hold":
+            given = given_lens(table, name, _corners_px(cell, name), is_spare=has_shape)
+            members += [] if given is None else [given]
     # Errors of an arm without joints follow its posture, and look like a board's size.
     is_sized = all(arm.has_joints for arm in cell.arms.values())
-    seen = {s.seen for s in cell.sightings if s.corners is not None}
-    for name, board in cell.boards.items():
-        if name in seen and not board.is_rig and cell.arms:
-            members.append(printed_board(name, board, has_shape=has_shape, is_sized=is_sized))
+    pictured = {s.seen for s in cell.sightings if s.corners is not None}
+    for name in dict.fromkeys(
+        s.seen for s in cell.sightings if s.seen in pictured or _is_of_board(s)
+    ):
+        board = cell.boards.get(name)
+        if cell.arms and (board is None or not board.is_rig):
+            shaped = has_shape and name in pictured
+            members.append(printed_board(name, board, has_shape=shaped, is_sized=is_sized))
     members += [random_effect(effect) for effect in effects]
     erring = _erring(cell)
     noise, ratios = list(flange_noise(erring)), [(f"rad {name}", f"m {name}") for name in erring]
@@ -137,30 +153,48 @@ def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
         own = [s.corners for s in cell.sightings if s.seer == name and s.corners is not None]
         if any(corners.stated_px is None for corners in own):
             noise.append(Size(f"px {name}", 0.3, 1e-4, 30.0))
-    for name in _measuring(cell):
-        noise += [Size(f"rad {name}", 3e-3, 1e-8, 0.3), Size(f"m {name}", 2e-3, 1e-8, 0.3)]
-        ratios.append((f"rad {name}", f"m {name}"))
+    for name, is_board in _measuring(cell).items():
+        parts = ("rad", "m", "roll", "depth") if is_board else ("rad", "m")
+        noise += [Size(f"{part} {name}", 3e-3, 1e-8, 0.3) for part in parts]
+        pairs = (("rad", "m"), ("rad", "roll"), ("m", "depth")) if is_board else (("rad", "m"),)
+        ratios += [(f"{a} {name}", f"{b} {name}") for a, b in pairs]
     return Unknowns(
         tuple(members), tuple(effects), start.lenses, erring, tuple(noise), ratios=tuple(ratios)
     )
 
 
-def _measuring(cell: Cell) -> list[str]:
-    """Frames from which poses and places of unknown noise were measured."""
-    found = {
-        s.seer
-        for s in cell.sightings
-        if (isinstance(s.evidence, MeasuredPose) and s.evidence.sigmas is None)
-        or (isinstance(s.evidence, MeasuredPlace) and s.evidence.sigma_m is None)
-    }
-    return sorted(found)
+def _is_of_board(sighting: Sighting) -> bool:
+    """Whether it is a pose that a program found by an image of a board."""
+    return isinstance(sighting.evidence, MeasuredPose) and sighting.evidence.is_of_board
+
+
+def _points(cell: Cell) -> set[str]:
+    """Frames of which places alone are seen, or the touch of another one at their own."""
+    points, frames = set[str](), set[str]()
+    for sighting in cell.sightings:
+        place = sighting.evidence
+        if isinstance(place, MeasuredPlace):
+            points.add(sighting.seen)
+            (frames if place.place_m.any() else points).add(sighting.seer)
+        else:
+            frames.update(sighting.pair)
+    return points - frames
+
+
+def _measuring(cell: Cell) -> dict[str, bool]:
+    """Frames from which poses and places of unknown noise were measured: whether by images."""
+    found = dict[str, bool]()
+    for sighting in cell.sightings:
+        evidence = sighting.evidence
+        if isinstance(evidence, MeasuredPose) and None in evidence.sigmas:
+            found[sighting.seer] = evidence.is_of_board
+        elif isinstance(evidence, MeasuredPlace) and evidence.sigma_m is None:
+            found[sighting.seer] = False
+    return found
 
 
 def _erring(cell: Cell) -> tuple[str, ...]:
-    """Flanges that err, unless nothing tells their errors from those of measured poses."""
-    stops = {sighting.stop for sighting in cell.sightings}
-    if _measuring(cell) and len(cell.sightings) == len(stops):
-        return ()
+    """Flanges whose errors some sighting shows."""
     passed = {step.robot for pair in cell.pairs for step in cell.tree.path(*pair)}
     return tuple(name for name in cell.arms if name in passed)
 

@@ -20,6 +20,7 @@ from visioncal.core.transforms import (
     rotation_angle,
 )
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
+from visioncal.fit.places import robust_carried
 from visioncal.fit.weights import by_homography, first_weighed
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
 from visioncal.model.effects.effect import LEVER_M
@@ -30,6 +31,8 @@ from visioncal.vision.targets import corner_positions, rotation_transforms, rota
 _IMAGES, _PAIRS = 40, 800
 # Small sets of sightings of which edges are tried; how many are refined.
 _SETS, _BEST = 200, 5
+# Places that differ by less are one, but for rounding.
+_SAME_M = 1e-9
 # The second pose of a flat board stays where it fits within this factor and addition [px].
 _ALIKE, _ALIKE_PX = 2.0, 0.3
 # Distortion moves corners off a homography by this and more [px].
@@ -60,15 +63,17 @@ class Start:
 
 def start_of(cell: Cell) -> Start:
     """Starts a fit; sightings without a pose, or whose frames are not connected, are left out."""
-    lenses = start_lenses(cell)
+    lenses = start_lenses(cell.with_sightings([s for s in cell.sightings if not s.is_held]))
     weighed = first_weighed(cell, lenses)
-    cell, sound = weighed.cell, weighed.sound
+    cell, sound = weighed.cell, weighed.sound & ~cell.held
     options = [candidates(cell, lenses, sighting) for sighting in cell.sightings]
     kept = [at for at, option in enumerate(options) if option is not None]
     cell, sound = cell.with_sightings([cell.sightings[at] for at in kept]), sound[kept]
     known = [option for option in options if option is not None]
-    places = _Places(cell)
-    places.join_all(known)
+    # What is held out helps no fit.
+    own = [at for at, sighting in enumerate(cell.sightings) if not sighting.is_held]
+    places = _Places(cell.with_sightings([cell.sightings[at] for at in own]))
+    places.join_all([known[at] for at in own])
     joined = [at for at, s in enumerate(cell.sightings) if places.are_joined(*s.pair)]
     cell, known = (
         cell.with_sightings([cell.sightings[at] for at in joined]),
@@ -82,6 +87,8 @@ def start_of(cell: Cell) -> Start:
         if isinstance(sighting.evidence, MeasuredPlace):
             between = places.predicted(sighting)[:3, 3] - sighting.evidence.place_m
             off = np.array([np.linalg.norm(between)])
+        # What is stated counts until sightings contradict it.
+        off = off * (not sighting.is_stated)
         best = int(off.argmin())
         distances[at] = off[best]
         turn = int(option.turns[best])
@@ -261,6 +268,10 @@ class _Places:
         self, pair: tuple[str, str], rows: Sequence[int], options: Sequence[Candidates]
     ) -> _Joint | None:
         """What the sightings of a pair determine, where one or two edges are unknown."""
+        seen_rows = [row for row in rows if not self.cell.sightings[row].is_stated]
+        if not seen_rows:
+            return self._stated(rows)
+        rows = seen_rows
         sightings = [self.cell.sightings[row] for row in rows]
         stops = np.array([sighting.stop for sighting in sightings])
         open_links, parts = list[tuple[str, str]](), [np.tile(np.eye(4), (len(rows), 1, 1))]
@@ -273,8 +284,9 @@ class _Places:
             if robot:
                 moved = self.cell.arms[robot].poses[stops]
                 parts[-1] = parts[-1] @ (invert(moved) if is_up else moved)
-        if any(isinstance(sighting.evidence, MeasuredPlace) for sighting in sightings):
-            return None
+        places = [s.evidence.place_m for s in sightings if isinstance(s.evidence, MeasuredPlace)]
+        if len(places) == len(rows):
+            return _placed(open_links, parts, np.array(places))
         seen = _padded([options[row] for row in rows])
         seen = invert(parts[0])[:, None] @ seen @ invert(parts[-1])[:, None]
         if len(open_links) == 1:
@@ -285,6 +297,43 @@ class _Places:
             links = ((*open_links[0], invert(x)), (*open_links[1], z))
             return _Joint(typical, links)
         return None
+
+    def _stated(self, rows: Sequence[int]) -> _Joint | None:
+        """What priors state of two frames where they state all of it: the last to be used."""
+        matrix, known = np.eye(4), 0
+        for row in rows:
+            evidence = self.cell.sightings[row].evidence
+            if isinstance(evidence, MeasuredPlace):
+                matrix[list(evidence.axes), 3] = evidence.place_m[list(evidence.axes)]
+                known += len(evidence.axes)
+            elif isinstance(evidence, MeasuredPose):
+                matrix[:3, :3], known = evidence.matrix[:3, :3], known + 3
+        pair = self.cell.sightings[rows[0]].pair
+        between = self.segments(*pair)
+        is_whole = known == 6 and len(between) == 1
+        return _Joint(np.inf, ((*pair, matrix),)) if is_whole else None
+
+
+def _placed(
+    links: Sequence[tuple[str, str]], parts: Sequence[FloatArray], places: FloatArray
+) -> _Joint | None:
+    """What (m, 3) places determine: rotations of frames at their ends are left as they are."""
+    near = np.einsum("mij,mj->mi", invert(parts[0]), np.insert(places, 3, 1.0, axis=1))[:, :3]
+    far = parts[-1][:, :3, 3]
+    is_point = float(np.ptp(far, axis=0).max()) < _SAME_M
+    if len(links) == 1 and is_point:
+        point = np.median(near - far, axis=0)
+        typical = float(np.median(np.linalg.norm(near - far - point, axis=1)))
+        return _Joint(typical, ((*links[0], compose(np.eye(3), point)),))
+    if len(links) == 1 and len(places) >= 3:
+        # A carrier without axes leaves no point to find.
+        frame, _, typical = robust_carried(compose(np.zeros((3, 3)), far), near)
+        return _Joint(typical, ((*links[0], invert(frame)),))
+    if len(links) == 2 and len(places) >= 4 and is_point:
+        frame, point, typical = robust_carried(parts[1], near)
+        second = compose(np.eye(3), point - far[0])
+        return _Joint(typical, ((*links[0], invert(frame)), (*links[1], second)))
+    return None
 
 
 def _padded(options: Sequence[Candidates]) -> FloatArray:

@@ -13,6 +13,8 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Target
 from visioncal.fit.lens_field import Field, by_lens
 from visioncal.model.boards import BEND, PLANE, SHAPES, SIZE
 from visioncal.model.effects import Effect, Size
+from visioncal.session.document import CameraTable
+from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
 Kind: TypeAlias = Literal["edge", "lens", "shape", "effect", "field"]
@@ -225,19 +227,35 @@ class Unknowns:
         return replace(self, closed=frozenset(names))
 
 
-def given_lens(frame: str, lens: Camera, px: FloatArray) -> Vector:
-    """A stated lens, which may be off: focal lengths, centre and distortion by a size each.
+def given_lens(table: CameraTable, frame: str, px: FloatArray, *, is_spare: bool) -> Vector | None:
+    """A stated lens, as far as it may be off; None where nothing says how far.
 
-    In units of intrinsics that move the (n, 2) corners by one pixel (rms).
+    Its focal lengths and centre are off by the stated sigma, if there is one. Where `is_spare`, (n,
+    2) corners are enough to tell the rest: by a maker's prior if it is to be refined, else by a
+    size of focal lengths, centre and distortion each. In units of intrinsics that move the corners
+    by one pixel (rms), but where these are stated.
     """
-    values = intrinsics(lens)
-    moved = np.sqrt(np.nanmean(by_lens(lens, px) ** 2, axis=(0, 1)) * 2.0)
-    parts = {"focal": (0, 2), "centre": (2, 4), "distortion": (4, len(values))}
-    priors = tuple(
-        Prior(np.arange(*ends), Size(f"{part} {frame}", 1.0, 1e-3, 100.0))
-        for part, ends in parts.items()
-    )
-    return Vector(("lens", frame), priors, values, 1.0 / moved)
+    lens, stated = table.stated, table.matrix_sigma_px
+    if lens is None:
+        raise KeyError(frame)
+    values, count = intrinsics(lens), 4 if stated is not None else 0
+    units, priors = np.ones(len(values)), list[Prior]()
+    if stated is not None:
+        priors.append(Prior(np.arange(4), sigma=stated))
+    if is_spare and table.intrinsics == "refine":
+        held = {prior.columns[0]: prior for prior in estimated_lens(frame, lens).priors}
+        priors += [prior for first, prior in held.items() if first >= count]
+        count = len(values)
+    elif is_spare and table.intrinsics == "auto":
+        moved = np.sqrt(np.nanmean(by_lens(lens, px) ** 2, axis=(0, 1)) * 2.0)
+        parts = {"focal": (0, 2), "centre": (2, 4), "distortion": (4, len(values))}
+        for part, (first, last) in parts.items():
+            if first >= count:
+                units[first:last] = 1.0 / moved[first:last]
+                size = Size(f"{part} {frame}", 1.0, 1e-3, 100.0)
+                priors.append(Prior(np.arange(first, last), size))
+        count = len(values)
+    return Vector(("lens", frame), tuple(priors), values[:count], units[:count]) if count else None
 
 
 def estimated_lens(frame: str, lens: Camera) -> Vector:
@@ -252,12 +270,13 @@ def estimated_lens(frame: str, lens: Camera) -> Vector:
     return Vector(("lens", frame), tuple(priors), mean, np.ones(len(values)))
 
 
-def printed_board(frame: str, board: Target, *, has_shape: bool, is_sized: bool) -> Vector:
-    """A printed board: its size, and its other errors where `has_shape`.
+def printed_board(frame: str, board: Target | None, *, has_shape: bool, is_sized: bool) -> Vector:
+    """A printed board, or None of which nothing is said: its size, its shape where `has_shape`.
 
     `is_sized` where errors of the arms cannot look like its size: then that is estimated.
     """
-    low = max(board.square_sigma_m / board.square_m, 1e-7)
+    share = board.square_sigma_m / board.square_m if board else DEFAULT_RELATIVE_SIGMA
+    low = max(share, 1e-7)
     high = 0.2 if is_sized else low
     size = Size(f"scale {frame}", min(0.01, high), low, high)
     priors = [Prior(np.arange(SHAPES)[SIZE], size)]

@@ -4,7 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from visioncal.core.types import FloatArray, Target
+import numpy as np
+
+from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.estimation.tree import Tree
 from visioncal.model.arm import Arm, Moments
 from visioncal.model.sightings import Sighting
@@ -33,6 +35,11 @@ class Cell:
         for index, sighting in enumerate(self.sightings):
             found.setdefault(sighting.pair, []).append(index)
         return found
+
+    @property
+    def held(self) -> Mask:
+        """(n,) sightings that are predicted only."""
+        return np.array([sighting.is_held for sighting in self.sightings], bool)
 
     @cached_property
     def unknown(self) -> tuple[str, ...]:

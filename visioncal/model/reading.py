@@ -9,7 +9,8 @@ from visioncal.core.types import Corners, FloatArray
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.model.arm import Arm, Moments, even_progress
 from visioncal.model.cell import Cell
-from visioncal.model.sightings import Evidence, MeasuredPlace, MeasuredPose, Sighting
+from visioncal.model.priors import stated_sightings
+from visioncal.model.sightings import Evidence, MeasuredPlace, MeasuredPose, Sighting, is_copy
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.columns import MEASURED_CAM_POSE
@@ -24,16 +25,15 @@ def read_cell(session: Session, corners: Mapping[int, Corners]) -> Cell:
     """Reads a session.
 
     Args:
-        session: The session; rows that are held out or of the lens alone are left out.
+        session: The session; rows of the lens alone are left out, and a copy of an earlier reading
+            of its stop.
         corners: The corners in its images by view, each numbered on its own board.
 
     Raises:
         DataError: No row has an observation, or frames are ambiguous.
     """
     rows = [
-        row
-        for row in session.observations
-        if not row.view.is_of_lens and not row.view.holdout and not row.missing_robots
+        row for row in session.observations if not row.view.is_of_lens and not row.missing_robots
     ]
     if not rows:
         raise DataError(
@@ -42,17 +42,25 @@ def read_cell(session: Session, corners: Mapping[int, Corners]) -> Cell:
         )
     stations = {station: at for at, station in enumerate(sorted({row.station for row in rows}))}
     arms = {arm.flange: arm for arm in _arms(session, rows, stations)}
-    sightings = []
+    sightings = list[Sighting]()
+    of_pair: dict[tuple[object, ...], list[Evidence]] = {}
     for row in rows:
         stop = stations[row.station]
         known = (arms[frame_name("flange", name)].poses[stop] for name in row.robots)
         found = corners.get(row.view.number)
         evidence = _evidence(session, row, found)
         if evidence is not None and all(np.isfinite(pose).all() for pose in known):
-            sighting = Sighting(row.view.number, stop, row.seer, row.seen, evidence)
-            sightings.append(sighting)
+            earlier = of_pair.setdefault((stop, row.seer, row.seen), [])
+            # A copy says nothing new about noise.
+            if not any(is_copy(evidence, other) for other in earlier):
+                earlier.append(evidence)
+                is_held = row.view.holdout
+                one = Sighting(row.view.number, stop, row.seer, row.seen, evidence, is_held)
+                sightings.append(one)
+    tree = _tree(session, [*arms], sightings)
+    sightings += stated_sightings(session.declaration, tree, sightings)
     return Cell(
-        _tree(session, [*arms], sightings),
+        tree,
         arms,
         {frame_name("camera", name): table for name, table in session.cameras.items()},
         {frame_name("target", name): plate for name, plate in session.plates.items()},
@@ -99,9 +107,11 @@ def _evidence(session: Session, row: Observation, corners: Corners | None) -> Ev
     noise = stated_instrument(session.instruments[name])
     sigma_m = float(noise.sigmas_m(place))
     probe = row.view.instrument_from_probe()
-    if probe is None or noise.sigma_rad is None:
-        return MeasuredPlace(place, sigma_m)
-    return MeasuredPose(probe, (noise.sigma_rad, sigma_m))
+    return (
+        MeasuredPlace(place, sigma_m)
+        if probe is None
+        else MeasuredPose(probe, (noise.sigma_rad, sigma_m))
+    )
 
 
 def _tree(session: Session, flanges: list[str], sightings: list[Sighting]) -> Tree:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import numpy as np
+
 from visioncal.core.types import Corners, FloatArray
 
 
@@ -11,35 +13,75 @@ class MeasuredPose:
     """A pose that was measured as such: by other software (`cft_` columns) or an instrument."""
 
     matrix: FloatArray  # (4, 4) `seer_from_seen`.
-    # Standard deviations per axis [rad], [m]; None where they are to be estimated.
-    sigmas: tuple[float, float] | None = None
+    # Standard deviations per axis [rad], [m]: None of what is to be estimated, infinite of what was
+    # not measured.
+    sigmas: tuple[float | None, float | None] = (None, None)
+
+    @property
+    def is_of_board(self) -> bool:
+        """Whether a program found it in an image: by the size that it was told of the board."""
+        return self.sigmas == (None, None)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPlace:
-    """A place that was measured by an instrument, or touched: nothing is known of its rotation."""
+    """A place that was measured by an instrument: nothing is known of its rotation.
+
+    Of a point that a tool's tip touched, it is the origin of the tip's own frame.
+    """
 
     place_m: FloatArray  # (3,) origin of the seen frame in the seer's [m].
     sigma_m: float | None = None  # Standard deviation per axis [m]; None if to be estimated.
+    axes: tuple[int, ...] = (0, 1, 2)  # Of the seer's axes, those along which it was measured.
 
 
 Evidence: TypeAlias = Corners | MeasuredPose | MeasuredPlace
+
+# Corners of two exposures differ by more in some corner [px]; a picture stored anew does not.
+_APART_PX = 0.01
+
+
+def is_copy(one: Evidence, other: Evidence) -> bool:
+    """Whether two pieces of evidence of one stop are the same reading."""
+    if isinstance(one, Corners) and isinstance(other, Corners):
+        same = np.array_equal(one.ids, other.ids)
+        return same and bool(np.abs(one.px - other.px).max(initial=0.0) < _APART_PX)
+    if isinstance(one, MeasuredPose) and isinstance(other, MeasuredPose):
+        return np.array_equal(one.matrix, other.matrix)
+    if isinstance(one, MeasuredPlace) and isinstance(other, MeasuredPlace):
+        return np.array_equal(one.place_m, other.place_m)
+    return False
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """One frame seen by another at a stop."""
 
-    view: int  # Its row's number in views.csv.
+    view: int  # Its row's number in views.csv; below 0 of what session.toml states of two frames.
     stop: int  # Index of the state of the cell.
     seer: str  # Frame of the camera or instrument.
     seen: str  # Frame of the board, probe or point.
     evidence: Evidence  # Corners are numbered on their own board.
+    is_held: bool = False  # Whether it is predicted only: no fit uses it.
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether it is a prior of where one frame is in another."""
+        return self.view < 0
 
     @property
     def corners(self) -> Corners | None:
         """Its corners, if it is an image."""
         return self.evidence if isinstance(self.evidence, Corners) else None
+
+    @property
+    def directions(self) -> int:
+        """How many of the six directions of a pose it tells."""
+        if isinstance(self.evidence, MeasuredPlace):
+            return len(self.evidence.axes)
+        if isinstance(self.evidence, MeasuredPose):
+            return 3 * sum(sigma is None or sigma < np.inf for sigma in self.evidence.sigmas)
+        return 6
 
     @property
     def pair(self) -> tuple[str, str]:

@@ -1,0 +1,205 @@
+"""Poses and places that were measured as such: what they determine, and how surely."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from support.small_cells import BOARD, PX, ROBOT_M, ROBOT_RAD, TABLE, made, pose
+
+from visioncal.core.transforms import exp, invert, log
+from visioncal.estimation.tree import Branch, Tree
+from visioncal.fit.linearise import linearised, pairs_of
+from visioncal.fit.search import Search, nearest
+from visioncal.fit.solve import solve, state_of, unknowns_of
+from visioncal.fit.start import start_of
+from visioncal.fit.unknowns import State
+from visioncal.model import Arm, Cell, MeasuredPlace, MeasuredPose, Moments, Sighting
+from visioncal.model.arm import even_progress
+from visioncal.vision.targets import corner_positions
+
+TRACKER_M, TRACKER_RAD = 2e-5, 5e-5
+
+
+def poses_by_opencv(small, size=1.0):
+    """The cell as other software saw it: poses by OpenCV, of a board `size` as large as it is."""
+    fx, fy, cx, cy = TABLE.matrix
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    points, found = corner_positions(BOARD) * size, []
+    for sighting in small.cell.sightings:
+        lens = np.array(TABLE.distortion)
+        _, turn, place = cv2.solvePnP(points, sighting.corners.px, matrix, lens)
+        measured = MeasuredPose(pose(turn.ravel(), place.ravel()))
+        found.append(replace(sighting, evidence=measured))
+    return small.cell.with_sightings(found)
+
+
+def tracked(seed, stops=14, points=1, *, are_poses=False, is_touch=False, sigma_rad=TRACKER_RAD):
+    """An arm whose points, or whose probe, a tracker measures, or whose tip touches points.
+
+    Returns the cell, and the true edges of the tracker (or tip) and the points.
+    """
+    rng = np.random.default_rng([seed, 61])
+    names = [f"point_{at}" for at in range(points)]
+    on_flange = {name: pose(rng.normal(0, 0.5, 3), rng.normal(0, 0.1, 3)) for name in names}
+    seer = pose(rng.normal(0, 0.5, 3), [2.0, -1.0, 0.4])
+    arm = [pose(rng.normal(0, 1.0, 3), rng.uniform(-0.5, 0.5, 3)) for _ in range(stops)]
+    if is_touch:
+        seer = pose([0, 0, 0], [0.02, -0.03, 0.2])
+        on_flange = {name: pose([0, 0, 0], rng.uniform(-0.3, 0.3, 3)) for name in names}
+        tips = [
+            on_flange[names[stop % points]]
+            @ pose(rng.normal(0, 0.7, 3), TRACKER_M * rng.normal(size=3))
+            for stop in range(stops)
+        ]
+        arm = [tip @ invert(seer) for tip in tips]
+    noise = rng.normal(size=(stops, 2, 3)) * np.array([ROBOT_RAD, ROBOT_M])[:, None]
+    reported = np.array([at @ pose(*step) for at, step in zip(arm, noise, strict=True)])
+    sightings = []
+    for stop, flange in enumerate(arm):
+        for at, name in enumerate(names):
+            if is_touch:
+                if at == stop % points:
+                    touch = MeasuredPlace(np.zeros(3), TRACKER_M)
+                    sightings.append(Sighting(stop, stop, "tip", name, touch))
+                continue
+            step = rng.normal(size=6) * np.repeat([TRACKER_RAD, TRACKER_M], 3)
+            read = invert(seer) @ flange @ on_flange[name] @ exp(step)
+            evidence = (
+                MeasuredPose(read, (sigma_rad, TRACKER_M))
+                if are_poses
+                else MeasuredPlace(read[:3, 3], TRACKER_M)
+            )
+            sightings.append(Sighting(len(sightings), stop, "tracker", name, evidence))
+    branches = {"flange": Branch("base", robot="flange"), "base": Branch("cell", known=np.eye(4))}
+    own = "tip" if is_touch else "tracker"
+    branches |= {own: Branch("flange" if is_touch else "cell")}
+    branches |= {name: Branch("base" if is_touch else "flange") for name in names}
+    arms = {"flange": Arm("flange", reported)}
+    moments = Moments.of(arms, even_progress(stops))
+    cell = Cell(Tree("cell", branches), arms, {}, {}, tuple(sightings), moments)
+    return cell, {own: seer, **on_flange}
+
+
+def is_fair(squares, degrees):
+    """Whether squared errors over their covariance are chance's, by 0.1 % on both sides.
+
+    Noise levels that a dozen stops determine make them a tenth larger than chi-square's.
+    """
+    low, high = chi2.ppf([0.001, 0.999], degrees * len(squares)) / len(squares)
+    return low < np.mean(squares) < 1.1 * high
+
+
+@pytest.mark.parametrize(("in_hand", "is_declared"), [(True, True), (True, False), (False, True)])
+def test_poses_by_other_software_are_as_sure_as_they_say(in_hand, is_declared):
+    squares = []
+    for seed in range(25):
+        small = made(seed, 14, in_hand=in_hand)
+        sigma = 1e-4 if is_declared else 1e-3
+        size = 1.0 + sigma * np.random.default_rng(seed).normal()
+        cell = poses_by_opencv(small, size)
+        fit = solve(cell if is_declared else replace(cell, boards={})).fit
+        away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
+        squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away))
+    assert is_fair(squares, 6)
+
+
+def test_distance_and_tilt_are_noisier_in_an_image_than_the_rest():
+    fit = solve(poses_by_opencv(made(3, 30))).fit
+    # A board of 0.16 m at 0.55 m: tilt is told by the second order of what it does to distances.
+    assert fit.sizes["rad cam"] > 2 * fit.sizes["roll cam"]
+    assert PX / TABLE.matrix[0] / 20 < fit.sizes["roll cam"] < 20 * PX / TABLE.matrix[0]
+
+
+def test_a_board_of_another_size_is_found_by_an_arm_whose_errors_are_told_apart():
+    small = made(2, 20)
+    cell = poses_by_opencv(small, 0.99)
+    start = start_of(cell)
+    unknowns = unknowns_of(start, ())
+    scale = next(m for m in unknowns.members if m.key == ("shape", "target"))
+    wide = replace(scale.priors[0], size=replace(scale.priors[0].size, start=0.01, high=0.2))
+    search = Search.of(cell, unknowns.with_members(replace(scale, priors=(wide,))))
+    fit, _ = search.run(state_of(start, ()), nearest(start))
+    sigma = float(np.sqrt(fit.covariance(("shape", "target"))[0, 0]))
+    found = fit.state.values["shape", "target"][0]
+    # Poses by a board 1 % too small: the real one is larger by that.
+    assert abs(found - (1 / 0.99 - 1)) < 4 * sigma
+    assert sigma < 1e-3
+
+
+def test_measured_rows_have_the_slopes_that_differences_show():
+    small = made(5, 6)
+    cell = poses_by_opencv(small, 1.02)
+    stated = [
+        Sighting(-1, 5, "flange", "cam", MeasuredPlace(np.array([0, 0, 0.1]), 1e-3, (2,))),
+        Sighting(-2, 5, "flange", "cam", MeasuredPose(exp(np.full(6, 0.1)), (1e-2, np.inf))),
+    ]
+    cell = cell.with_sightings([*cell.sightings, *stated])
+    start = start_of(cell)
+    unknowns, state = unknowns_of(start, ()), state_of(start, ())
+    rng = np.random.default_rng(1)
+    errors = {name: 1e-2 * rng.normal(size=at.shape) for name, at in state.errors.items()}
+    state = unknowns.moved(State(state.values, errors), 1e-2 * rng.normal(size=unknowns.count), {})
+    logs, pairs = np.zeros(len(unknowns.sizes)), pairs_of(cell)
+    grams = linearised(cell, unknowns, state, pairs)
+    counts = [sum(count.sum() for *_, count in gram.parts) for gram in grams]
+    assert counts == [36, 1, 3]
+    for column in range(unknowns.count):
+        step = 1e-6 * (np.arange(unknowns.count) == column)
+        ahead, behind = (
+            [g.weighted(logs)[:, -1, -1] for g in linearised(cell, unknowns, at, pairs)]
+            for at in (unknowns.moved(state, sign * step, {}) for sign in (1, -1))
+        )
+        for gram, a, b in zip(grams, ahead, behind, strict=True):
+            at = np.flatnonzero(gram.columns == column)
+            slope = gram.in_common(gram.weighted(logs))[:, :-1, -1]
+            expected = slope[:, 6 * len(gram.flanges) + at].sum(axis=1)
+            # The axes of the line of sight are held, as they whiten rows alone.
+            assert -(a - b) / 4e-6 == pytest.approx(expected, rel=2e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["place", "places", "pose", "pose of unknown rotation"])
+def test_what_a_tracker_read_is_as_sure_as_it_says(kind):
+    squares, turned = [], kind.startswith("pose")
+    for seed in range(20):
+        cell, edges = tracked(
+            seed, points=3 if kind == "places" else 1, are_poses=turned,
+            sigma_rad=None if "unknown" in kind else TRACKER_RAD,
+        )  # fmt: skip
+        fit = solve(cell).fit
+        assert fit.used.sum() >= len(fit.used) - 1
+        away = log(invert(edges["tracker"]) @ fit.edge("tracker"))
+        squares.append(away @ np.linalg.solve(fit.covariance(("edge", "tracker")), away))
+    assert is_fair(squares, 6)
+
+
+def test_points_that_a_tip_touched_are_as_sure_as_they_say():
+    squares = []
+    for seed in range(20):
+        cell, edges = tracked(seed, stops=24, points=3, is_touch=True)
+        fit = solve(cell).fit
+        away = fit.edge("tip")[:3, 3] - edges["tip"][:3, 3]
+        turn = fit.edge("tip")[:3, :3]
+        covariance = turn @ fit.covariance(("edge", "tip"))[3:, 3:] @ turn.T
+        squares.append(away @ np.linalg.solve(covariance, away))
+    assert is_fair(squares, 3)
+
+
+def test_a_wrong_reading_is_left_out_and_a_held_one_is_predicted():
+    cell, edges = tracked(4, stops=20)
+    sightings = list(cell.sightings)
+    wrong = sightings[7].evidence.place_m + np.array([0.01, 0, 0])
+    sightings[7] = replace(sightings[7], evidence=MeasuredPlace(wrong, TRACKER_M))
+    for row in (2, 3, 4, 5):
+        sightings[row] = replace(sightings[row], is_held=True)
+    solved = solve(cell.with_sightings(sightings))
+    held = [2, 3, 4, 5]
+    assert np.flatnonzero(~solved.used).tolist() == [2, 3, 4, 5, 7]
+    # 0.999 of twelve degrees of freedom.
+    assert 0.3 < solved.left_out.squares[held].sum() < 33
+    assert np.linalg.norm(fit_error(solved, edges)) < 5e-4
+
+
+def fit_error(solved, edges):
+    return solved.fit.edge("tracker")[:3, 3] - edges["tracker"][:3, 3]

@@ -1,0 +1,130 @@
+"""What session.toml states of frames and lenses: as much as it says, unless views contradict it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_cells import TABLE, made, pose
+from test_measured import is_fair
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import invert, log
+from visioncal.fit.solve import solve
+from visioncal.model import MeasuredPlace, MeasuredPose, Sighting, read_cell
+from visioncal.simulation.instrument_session import InstrumentOptions, session_of, tracked
+
+
+def with_prior(small, place_m, sigma_m, turn=None, sigma_rad=1.0):
+    """A made cell with a prior of all of a camera's place on the flange, and of its turn."""
+    stated = [
+        Sighting(
+            -1 - axis,
+            7,
+            "flange",
+            "cam",
+            MeasuredPlace(place_m * np.eye(3)[axis], sigma_m, (axis,)),
+        )
+        for axis in range(3)
+    ]
+    if turn is not None:
+        evidence = MeasuredPose(pose(turn, [0, 0, 0]), (sigma_rad, np.inf))
+        stated.append(Sighting(-4, 7, "flange", "cam", evidence))
+    return small.cell.with_sightings([*small.cell.sightings, *stated])
+
+
+def test_a_prior_is_worth_what_it_says():
+    squares, gains, sigma = [], [], 5e-5
+    for seed in range(25):
+        small = made(seed)
+        place = small.edges["cam"][:3, 3] + sigma * np.random.default_rng(seed).normal(size=3)
+        solved = solve(with_prior(small, place, sigma))
+        assert solved.used[-3:].all()
+        fit = solved.fit
+        away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
+        covariance = fit.covariance(("edge", "cam"))
+        squares.append(away @ np.linalg.solve(covariance, away))
+        assert np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])).max() < sigma
+        alone = solve(small.cell).fit.covariance(("edge", "cam"))
+        gains.append(np.trace(alone[3:, 3:]) / np.trace(covariance[3:, 3:]))
+    assert is_fair(squares, 6)
+    assert min(gains) > 1.0
+
+
+def test_a_component_that_the_views_contradict_goes_alone():
+    small = made(3, 16)
+    place = small.edges["cam"][:3, 3] + np.array([0.0, 0.01, 0.0])
+    turn = log(small.edges["cam"])[:3]
+    solved = solve(with_prior(small, place, 5e-5, turn, 2e-3))
+    assert solved.used[-4:].tolist() == [True, False, True, True]
+    away = log(invert(small.edges["cam"]) @ solved.fit.edge("cam"))
+    covariance = solved.fit.covariance(("edge", "cam"))
+    # 0.999 of six degrees of freedom.
+    assert away @ np.linalg.solve(covariance, away) < 22.5
+
+
+def test_tables_become_sightings_of_one_component_each():
+    table = {"x_m": 0.03, "z_m": 0.12, "sigma_m": 1e-4}
+    shop = tracked(InstrumentOptions(stops=6))
+    session = session_of(shop, prior={"flange_from_probe": table})
+    stated = [s for s in read_cell(session, {}).sightings if s.is_stated]
+    assert [s.pair for s in stated] == [("flange", "point")] * 2
+    assert [s.evidence.axes for s in stated] == [(0,), (2,)]
+    assert [s.evidence.sigma_m for s in stated] == [1e-4, 1e-4]
+    # One of no edge that is looked at says nothing.
+    session = session_of(shop, prior={"flange_from_cam": table})
+    assert not any(s.is_stated for s in read_cell(session, {}).sightings)
+
+
+def test_a_prior_across_a_robot_is_refused_where_frames_have_names():
+    shop = tracked(InstrumentOptions(stops=6))
+    tables = {"base_from_probe": {"x_m": 0.0, "sigma_m": 1e-3}}
+    session = session_of(shop, prior=tables, frames={"instrument": "cell"})
+    with pytest.raises(DataError, match="no fixed place in each other"):
+        read_cell(session, {})
+
+
+def test_copies_of_a_reading_count_once_and_held_rows_are_kept():
+    session = session_of(tracked(InstrumentOptions(stops=6)))
+    first = session.views[0]
+    copy = replace(first, number=100)
+    held = replace(session.views[1], holdout=True)
+    more = replace(session, views=(first, copy, held, *session.views[2:]))
+    cell = read_cell(more, {})
+    assert [s.view for s in cell.sightings] == [v.number for v in session.views]
+    assert cell.held.tolist() == [False, True, False, False, False, False]
+
+
+def off_lens(rng, sigma_px, **changes):
+    """A table of a lens whose matrix is stated wrong by a sigma."""
+    matrix = (np.array(TABLE.matrix) + sigma_px * rng.normal(size=4)).tolist()
+    return TABLE.model_copy(update={"matrix": matrix, "matrix_sigma_px": sigma_px, **changes})
+
+
+@pytest.mark.parametrize("mode", ["hold", "refine", "auto"])
+def test_a_stated_lens_is_as_sure_as_its_sigma(mode):
+    squares, sigma = [], 2.0
+    for seed in range(16):
+        small = made(seed, 14)
+        table = off_lens(np.random.default_rng(seed), sigma, intrinsics=mode)
+        fit = solve(replace(small.cell, cameras={"cam": table})).fit
+        away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
+        squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away))
+        has_moved = not np.array_equal(fit.camera("cam").matrix, np.array(table.matrix))
+        assert has_moved == (mode != "hold")
+        if mode != "hold":
+            off = (fit.camera("cam").matrix - np.array(TABLE.matrix))[:4]
+            sigmas = np.sqrt(np.diag(fit.covariance(("lens", "cam"))))[:4]
+            assert (sigmas < sigma).all()
+            assert (np.abs(off) < 5 * sigmas).all()
+    assert is_fair(squares, 6)
+
+
+def test_a_refined_lens_without_a_sigma_is_found_from_the_corners():
+    small = made(5, 20)
+    matrix = [value * 1.02 for value in TABLE.matrix[:2]] + list(TABLE.matrix[2:])
+    table = TABLE.model_copy(update={"matrix": matrix, "intrinsics": "refine"})
+    fit = solve(replace(small.cell, cameras={"cam": table})).fit
+    off = fit.camera("cam").matrix - np.array(TABLE.matrix)
+    sigmas = np.sqrt(np.diag(fit.covariance(("lens", "cam"))))[:4]
+    assert (np.abs(off) < 5 * sigmas).all()
+    assert (sigmas < 10).all()
