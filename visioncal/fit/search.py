@@ -137,10 +137,9 @@ class Search:
 
 def nearest(start: Start) -> Mask:
     """(n,) sightings near a start's prediction; half of each pair, to determine all edges."""
-    near = start.distances
-    limit = max(4.0 * float(np.median(near)), float(np.sort(near)[min(len(near) - 1, 6)]))
-    used: Mask = near <= limit
-    near = np.where(start.sound, near, np.inf)
+    near = np.where(start.sound, start.distances, np.inf)
+    used: Mask = near <= 4.0 * float(np.median(near[start.sound]))
     for rows in map(np.array, start.cell.pairs.values()):
-        used[rows[near[rows].argsort()][: len(rows) // 2 + 1]] = True
-    return np.asarray(used & start.sound)
+        count = int(start.sound[rows].sum())
+        used[rows[near[rows].argsort()][: min(count // 2 + 1, count)]] = True
+    return used

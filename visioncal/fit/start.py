@@ -7,6 +7,7 @@ looks the same after a turn: all stay candidates until edges tell which agree.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -33,6 +34,9 @@ _IMAGES, _PAIRS = 40, 800
 _SETS, _BEST = 200, 5
 # Places that differ by less are one, but for rounding.
 _SAME_M = 1e-9
+# Rows by which poses may be shifted; a row is wrong from this multiple of the typical distance on;
+# larger distances than this [m] may be those of wrong rows.
+_SHIFTS, _FAR, _NEAR_M = (1, -1, 2, -2, 3, -3), 6.0, 0.002
 # The second pose of a flat board stays where it fits within this factor and addition [px].
 _ALIKE, _ALIKE_PX = 2.0, 0.3
 # Distortion moves corners off a homography by this and more [px].
@@ -58,7 +62,9 @@ class Start:
     edges: Mapping[str, FloatArray]  # (4, 4) `parent_from_frame` of the unknown edges.
     distances: FloatArray  # (n,) of the sightings from what the edges predict [m].
     rivals: tuple[FloatArray, ...]  # Other poses (j, 4, 4) that each sighting may have.
-    sound: Mask  # (n,) sightings that may agree: most of their own corners do.
+    # (n,) sightings that may agree: most of their own corners do, and they are not those of a row
+    # nearby.
+    sound: Mask
 
 
 def start_of(cell: Cell) -> Start:
@@ -79,7 +85,7 @@ def start_of(cell: Cell) -> Start:
         cell.with_sightings([cell.sightings[at] for at in joined]),
         [known[at] for at in joined],
     )
-    sound = sound[joined]
+    sound = sound[joined] & np.array([s.view not in places.misplaced for s in cell.sightings])
     edges = {name: places.edge(name) for name in cell.unknown}
     sightings, distances, rivals = list(cell.sightings), np.zeros(len(known)), []
     for at, (sighting, option) in enumerate(zip(cell.sightings, known, strict=True)):
@@ -195,6 +201,9 @@ class _Joint:
     links: tuple[tuple[str, str, FloatArray], ...]
 
 
+_HandEye: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+
+
 class _Places:
     """Frames whose relative poses are known form parts; sightings join these."""
 
@@ -203,6 +212,7 @@ class _Places:
         frames = [cell.tree.root, *cell.tree.branches]
         self.part = {name: name for name in frames}
         self.pose = {name: np.eye(4) for name in frames}  # In the part's own frame.
+        self.misplaced = set[int]()  # Views whose robot's pose is that of a row nearby.
         for name, branch in cell.tree.branches.items():
             if branch.known is not None:
                 self.join(branch.parent, name, branch.known)
@@ -271,32 +281,78 @@ class _Places:
         seen_rows = [row for row in rows if not self.cell.sightings[row].is_stated]
         if not seen_rows:
             return self._stated(rows)
-        rows = seen_rows
+        rows = [row for row in seen_rows if self.cell.sightings[row].view not in self.misplaced]
         sightings = [self.cell.sightings[row] for row in rows]
+        if not rows:
+            return None
         stops = np.array([sighting.stop for sighting in sightings])
-        open_links, parts = list[tuple[str, str]](), [np.tile(np.eye(4), (len(rows), 1, 1))]
+        links, parts = self._parts(pair, stops)
+        places = [s.evidence.place_m for s in sightings if isinstance(s.evidence, MeasuredPlace)]
+        if len(places) == len(rows):
+            return _placed(links, parts, np.array(places))
+        both = _padded([options[row] for row in rows])
+        seen = invert(parts[0])[:, None] @ both @ invert(parts[-1])[:, None]
+        if len(links) == 1:
+            matrix, typical = _agreed(seen)
+            return _Joint(typical, ((*links[0], matrix),))
+        if len(links) != 2 or len(rows) < 3:
+            return None
+        x, z, own = robust_hand_eye(invert(parts[1]), seen)
+        if _is_doubtful(own):
+            x, z, own = self._shifted(sightings, both, (x, z, own))
+        typical = float(np.sort(own)[: len(rows) // 2 + 1].mean())
+        return _Joint(typical, ((*links[0], invert(x)), (*links[1], z)))
+
+    def _parts(
+        self, pair: tuple[str, str], stops: IntArray
+    ) -> tuple[list[tuple[str, str]], list[FloatArray]]:
+        """Ends of the unknown edges of a path, and (m, 4, 4) what is known around them."""
+        links, parts = list[tuple[str, str]](), [np.tile(np.eye(4), (len(stops), 1, 1))]
         for first, second, robot, is_up in self.segments(*pair):
             if self.part[first] == self.part[second]:
                 parts[-1] = parts[-1] @ invert(self.pose[first]) @ self.pose[second]
             else:
-                open_links.append((first, second))
-                parts.append(np.tile(np.eye(4), (len(rows), 1, 1)))
+                links.append((first, second))
+                parts.append(np.tile(np.eye(4), (len(stops), 1, 1)))
             if robot:
                 moved = self.cell.arms[robot].poses[stops]
                 parts[-1] = parts[-1] @ (invert(moved) if is_up else moved)
-        places = [s.evidence.place_m for s in sightings if isinstance(s.evidence, MeasuredPlace)]
-        if len(places) == len(rows):
-            return _placed(open_links, parts, np.array(places))
-        seen = _padded([options[row] for row in rows])
-        seen = invert(parts[0])[:, None] @ seen @ invert(parts[-1])[:, None]
-        if len(open_links) == 1:
-            matrix, typical = _agreed(seen)
-            return _Joint(typical, ((*open_links[0], matrix),))
-        if len(open_links) == 2 and len(rows) >= 3:
-            x, z, typical = robust_hand_eye(invert(parts[1]), seen)
-            links = ((*open_links[0], invert(x)), (*open_links[1], z))
-            return _Joint(typical, links)
-        return None
+        return links, parts
+
+    def _shifted(self, sightings: Sequence[Sighting], seen: FloatArray, best: _HandEye) -> _HandEye:
+        """Both edges by poses of rows nearby, if these are of the same edges as some rows' own.
+
+        Where rows are shifted from one on, fewer than half may be right; those shifted back have
+        the same edges, and both together have more.
+        """
+        pair, stops = sightings[0].pair, np.array([sighting.stop for sighting in sightings])
+        half, found = len(stops) // 2 + 1, best
+        robots = [robot for _, _, robot, _ in self.segments(*pair) if robot]
+        own = self._parts(pair, stops)[1]
+        for shift in _SHIFTS:
+            there = np.flatnonzero((stops + shift >= 0) & (stops + shift < len(self.cell.moments)))
+            moved = [self.cell.arms[robot].poses[stops[there] + shift] for robot in robots]
+            there = there[np.isfinite(moved).all(axis=(0, 2, 3))]
+            if len(there) < half:
+                continue
+            other = self._parts(pair, stops[there] + shift)[1]
+            near_both = invert(other[0])[:, None] @ seen[there] @ invert(other[2])[:, None]
+            x, z, _ = robust_hand_eye(invert(other[1]), near_both)
+            near = away(own[0] @ invert(x) @ own[1] @ z @ own[2], seen).min(axis=1)
+            by_shift = np.full(len(stops), np.inf)
+            by_shift[there] = away(invert(x) @ other[1] @ z, near_both).min(axis=1)
+            either = np.minimum(near, by_shift)
+            limit = _FAR * np.sort(either)[:half].mean()
+            is_better = 4.0 * np.sort(either)[:half].sum() < np.sort(found[2])[:half].sum()
+            if is_better and (near <= limit).sum() >= 4:
+                found = x, z, either
+                wrong = (near > limit) & (by_shift <= limit)
+                gone = set(stops[wrong].tolist()) - set(stops[~wrong].tolist())
+                views = {sightings[row].view for row in np.flatnonzero(wrong).tolist()}
+                self.misplaced = views | {
+                    s.view for s in self.cell.sightings if s.stop in gone and not s.is_stated
+                }
+        return found
 
     def _stated(self, rows: Sequence[int]) -> _Joint | None:
         """What priors state of two frames where they state all of it: the last to be used."""
@@ -357,8 +413,8 @@ def _agreed(seen: FloatArray) -> tuple[FloatArray, float]:
     return matrix, float(own[near].mean() / np.sqrt(half))
 
 
-def robust_hand_eye(robot: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Both edges (4, 4) of `robot X seen = Z`, and the mean distance of the nearest half [m].
+def robust_hand_eye(robot: FloatArray, seen: FloatArray) -> _HandEye:
+    """Both edges (4, 4) of `robot X seen = Z`, and (m,) how far each row is from them [m].
 
     Least trimmed squares over small sets (Rousseeuw and Van Driessen 1999).
 
@@ -385,9 +441,15 @@ def robust_hand_eye(robot: FloatArray, seen: FloatArray) -> tuple[FloatArray, Fl
             if lower >= total:
                 break
             best, own, total = (one[0][0], one[1][0]), trial, lower
-        found.append((total, best))
-    total, best = min(found, key=lambda item: item[0])
-    return *best, total / half
+        found.append((total, best, own.min(axis=1)))
+    _, best, own = min(found, key=lambda item: item[0])
+    return *best, own
+
+
+def _is_doubtful(own: FloatArray) -> bool:
+    """Whether (m,) distances are not those of noise for two thirds of the rows [m]."""
+    typical = np.sort(own)[: max(2 * len(own) // 5, 1)].mean()
+    return bool(typical > _NEAR_M or np.mean(own > _FAR * typical) > 1 / 3)
 
 
 def _hand_eye(robot: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:

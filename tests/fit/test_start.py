@@ -1,0 +1,65 @@
+"""Starts in spite of what is wrong: rows that are shifted from one on, lenses without a start."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_cells import made
+
+from visioncal.core.quantiles import f_limit
+from visioncal.core.transforms import invert, log
+from visioncal.fit.solve import solve
+from visioncal.fit.start import start_of
+from visioncal.model import Moments
+from visioncal.model.arm import even_progress
+
+
+def with_poses(cell, poses):
+    """The cell whose arm reports other (s, 4, 4) poses."""
+    arms = {"flange": replace(cell.arms["flange"], poses=poses)}
+    return replace(cell, arms=arms, moments=Moments.of(arms, even_progress(len(poses))))
+
+
+def shifted(cell, start, by):
+    """The cell whose rows have the poses of others from one on."""
+    poses = cell.arms["flange"].poses
+    stops = np.arange(len(poses))
+    rows = np.where(stops >= start, np.clip(stops + by, 0, len(poses) - 1), stops)
+    return with_poses(cell, poses[rows]), rows != stops
+
+
+@pytest.mark.parametrize("by", [1, -1, 3])
+@pytest.mark.parametrize("in_hand", [True, False])
+def test_rows_that_are_shifted_from_one_on_are_left_out(by, in_hand):
+    for seed in range(2):
+        small = made(seed, stops=18, in_hand=in_hand)
+        cell, wrong = shifted(small.cell, 6 + seed % 3, by)
+        fit = solve(cell).fit
+        assert fit.used.tolist() == (~wrong).tolist()
+        away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
+        square = away @ np.linalg.solve(fit.covariance(("edge", "cam")), away)
+        # Six to eight stops tell the flange's noise by some twenty degrees of freedom.
+        assert square / 6 < f_limit(1e-4, 6, 20)
+
+
+def test_cameras_beside_each_other_lose_the_same_rows():
+    small = made(5, stops=16, cameras=2)
+    cell, wrong = shifted(small.cell, 6, 1)
+    fit = solve(cell).fit
+    assert fit.used.tolist() == (~np.repeat(wrong, 2)).tolist()
+
+
+def test_a_sound_start_takes_no_row_for_another():
+    for seed in range(10):
+        start = start_of(made(seed, stops=12).cell)
+        assert start.sound.all()
+
+
+def test_poses_at_random_are_not_taken_for_shifted():
+    small = made(3, stops=16)
+    poses, rng = small.cell.arms["flange"].poses.copy(), np.random.default_rng(8)
+    rows = rng.permutation(16)[:7]
+    poses[rows] = poses[np.roll(rows, 2)]
+    cell = with_poses(small.cell, poses)
+    assert start_of(cell).sound.all()
+    assert np.flatnonzero(~solve(cell).fit.used).tolist() == sorted(rows.tolist())
