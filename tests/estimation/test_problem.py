@@ -573,16 +573,26 @@ def test_a_fit_has_its_unknowns_by_name_and_none_of_exact_values():
         assert len(fit.unknowns.values_of(lens)) == (0 if given else len(fit.values(lens)))
 
 
-def test_a_forward_model_of_a_fit_errs_by_the_whole_covariance():
-    known = calibrated(simulate(replace(FINE, state_intrinsics=False, views=12, seed=1)))
-    fit, rng = known.assessment.fit, np.random.default_rng(0)
-    parts = {
-        unknown: rng.normal(size=(5, 3, len(fit.covariance(unknown))))
-        for unknown in fit.unknowns.all_of("edge", "lens")
-    }
-    names, whole = [*parts], fit.covariance(*parts)
-    slope = np.concatenate([parts[name] for name in names], axis=2)
-    np.testing.assert_allclose(fit.predicted(parts), slope @ whole @ slope.mT, rtol=1e-12)
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_closure_in_the_base_is_the_derivative_of_where_things_are_seen(mount):
+    options = replace(FINE, state_intrinsics=False, mount=mount, views=8, seed=6)
+    fit, rows = calibrated(simulate(options)).assessment.fit, np.array([1, 4])
+    closure = fit.closure(rows, "base")
+    steps = np.random.default_rng(0).normal(size=(4, len(fit.whole))) * 1e-7
+    # A board's size moves no thing.
+    steps[:, fit.unknowns.of_kinds("board")] = 0.0
+    for step in steps:
+        after, before = (
+            fit.at(fit.state.moved(side * step)).closure(rows, "base").poses for side in (0.5, -0.5)
+        )
+        by_step = log(after @ invert(before))
+        # By the lens it is that where the corners were linearised, the fit's last small step away.
+        np.testing.assert_allclose(
+            closure.linear.jacobian @ step, by_step, atol=1e-4 * np.abs(by_step).max()
+        )
+    slope = closure.linear.jacobian
+    expected = slope @ fit.whole @ slope.mT
+    np.testing.assert_allclose(closure.covariance(fit.whole), expected, rtol=1e-9)
 
 
 def test_one_more_column_of_a_fit_steps_to_what_a_fit_with_it_finds():

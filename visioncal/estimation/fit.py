@@ -1,14 +1,16 @@
-"""The fit of a cell, as all that reports, judges, verifies, plans and picks from it reads it.
+"""The fit of a cell, as all that reports, judges, verifies and picks from it reads it.
 
-Readers ask by the names of `unknowns`: which values there are, what they are, how their errors
-are correlated, and what a forward model of them errs by (`predicted`). What they must not know is
-how the fit was made: `problem`, `solution` and `corners` are of the engine, and only its own
-modules, searches and tests of residuals read them. Another engine stands behind the same door if
-it gives
+Readers ask by the names of `unknowns`: which unknowns there are, what they are, how their errors
+are correlated, and what a forward model of them errs by (`closure`). They do not know how the fit
+was made: `problem`, `solution` and `corners` are of the engine, read by its own modules and by
+tests of residuals alone. Another engine stands behind the same door if it gives
 
-    unknowns, frames, values, camera, noise   what there is, and its estimates
-    absorbed, by_noise, beside                (p, p) covariances, by name of the source
-    shift                                     what held values would have moved the others by
+    unknowns, values, frames, camera      what there is, and its estimates
+    level, noise, sigmas_px, shown_px     noise of flanges, sensors and corners
+    seen, measured, expected, closure     sightings, and their forward model
+    by_noise, beside, shift               covariances by source; what held values would have moved
+    absorbed, equations, with_columns     score tests of further unknowns
+    bias                                  the fit's response to what it takes for noise
 
 Everything else here follows from these.
 """
@@ -19,15 +21,45 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.transforms import adjoint
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import normal_equations
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.problem import Linear, Problem
+from visioncal.estimation.problem_parts import Effect, Noise, Observations, State
 from visioncal.estimation.solve import Solution, covariance_of, held_shift
-from visioncal.estimation.unknowns import EDGE, LENS, LENS_ERRORS, Unknown, Unknowns
+from visioncal.estimation.tree import Tree
+from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, Unknown, Unknowns
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """What m sightings saw relative to what the chain of frames predicts, as a forward model.
+
+    It is a right perturbation (rotation [rad], translation [m]); of a mere place, without rotation.
+    """
+
+    problem: Problem  # The sightings, of the engine.
+    linear: Linear  # It linearised where the chain closes.
+    poses: FloatArray  # (m, 4, 4) pose of what was seen in the frame in which the chain closes.
+
+    def covariance(self, covariance: FloatArray) -> FloatArray:
+        """(m, 6, 6) covariances J C J' by a (p, p) covariance of the unknowns."""
+        return self.linear.covariance(covariance)
+
+    def noise(self, levels: Noise) -> FloatArray:
+        """(m, 6, 6) covariances by the noise of the robots' flanges."""
+        total = self.problem.total_covariance(self.linear, levels)
+        return np.asarray(total - self.problem.covariance(levels))
+
+    def by_flange(self, robot: str) -> FloatArray:
+        """(m, 6, 6) Jacobian by errors of a robot's flange, on its right."""
+        of, members = self.problem.units
+        by_slots = self.linear.by_flanges.reshape(len(of), 6, -1, 6)
+        mine = members[of] == self.problem.robots.index(robot)
+        return np.asarray(np.einsum("mw,mawb->mab", mine, by_slots))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +143,78 @@ class Fit:
         return problem.stack.shown_px(compressed.residuals, problem.unknowns(compressed))
 
     @property
+    def tree(self) -> Tree:
+        """The frames, of which one that moved is several."""
+        return self.problem.tree
+
+    @property
+    def flanges(self) -> Mapping[str, FloatArray]:
+        """(s, 4, 4) `base_from_flange` of each robot at the stops, without unknown errors of it."""
+        return self.problem.poses
+
+    def level(self, robot: str) -> FloatArray:
+        """(2,) noise of a robot's flange from stop to stop, of rotation [rad] and position [m]."""
+        return np.asarray(self.noise.robots[self.problem.robots.index(robot)])
+
+    def with_level(self, robot: str, level: FloatArray) -> Noise:
+        """The noise with another level (2,) of a robot."""
+        robots = self.noise.robots.copy()
+        robots[self.problem.robots.index(robot)] = level
+        return replace(self.noise, robots=robots)
+
+    @property
+    def measured(self) -> FloatArray:
+        """(n, 4, 4) `observer_from_observed` that the sightings measured, by lenses and boards."""
+        return self.problem.measured(self.state)
+
+    @property
+    def seen(self) -> Observations:
+        """The n sightings: who saw what at which stop."""
+        return self.problem.observations
+
+    @property
+    def is_combined(self) -> bool:
+        """Whether robot and camera have one noise together, that of each sighting."""
+        return self.problem.is_combined
+
+    @property
+    def expected(self) -> FloatArray:
+        """(n, 6, 6) covariance of the sightings' residuals by all unknowns and all noise."""
+        linear = self.problem.linear(self.state, ideal=True)
+        by_noise = self.problem.total_covariance(linear, self.noise)
+        return linear.covariance(self.whole) + by_noise
+
+    def closure(self, rows: IntArray, frame: str = "", things: FloatArray | None = None) -> Closure:
+        """The closure of the chains of (m,) some sightings, in the frames that they saw.
+
+        Args:
+            rows: The sightings.
+            frame: A frame to close in instead: it is seen from there, through what they saw.
+            things: (m, 3, b) Jacobian, by the columns of boards, of places of things that they see
+                instead of boards, whose size is not that of their distance.
+        """
+        part = self.problem.subset(np.isin(np.arange(len(self.seen)), rows))
+        poses, carry, seen = part.measured(self.state), np.eye(6), part.observations
+        if frame:
+            there = replace(seen, observers=(frame,) * len(seen), observed=seen.observers)
+            every = np.ones(len(seen), dtype=bool)
+            seen = replace(seen, observed=there.observers, has_rotation=every)
+            poses = replace(part, observations=there).predicted(self.state) @ poses
+            part = replace(part, observations=seen, points=frozenset(), with_repeats=False)
+            carry = adjoint(poses)
+        effects, at, boards = [], 6 * len(self.frames), self.unknowns.of_kinds(BOARD)
+        for effect in part.effects:
+            of_boards = np.isin(np.arange(at, at := at + len(effect)), boards)
+            by_sensor = effect.by_sensor
+            if by_sensor is not None and (frame or things is not None):
+                by_sensor = carry @ by_sensor * ~of_boards
+                if things is not None and of_boards.any():
+                    by_sensor[:, 3:, of_boards] = -things
+            effects.append(replace(effect, by_sensor=by_sensor))
+        closed = replace(part, effects=tuple(effects))
+        return Closure(closed, closed.linear(self.state, ideal=True), poses)
+
+    @property
     def frames(self) -> dict[str, FloatArray]:
         """Poses (4, 4) `parent_from_frame` of the unknown frames."""
         return self.problem.frames(self.state)
@@ -186,8 +290,3 @@ class Fit:
         for unknown, part in parts.items():
             jacobian[..., self.unknowns[unknown]] = part
         return jacobian
-
-    def predicted(self, parts: Mapping[tuple[str, str], FloatArray]) -> FloatArray:
-        """(..., m, m) covariance J C J' of a forward model with Jacobians (..., m, c)."""
-        jacobian = self.by_columns(parts)
-        return np.asarray(jacobian @ self.whole @ jacobian.mT)

@@ -95,7 +95,6 @@ def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
     return PickInputs(
         answer.fit,
-        answer.fit.problem,
         answer.held_out,
         middles_of(cell_fit.cell),
         dict(zip(answer.fit.problem.robots, freedom, strict=True)),

@@ -29,7 +29,7 @@ to the above: one that carries its camera looks in the posture of one view, and 
 another.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -41,11 +41,9 @@ from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, apply_each, compose, invert, log
-from visioncal.core.types import FloatArray, IntArray, Mask, Need
+from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.arm import ArmErrors
-from visioncal.estimation.fit import Fit
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.fit import Closure, Fit
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.estimation.unknowns import BOARD
 from visioncal.results import NeedMet, Picker
@@ -181,13 +179,12 @@ def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) 
 class PickInputs:
     """Input for the prediction of picks."""
 
-    fit: Fit  # The fit.
-    problem: Problem  # Its observations, or n of them.
-    held_out: HeldOutResiduals  # The observations' residuals by fits without their stops.
+    fit: Fit  # The fit of n sightings.
+    held_out: HeldOutResiduals  # Their residuals by fits without their stops.
     # (3,) of each target, in its frame [m]; of others, their origin.
     target_centres: Mapping[str, FloatArray]
     freedom: Mapping[str, float]  # Degrees of freedom of each robot's noise.
-    arms: Mapping[str, RobotArm]  # The robots' arms, at the problem's stops.
+    arms: Mapping[str, RobotArm]  # The robots' arms, at the fit's stops.
     # (3, b) Jacobian of each target's middle by the columns of boards, by its frame [m].
     centre_jacobians: Mapping[str, FloatArray]
     # Relative change of the focal length of each camera from image to image.
@@ -195,27 +192,20 @@ class PickInputs:
     # (m, 2) turn [rad] and shift [m] of its views that were rejected, by camera; see `Picks`.
     strays: Mapping[str, FloatArray] = field(default_factory=dict)
 
-    @property
-    def board_columns(self) -> IntArray:
-        """(b,) the columns of boards' shapes."""
-        return self.fit.unknowns.of_kinds(BOARD)
-
 
 def predict_picks(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
     """Predicts picks, for each camera and each robot between it and what it sees.
 
     They are at the need's place, or where the views looked.
     """
-    problem = fitted.problem
-    pairs: dict[tuple[str, str], list[int]] = {}
-    for group in problem.groups:
-        observer = problem.observations.observers[int(group.rows[0])].partition("@")[0]
-        for step in group.path:
+    seen, pairs = fitted.fit.seen, dict[tuple[str, str], list[int]]()
+    for at, (observer, observed) in enumerate(zip(seen.observers, seen.observed, strict=True)):
+        for step in fitted.fit.tree.path(observer, observed):
             if step.robot:
-                pairs.setdefault((observer, step.robot), []).extend(group.rows.tolist())
+                pairs.setdefault((observer.partition("@")[0], step.robot), []).append(at)
     bias = {robot: _arm_bias(fitted, robot) for robot in {robot for _, robot in pairs}}
     return tuple(
-        _picks(_subset(fitted, sorted(rows)), camera, robot, bias[robot], need)
+        _picks(fitted, np.array(rows), camera, robot, bias[robot], need)
         for (camera, robot), rows in pairs.items()
     )
 
@@ -228,26 +218,24 @@ def _arm_bias(fitted: PickInputs, robot: str) -> FloatArray | None:
     return arm.errors.sigma * fitted.fit.bias(robot, arm.errors)
 
 
-def _subset(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:
-    """The input restricted to some of the observations."""
-    chosen = np.isin(np.arange(len(fitted.problem)), rows)
-    held = fitted.held_out
-    kept = replace(held, residual_m=held.residual_m[chosen], residual_rad=held.residual_rad[chosen])
-    return replace(fitted, problem=fitted.problem.subset(chosen), held_out=kept)
-
-
 def _picks(
-    fitted: PickInputs, camera: str, robot: str, bias: FloatArray | None, need: Need | None
+    fitted: PickInputs,
+    rows: IntArray,
+    camera: str,
+    robot: str,
+    bias: FloatArray | None,
+    need: Need | None,
 ) -> Picks:
-    """Picks by one robot of what one camera sees, from the observations with it between."""
-    problem, state, noise = fitted.problem, fitted.fit.state, fitted.fit.noise
-    seen, base, arm = problem.observations, problem.tree.bases[robot], fitted.arms.get(robot)
-    in_base = _base_from_targets(problem, state, base)
-    frames = (name.partition("@")[0] for name in seen.observed)
+    """Picks by one robot of what one camera sees, from the (n,) sightings with it between."""
+    fit, arm, seen = fitted.fit, fitted.arms.get(robot), fitted.fit.seen.take(rows)
+    base, stops = fit.tree.bases[robot], seen.stops
+    frames = [name.partition("@")[0] for name in seen.observed]
     middles = np.array([fitted.target_centres.get(frame, np.zeros(3)) for frame in frames])
+    closure, noise = fit.closure(rows, base), fit.noise
+    in_base, to_base = closure.poses, adjoint(closure.poses)
     carries = np.array(
         [
-            any(step.robot == robot for step in problem.tree.path(observer, base))
+            any(step.robot == robot for step in fit.tree.path(observer, base))
             for observer in seen.observers
         ]
     )
@@ -255,45 +243,41 @@ def _picks(
     errors = None if arm is None or calibrated else arm.errors
     as_noise = None if bias is None else errors
     whole = calibrated or (as_noise is not None and (as_noise.of_links or as_noise.is_significant))
+    boards = fit.unknowns.of_kinds(BOARD)
     if whole:
         # The whole chain, in the targets' frames, includes the noise of its flanges.
-        observations, at_m = _as_things(fitted), middles
+        unmoved = np.zeros((3, len(boards)))
+        moved = [fitted.centre_jacobians.get(frame, unmoved) for frame in frames]
+        closure, at_m = fit.closure(rows, things=np.array(moved)), middles
     else:
-        observations, at_m = _as_seen_by_base(fitted, base, in_base), apply_each(in_base, middles)
+        at_m = apply_each(in_base, middles)
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
-    linearised, covariance, parts = observations.linear(state, ideal=True), fitted.fit.whole, {}
-    to_base, column = adjoint(in_base), problem.robots.index(robot)
-    level = pick_level = noise.robots[column]
+    covariance, parts = fit.whole, dict[str, FloatArray]()
+    level = pick_level = fit.level(robot)
     if as_noise is not None and bias is not None:
         covariance = covariance - bias @ bias.T
-        by_posture, in_time = _arm_covariances(fitted, robot, as_noise, bias)
+        by_posture, in_time = _arm_covariances(fit.closure(rows), robot, stops, as_noise, bias)
         if not whole:
             by_posture, in_time = (to_base @ array @ to_base.mT for array in (by_posture, in_time))
         parts["arm"] = by_posture + in_time
         if as_noise.white is not None:
-            level, levels = as_noise.white, noise.robots.copy()
-            levels[column] = level
-            noise = replace(noise, robots=levels)
+            level, noise = as_noise.white, fit.with_level(robot, as_noise.white)
         pick_level = np.hypot(level, _lasting_sigma(as_noise))
     elif errors is not None:
-        stops = seen.stops
-        root = errors.sigma * adjoint(problem.poses[robot][stops]) @ errors.basis[stops]
+        root = errors.sigma * adjoint(fit.flanges[robot][stops]) @ errors.basis[stops]
         parts["arm"] = root @ root.mT
     # The part of the covariance that is due to the boards' shapes.
-    cross = covariance[:, fitted.board_columns]
-    of_boards = cross @ np.linalg.pinv(cross[fitted.board_columns], hermitian=True) @ cross.T
-    parts["calibration"] = linearised.covariance(covariance - of_boards)
-    parts["board"] = linearised.covariance(of_boards)
+    cross = covariance[:, boards]
+    of_boards = cross @ np.linalg.pinv(cross[boards], hermitian=True) @ cross.T
+    parts["calibration"] = closure.covariance(covariance - of_boards)
+    parts["board"] = closure.covariance(of_boards)
     carried = carries[:, None, None]
-    if problem.is_combined:
-        # Combined noise counts as the robot's, where it carries the camera.
-        look = carried * (to_base @ _diagonal(level) @ to_base.mT)
-    else:
-        look = observations.total_covariance(linearised, noise) - observations.covariance(noise)
-    parts["look"] = look
+    # Combined noise counts as the robot's, where it carries the camera.
+    combined = carried * (to_base @ _diagonal(level) @ to_base.mT)
+    parts["look"] = combined if fit.is_combined else closure.noise(noise)
     by_source = {name: _at_points(part, at_m) for name, part in parts.items()}
-    at_camera = problem.measured(state)
+    at_camera = fit.measured[rows]
     in_camera = apply_each(at_camera, middles)
     axes = np.swapaxes(at_camera[:, :3, :3], 1, 2)[:, :, 2]
     if not whole:
@@ -305,10 +289,10 @@ def _picks(
     # the posture is the same, and the noise of a whole chain is already in it.
     fixed = 0.0 if whole else _diagonal(level)
     pick_noise = np.where(carried, _diagonal(pick_level), fixed)
-    by_source["pick"] = _flange_covariance(problem, robot, in_base, pick_noise)
+    by_source["pick"] = _flange_covariance(fit, robot, stops, in_base, pick_noise)
     if as_noise is not None and not as_noise.of_links:
         by_source["pick"] = by_source["pick"] + carried * _at_points(by_posture, at_m)
-    by_source["left out"] = np.broadcast_to(_excess_covariance(fitted), parts["look"].shape)
+    by_source["left out"] = np.broadcast_to(_excess_covariance(fitted, rows), parts["look"].shape)
     picks = Picks(
         camera,
         robot,
@@ -319,7 +303,7 @@ def _picks(
         strays=np.tile(fitted.strays.get(camera, np.zeros((0, 2))), (1 + bool(carries.any()), 1)),
     )
     by_controller = _uncorrected(
-        picks, fitted, in_base, at_m, whole=whole, is_carried=bool(carries.all())
+        *(picks, fitted, stops, in_base, at_m), whole=whole, is_carried=bool(carries.all())
     )
     return replace(picks, uncorrected=by_controller)
 
@@ -327,6 +311,7 @@ def _picks(
 def _uncorrected(
     picks: Picks,
     fitted: PickInputs,
+    stops: IntArray,
     in_base: FloatArray,
     at_m: FloatArray,
     *,
@@ -336,18 +321,17 @@ def _uncorrected(
     """The same picks by the controller's own poses; None where these are the arm's.
 
     Args:
-        picks: Picks at the n observations.
+        picks: Picks at n sightings.
         fitted: Their fit.
+        stops: (n,) their stops.
         in_base: (n, 4, 4) `base_from_target`.
         at_m: (n, 3) the positions, in the targets' frames where `whole`, else in the base [m].
         whole: Whether the picks are in the targets' frames.
         is_carried: Whether the robot carries the camera.
     """
-    problem, arm = fitted.problem, fitted.arms.get(picks.robot)
+    arm, flange = fitted.arms.get(picks.robot), fitted.fit.flanges[picks.robot][stops]
     if arm is None or (arm.model is None and arm.drift is None):
         return None
-    stops = problem.observations.stops
-    flange = problem.poses[picks.robot][stops]
     carry = adjoint((invert(in_base) if whole else np.eye(4)) @ flange)
     missed = carry @ log(invert(flange) @ arm.reported[stops])[:, :, None]
     offsets = missed[:, :, 0]
@@ -373,77 +357,19 @@ def _diagonal(level: FloatArray) -> FloatArray:
 
 
 def _flange_covariance(
-    problem: Problem, robot: str, in_base: FloatArray, noise: FloatArray
+    fit: Fit, robot: str, stops: IntArray, in_base: FloatArray, noise: FloatArray
 ) -> FloatArray:
     """(n, 6, 6) noise of a flange at its own origin, from (n, 6, 6) by its level."""
     # Combined noise of robot and camera is that of targets: its position part includes the flange's
     # rotation times their distance.
     covariance = noise.copy()
-    if problem.is_combined:
-        flange_m = problem.poses[robot][problem.observations.stops, :3, 3]
+    if fit.is_combined:
+        flange_m = fit.flanges[robot][stops, :3, 3]
         lever_m2 = np.sum((in_base[:, :3, 3] - flange_m) ** 2, axis=1)
         # With equal rotations about three axes, a point moves by two of their components.
         own_m2 = np.maximum(noise[:, 3, 3] - noise[:, 0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
         covariance[:, 3:, 3:] = own_m2[:, None, None] * np.eye(3)
     return covariance
-
-
-def _base_from_targets(problem: Problem, state: State, base: str) -> FloatArray:
-    """(n, 4, 4) `base_from_target` of each observation."""
-    base_from_camera = np.zeros((len(problem), 4, 4))
-    for group in problem.groups:
-        observer = problem.observations.observers[int(group.rows[0])]
-        base_from_camera[group.rows] = problem.between(base, observer, state, group.rows)
-    return np.asarray(base_from_camera @ problem.measured(state))
-
-
-def _with_sensors(
-    fitted: PickInputs, change: Callable[[FloatArray, Mask], FloatArray]
-) -> tuple[Effect, ...]:
-    """Effects whose (n, 6, k) actions on measured poses are changed; the mask is of boards."""
-    effects, at = [], 6 * len(fitted.problem.unknown)
-    for effect in fitted.problem.effects:
-        of_boards = np.isin(np.arange(at, at := at + len(effect)), fitted.board_columns)
-        by_sensor = effect.by_sensor
-        by_sensor = None if by_sensor is None else change(by_sensor, of_boards)
-        effects.append(replace(effect, by_sensor=by_sensor))
-    return tuple(effects)
-
-
-def _as_seen_by_base(fitted: PickInputs, base: str, in_base: FloatArray) -> Problem:
-    """The observations converted to ones of the base, through what they saw."""
-    # The lens's effect on the measured poses of targets then moves the base instead.
-    problem, carry = fitted.problem, adjoint(in_base)
-    observations = replace(
-        problem.observations,
-        observed=(base,) * len(problem),
-        measured=problem.measured(fitted.fit.state) @ invert(in_base),
-        has_rotation=np.ones(len(problem), dtype=bool),
-    )
-    return replace(
-        problem,
-        observations=observations,
-        effects=_with_sensors(fitted, lambda array, boards: carry @ array * ~boards),
-        points=frozenset(),
-        with_repeats=False,
-    )
-
-
-def _as_things(fitted: PickInputs) -> Problem:
-    """The observations converted to ones of things at the boards' middles."""
-    # A board of another size was measured at another distance, and a thing is not: a board's shape
-    # then only moves its middle.
-    problem, unmoved = fitted.problem, np.zeros((3, len(fitted.board_columns)))
-    frames = (frame.partition("@")[0] for frame in problem.observations.observed)
-    jacobian = np.array([fitted.centre_jacobians.get(frame, unmoved) for frame in frames])
-
-    def moved(array: FloatArray, boards: Mask) -> FloatArray:
-        array = array * ~boards
-        if boards.any():
-            array[:, 3:, boards] = -jacobian
-        return array
-
-    return replace(problem, effects=_with_sensors(fitted, moved))
 
 
 def _at_points(covariances: FloatArray, points_m: FloatArray) -> FloatArray:
@@ -453,13 +379,14 @@ def _at_points(covariances: FloatArray, points_m: FloatArray) -> FloatArray:
 
 
 def _arm_covariances(
-    fitted: PickInputs, robot: str, errors: ArmErrors, bias: FloatArray
+    closure: Closure, robot: str, stops: IntArray, errors: ArmErrors, bias: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Covariances from arm errors that a fit treats as noise, for each observation.
+    """Covariances from arm errors that a fit treats as noise, for each of n sightings.
 
     Args:
-        fitted: The fit.
+        closure: Their closure.
         robot: The robot.
+        stops: (n,) their stops.
         errors: Its arm's errors.
         bias: (p, q) the fit's bias for each of them, scaled by its sigma.
 
@@ -467,12 +394,8 @@ def _arm_covariances(
         (n, 6, 6) twice: of posture-dependent errors, and of lasting ones. The latter have other
         values than at the stops of the fit, and vary as much as among these.
     """
-    problem, state = fitted.problem, fitted.fit.state
-    widened = problem.with_effects([*problem.effects, errors.effect(robot)])
-    values = np.concatenate([state.values, np.zeros(bias.shape[1])])
-    jacobian = widened.linear(replace(state, values=values), ideal=True).jacobian
-    size, last = problem.size, errors.is_time_correlated
-    by_fit, own = jacobian[:, :, :size] @ bias, errors.sigma * jacobian[:, :, size:]
+    by_fit, last = closure.linear.jacobian @ bias, errors.is_time_correlated
+    own = errors.sigma * (closure.by_flange(robot) @ errors.basis[stops])
     by_posture = by_fit[:, :, ~last] - own[:, :, ~last]
     changing = own[:, :, last] - own[:, :, last].mean(axis=0)
     in_time = np.concatenate([by_fit[:, :, last], changing], axis=2)
@@ -489,15 +412,12 @@ def _lasting_sigma(errors: ArmErrors) -> FloatArray:
     return np.asarray(np.sqrt(squares.mean(axis=(0, 2))))
 
 
-def _excess_covariance(fitted: PickInputs) -> FloatArray:
-    """(6, 6) excess of held-out residuals over their prediction, beyond chance."""
-    problem, noise = fitted.problem, fitted.fit.noise
-    linear = problem.linear(fitted.fit.state, ideal=True)
-    expected = linear.covariance(fitted.fit.whole) + problem.total_covariance(linear, noise)
-    held_out, excess = fitted.held_out, np.zeros((6, 6))
+def _excess_covariance(fitted: PickInputs, rows: IntArray) -> FloatArray:
+    """(6, 6) excess of some held-out residuals over their prediction, beyond chance."""
+    expected, held_out, excess = fitted.fit.expected[rows], fitted.held_out, np.zeros((6, 6))
     for residuals, axes in (
-        (held_out.residual_rad, slice(0, 3)),
-        (held_out.residual_m, slice(3, 6)),
+        (held_out.residual_rad[rows], slice(0, 3)),
+        (held_out.residual_m[rows], slice(3, 6)),
     ):
         measured = np.isfinite(residuals)
         if not measured.any():
