@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.small_cells import made
+from scipy.spatial.transform import Rotation
+from support.small_cells import TABLE, made, seen_at
 
 from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import invert, log
@@ -63,3 +64,29 @@ def test_poses_at_random_are_not_taken_for_shifted():
     cell = with_poses(small.cell, poses)
     assert start_of(cell).sound.all()
     assert np.flatnonzero(~solve(cell).fit.used).tolist() == sorted(rows.tolist())
+
+
+def test_far_boards_tell_a_lens_by_the_robots_motion(monkeypatch):
+    def far(rng):
+        found = seen_at(rng)
+        found[:3, 3] += np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(2.2, 2.8)])
+        found[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.15, 3)).as_matrix()
+        return found
+
+    monkeypatch.setattr("support.small_cells.seen_at", far)
+    for seed in range(2):
+        small = made(seed, stops=16, given=False)
+        # By corners alone, focal lengths are hundreds of widths, or differ.
+        fx, fy = start_of(small.cell).lenses["cam"].matrix[:2]
+        assert fx == pytest.approx(fy, rel=0.06)
+        assert fx == pytest.approx(1150.0, rel=0.3)
+        fit = solve(small.cell).fit
+        assert fit.used.sum() >= 14
+        for key, true in (("edge", small.edges["cam"]), ("lens", TABLE.matrix)):
+            covariance = fit.covariance((key, "cam"))
+            if key == "edge":
+                away = log(invert(true) @ fit.edge("cam"))
+            else:
+                away, covariance = fit.camera("cam").matrix - true, covariance[:4, :4]
+            square = away @ np.linalg.solve(covariance, away)
+            assert square / len(away) < f_limit(1e-4, len(away), 40)

@@ -73,10 +73,12 @@ class Search:
 
     def weighed(self, fit: Fit) -> "Search | None":
         """The search with corners judged by a fit; None where these are as sure as they were."""
-        found = weighed(self.cell, fit.unknowns, fit.state, self.pairs, fit.used)
-        if not found.changed:
+        # Under the lens of a start, a sound view may have seemed none.
+        judged = fit.used | ~(self.sound | self.cell.held)
+        found = weighed(self.cell, fit.unknowns, fit.state, self.pairs, judged)
+        sound = np.where(judged, found.sound, self.sound)
+        if not found.changed and np.array_equal(sound, self.sound):
             return None
-        sound = self.sound & found.sound
         return replace(self, cell=found.cell, pairs=pairs_of(found.cell), sound=sound)
 
     def _sized(self, state: State, used: Mask, last: Fit | None) -> Fit:

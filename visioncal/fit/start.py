@@ -11,6 +11,7 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from visioncal.core.transforms import (
     compose,
@@ -37,6 +38,8 @@ _SAME_M = 1e-9
 # Rows by which poses may be shifted; a row is wrong from this multiple of the typical distance on;
 # larger distances than this [m] may be those of wrong rows.
 _SHIFTS, _FAR, _NEAR_M = (1, -1, 2, -2, 3, -3), 6.0, 0.002
+# Focal lengths that lenses have, over the width, and how many are tried; ratio of both, less one.
+_FOCAL, _FOCALS, _SQUARE = (0.25, 10.0), 12, 0.05
 # The second pose of a flat board stays where it fits within this factor and addition [px].
 _ALIKE, _ALIKE_PX = 2.0, 0.3
 # Distortion moves corners off a homography by this and more [px].
@@ -138,7 +141,48 @@ def start_lenses(cell: Cell) -> dict[str, Camera]:
             _, matrix, lens, *_ = cv2.calibrateCamera(points, px, size, np.eye(3), np.zeros(5))
         four = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], float)
         found[frame] = Camera(table.model, size, four, np.asarray(lens, float).ravel()[:5])
+        if not _is_made(found[frame]):
+            found[frame] = _lens_by_motion(cell, frame, found[frame])
     return found
+
+
+def _is_made(lens: Camera) -> bool:
+    """Whether a lens has square pixels and a focal length that are made."""
+    fx, fy = lens.matrix[:2] / lens.resolution[0]
+    return bool(_FOCAL[0] < fx < _FOCAL[1] and abs(np.log(fx / fy)) < _SQUARE)
+
+
+def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:
+    """A lens with the focal length by which boards' poses agree best with the robots' motion.
+
+    Boards that are far, or face the camera, have none of their own: it is as good as a distance.
+    """
+    cell = cell.with_sightings([s for s in cell.sightings if s.seer == frame and s.corners])
+    middle, none = (np.array(lens.resolution) - 1.0) / 2.0, np.zeros_like(lens.distortion)
+
+    def at(focal: float) -> Camera:
+        return Camera(lens.model, lens.resolution, np.array([focal, focal, *middle]), none)
+
+    def closing(log_focal: float) -> float:
+        trial = {frame: at(float(np.exp(log_focal)))}
+        known = [(s, found) for s in cell.sightings if (found := candidates(cell, trial, s))]
+        places = _Places(cell.with_sightings([sighting for sighting, _ in known]))
+        places.join_all([found for _, found in known])
+        off = [
+            float(away(places.predicted(s), found.poses).min())
+            for s, found in known
+            if places.are_joined(*s.pair)
+        ]
+        return float(np.mean(np.sort(off)[: len(off) // 2 + 1])) if off else np.inf
+
+    logs = np.log(lens.resolution[0] * np.geomspace(*_FOCAL, _FOCALS))
+    values = [closing(float(value)) for value in logs]
+    best = int(np.argmin(values))
+    if not np.isfinite(values[best]):
+        return lens
+    ends = logs[max(best - 1, 0)], logs[min(best + 1, len(logs) - 1)]
+    found = minimize_scalar(closing, bounds=ends, method="bounded", options={"xatol": 1e-2})
+    return at(float(np.exp(found.x)))
 
 
 def _spread(count: int, most: int) -> IntArray:
