@@ -37,7 +37,8 @@ def print_of(kind: str, rng: np.random.Generator, *, first: int | None = None) -
     said: dict[str, Any] = {"kind": kind, "columns": columns, "rows": rows}
     if kind == "charuco":
         legacy = bool(rng.integers(2))
-        share = float(rng.uniform(0.6, 0.8))
+        # Whole pixels around markers: OpenCV draws some others outside of its image.
+        share = 1.0 - (2 * round(_UNIT * rng.uniform(0.1, 0.2)) + 1e-3) / _UNIT
         ids = np.arange(columns * rows // 2, dtype=np.int32) + first
         board = cv2.aruco.CharucoBoard((columns, rows), 1.0, share, dictionary_of(name), ids)
         board.setLegacyPattern(legacy)
@@ -129,7 +130,7 @@ def photographs(
         blur: Range of the blur's sigma [px].
         noise: Sigma of the noise [grey levels].
         turned: Whether the camera is turned about its axis at random.
-        hidden: Share of the board's width that a dark thing covers.
+        hidden: Largest share of the board that a dark thing covers from one side.
     """
     return [
         _photograph(board.drawn, rng, size, fill, tilt, blur, noise, turned, hidden)
@@ -155,8 +156,11 @@ def _photograph(drawn, rng, size, fill, tilt, blur, noise, turned, hidden):
     source = corners + np.array([width, height]) / 2
     flat = cv2.getPerspectiveTransform(source.astype(np.float32), px.astype(np.float32))
     if hidden:
-        drawn = drawn.copy()
-        drawn[:, : round(hidden * width)] = 60
+        # From any side, and by any share up to this one.
+        side = int(rng.integers(4))
+        drawn = np.rot90(drawn, side).copy()
+        drawn[:, : round(rng.uniform(0.2, 1.0) * hidden * drawn.shape[1])] = 60
+        drawn = np.rot90(drawn, -side)
     # Twice the size against aliasing.
     twice = np.diag([2.0, 2.0, 1.0]) @ flat
     large = (2 * size[0], 2 * size[1])
@@ -190,7 +194,7 @@ def described(board: Print) -> dict[str, Any]:
 HARD: dict[str, dict[str, Any]] = {
     "small": {"fill": (0.12, 0.25)},
     "far": {"fill": (0.06, 0.1)},
-    "hidden in part": {"hidden": 0.3},
+    "hidden in part": {"hidden": 0.5},
     "blurred": {"blur": (2.5, 5.0)},
     "very blurred": {"blur": (5.0, 9.0)},
     "noisy": {"noise": 25.0},

@@ -16,6 +16,7 @@ from support.marks import slow
 from support.photographed import (
     HARD,
     KINDS,
+    Print,
     described,
     dictionary_of,
     is_named,
@@ -55,22 +56,71 @@ def test_a_random_board_is_named_from_three_photographs(seed):
     assert identity.is_mirrored == mirrored
 
 
+@pytest.mark.parametrize("seed", [16, slow(28)])
+def test_large_circles_in_shifted_rows_are_no_squares(seed):
+    rng = np.random.default_rng([303, seed])
+    board = print_of("circles", rng)
+    assert board.said["asymmetric"]
+    assert is_named(board, identify(photographs(board, rng)))
+
+
+def is_accused(board, images):
+    """Whether a sound board is said to be another one; it may be found, or not found."""
+    target = target_from_document(described(board), "board")
+    session = Session.from_arrays(images, np.tile(np.eye(4), (len(images), 1, 1)), target)
+    try:
+        detect(session)
+    except DataError as error:
+        return isinstance(error, OtherBoardError) or "another board" in str(error)
+    return False
+
+
 @pytest.mark.parametrize("kind", [KINDS[0], *map(slow, KINDS[1:])])
 @pytest.mark.parametrize("hard", HARD)
 def test_no_sound_board_is_accused(kind, hard):
     rng = np.random.default_rng([70, KINDS.index(kind), [*HARD].index(hard)])
     board = print_of(kind, rng)
-    images = photographs(board, rng, **HARD[hard])
-    target = target_from_document(described(board), "board")
-    session = Session.from_arrays(images, np.tile(np.eye(4), (3, 1, 1)), target)
-    # It is found, or not found, but not said to be another one.
-    found: DataError | None = None
-    try:
-        detect(session)
-    except DataError as error:
-        found = error
-    assert not isinstance(found, OtherBoardError)
-    assert "another board" not in str(found)
+    assert not is_accused(board, photographs(board, rng, **HARD[hard]))
+
+
+@pytest.mark.parametrize(
+    ("seed", "kind", "hard"),
+    [
+        # Detectors' corners make gaps look wider; a single tag is read by chance.
+        ([404, 6, 3], "gridboard", "blurred"),
+        ([404, 8, 7], "gridboard", "steep"),
+        ([404, 11, 3], "aprilgrid", "blurred"),
+        ([404, 11, 4], "gridboard", "very blurred"),
+        # From the side its rows are columns.
+        ([9, 4], "circles", "hidden in part"),
+    ],
+)
+def test_sound_boards_that_look_like_others_are_not_accused(seed, kind, hard):
+    rng = np.random.default_rng(seed)
+    board = print_of(kind, rng)
+    assert not is_accused(board, photographs(board, rng, **HARD[hard]))
+
+
+def test_a_board_whose_first_rows_are_covered_begins_at_no_other_id():
+    rng = np.random.default_rng(13)
+    board = cv2.aruco.CharucoBoard((4, 4), 1.0, 0.7, dictionary_of("DICT_6X6_1000"))
+    board.setLegacyPattern(True)
+    drawn = board.generateImage((240, 240))
+    drawn[:120] = 60
+    said = {"kind": "charuco", "columns": 4, "rows": 4, "legacy": True, "family": "6X6"}
+    covered = Print(np.pad(drawn, 60, constant_values=255), said)
+    images = photographs(covered, rng)
+    assert not is_accused(covered, images)
+
+
+def test_a_grid_of_markers_with_other_gaps_is_named():
+    rng = np.random.default_rng(5)
+    board = print_of("gridboard", rng, first=0)
+    images = photographs(board, rng)
+    # By twice of what differs unnoticed.
+    for off in (-0.04, 0.04):
+        other = replace(board, said=board.said | {"spacing": board.said["spacing"] + off})
+        assert is_accused(other, images)
 
 
 GRID = Target("grid", "gridboard", 4, 3, 0.04, 4e-5, dictionary="DICT_5X5_250", spacing=0.2)

@@ -28,8 +28,8 @@ from visioncal.vision.targets import (
 LOOKED_AT = 3
 # Least share of a board's corners in an image that identifies it.
 _LEAST_CORNERS = 0.2
-# Paper that is looked for beyond the print: less than a square, and up to the next circle.
-_RIM = {"checkerboard": 0.35, "circles": 0.8}
+# Paper that is looked for beyond a checkerboard [squares].
+_RIM = 0.35
 # Contrast of squares over that of paper: markers that blur hides leave half of it.
 _PLAIN = 0.75
 # Gaps between markers that differ by less are the same [sides].
@@ -122,7 +122,10 @@ def _is_part(identity: Identity, declared: Target) -> bool:
         declared = replace(declared, kind="checkerboard", columns=inner[0], rows=inner[1])
     if identity.board.dictionary or identity.board.kind != declared.kind:
         return False
-    seen, stated = (sorted((one.columns, one.rows)) for one in (identity.board, declared))
+    # Shifted rows are shifted columns from the side: in steps of half a column they count alike.
+    seen, stated = (
+        sorted(((1 + one.asymmetric) * one.columns, one.rows)) for one in (identity.board, declared)
+    )
     return all(few <= many for few, many in zip(seen, stated, strict=True))
 
 
@@ -137,10 +140,9 @@ def _has_rim(image: Image, board: Target) -> bool:
         return False
     low, high = extent_m(board)
     along = np.linspace(0.0, 1.0, 40)[:, None]
-    # Of sides of 1 m.
-    ends = outline(board)[:, :2] + _RIM[board.kind] * np.sign(
-        outline(board)[:, :2] - (low + high) / 2
-    )
+    # Of sides of 1 m; the next circles' centres are a distance from the outermost ones.
+    rim = 1.0 - board.diameter_m / 2 if board.kind == "circles" else _RIM
+    ends = outline(board)[:, :2] + rim * np.sign(outline(board)[:, :2] - (low + high) / 2)
     sides = [a + along * (b - a) for a, b in zip(ends, np.roll(ends, -1, axis=0), strict=True)]
     # Middles of squares; circles are seen between them too.
     step = 1.0 if board.kind == "checkerboard" else 0.25
@@ -152,7 +154,8 @@ def _has_rim(image: Image, board: Target) -> bool:
         u, v = px[(px >= 0).all(axis=1) & (px < image.shape[::-1]).all(axis=1)].T
         grey.append(image[v, u])
     dark, light = np.percentile(grey[-1], [25, 75])
-    paper = [float(np.median(side)) for side in grey[:-1] if len(side)]
+    # On the next squares of a longer board a half of a side is dark, on circles a quarter.
+    paper = [float(np.percentile(side, 20)) for side in grey[:-1] if len(side)]
     is_plain = board.kind == "circles" or light - dark > _PLAIN * (np.median(paper) - dark)
     return len(paper) == 4 and min(paper) > (dark + light) / 2 and bool(is_plain)
 

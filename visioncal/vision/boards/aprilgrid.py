@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.boards.board import Board
-from visioncal.vision.boards.gridboard import GridBoard, marker_grid
+from visioncal.vision.boards.gridboard import GridBoard, foreign, marker_grid
 from visioncal.vision.boards.kind import COUNTS, MM, Cells, DetectedCorners, NotFound, marker_cells
 from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit, once, read_markers
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
@@ -25,7 +25,7 @@ _WINDOW, _WINDOWS_PX = 0.35, (2, 6)
 _ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-2)
 
 
-class AprilGrid(Board, GridBoard):
+class AprilGrid(GridBoard, Board):
     """An AprilGrid. Its origin is the outer corner of the tag at the upper left."""
 
     name: ClassVar[str] = "aprilgrid"
@@ -34,6 +34,7 @@ class AprilGrid(Board, GridBoard):
     side, sides = "side of a tag", "tags"
     usual_dictionary = APRILGRID_DICTIONARY
     usual_place, usual_border = " at the lower left", 2  # Of Kalibr's pages.
+    located = Board.find
     has_lone_tags = False
 
     def extent_m(self, target: Target) -> tuple[FloatArray, FloatArray]:
@@ -89,8 +90,7 @@ class AprilGrid(Board, GridBoard):
         numbers = ids - target.marker_id
         own = (numbers >= 0) & (numbers < target.columns * target.rows)
         if own.sum() <= 0.5 * len(own):
-            others = ", ".join(map(str, ids[~own][:5].tolist()))
-            return NotFound(f"most tags seen ({others}) are none of the target's", misfit=True)
+            return foreign(ids[~own].tolist())
         px, misfit = self._ordered(target, numbers, px, own)
         if misfit > LAYOUT_MISFIT:
             return NotFound("the tags do not lie as the target describes them", misfit=True)
@@ -99,7 +99,7 @@ class AprilGrid(Board, GridBoard):
             return NotFound(f"the grid has tag {ids[~own][0]} besides {size}", misfit=True)
         numbers, px = numbers[own], px[own]
         refined = _refined_tags(image, px, target.spacing)
-        if why := self.other_spacing(target, self.page_places(target, numbers), refined):
+        if why := self.other_spacing(target, self.page_places(target, numbers), refined, image):
             return NotFound(why, misfit=True)
         if not _has_squares(image, px, target.spacing):
             return NotFound(

@@ -27,11 +27,9 @@ from visioncal.vision.boards.kind import (
     sigma_of,
     size_of,
 )
-from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit
+from visioncal.vision.boards.layout import LAYOUT_MARKERS, LAYOUT_MISFIT, layout_misfit
 from visioncal.vision.boards.template import Print
 
-# A homography has eight unknowns and a marker gives eight equations: three are a check.
-_LAYOUT_MARKERS = 3
 _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
 
 
@@ -164,7 +162,7 @@ class Charuco(Board):
         px, ids, marker_px, marker_ids = detector.detectBoard(image)
         if not marker_px:
             return NotFound(f"no board: no marker of {target.dictionary} is seen")
-        if len(marker_px) - len(np.unique(marker_ids)) >= _LAYOUT_MARKERS:
+        if len(marker_px) - len(np.unique(marker_ids)) >= LAYOUT_MARKERS:
             # The corners could be of either board, or of both.
             return NotFound(
                 "markers are seen twice: another board with the same markers is in the image"
@@ -172,7 +170,7 @@ class Charuco(Board):
         places = dict(zip(np.ravel(board.getIds()).tolist(), board.getObjPoints(), strict=True))
         by_id = dict(zip(np.ravel(marker_ids).tolist(), marker_px, strict=True))
         known = [marker for marker in by_id if marker in places]
-        if len(known) >= _LAYOUT_MARKERS:
+        if len(known) >= LAYOUT_MARKERS:
             on_board = np.array([places[marker][:, :2] for marker in known], dtype=float)
             in_image = np.array([by_id[marker] for marker in known], dtype=float)
             if layout_misfit(on_board, in_image.reshape(-1, 4, 2)) > LAYOUT_MISFIT:

@@ -140,7 +140,8 @@ class Checkerboard(Board):
                 px = seen.px.reshape(rows, columns, 2)
                 outside = _extended(px).reshape(-1, 2)
                 is_whole = (outside > -0.5).all() and (outside < image.shape[::-1]).all()
-                return board if is_whole and not _has_marks(image, px) else None
+                is_plain = _has_tips(image, px) and not _has_marks(image, px)
+                return board if is_whole and is_plain else None
         return None
 
 
@@ -184,6 +185,15 @@ def _extended(grid: FloatArray) -> FloatArray:
         before, after = 2 * first - np.take(grid, [1], axis), 2 * last - np.take(grid, [-2], axis)
         grid = np.concatenate([before, grid, after], axis=axis)
     return grid
+
+
+def _has_tips(image: Image, grid: FloatArray) -> bool:
+    """Whether squares meet at the corners of a (rows, columns, 2) grid, as circles do not.
+
+    Of squares, a corner is half way from dark to light under any even blur.
+    """
+    dark, light = np.percentile(_levels(image, grid), [25, 75])
+    return bool(np.median(_at(image, grid)) < light - (light - dark) / 4)
 
 
 def _has_marks(image: Image, grid: FloatArray) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target
+from visioncal.vision.boards.imaging import blur_at_corners
 from visioncal.vision.boards.kind import (
     COUNTS,
     MM,
@@ -21,7 +22,13 @@ from visioncal.vision.boards.kind import (
     sigma_of,
     size_of,
 )
-from visioncal.vision.boards.layout import find_tags, once, read_markers, side_share
+from visioncal.vision.boards.layout import (
+    LAYOUT_MARKERS,
+    find_tags,
+    once,
+    read_markers,
+    side_share,
+)
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
 from visioncal.vision.boards.template import SQUARE
 
@@ -133,24 +140,48 @@ class GridBoard(BoardKind):
 
     def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
         """Corners of the markers in a (h, w) grey image, or why there are none."""
+        seen = self.located(image, target)
+        if isinstance(seen, DetectedCorners) and (
+            why := self.other_spacing(target, *self.whole(target, seen))
+        ):
+            return NotFound(why, misfit=True)
+        return seen
+
+    def located(self, image: Image, target: Target) -> DetectedCorners | NotFound:
+        """Corners as `find` gives them, whose refined gaps may be others than stated."""
         numbers = np.arange(target.columns * target.rows)
         ids = numbers + target.marker_id
         seen = once(*read_markers(image, target.dictionary, target.border))
         own = {number: px for number, px in seen.items() if number in ids}
         if 2 * len(own) < len(seen):
-            others = ", ".join(str(number) for number in seen if number not in own)
-            return NotFound(f"most tags seen ({others}) are none of the target's", misfit=True)
+            return foreign([number for number in seen if number not in own])
         places = self.page_places(target, np.array([*own], dtype=np.int64) - target.marker_id)
-        if why := self.other_spacing(target, places, np.reshape([*own.values()], (-1, 4, 2))):
+        px = np.reshape([*own.values()], (-1, 4, 2))
+        if why := self.other_spacing(target, places, px, image):
             return NotFound(why, misfit=True)
         corner_ids = dict(zip(ids.tolist(), 4 * numbers[:, None] + np.arange(4), strict=True))
         return find_tags(image, target.dictionary, target.border, corner_ids, self.corners(target))
 
-    def other_spacing(self, target: Target, places: FloatArray, px: FloatArray) -> str:
-        """Says that tags at (t, 2) places lie nearer or farther than stated; empty where not."""
+    def other_spacing(
+        self, target: Target, places: FloatArray, px: FloatArray, image: Image | None = None
+    ) -> str:
+        """Says that tags lie nearer or farther than stated; empty where not.
+
+        Args:
+            target: The grid.
+            places: (t, 2) columns and rows of the tags.
+            px: (t, 4, 2) their corners [px].
+            image: Their (h, w) grey image where the corners are a detector's: blur draws these
+                inwards by up to its width.
+        """
         share, scatter = side_share([places], [px])
         # Scattered corners, as in blurred images, are inconclusive. Differences are in sides.
-        if not scatter <= 0.05 * share**2 or abs(1.0 / share - 1.0 - target.spacing) <= 0.02:
+        if not scatter <= 0.05 * share**2:
+            return ""
+        side_px = float(np.median(np.linalg.norm(np.diff(px, axis=1), axis=2)))
+        off_px = 0.0 if image is None else blur_at_corners(image, px.reshape(-1, 2))
+        off = 0.02 + 2.0 * (1.0 + target.spacing) * off_px / side_px
+        if abs(1.0 / share - 1.0 - target.spacing) <= off:
             return ""
         # No print has gaps of so small a share: they are metres.
         unit = ", which looks like metres" if target.spacing < _LEAST_SPACING else ""
@@ -159,13 +190,19 @@ class GridBoard(BoardKind):
             f"spacing = {target.spacing:g}{unit}"
         )
 
-    def seen_spacing(self, target: Target, seen: DetectedCorners) -> float:
-        """Gap between markers by their refined corners [sides]; the stated one where unknown."""
+    def whole(self, target: Target, seen: DetectedCorners) -> tuple[FloatArray, FloatArray]:
+        """(t, 2) columns and rows of tags that are seen whole, and their (t, 4, 2) corners [px]."""
         numbers, counts = np.unique(seen.ids // 4, return_counts=True)
-        whole = numbers[counts == 4]
-        px = seen.px[np.isin(seen.ids // 4, whole)].reshape(-1, 4, 2)
-        share, _ = side_share([self.page_places(target, whole)], [px])
-        return round(1.0 / share - 1.0, 3) if share > 0.0 else target.spacing
+        of_whole = np.isin(seen.ids // 4, numbers[counts == 4])
+        return self.page_places(target, numbers[counts == 4]), seen.px[of_whole].reshape(-1, 4, 2)
+
+
+def foreign(others: Sequence[int]) -> NotFound:
+    """Says that most markers seen, these, are none of a target's; a few are read by chance."""
+    some = ", ".join(map(str, others[:5]))
+    return NotFound(
+        f"most tags seen ({some}) are none of the target's", misfit=len(others) >= LAYOUT_MARKERS
+    )
 
 
 def marker_grid(numbers: IntArray, columns: int) -> FloatArray:

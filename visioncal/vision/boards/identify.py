@@ -180,7 +180,9 @@ class _Look:
         layout, order = grid.tied[0], grid.fullest_first
         places, kind = grid.places(layout), KINDS[layout.kind]
         shown = [grid.fits & (grid.image_of == at) for at in order]
-        share, _ = side_share([places[at] for at in shown], [grid.px[at] for at in shown])
+        shares = [side_share([places[at]], [grid.px[at]])[0] for at in shown]
+        # Blur draws detected corners inwards, least in the sharpest image.
+        share = max((one for one in shares if np.isfinite(one)), default=0.0)
         # A legacy board with an odd number of rows does not start with a marker.
         has_squares, ids = "marker_m" in kind.keys, grid.ids[grid.fits]
         legacy = has_squares and layout.variant > 0
@@ -206,11 +208,7 @@ class _Look:
         if others:
             notes.append(f"{listed(others)} hold the same markers: any of them finds this board.")
         fullest = self.shown(mirrored=mirrored)[order[0]]
-        seen = kind.find(fullest, board)
-        # Blur draws corners inwards, so that gaps look wider.
-        for narrower in (0.03, 0.06) if isinstance(kind, GridBoard) else ():
-            if isinstance(seen, NotFound):
-                seen = kind.find(fullest, replace(board, spacing=board.spacing - narrower))
+        seen = (kind.located if isinstance(kind, GridBoard) else kind.find)(fullest, board)
         if isinstance(seen, NotFound):
             # So many markers in place prove a board without its corners, but for the squares at
             # the tags of an AprilGrid.
@@ -218,7 +216,8 @@ class _Look:
                 return
             notes.insert(0, f"Its corners are not found in this image: {seen.reason}.")
         elif isinstance(kind, GridBoard):
-            board = replace(board, spacing=kind.seen_spacing(board, seen))
+            refined, _ = side_share(*([part] for part in kind.whole(board, seen)))
+            board = replace(board, spacing=round(1.0 / refined - 1.0, 3)) if refined > 0 else board
         yield Identity(
             board,
             len(seen.ids) if isinstance(seen, DetectedCorners) else 0,
@@ -361,21 +360,26 @@ class _Grid:
         fits, declared = self._fits(layout), self.declared
         lowest = int(self.ids[fits].min())
         usual = [0] if declared is None else [max(declared.marker_id, 0), 0]
+        stated = declared and (declared.kind, declared.columns)
         nearest = lowest - (lowest - layout.first) % layout.columns
         row_before = np.arange(max(lowest - layout.columns, 0), lowest)
         for first in usual:
             if first <= lowest and (first - nearest) % layout.columns == 0:
-                layout = layout._replace(first=first)
-                hidden = row_before[row_before >= first]
-                if not self._would_be_seen(layout, fits, hidden):
+                layout = self._counted(layout._replace(first=first), fits)
+                # Of the declared board, rows may be covered.
+                if declared and layout[:2] == stated and layout.rows <= declared.rows:
+                    break
+                if not self._would_be_seen(layout, fits, row_before[row_before >= first]):
                     break
         else:
-            layout = layout._replace(first=nearest)
-        layout = layout._replace(rows=int(np.abs(self.places(layout)[fits, 1]).max()) + 1)
-        stated = declared and (declared.kind, declared.columns)
+            layout = self._counted(layout._replace(first=nearest), fits)
         is_other = layout[:2] != stated or layout.first not in usual
         is_other |= declared is not None and declared.legacy and not layout.variant
         return (is_other, layout.first > 0, layout.columns, lowest - layout.first), layout
+
+    def _counted(self, layout: _Layout, fits: Mask) -> _Layout:
+        """A layout with the rows up to its last marker that fits."""
+        return layout._replace(rows=int(np.abs(self.places(layout)[fits, 1]).max()) + 1)
 
     def _would_be_seen(self, layout: _Layout, fits: Mask, ids: IntArray) -> bool:
         """Whether an image would show most markers of these ids, if there were any."""

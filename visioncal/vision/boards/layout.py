@@ -14,6 +14,8 @@ from visioncal.vision.boards.template import SQUARE, refine_tags
 # Largest rms distance of markers from a homography, in marker sides. Lens distortion and noise stay
 # under 0.1; another layout moves every second row by more than a side.
 LAYOUT_MISFIT = 0.35
+# Markers that prove another board: one or two are read by chance, and one determines a homography.
+LAYOUT_MARKERS = 3
 # Dictionaries by family, smallest first. Each contains the markers of the previous ones under the
 # same ids, so that the largest decodes all.
 FAMILIES: dict[str, tuple[str, ...]] = {
@@ -258,7 +260,8 @@ def find_tags(
     if not quads:
         seen = f"; seen instead: {', '.join(map(str, numbers[:5]))}" if numbers else ""
         return NotFound(
-            f"no tag of the target's, of {dictionary}, is seen{seen}", misfit=bool(numbers)
+            f"no tag of the target's, of {dictionary}, is seen{seen}",
+            misfit=len(numbers) >= LAYOUT_MARKERS,
         )
     points = np.array([corner_ids[quad] for quad in quads])
     quads_px = np.array([*quads.values()])
@@ -268,7 +271,10 @@ def find_tags(
         flat = places[points, :2]
         side = float(np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1).mean())
         if layout_misfit(flat / side, quads_px) > LAYOUT_MISFIT:
-            return NotFound("the tags do not lie as the target describes them", misfit=True)
+            return NotFound(
+                "the tags do not lie as the target describes them",
+                misfit=len(quads) >= LAYOUT_MARKERS,
+            )
         parts = [refine_tags(image, count, quads_px, flat)]
     else:
         parts = [refine_tags(image, count, quad[None]) for quad in quads_px]
