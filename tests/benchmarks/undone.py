@@ -1,7 +1,7 @@
 """Mistakes of the record planted into measured poses, and sound sessions: what is named first.
 
 Cells by camera in hand and to hand of 12 to 60 views with noise of several sizes; rows are shifted
-from one on, boards turned in some views, poses copied from the row before.
+from one on, boards turned or tilted the other way in some views, poses copied from the row before.
 
     PYTHONPATH=tests python tests/benchmarks/undone.py [--quick] [PLANTED OF EACH KIND]
 """
@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from time import process_time
 
+import cv2
 import numpy as np
 from elsewhere import pose, views_of
 from results import wished, write_section
@@ -66,6 +67,20 @@ def turned(pair: Pair, rng: np.random.Generator) -> Pair:
     return robot, boards
 
 
+def flipped(pair: Pair, rng: np.random.Generator) -> Pair:
+    """The second of the poses that OpenCV finds of a marker of 40 to 80 mm in some views."""
+    robot, boards = pair
+    boards, side = boards.copy(), rng.uniform(0.02, 0.04)
+    marker = side * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    for view in rng.choice(len(robot), int(rng.integers(1, int(0.42 * len(robot)))), replace=False):
+        turn, place = cv2.Rodrigues(boards[view, :3, :3])[0], boards[view, :3, 3]
+        px = cv2.projectPoints(marker, turn, place, np.eye(3), None)[0]
+        way = cv2.SOLVEPNP_IPPE_SQUARE
+        _, turns, places, _ = cv2.solvePnPGeneric(marker, px, np.eye(3), None, flags=way)
+        boards[view] = compose(cv2.Rodrigues(turns[1])[0], places[1].ravel())
+    return robot, boards
+
+
 def copied(pair: Pair, rng: np.random.Generator) -> Pair:
     robot, boards = pair
     robot, count = robot.copy(), len(robot)
@@ -100,6 +115,7 @@ def wrong(pair: Pair, rng: np.random.Generator) -> Pair:
 PLANTS: dict[str, Callable[[Pair, np.random.Generator], Pair]] = {
     "shifted_rows": shifted,
     "turned_board": turned,
+    "flipped_poses": flipped,
     "copied_poses": copied,
     "exchanged_views": exchanged,
     "wrong views": wrong,

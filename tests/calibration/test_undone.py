@@ -5,6 +5,7 @@ Cells of poses measured with noise, without images.
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from support.cells import pairs_session
@@ -52,6 +53,25 @@ def turned(robot, boards, some=(1, 4, 5, 8, 11, 13, 16, 19)):
     return robot, boards
 
 
+def flipped(robot, boards, some=(0, 2, 10, 14, 15, 20)):
+    """Views with the second pose that OpenCV finds of a marker of 50 mm."""
+    boards, marker = (
+        boards.copy(),
+        0.025 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]),
+    )
+    for view in some:
+        px = cv2.projectPoints(marker, *split(boards[view]), np.eye(3), None)[0]
+        _, turns, places, _ = cv2.solvePnPGeneric(
+            marker, px, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        )
+        boards[view] = compose(cv2.Rodrigues(turns[1])[0], places[1].ravel())
+    return robot, boards
+
+
+def split(pose):
+    return cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3]
+
+
 def copied(robot, boards, start=12):
     robot = robot.copy()
     robot[start:] = robot[start - 1]
@@ -61,6 +81,7 @@ def copied(robot, boards, start=12):
 PLANTED = {
     "shifted_rows": (shifted, [*range(10, 22)], "From view 10 on, images and poses are 2 rows"),
     "turned_board": (turned, [1, 4, 5, 8, 11, 13, 16, 19], "turned by 180 deg"),
+    "flipped_poses": (flipped, [0, 2, 10, 14, 15, 20], "tilted the other way"),
     "copied_poses": (copied, [*range(12, 24)], "to the last digit"),
 }
 
@@ -162,6 +183,19 @@ def test_real_records_are_mended(tmp_path, monkeypatch, case, mount, kind):
     typed("convert", source, "cell", "--mount", mount).good()
     assert visioncal.calibrate("cell").verdict.causes[0].kind == kind
     assert follow("calibrate", "cell", "-o", "out").last.status == 0
+
+
+def test_a_small_marker_with_the_other_pose_is_named(tmp_path, monkeypatch):
+    if not CASES.is_dir():
+        pytest.skip("there are no recordings of others here")
+    monkeypatch.chdir(tmp_path)
+    typed("convert", CASES / "flips/flips.json", "cell", "--mount", "eye-to-hand").good()
+    found = visioncal.calibrate("cell")
+    assert found.verdict.causes[0].kind == "flipped_poses"
+    assert [*found.verdict.causes[0].views] == [0, 2, 10, 14, 15, 20, 22]
+    # Two sigma of what single tags of 50 mm leave, 5 mm a view.
+    away = found.edges["base_from_cam"].matrix[:3, 3] - [0.9, 0.2, 0.8]
+    assert np.linalg.norm(away) < 0.01
 
 
 @pytest.mark.parametrize("words", ["3", "3-5:0", "3-5:x", "90:2"])

@@ -1,6 +1,7 @@
 """Mistakes of a record that, undone, make the views agree.
 
-Rows may be shifted from one on, boards read as if they were turned, poses repeated.
+Rows may be shifted from one on, boards read as if they were turned or tilted the other way, poses
+repeated.
 
 Each hypothesis pairs views with poses of the robot otherwise, or turns boards back. It is compared
 with the record as it stands, in which the same views are wrong for no known reason, by likelihoods
@@ -189,6 +190,7 @@ def likeliest(run: RunState) -> Undoing | None:
     base, agrees = _evidence(best.of(own)[None])
     rivals = [
         *_copied(record, best, own, agrees[0]),
+        *_flipped(record, best, own, float(base[0])),
         *_turned(record, best, own, float(base[0])),
         *_shifted(record, every, pairs, float(base[0])),
     ]
@@ -217,6 +219,50 @@ def _copied(record: _Record, edges: _Edges, own: IntArray, agrees: Mask) -> Iter
             views,
         ),
         "the robot's pose is that of the row before, once more",
+    )
+
+
+def _flipped(record: _Record, edges: _Edges, own: IntArray, base: float) -> Iterator[Undoing]:
+    """Views of a flat board with the other one of the two poses that its image nearly fits.
+
+    The board's normal is reflected about the line of sight (Collins and Bartoli 2014, IPPE).
+    """
+    seen = record.camera
+    sight = seen[..., :3, 3:] / np.linalg.norm(seen[..., :3, 3:], axis=-2, keepdims=True)
+    mirror = np.eye(3) - 2.0 * sight @ np.swapaxes(sight, -1, -2)
+    other = compose(mirror @ seen[..., :3, :3] @ np.diag([1.0, 1.0, -1.0]), seen[..., :3, 3])
+    mirrored = replace(edges, record=replace(record, camera=other)).of(own)
+    apart = edges.of(own)
+    # Views by how much better the other pose is; any number of them is as likely, and any choice.
+    there, here = (np.where(own < 0, 1.0, at.sum(axis=1)) for at in (mirrored, apart))
+    order = np.argsort((there + _LEAST**2) / (here + _LEAST**2), kind="stable")
+    number = np.arange(1, len(own) + 1)
+    flips = np.argsort(order) < number[:, None]
+    squares = np.where(flips[..., None], mirrored, apart)
+    logs, agrees = _evidence(squares)
+    choices = gammaln(len(own) + 2) - gammaln(number + 1) - gammaln(len(own) - number + 1)
+    odds = EVIDENCE * (logs - base) + _MISTAKE - choices
+    at = int(odds.argmax())
+    wrong = flips[at] & agrees[at]
+    views = tuple(record.views[record.rows[wrong]].tolist())
+    if not views or squares[at][agrees[at]].mean() > CLOSING_SCORE**2:
+        return
+    others = record.views[record.rows[~wrong]].tolist()
+    short = "the board's pose is the other one of the two that a flat board's image nearly fits"
+    yield Undoing(
+        float(odds[at]),
+        Finding(
+            "flipped_poses",
+            f"In views {some_of([*map(str, views)])} {short}: tilted the other way about the line "
+            "of sight. They were left out.",
+            or_alone(
+                "Have the detector give both poses and take the other one in these views (OpenCV: "
+                "solvePnPGeneric), or give images or corners; or calibrate the other views alone.",
+                others,
+            ),
+            views,
+        ),
+        short,
     )
 
 
