@@ -11,6 +11,7 @@ from support.problems import world
 from support.slopes import jacobian
 
 from visioncal.calibration.pipeline.arm_results import misfit_covariance
+from visioncal.calibration.run import calibrate
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
@@ -44,7 +45,7 @@ from visioncal.estimation.problem_parts import ROBOT
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.robot import load_robot
-from visioncal.simulation import CAMERAS, CellOptions, simulate
+from visioncal.simulation import CAMERAS, CellOptions, cell_session, simulate
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions
 
@@ -288,6 +289,18 @@ def test_a_focus_that_is_fixed_neither_breathes_nor_jitters():
     (problem,) = fixed.cell_fit.fit.camera_parameters.problems.values()
     levels = problem.levels
     assert (levels.breathing, levels.jitter) == (0.0, 0.0)
+
+
+def test_a_focus_that_chance_explains_leaves_the_flange_its_noise():
+    """Else errors along the lens's axis alone shrink the noise of all directions."""
+    for seed in range(2, 9):
+        cell = simulate(replace(FINE, pixel_sigma_px=0.003, views=12, seed=seed))
+        session = cell_session(cell, "cell", seen="corners")
+        camera = session.document["camera"] | {"focus": "fixed"}
+        fixed = replace(session, document=session.document | {"camera": camera})
+        found, known = (calibrate(told).noise["robot_translation_mm"] for told in (session, fixed))
+        # What is left of it is far less than the uncertainty of the noise, a sixth.
+        assert found == pytest.approx(known, rel=0.02)
 
 
 X, Z = exp(np.array([0.1, -0.2, 0.3, 0.03, -0.05, 0.09])), exp(np.array([0, 0, 0, 0.6, 0.1, 0.0]))

@@ -63,7 +63,7 @@ SIGNIFICANT = float(chi2_limit(2e-4, 1))
 # a given lens; then three of each printed board, and two of each flange.
 _NOISE, _FIELD, _BREATHING, _JITTER, _ONE, _FOCAL, _CENTRE, _SHAPE, _BOARDS = range(9)
 # Share of boards whose size is not within what is stated; of boards that are not flat, or not drawn
-# to one scale, and of given lenses that have errors.
+# to one scale, of given lenses that have errors, and of lenses whose focus moves.
 _WRONG_SIZE, _WRONG_SHAPE = 1e-2, 0.1
 # Weight of a size below which it is zero.
 _NO_WEIGHT = 0.05
@@ -130,8 +130,11 @@ class _Likelihood:
             return 0.0
         without[level] = least
         upper_bound = 2.0 * (self.model.at(without, is_sloped=False).value - found.value)
-        # The other levels are only refitted where it matters.
-        if upper_bound < SIGNIFICANT or (level >= _FOCAL and not _is_scale(level)):
+        # The other levels are only refitted where it matters: of a focus in any case, as most of
+        # what it explains may be noise of the flange.
+        is_focus = level in (_BREATHING, _JITTER)
+        is_refitted = upper_bound >= SIGNIFICANT and (level == _FIELD or _is_scale(level))
+        if not (is_focus or is_refitted):
             return upper_bound
         refitted = self.minimised(without, (*closed, level), little=_LITTLE_GAIN)
         return 2.0 * (refitted.value - found.value)
@@ -218,18 +221,14 @@ def estimate_sizes(
         found, length, likelihood = other, shorter, candidate
     low = np.exp(likelihood.limits(closed)[0])
     sizes = np.where(np.exp(found.logs) > 2.0 * low, np.exp(found.logs), 0.0)
-    field, breathing, jitter = sizes[_FIELD : _JITTER + 1] / np.exp(found.logs[_NOISE])
-    gains = [likelihood.gain(found, closed, index) for index in (_FIELD, _BREATHING, _JITTER)]
-    for index in range(_FOCAL, likelihood.flanges):
-        if sizes[index]:
-            gain, wrong = likelihood.gain(found, closed, index), _WRONG_SHAPE
-            if _is_scale(index):
-                gain, wrong = gain / uneven**2, _WRONG_SIZE
-            # Averaged over a size of zero, too.
-            weight = level_weight(gain, wrong)
-            sizes[index] *= weight**0.5 if weight > _NO_WEIGHT else 0.0
+    tested = (_FIELD, _BREATHING, _JITTER, *range(_FOCAL, likelihood.flanges))
+    gains = {at: likelihood.gain(found, closed, at) if sizes[at] else 0.0 for at in tested}
+    moves = max(gains[_BREATHING], gains[_JITTER]) > SIGNIFICANT
+    for at in tested[1:]:
+        sizes[at] *= _root_weight(at, gains[at], uneven, moves=moves)
+    field, breathing, jitter = (sizes[_FIELD:_ONE] / np.exp(found.logs[_NOISE])).tolist()
     levels = LensLevels(
-        float(field), length, float(breathing), float(jitter), (gains[0], gains[1], gains[2])
+        *(field, length, breathing, jitter), (gains[_FIELD], gains[_BREATHING], gains[_JITTER])
     )
     boards = sizes[_BOARDS : likelihood.flanges].reshape(-1, 3).tolist()
     return (
@@ -237,6 +236,18 @@ def estimate_sizes(
         LensSizes(*sizes[_FOCAL:_BOARDS].tolist()),
         tuple(BoardSizes(*at) for at in boards),
     )
+
+
+def _root_weight(size: int, gain: float, uneven: float, *, moves: bool) -> float:
+    """Root of the weight of a size by its gain: it is averaged over a size of zero, too.
+
+    `moves` is whether the focus surely does: then it is as likely to move otherwise as well.
+    """
+    if _is_scale(size):
+        weight = level_weight(gain / uneven**2, _WRONG_SIZE)
+    else:
+        weight = level_weight(gain, 0.5 if moves and size < _FOCAL else _WRONG_SHAPE)
+    return weight**0.5 if weight > _NO_WEIGHT else 0.0
 
 
 def _is_scale(size: int) -> bool:
