@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 import sqlite3
+import struct
 import subprocess
 import sys
 from contextlib import closing
@@ -212,6 +213,37 @@ def test_a_history_that_came_with_a_session_is_not_adopted(tmp_path, inputs):
     assert History.of_site(session) is History.of_site(session / "deeper") is None
     History(session.parent / SITE_FILE).append()
     assert History.of_site(session) == History(session.parent / SITE_FILE)
+
+
+def plant_journal(database, victim):
+    """A journal of a transaction over several databases: SQLite deletes the file that it names."""
+    magic, name = bytes.fromhex("d9d505f920a163d7"), str(victim).encode()
+    page = int.from_bytes(database.read_bytes()[16:18], "big")
+    head = magic + struct.pack(">5I", 0, 1, database.stat().st_size // page, 512, page)
+    end = struct.pack(">I", 0x40000000 // page + 1) + name
+    end += struct.pack(">2I", len(name), sum(name)) + magic
+    Path(f"{database}-journal").write_bytes(head.ljust(512, b"\0") + end)
+
+
+def test_a_journal_beside_a_database_deletes_no_file(tmp_path, inputs):
+    victim, history, bag = tmp_path / "precious.txt", tmp_path / SITE_FILE, tmp_path / "bag"
+    victim.write_text("mine")
+    History(history).append()
+    plant_journal(history, victim)
+    (tmp_path / "link.db").symlink_to(history)
+    for path in (history, tmp_path / "link.db"):
+        visioncal("history", path).refused(f"{history}-journal", "SQLite would delete")
+    done = visioncal("calibrate", inputs / "pairs", "-o", tmp_path / "out", "--history", history)
+    assert "This is not in the history" in done.err
+    bag.mkdir()
+    shutil.copy(history, bag / "bag_0.db3")
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 5}")
+    plant_journal(bag / "bag_0.db3", victim)
+    visioncal("convert", bag, tmp_path / "new").refused("bag_0.db3-journal", "SQLite would delete")
+    assert victim.read_text() == "mine"
+    # What a process that was killed leaves is undone as ever.
+    Path(f"{history}-journal").write_bytes(Path(f"{history}-journal").read_bytes()[:512])
+    visioncal("history", history).good()
 
 
 def test_reading_a_history_has_an_end(tmp_path, monkeypatch):

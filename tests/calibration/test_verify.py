@@ -472,6 +472,17 @@ def cell(tmp_path_factory):
     return folder
 
 
+# Of what recover.json holds, and what is said of it; a text that is no act at all.
+EDITED_ACTS = (
+    ({"minutes": "x"}, "minutes is 'x'; a table"), ({"minutes": {"plan": np.nan}}, "minutes.plan"),
+    ({"minutes": {"plan": "1"}}, "a number is needed"), ({"stated": None}, "stated is None"),
+    ({"stated": "camera"}, "a list is needed"), ({"against": 3}, "against is 3"),
+    ({"record": "visioncal record; rm -rf x"}, "a visioncal record is needed"),
+    ({"record": "rm -rf x"}, "a visioncal record is needed"), ({"schema": 9}, "schema is 9"),
+    ({}, "{"), ({}, "null"), ({}, "{}"), ({}, ""),
+)  # fmt: skip
+
+
 def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     act, out, stops = tmp_path / "act", cell / "out", tmp_path / "act/stops"
     command = ("recover", act, "--against", out)
@@ -485,6 +496,12 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     # A step of the act is no error.
     assert "error" not in begun.err
     assert "BOARD stands for the target's name" in begun.err
+    told = json.loads((act / "recover.json").read_text())
+    for edited, words in EDITED_ACTS:
+        (act / "recover.json").write_text(json.dumps(told | edited) if edited else words)
+        refused = visioncal(*command).refused("recover.json" if not edited else words)
+        assert "rm -rf" not in refused.err.partition("needed.")[2]
+    (act / "recover.json").write_text(json.dumps(told))
     # The recording was cut off after nine stops, and is whole later.
     stops.mkdir()
     (stops / "session.toml").write_text((cell / "moved/session.toml").read_text())

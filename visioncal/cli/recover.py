@@ -3,12 +3,12 @@
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import typer
@@ -35,16 +35,35 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import CorrectOptions, ExportOptions, RecoverOptions
 from visioncal.cli.session_options import PlanOptions
 from visioncal.cli.summary import print_conditions, print_steps, print_verdict
+from visioncal.core.codec import read, reading
+from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
-from visioncal.core.files import write_json
+from visioncal.core.files import read_bytes, write_json
 from visioncal.core.verdict import Verdict
 from visioncal.interchange.outputs import STOPS, write_outputs
-from visioncal.interchange.result_files import content_of, load_result
+from visioncal.interchange.result_files import load_result
 from visioncal.results import Calibration, select_matching
 from visioncal.results.history import entries_of
 from visioncal.session import Session
 
 _ACT, _TABLE, _TARGETS = "recover.json", "views.csv", "targets.csv"
+
+
+@dataclass(frozen=True)
+class _Act:
+    """What recover.json holds."""
+
+    schema: Literal[1]
+    against: tuple[str, str]  # Digest of the earlier calibration's session, and when it was made.
+    minutes: Mapping[str, float]  # Of each step that is done.
+    stated: tuple[str, ...]  # Causes.
+    record: str | None = None  # The command that records the planned stops, as it was printed.
+
+    def __post_init__(self) -> None:
+        words = shlex.split(self.record or "visioncal record")
+        # Whoever edited the file has no say in what is typed.
+        if words[:2] != ["visioncal", "record"] or self.record not in (None, shlex.join(words)):
+            raise ValueError(f"record is {self.record!r}; a visioncal record is needed")
 
 
 def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
@@ -56,7 +75,11 @@ def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
             culprits=["--targets"],
             next_step="Give the taught targets another name, or put them elsewhere.",
         )
-    known, against = content_of(folder / _ACT), [old.session_sha256, old.created]
+    against, known, file = [old.session_sha256, old.created], dict[str, Any](), folder / _ACT
+    if file.is_file():
+        known = parse_stored(read_bytes(file), str(file))
+        with reading(str(file), "a recovery", f"Remove it: rm {shlex.quote(str(file))}"):
+            read(_Act, known, "")
     if known.get("against", against) != against:
         raise DataError(
             f"{folder} is the recovery of another calibration than that of "

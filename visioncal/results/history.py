@@ -18,7 +18,7 @@ from visioncal.core.codec import REST, Key, read, reading, write
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
-from visioncal.core.files import one_line, sha256
+from visioncal.core.files import check_journal, one_line, sha256
 from visioncal.core.types import Need
 from visioncal.core.verdict import VerdictStatus
 from visioncal.core.version import __version__
@@ -317,6 +317,7 @@ class History:
 
     def _connected(self, mode: str) -> sqlite3.Connection:
         address, beside = self.path.absolute().as_uri(), Path(f"{self.path}-wal")
+        check_journal(self.path)
         try:
             return _connection(f"{address}?mode={mode}")
         except sqlite3.OperationalError as error:

@@ -28,7 +28,7 @@ from visioncal.calibration.stages.motion import is_standing_still
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.extras import client_library
-from visioncal.core.files import MOST_IMAGE_BYTES
+from visioncal.core.files import MOST_IMAGE_BYTES, check_journal
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray, Mount
@@ -151,6 +151,8 @@ def _opened(source: Path) -> Iterator[Reader]:
     for table in (first.decompressors, mcap.DECOMPRESSORS):
         table |= {name: partial(_limited, of[name]) for name in of if name in table}
     vars(second)["zstd"] = SimpleNamespace(open=zstd.open, decompress=partial(_limited, of["zstd"]))
+    for path in source.iterdir() if source.is_dir() else [source]:
+        check_journal(path)
     with _bag_errors(source):
         # Bags of old versions of ROS 2 do not hold the definitions of their messages.
         types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
