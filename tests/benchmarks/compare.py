@@ -1,12 +1,13 @@
 """Compares two checkouts world by world: accuracy, honesty, verdicts, causes and processor time.
 
-    PYTHONPATH=tests python tests/benchmarks/compare.py BEFORE[:PYTHON] AFTER[:PYTHON]
+    PYTHONPATH=tests python tests/benchmarks/compare.py BEFORE[:PYTHON] AFTER[:PYTHON][@core]
         [--worlds NAME ...] [--minutes 10] [--seeds N] [--lanes 2] [--keep FOLDER]
 
 Each session is written once, by this checkout's simulation or by the independent generator of
 `elsewhere.py`, and both checkouts work on the same folder: through commands and the results' files
 alone, each in a process of its own (`compare_worker.py`). All worlds get their first seed, then all
-their second, until the time is over. A row a world, with intervals of 95 % of the paired ratio or
+their second, until the time is over. A checkout `@core` answers by `visioncal.fit`, without a
+verdict (`core_worker.py`). A row a world, with intervals of 95 % of the paired ratio or
 difference; the last line says what differs beyond chance, by a limit that counts all comparisons
 (Holm 1979). Exit status 1 where anything is worse, or a bug.
 """
@@ -38,6 +39,8 @@ class Checkout:
     """A process of one checkout that does jobs; one that is killed is started anew."""
 
     def __init__(self, text: str) -> None:
+        text, _, core = text.partition("@")
+        self.options = [f"--{core}"] if core else []
         folder, _, python = text.partition(":")
         self.folder, self.python = Path(folder).resolve(), python or sys.executable
         self.process: subprocess.Popen[str] | None = None
@@ -46,8 +49,10 @@ class Checkout:
         """Has a job done: its status, output and processor time."""
         if self.process is None or self.process.poll() is not None:
             own = {"PYTHONPATH": str(self.folder), "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "300"}
+            if self.options:
+                own["PYTHONPATH"] += os.pathsep + str(Path(__file__).parents[1])
             self.process = subprocess.Popen(
-                [self.python, "-P", str(WORKER)], env=os.environ | own, text=True,
+                [self.python, "-P", str(WORKER), *self.options], env=os.environ | own, text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             )  # fmt: skip
         into, out = self.process.stdin, self.process.stdout

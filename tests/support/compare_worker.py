@@ -60,6 +60,10 @@ def main():
     answers, sys.stdout = sys.stdout, sys.stderr
     warnings.simplefilter("ignore")
     jobs = {"command": command, "located": located, "arm": arm}
+    if "--core" in sys.argv:
+        from support import core_worker
+
+        jobs |= {"command": core_worker.command, "located": core_worker.located}
     for line in asked:
         job, begun = json.loads(line), used_s()
         try:

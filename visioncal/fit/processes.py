@@ -71,21 +71,31 @@ def processes(poses: FloatArray, levels: FloatArray) -> Iterator[Process]:
     flange = np.broadcast_to(np.diag(levels), (count, 6, 6))
     of_base = size * adjoint(invert(poses)) * TWIST
     both = np.concatenate([flange, of_base], axis=2)
-    factors = np.concatenate([poses[:, :3, 3] / 0.6, poses[:, :3, 2]], axis=1).T
-    varying = [of_base * factor[:, None, None] for factor in factors]
-    constant = np.broadcast_to(size * np.diag(TWIST), of_base.shape)
-    smooth = np.concatenate([constant, of_base, *varying], axis=2)
-    yield Process(1 / 4, np.ones((count, count)), smooth)
+    factors = np.concatenate([poses[:, :3, 3] / 0.6, poses[:, :3, 2]], axis=1)
+    yield Process(1 / 4, _beyond_mean(factors @ factors.T), of_base)
     turns = poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
     places = np.concatenate([poses[:, :3, 3] / _REACH_M, turns], axis=1)
     squared = np.sum((places[:, None] - places) ** 2, axis=2)
     for length in _RANGES:
-        yield Process(1 / 4 / len(_RANGES), np.exp(-squared / (2.0 * length**2)), both)
+        kernel = _beyond_mean(np.exp(-squared / (2.0 * length**2)))
+        yield Process(1 / 4 / len(_RANGES), kernel, both)
     apart = np.abs(order[:, None] - order)
     for memory in _MEMORIES:
         yield Process(1 / 8 / len(_MEMORIES), np.exp(-apart / memory), flange)
     ramp = (order - order.mean()) / order.std()
     yield Process(1 / 16, np.outer(ramp, ramp), both)
+
+
+def _beyond_mean(kernel: FloatArray) -> FloatArray:
+    """A kernel (s, s) of errors by posture, less their mean over postures like these.
+
+    One twist of the base and one of the flange at all postures belongs to the frames of which the
+    robot reports. The mean over the stops differs from that by a share of what they vary by.
+    """
+    count = len(kernel)
+    centre = np.eye(count) - 1.0 / count
+    varying = centre @ kernel @ centre
+    return np.asarray(varying + np.trace(varying) / (count - 1.0) / count)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,128 @@
+"""What `compare_worker.py` answers by the one likelihood of `visioncal.fit`, in place of commands.
+
+It knows no verdict: each result is `good`. Fits stay in this process, by the folders of results.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+SOLVED = {}
+
+
+def command(argv):
+    """Fits a session in place of `calibrate SESSION -o OUT`, and writes what worlds judge."""
+    from visioncal.core.errors import VisioncalError
+
+    if argv[0] != "calibrate":
+        return {"status": 1, "out": f"no command {argv[0]} by the one likelihood"}
+    try:
+        document = fitted(Path(argv[1]), Path(argv[3]))
+    except VisioncalError as error:
+        told = {"class": type(error).__name__, "message": str(error)}
+        return {"status": 2, "out": json.dumps({"error": told})}
+    return {"status": 0, "out": json.dumps(document)}
+
+
+def fitted(path, out):
+    """Fits a session; its document has the keys of calibration.json that worlds read."""
+    from visioncal.calibration.stages.detect import detect
+    from visioncal.fit.solve import solve
+    from visioncal.model import read_cell
+    from visioncal.session import Session
+
+    session = Session.load(path)
+    corners = dict(session.corners)
+    if any(view.image and not view.has_corners for view in session.views):
+        corners |= dict(detect(session).corners)
+    solved = solve(read_cell(session, corners))
+    fit = solved.fit
+    SOLVED[str(out / "calibration.json")] = fit
+    names = {}
+    for frame in fit.cell.unknown:
+        parent = fit.cell.tree.branches[frame].parent
+        if parent == "cell" and len(fit.cell.arms) == 1:
+            parent = next(fit.cell.tree.branches[arm].parent for arm in fit.cell.arms)
+        names[frame] = f"{parent}_from_{frame}"
+    document = {
+        "transforms": {name: {"matrix": fit.edge(at).tolist()} for at, name in names.items()},
+        "joint_covariance": {
+            "order": [*names.values()],
+            "matrix": fit.covariance(*(("edge", frame) for frame in names)).tolist(),
+        },
+        "verdict": {"status": "good", "causes": []},
+        "views": [
+            {"view": sighting.view, "used": bool(used)}
+            for sighting, used in zip(fit.cell.sightings, fit.used, strict=True)
+        ],
+        "effort": {
+            "linearisations": solved.effort.linearisations,
+            "likelihoods": solved.effort.likelihoods,
+        },
+    }
+    if len(fit.unknowns.lenses) == 1:
+        (camera,) = fit.unknowns.lenses
+        values = fit.state.values["lens", camera]
+        document["camera"] = {"matrix": values[:4].tolist(), "distortion": values[4:].tolist()}
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "calibration.json").write_text(json.dumps(document))
+    return document
+
+
+def located(calibration, looks):
+    """Places (3,) in the base and covariances of pixels, each on a plane of its own."""
+    fit = SOLVED[calibration]
+    (camera,) = fit.unknowns.lenses
+    keys = [key for key in fit.unknowns.slices if key[1] == camera]
+    values, covariance = fit.state.values, fit.covariance(*keys)
+    px_sigma = fit.sizes.get(f"px {camera}", 0.0)
+    found = []
+    for look in looks:
+        spread = np.zeros((3, len(covariance)))
+        centre, at = place(fit, camera, values, look), 0
+        for key in keys:
+            member = fit.unknowns[key]
+            for column in range(member.count):
+                # Of a unit: a radian, a metre, or what moves a corner by a pixel.
+                step = 1e-4 * (np.arange(member.count) == column)
+                moved = {**values, key: member.moved(values[key], step)}
+                slope = (place(fit, camera, moved, look) - centre) / 1e-4
+                spread[:, at] = slope / member.units[column]
+                at += 1
+        total = spread @ covariance @ spread.T
+        for axis in range(2):
+            step = 1e-3 * (np.arange(2) == axis)
+            moved = {**look, "px": np.array(look["px"]) + step}
+            slope = (place(fit, camera, values, moved) - centre) / 1e-3
+            total += px_sigma**2 * np.outer(slope, slope)
+        if look["pose"] is not None:
+            from visioncal.core.transforms import exp
+
+            for axis in range(6):
+                name = "rad" if axis < 3 else "m"
+                sigma = max(fit.sizes.get(f"{name} {arm}", 0.0) for arm in fit.cell.arms)
+                pose = np.array(look["pose"]) @ exp(1e-6 * np.eye(6)[axis])
+                slope = (place(fit, camera, values, {**look, "pose": pose}) - centre) / 1e-6
+                total += sigma**2 * np.outer(slope, slope)
+        found.append([centre.tolist(), total.tolist()])
+    return {"status": 0, "out": found}
+
+
+def place(fit, camera, values, look):
+    """(3,) where a pixel's ray meets its plane, in the base."""
+    from visioncal.vision.camera import normalise, with_intrinsics
+
+    lens, px = (
+        with_intrinsics(fit.unknowns.lenses[camera], values["lens", camera]),
+        np.array(look["px"]),
+    )
+    if camera in fit.unknowns.fields:
+        px = px - fit.unknowns.fields[camera].at(px[None])[0] @ values["field", camera]
+    ray = np.append(normalise(lens, px[None])[0], 1.0)
+    base_from_cam = values["edge", camera]
+    if look["pose"] is not None:
+        base_from_cam = np.array(look["pose"]) @ base_from_cam
+    origin, along = base_from_cam[:3, 3], base_from_cam[:3, :3] @ ray
+    normal = np.array(look["normal"])
+    return origin + along * (normal @ (np.array(look["point"]) - origin)) / (normal @ along)
