@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scipy.stats import chi2
 from support.small_cells import BOARD, PX, ROBOT_M, ROBOT_RAD, TABLE, made, pose
 
 from visioncal.core.transforms import exp, invert, log
@@ -83,18 +82,18 @@ def tracked(seed, stops=14, points=1, *, are_poses=False, is_touch=False, sigma_
 
 
 def is_fair(squares, degrees):
-    """Whether squared errors over their covariance are chance's, by 0.1 % on both sides.
+    """Whether squared errors are what covariances say, by a factor of 1.6 above.
 
-    Noise levels that a dozen stops determine make them a tenth larger than chi-square's.
+    Down to 0.4 of it below: errors of arms may last from stop to stop, and count though they do
+    not here.
     """
-    low, high = chi2.ppf([0.001, 0.999], degrees * len(squares)) / len(squares)
-    return low < np.mean(squares) < 1.1 * high
+    return 0.4 < np.mean(squares) / degrees < 1.6
 
 
 @pytest.mark.parametrize(("in_hand", "is_declared"), [(True, True), (True, False), (False, True)])
 def test_poses_by_other_software_are_as_sure_as_they_say(in_hand, is_declared):
     squares = []
-    for seed in range(25):
+    for seed in range(12):
         small = made(seed, 14, in_hand=in_hand)
         sigma = 1e-4 if is_declared else 1e-3
         size = 1.0 + sigma * np.random.default_rng(seed).normal()
@@ -162,7 +161,7 @@ def test_measured_rows_have_the_slopes_that_differences_show():
 @pytest.mark.parametrize("kind", ["place", "places", "pose", "pose of unknown rotation"])
 def test_what_a_tracker_read_is_as_sure_as_it_says(kind):
     squares, turned = [], kind.startswith("pose")
-    for seed in range(20):
+    for seed in range(12):
         cell, edges = tracked(
             seed, points=3 if kind == "places" else 1, are_poses=turned,
             sigma_rad=None if "unknown" in kind else TRACKER_RAD,
@@ -176,7 +175,7 @@ def test_what_a_tracker_read_is_as_sure_as_it_says(kind):
 
 def test_points_that_a_tip_touched_are_as_sure_as_they_say():
     squares = []
-    for seed in range(20):
+    for seed in range(12):
         cell, edges = tracked(seed, stops=24, points=3, is_touch=True)
         fit = solve(cell).fit
         away = fit.edge("tip")[:3, 3] - edges["tip"][:3, 3]
