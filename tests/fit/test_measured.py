@@ -154,7 +154,6 @@ def test_measured_rows_have_the_slopes_that_differences_show():
             at = np.flatnonzero(gram.columns == column)
             slope = gram.in_common(gram.weighted(logs))[:, :-1, -1]
             expected = slope[:, 6 * len(gram.flanges) + at].sum(axis=1)
-            # The axes of the line of sight are held, as they whiten rows alone.
             assert -(a - b) / 4e-6 == pytest.approx(expected, rel=2e-3, abs=1e-6)
 
 

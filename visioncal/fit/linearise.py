@@ -298,7 +298,7 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
 
 _Parts: TypeAlias = tuple[tuple[int, FloatArray, FloatArray], ...]
 
-# Noise of measured poses and places by the rows that have it, turns first.
+# Noise of poses that were measured by images (at a metre), by the rows that have it.
 _NOISES = (
     ("rad", slice(0, 2)), ("roll", slice(2, 3)), ("m", slice(3, 5)), ("depth", slice(5, 6)),
 )  # fmt: skip
@@ -366,7 +366,8 @@ def _measured_parts(
             rows[at, [3 + axis for axis in range(3) if axis not in evidence.axes]] = 0.0
     noises: Sequence[tuple[str, slice]] = _NOISES
     if is_of_board:
-        rows = _by_sight(rows, poses, pair.middle)
+        at_sight = [s.evidence.matrix for s in pair.sightings if isinstance(s.evidence, MeasuredPose)]
+        rows = _by_sight(rows, np.array(at_sight), pair.middle)
     else:
         rows = np.delete(rows, 6, axis=2)
         sigmas = first.sigmas if isinstance(first, MeasuredPose) else (1.0, place_m)
@@ -387,14 +388,18 @@ def _by_sight(rows: FloatArray, poses: FloatArray, middle: FloatArray) -> FloatA
     """Rows (k, 6, w) of poses about a board's middle, in axes of which the last is along the sight.
 
     An image tells tilt and distance worse than the turn about the line of sight and what is across
-    it, and all of it worse from afar: by the size of the board in it.
+    it. The smaller the board is in it, the worse: rows are in units of what noise is at a metre,
+    from where it grows with the distance, and along the sight with its square. Both are of the
+    (k, 4, 4) poses as measured, so that noise does not depend on the unknowns.
     """
     rows = adjoint(invert(compose(np.eye(3), middle))) @ rows
     places = poses[:, :3, :3] @ middle + poses[:, :3, 3]
-    far = np.linalg.norm(places, axis=1)
+    # One at no distance is wrong: it gets a millimetre.
+    far = np.maximum(np.linalg.norm(places, axis=1), 1e-3)
     along = places / far[:, None]
     across = np.cross([0.0, 1.0, 0.0], along)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     axes = np.stack([across, np.cross(along, across), along], axis=1) @ poses[:, :3, :3]
     turned = axes[:, None] @ rows.reshape(len(rows), 2, 3, -1)
-    return np.asarray(turned.reshape(rows.shape))
+    noise = far[:, None] ** np.array([1, 1, 1, 1, 1, 2])
+    return np.asarray(turned.reshape(rows.shape) / noise[:, :, None])

@@ -52,7 +52,8 @@ def read_cell(session: Session, corners: Mapping[int, Corners]) -> Cell:
         if evidence is not None and all(np.isfinite(pose).all() for pose in known):
             earlier = of_pair.setdefault((stop, row.seer, row.seen), [])
             # A copy says nothing new about noise.
-            if not any(is_copy(evidence, other) for other in earlier):
+            is_anew = row.view.stop is not None or row.view.stamp_s is not None
+            if not any(is_copy(evidence, other, is_anew=is_anew) for other in earlier):
                 earlier.append(evidence)
                 is_held = row.view.holdout
                 one = Sighting(row.view.number, stop, row.seer, row.seen, evidence, is_held)

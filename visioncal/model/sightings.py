@@ -5,7 +5,9 @@ from typing import TypeAlias
 
 import numpy as np
 
+from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Corners, FloatArray
+from visioncal.session.observations import APART_DEG, APART_MM
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +43,19 @@ Evidence: TypeAlias = Corners | MeasuredPose | MeasuredPlace
 _APART_PX = 0.01
 
 
-def is_copy(one: Evidence, other: Evidence) -> bool:
-    """Whether two pieces of evidence of one stop are the same reading."""
+def is_copy(one: Evidence, other: Evidence, *, is_anew: bool) -> bool:
+    """Whether two pieces of evidence of one stop are the same reading.
+
+    Poses that a program found in images differ by more, unless `is_anew` is stated: a time of its
+    own.
+    """
     if isinstance(one, Corners) and isinstance(other, Corners):
         same = np.array_equal(one.ids, other.ids)
         return same and bool(np.abs(one.px - other.px).max(initial=0.0) < _APART_PX)
     if isinstance(one, MeasuredPose) and isinstance(other, MeasuredPose):
-        return np.array_equal(one.matrix, other.matrix)
+        mm, deg = pose_difference(one.matrix, other.matrix)
+        is_near = one.is_of_board and not is_anew and mm < APART_MM and deg < APART_DEG
+        return is_near or np.array_equal(one.matrix, other.matrix)
     if isinstance(one, MeasuredPlace) and isinstance(other, MeasuredPlace):
         return np.array_equal(one.place_m, other.place_m)
     return False
