@@ -11,6 +11,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.fit.solve import solve
 from visioncal.model import MeasuredPlace, MeasuredPose, Sighting, read_cell
+from visioncal.model.sightings import is_copy
 from visioncal.simulation import instrument_session
 from visioncal.simulation.instrument_session import InstrumentOptions, session_of
 
@@ -93,6 +94,15 @@ def test_copies_of_a_reading_count_once_and_held_rows_are_kept():
     cell = read_cell(more, {})
     assert [s.view for s in cell.sightings] == [v.number for v in session.views]
     assert cell.held.tolist() == [False, True, False, False, False, False]
+
+
+def test_poses_by_images_that_hardly_differ_are_one_reading_unless_taken_anew():
+    one, other = (MeasuredPose(pose([0, 0, 0.3], [0, 0, 0.5 + away])) for away in (0.0, 1e-4))
+    assert is_copy(one, other, is_anew=False)
+    assert not is_copy(one, other, is_anew=True)
+    assert not is_copy(one, MeasuredPose(pose([0, 0, 0.3], [0, 0, 0.503])), is_anew=False)
+    by_tracker = [MeasuredPose(at.matrix, (5e-5, 2e-5)) for at in (one, other)]
+    assert not is_copy(*by_tracker, is_anew=False)
 
 
 def off_lens(rng, sigma_px, **changes):

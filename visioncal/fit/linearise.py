@@ -366,7 +366,9 @@ def _measured_parts(
             rows[at, [3 + axis for axis in range(3) if axis not in evidence.axes]] = 0.0
     noises: Sequence[tuple[str, slice]] = _NOISES
     if is_of_board:
-        at_sight = [s.evidence.matrix for s in pair.sightings if isinstance(s.evidence, MeasuredPose)]
+        at_sight = [
+            s.evidence.matrix for s in pair.sightings if isinstance(s.evidence, MeasuredPose)
+        ]
         rows = _by_sight(rows, np.array(at_sight), pair.middle)
     else:
         rows = np.delete(rows, 6, axis=2)
