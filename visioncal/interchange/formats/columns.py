@@ -19,7 +19,6 @@ from visioncal.interchange.formats.fields import (
     is_image_name,
     named_by,
     stamp_name,
-    unnamed_columns,
 )
 from visioncal.interchange.formats.file_search import (
     FileGroup,
@@ -96,8 +95,7 @@ def foreign_from(
     `images` are those of the source, which describes itself where nothing is known. Raises
     DataError.
     """
-    unnamed = unnamed_columns(fields)
-    names = _pose_fields(fields, requested, unnamed)
+    names = _pose_fields(fields, requested)
     used = {name for of_side in names.values() for name in of_side}
     joint_fields = requested.joints or joint_names(fields, used)
     used.update(map(fields.find, joint_fields))
@@ -128,7 +126,7 @@ def foreign_from(
     # Components of a field that is used.
     used |= {text for text in fields.texts if text.rpartition(".")[0] in used}
     stamps = stamp_name(fields, used)
-    if stamps and stamps in unnamed["time"]:
+    if stamps.isdecimal():
         notes.append(f"Column {stamps} is taken for times, as the source does not say.")
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
     pairing, image_name = _images(fields, requested, images, used)
@@ -149,9 +147,7 @@ def foreign_from(
     )
 
 
-def _pose_fields(
-    fields: Fields, requested: ImportOptions, unnamed: Mapping[str, tuple[str, ...]]
-) -> dict[Side, tuple[str, ...]]:
+def _pose_fields(fields: Fields, requested: ImportOptions) -> dict[Side, tuple[str, ...]]:
     """The fields of each side's poses, the robot's first."""
     used = {fields.find(name) for name in requested.joints}
     sides: list[tuple[Side, PoseImportOptions]] = [
@@ -161,7 +157,7 @@ def _pose_fields(
     names: dict[Side, tuple[str, ...]] = {"robot": (), "camera": ()}
     # What the user names of one side is not the other's.
     for whose, asked in sorted(sides, key=lambda side: not side[1].names):
-        names[whose] = pose_names(fields, asked.names, unnamed[whose], whose, used)
+        names[whose] = pose_names(fields, asked.names, whose, used)
         used.update(names[whose])
     return names
 
@@ -338,11 +334,8 @@ def _poses(
     fields: Fields, requested: PoseImportOptions, whose: Side
 ) -> tuple[PoseNumbers, tuple[str, ...], tuple[str, ...]]:
     """Reads the poses of one file: (poses, the fields that hold them, notes on assumptions)."""
-    unnamed = unnamed_columns(fields)["robot"]
     # A file of camera poses alone may use the names of a robot's file.
-    candidates = (
-        pose_names(fields, requested.names, unnamed, name, ()) for name in (whose, "robot")
-    )
+    candidates = (pose_names(fields, requested.names, name, ()) for name in (whose, "robot"))
     names = next(filter(None, candidates), ())
     if not names:
         raise DataError(

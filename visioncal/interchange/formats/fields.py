@@ -20,10 +20,6 @@ from visioncal.core.types import FloatArray, IntArray, chosen_rows
 from visioncal.session.images import IMAGE_ENDINGS
 
 _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
-# Layout of a table without a header by its number of columns: (times, robot pose, camera pose),
-# each pose a position with a quaternion or a matrix by rows.
-_LAYOUTS = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16, 0)}
-_LAYOUTS |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
 _NORM_TOLERANCE = 0.01
 # A pose with its covariance has fewer numbers; lists of corners and images have more.
 MOST_NUMBERS = 200
@@ -200,14 +196,14 @@ def appearance(numbers: FloatArray) -> str:
         is_unit = _are_unit(flat[:, -4:]) or _are_unit(flat[:, :4])
         return ("quaternion" if size == 4 else "pose") * is_unit
     rotations = flat if size == 9 else split_matrices(flat)[1]
-    is_rotation = bool(np.isfinite(matrix.read(rotations)).all())
+    is_rotation = bool(np.isfinite(matrix.read(rotations)).all(axis=(1, 2)).mean() > 0.5)
     return ("rotation" if size == 9 else "pose") * is_rotation
 
 
 def _are_unit(numbers: FloatArray) -> bool:
-    """Whether (n, k) numbers, or the filled rows of them, are unit vectors."""
-    norms = np.linalg.norm(numbers[np.isfinite(numbers).all(axis=1)], axis=1)
-    return bool(len(norms) and (np.abs(norms - 1.0) < _NORM_TOLERANCE).all())
+    """Whether most (n, k) numbers are unit vectors; others are refused by their row."""
+    away = np.abs(np.linalg.norm(numbers, axis=1) - 1.0)
+    return bool((away < _NORM_TOLERANCE).sum() * 2 > np.isfinite(away).sum())
 
 
 def position_first(flat: FloatArray) -> FloatArray:
@@ -351,7 +347,7 @@ def keys_of(fields: Fields) -> Keys:
     }
     names |= {k: cells for k, cells in fields.texts.items() if any(cells) and k not in measured}
     keys = Keys.of(len(fields), names, {"": fields.views} if fields.views else {})
-    stamp = stamp_name(fields, unnamed_columns(fields)["robot"])
+    stamp = stamp_name(fields, ())
     times_s = {} if not stamp else {stamp: in_seconds(fields.column(stamp)[:, 0])}
     return replace(keys, times_s={**keys.times_s, **times_s})
 
@@ -484,8 +480,7 @@ def _merged(
             for key in (*part.numbers, *part.texts, *part.shape_errors)
         }
         values = dict(part.numbers)
-        columns = [*map(str, range(1, len(part.texts) + 1))]
-        if prefixed and columns and [*part.texts] == columns:
+        if prefixed and is_headerless(part):
             # Columns without names are an array of the file's.
             new[part.name], values = part.name, {part.name: np.stack([*values.values()], axis=1)}
         for key, each in values.items():
@@ -510,51 +505,20 @@ def _merged(
     )
 
 
-def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
-    """Interprets the columns of a table without a header by their number.
-
-    Returns:
-        The columns of `time`, `robot` and `camera`; all empty for a table with a header or another
-        number of columns.
-    """
-    names = [str(at) for at in range(1, len(fields.texts) + 1)]
-    if not names or list(fields.texts) != names:
-        return {"time": (), "robot": (), "camera": ()}
-    # Names of images are no part of a pose.
-    names = [name for name in names if not all(map(is_image_name, fields.texts[name]))]
-    time, robot, camera = _LAYOUTS.get(len(names), (0, 0, 0))
-    is_numeric = set(names) == set(fields.numbers)
-    if is_numeric and len(names) == 12:
-        numbers = np.stack([fields.numbers[name] for name in names], axis=1)
-        lengths = np.linalg.norm(numbers.reshape(-1, 3, 4)[..., :3], axis=2)
-        if (np.abs(lengths - 1.0) < _NORM_TOLERANCE).all():
-            # The upper three rows of matrices, not two poses.
-            robot = 12
-    if is_numeric and len(names) == 7:
-        last = np.stack([fields.numbers[name] for name in names[3:]])
-        if (np.abs(np.linalg.norm(last, axis=0) - 1.0) > _NORM_TOLERANCE).all():
-            # A number or a time, and a position with three angles.
-            time, robot = 1, 6
-    pose = names[time : time + robot]
-    return {
-        "time": tuple(names[:time]),
-        "robot": tuple(pose),
-        "camera": tuple(names[time + robot :]) if camera else (),
-    }
+def is_headerless(fields: Fields) -> bool:
+    """Whether the columns are those of a table without a header."""
+    return bool(fields.texts) and [*fields.texts] == [str(n + 1) for n in range(len(fields.texts))]
 
 
 def stamp_name(fields: Fields, taken: Collection[str]) -> str:
     """Finds the field of times, one number a row and not `taken`; else empty."""
-    unnamed = unnamed_columns(fields)
-    # In a table without a header, the poses follow the times.
-    for name in unnamed["time"] if set(unnamed["robot"]) <= set(taken) else ():
-        numbers = fields.column(name)[:, 0]
+    for name, numbers in fields.numbers.items():
+        if name in taken or numbers.ndim > 1:
+            continue
         # Numbers that count rows, possibly with gaps, are no times; those of an epoch are larger.
-        if (numbers % 1 != 0).any() or numbers.max(initial=0.0) >= 1e6:
+        is_time = (numbers % 1 != 0).any() or numbers.max(initial=0.0) >= 1e6
+        if name.lower() in _TIME_NAMES or (
+            is_headerless(fields) and name == "1" and is_time and (np.diff(numbers) > 0).all()
+        ):
             return name
-    named = (
-        name
-        for name, numbers in fields.numbers.items()
-        if name.lower() in _TIME_NAMES and name not in taken and numbers.size == len(fields)
-    )
-    return next(named, "")
+    return ""

@@ -2,7 +2,7 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -129,11 +129,11 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
         alike[re.sub(r"[0-9]+", "#", _stem(path)), path.suffix.lower()].append(file)
     groups, single = list[FileGroup](), list[Path]()
     for (_, ending), files in alike.items():
-        for part in _series(source, files):
-            if len(part) > 1:
-                groups.append(_numbered(source, part, ending))
+        for group in _series(source, files, ending):
+            if len(group.files) > 1:
+                groups.append(group)
             else:
-                single += part
+                single += group.files
     # Of any names: images of a folder, and records that are called as images are.
     stems = {file.stem for group in groups for file in group.files if group.is_images}
     stems |= {file.stem for file in single if is_image_name(file.name)}
@@ -159,33 +159,24 @@ def _in_order(path: Path) -> tuple[object, ...]:
     return natural(Path(path.as_posix().replace("/", "|")))
 
 
-def _series(source: Path, files: list[Path]) -> Iterable[list[Path]]:
-    """Splits files that differ in several numbers into series with the same last numbers."""
-    by_rest: dict[str, list[Path]] = defaultdict(list)
-    for file in files:
-        words = _stem(file.relative_to(source))
-        by_rest[re.sub(r"[0-9]+([^0-9]*)$", r"#\1", words)].append(file)
-    last = [{number_in(_last_numbered(file)) for file in part} for part in by_rest.values()]
-    is_split = len(by_rest) > 1 and len(last[0]) > 1 and all(part == last[0] for part in last)
-    return by_rest.values() if is_split else [files]
-
-
-def _last_numbered(file: Path) -> str:
-    """The last part of a path, without its ending, that has a number."""
-    parts = (file.stem, *reversed(file.parent.parts))
-    return next((part for part in parts if re.search("[0-9]", part)), "") + "."
-
-
-def _numbered(source: Path, files: list[Path], ending: str) -> FileGroup:
+def _series(source: Path, files: Sequence[Path], ending: str) -> Iterator[FileGroup]:
+    """Files that differ in numbers alone, in series of their own where the last ones are alike."""
     files = sorted(files, key=_in_order)
     runs = [re.split(r"([0-9]+)", _stem(file.relative_to(source))) for file in files]
     differing = [at for at in range(1, len(runs[0]), 2) if len({run[at] for run in runs}) > 1]
-    label = "".join("#" if at in differing else part for at, part in enumerate(runs[0]))
-    for at in reversed(differing):
-        numbers = tuple(int(run[at][:18]) for run in runs)
-        if len({*numbers}) == len(numbers):
-            return FileGroup(label + ending, tuple(files), numbers)
-    return FileGroup(label + ending, tuple(files))
+    label = "".join("#" if at in differing else part for at, part in enumerate(runs[0])) + ending
+    numbered = (tuple(int(run[at][:18]) for run in runs) for at in reversed(differing))
+    numbers = next((each for each in numbered if len({*each}) == len(each)), ())
+    parts: dict[str, dict[Path, str]] = defaultdict(dict)
+    last = max(differing, default=0)
+    for file, run in zip(files, runs, strict=True):
+        parts["".join(run[:last])][file] = run[last]
+    first, *others = parts.values()
+    if others and len(first) > 1 and all({*first.values()} == {*each.values()} for each in others):
+        for part in parts.values():
+            yield from _series(source, [*part], ending)
+    else:
+        yield FileGroup(label, tuple(files), numbers)
 
 
 def _walked(folder: Path, depth: int) -> Iterator[Path]:

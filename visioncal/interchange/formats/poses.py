@@ -4,7 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
     Fields,
     appearance,
+    is_headerless,
     named_by,
     position_first,
     split_matrices,
@@ -186,16 +187,33 @@ def _without_names(
             # The position comes first, unless the names say otherwise.
             names = sorted((*first.names, *second.names), key=_is_rotation_name)
             yield PoseFields((*names,), (*first.words, *second.words), is_named=False)
+    if is_headerless(fields):
+        found = _in_sequence(next(iter(column_groups(fields).values()), ()), fields)
+        yield from (item for item in found if not {*item.names} & {*taken})
+        return
     for parent, columns in column_groups(fields, taken).items():
         if {*joint_names(fields, ())} & {*columns} or len(columns) > _MOST_COLUMNS:
             continue
         flat = np.stack([fields.numbers[name] for name in columns], axis=1)
-        for size in (16, 12, 7, 6):
-            for at in range(len(columns) - size + 1):
-                is_pose = bool(appearance(flat[:, at : at + size]))
-                if is_pose if size > 6 else len(columns) < 9:
-                    window = columns[at : at + size]
-                    yield PoseFields(window, tuple(words_of(parent)), is_named=False)
+        for size, at in product((16, 12, 7, 6), range(len(columns) - 5)):
+            is_pose = appearance(flat[:, at : at + size]) if size > 6 else len(columns) < 9
+            if is_pose and at + size <= len(columns):
+                window = columns[at : at + size]
+                yield PoseFields(window, tuple(words_of(parent)), is_named=False)
+
+
+def _in_sequence(columns: tuple[str, ...], fields: Fields) -> Iterator[PoseFields]:
+    """Poses of the robot and then of the target among the columns of a table without a header."""
+    flat = np.array([fields.numbers[name] for name in columns]).T
+    at, sides = 0, iter(("robot", "target"))
+    while at + 6 < len(columns):
+        size = next((s for s in (16, 12, 7) if appearance(flat[:, at : at + s])), 0)
+        if size and (side := next(sides, "")):
+            yield PoseFields(columns[at : at + size], (side,))
+        at += size or 1
+    if next(sides, "") == "robot" and len(columns) in (6, 7):
+        # A number or a time may stand before a position with three angles.
+        yield PoseFields(columns[-6:], ("robot",))
 
 
 def column_groups(fields: Fields, taken: Collection[str] = ()) -> dict[str, tuple[str, ...]]:
@@ -278,7 +296,6 @@ def _by_prefix(fields: Fields, taken: Collection[str]) -> dict[str, dict[str, st
 def pose_names(
     fields: Fields,
     given: Sequence[str],
-    unnamed: tuple[str, ...],
     whose: str,
     taken: Collection[str],
     *,
@@ -286,9 +303,9 @@ def pose_names(
 ) -> tuple[str, ...]:
     """Full names of the fields with the poses of the `robot` or `camera`; empty where none fit.
 
-    They are those that the user gives, else the `unnamed` columns of a table without a header, else
-    the only fields that may hold poses and whose words say so: by the frames of that side, first in
-    the right order, and for the robot without any words. Raises DataError.
+    They are those that the user gives, else the only fields that may hold poses and whose words say
+    so: by the frames of that side, first in the right order, and for the robot without any words.
+    Raises DataError.
     """
     if given:
         inner = f".{given[0]}."
@@ -297,8 +314,6 @@ def pose_names(
         is_whole = len(given) > 1 or inner[1:-1] in {*fields.numbers, *fields.texts}
         held = None if is_whole else next(within, None)
         return held or tuple(fields.find(name) for name in given)
-    if unnamed:
-        return () if set(unnamed) & set(taken) else unnamed
     first = next(iter(ranked_poses(fields, whose, taken, by_shape=by_shape)), [])
     if first:
         return first[0].names if len(first) == 1 else ()

@@ -236,6 +236,17 @@ def rows_of_document(document: object, path: Path) -> list[Fields]:
         raise DataError(
             f"{path} holds no rows; a list with one entry a pose is needed.", culprits=[str(path)]
         )
+    found = _fields_of_lists(lists, path)
+    if not any(map(holds_pose, found)):
+        # The poses may be in lists of several groups.
+        opened = (_opened(rows, name) for name, rows, _ in lists)
+        found += _fields_of_lists([each for groups in opened for each in groups], path)
+    return found
+
+
+def _fields_of_lists(
+    lists: Sequence[tuple[str, list[object], tuple[str, ...]]], path: Path
+) -> list[Fields]:
     records = [rows for _, rows, _ in lists if isinstance(rows[0], Mapping)]
     return [
         replace(_fields_of_rows(f"{name}." * (records != [rows]), rows, path), stems=keys)
@@ -266,7 +277,6 @@ def _row_lists(
         # A list of one entry is a wrapper, unless there is nothing in it.
         inner = [*_row_lists(rows[0], name)] if len(rows) == 1 else []
         yield from inner or [(name, rows, ())]
-        yield from _opened(rows, name)
     elif isinstance(document, Mapping):
         values = [*document.values()]
         arrays = _arrays_of(values)
@@ -280,7 +290,6 @@ def _row_lists(
             and set[object].intersection(*({*value} for value in values))
         ):
             yield name, values, tuple(map(str, document))
-            yield from _opened(values, name)
             if len(values) > 3:
                 return
         for key, value in document.items():

@@ -19,9 +19,9 @@ from visioncal.interchange.formats.fields import (
     Fields,
     appearance,
     fields_of_records,
+    is_headerless,
     joined,
     named_by,
-    unnamed_columns,
 )
 from visioncal.interchange.formats.file_search import FileGroup, groups_in
 from visioncal.interchange.formats.foreign import ImportOptions
@@ -145,9 +145,8 @@ def _array(fields: Fields) -> FloatArray | None:
     """The numbers of a file without names; None where they have some."""
     if [*fields.numbers] == ["matrix"]:
         return fields.numbers["matrix"]
-    names = [str(at) for at in range(1, len(fields.numbers) + 1)]
-    is_unnamed = bool(names) and [*fields.numbers] == names == [*fields.texts]
-    return np.stack([*fields.numbers.values()], axis=1) if is_unnamed else None
+    is_plain = is_headerless(fields) and len(fields.numbers) == len(fields.texts)
+    return np.stack([*fields.numbers.values()], axis=1) if is_plain else None
 
 
 def _part(group: FileGroup, form: str | None) -> Part:
@@ -186,10 +185,10 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
         later = 4 * bool(fields.form) + 2 * (len(rows) > 1 and not _NAMED.search(fields.name))
         by_count = () if requested.joints or joint_names(fields, ()) else _joints(fields, requested)
         asked = replace(requested, joints=requested.joints or by_count)
-        joints, unnamed = asked.joints or joint_names(fields, ()), unnamed_columns(fields)["robot"]
+        joints = asked.joints or joint_names(fields, ())
         groups = [] if given else ranked_poses(fields, "robot", joints)
-        said = pose_names(fields, (), unnamed, "robot", joints) if is_seen or not joints else ()
-        if given or said or unnamed or (joints and (is_seen or not groups)):
+        said = pose_names(fields, (), "robot", joints) if is_seen or not joints else ()
+        if given or said or (joints and (is_seen or not groups)):
             found.append((later + len(groups) * (not said), fields, asked))
         for rank, item in ((rank, item) for rank, group in enumerate(groups) for item in group):
             # Beside joint angles the pose is what was seen.
@@ -198,7 +197,7 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
             else:
                 of_item = replace(asked, robot=replace(requested.robot, names=item.names))
             if item.names != said:
-                found.append((later + rank + bool(unnamed), fields, of_item))
+                found.append((later + rank, fields, of_item))
     faults = [part.fault for part in source.parts if part.fault and not part.lenses]
     if not rows and len(faults) == 1:
         raise faults[0]
@@ -266,4 +265,4 @@ def _joined(source: Source) -> list[Fields]:
 
 
 def _holds(fields: Fields) -> bool:
-    return bool(possible_poses(fields) or unnamed_columns(fields)["robot"])
+    return bool(possible_poses(fields))

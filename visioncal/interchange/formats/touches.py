@@ -12,7 +12,7 @@ from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 from visioncal.frames.touches import NominalPoints, TouchRows, touches_of
 from visioncal.interchange.formats.columns import foreign_from, view_numbers
-from visioncal.interchange.formats.fields import Fields, named_by, unnamed_columns
+from visioncal.interchange.formats.fields import Fields, named_by
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.poses import (
     check_radians,
@@ -49,8 +49,7 @@ def read_touches(
         return touches_of(Session.load(path), robot)
     given, joints_rad = requested.robot, None
     fields = _of_robot(read_fields(path, given.form or given.usual), robot)
-    unnamed = unnamed_columns(fields)["robot"]
-    named = pose_names(fields, given.names, unnamed, "robot", (), by_shape=False)
+    named = pose_names(fields, given.names, "robot", (), by_shape=False)
     if positions and (not named or (given.names and len(named) == 3)):
         maker = POSE_FORMS.get(given.form or "")
         unit = given.unit or (maker.unit if maker else None)
@@ -85,8 +84,7 @@ def read_typed(path: Path, given: PoseImportOptions) -> tuple[tuple[str, ...], P
     """
     fields = read_fields(path, given.form or given.usual)
     # A robot moves to these: their names must say what they are.
-    unnamed = unnamed_columns(fields)["robot"]
-    names = pose_names(fields, (), unnamed, "robot", (), by_shape=False)
+    names = pose_names(fields, (), "robot", (), by_shape=False)
     is_ours = not names or names == POSE
     return None if is_ours else (names, poses_from(fields, names, given, "robot")[0])
 
