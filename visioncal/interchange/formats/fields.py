@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from itertools import product
 from pathlib import Path, PureWindowsPath
 from typing import Self
 
@@ -291,32 +292,29 @@ class Keys:
     """What tells n rows or files apart, by which those of another source belong to them."""
 
     count: int
-    names: Mapping[str, tuple[str, ...]]  # (n,) names by column; those of files have none.
-    numbers: Mapping[str, tuple[int | None, ...]]
-    times_s: Mapping[str, FloatArray]
+    # By the kind of key, among `HOW`, and the column, which names of files have none of.
+    found: Mapping[str, Mapping[str, Sequence[object]]]
 
     @classmethod
     def of(
-        cls,
-        count: int,
-        names: Mapping[str, tuple[str, ...]],
-        numbers: Mapping[str, tuple[int | None, ...]],
-    ) -> "Keys":
-        """From (n,) names by column, and (n,) numbers that are known."""
-        plain = {column: tuple(map(plain_name, cells)) for column, cells in names.items()}
-        counted = {column: tuple(map(number_in, cells)) for column, cells in plain.items()}
-        times = {column: np.array([*map(time_in, cells)]) for column, cells in plain.items()}
-        return cls(
-            count,
-            {column: cells for column, cells in plain.items() if _are_keys(cells)},
-            {k: cells for k, cells in {**counted, **numbers}.items() if _are_keys(cells)},
-            {k: s for k, s in times.items() if len(s) > 2 and _are_keys(tuple(s[np.isfinite(s)]))},
-        )
+        cls, count: int, names: Mapping[str, tuple[str, ...]], **known: Sequence[object]
+    ) -> Self:
+        """From (n,) names by column, and known (n,) `numbers` or `times`."""
+        plain = {column: [*map(plain_name, cells)] for column, cells in names.items()}
+        found: list[dict[str, Sequence[object]]] = [
+            {**plain},
+            {column: [*map(number_in, cells)] for column, cells in plain.items()},
+            {column: [*map(time_in, cells)] for column, cells in plain.items()},
+        ]
+        found[1] |= {"": known["numbers"]} if known.get("numbers") else {}
+        found[2] |= {"": known["times"]} if "times" in known else {}
+        sure = ({k: cells for k, cells in each.items() if _are_keys(cells)} for each in found)
+        return cls(count, dict(zip(HOW, sure, strict=False)))
 
 
 def _are_keys(cells: Sequence[object]) -> bool:
     """Whether the filled cells are most of them, and no two are the same."""
-    filled = [cell for cell in cells if cell not in ("", None)]
+    filled = [cell for cell in cells if cell not in ("", None) and cell == cell]
     return len({*filled}) == len(filled) and 2 * len(filled) >= len(cells) > 0
 
 
@@ -327,11 +325,6 @@ class Match:
     how: str  # A name among `HOW`.
     rows: IntArray  # (n,) the other's row of each; -1 for none.
 
-    @property
-    def lost(self) -> int:
-        """The number of rows without another."""
-        return int((self.rows < 0).sum())
-
 
 HOW = ("equal names", "equal numbers", "their times", "their order")
 
@@ -339,41 +332,31 @@ HOW = ("equal names", "equal numbers", "their times", "their order")
 def keys_of(fields: Fields) -> Keys:
     """What tells the rows of a source apart."""
     names = {"": fields.stems} if fields.stems else {}
-    # A measured number is no name, and its digits no number.
-    measured = {
-        name
-        for name, numbers in fields.numbers.items()
-        if numbers.ndim == 1 and (np.mod(numbers[np.isfinite(numbers)], 1) != 0).any()
-    }
-    names |= {k: cells for k, cells in fields.texts.items() if any(cells) and k not in measured}
-    keys = Keys.of(len(fields), names, {"": fields.views} if fields.views else {})
+    for name, cells in fields.texts.items():
+        numbers = fields.numbers.get(name, np.zeros(1))
+        # A measured number is no name, and its digits no number.
+        if any(cells) and not (numbers[np.isfinite(numbers)] % 1).any():
+            names[name] = cells
     stamp = stamp_name(fields, ())
-    times_s = {} if not stamp else {stamp: in_seconds(fields.column(stamp)[:, 0])}
-    return replace(keys, times_s={**keys.times_s, **times_s})
+    times = {"times": in_seconds(fields.column(stamp)[:, 0]).tolist()} if stamp else {}
+    return Keys.of(len(fields), names, numbers=fields.views, **times)
 
 
 def matched(first: Keys, second: Keys) -> Match | None:
     """Matches rows by equal names, else numbers, else times, else by their order; None if none."""
     fewest = min(first.count, second.count)
-    kinds = ((HOW[0], first.names, second.names), (HOW[1], first.numbers, second.numbers))
-    for how, mine, others in kinds:
+    for how in HOW[:3]:
         best: tuple[tuple[int, bool, bool], IntArray] = ((1, False, False), np.zeros(0, int))
-        for a, keys in mine.items():
-            for b, their in others.items():
-                rows, is_equal = _equal(keys, their)
-                common, is_same = int((rows >= 0).sum()), a == b
-                # Columns of different names have some numbers in common by chance.
-                is_sure = is_same or any(len(str(key)) > 4 for key in their)
-                fits = common == fewest or (2 * common > fewest and is_sure)
-                if fits and (common, is_equal, is_same) > best[0]:
-                    best = (common, is_equal, is_same), rows
+        for (a, keys), (b, their) in product(first.found[how].items(), second.found[how].items()):
+            rows, is_equal = _nearest(keys, their) if how == HOW[2] else _equal(keys, their)
+            common, is_same = int((rows >= 0).sum()), a == b
+            # Columns of different names have some numbers in common by chance.
+            is_sure = is_same or how == HOW[2] or any(len(str(key)) > 4 for key in their)
+            fits = common == fewest or (2 * common > fewest and is_sure)
+            if fits and (common, is_equal, is_same) > best[0]:
+                best = (common, is_equal, is_same), rows
         if len(best[1]):
             return Match(how, best[1])
-    for mine_s in first.times_s.values():
-        for their_s in second.times_s.values():
-            rows = _nearest(mine_s, their_s)
-            if 2 * (rows >= 0).sum() > fewest > 2:
-                return Match(HOW[2], rows)
     return Match(HOW[3], np.arange(first.count)) if first.count == second.count else None
 
 
@@ -394,18 +377,18 @@ def _equal(keys: Sequence[object], their: Sequence[object]) -> tuple[IntArray, b
     return np.array([place.get(key, -1) for key in keys]), True
 
 
-def _nearest(mine_s: FloatArray, their_s: FloatArray) -> IntArray:
+def _nearest(first_s: Sequence[object], second_s: Sequence[object]) -> tuple[IntArray, bool]:
     """(n,) the other's row of the nearest time, but for a constant offset; -1 for none."""
+    mine_s, their_s = np.array(first_s, dtype=float), np.array(second_s, dtype=float)
+    best = np.full(len(mine_s), -1)
     if len(mine_s) > len(their_s):
-        back = _nearest(their_s, mine_s)
-        rows = np.full(len(mine_s), -1)
-        rows[back[back >= 0]] = np.flatnonzero(back >= 0)
-        return rows
-    own, best = mine_s[np.isfinite(mine_s)], np.full(len(mine_s), -1)
-    order = np.argsort(their_s)
+        back, _ = _nearest(second_s, first_s)
+        best[back[back >= 0]] = np.flatnonzero(back >= 0)
+        return best, True
+    own, order = mine_s[np.isfinite(mine_s)], np.argsort(their_s)
     ends = their_s[order][np.isfinite(their_s[order])]
     if len(own) < 3 or len(ends) < 3:
-        return best
+        return best, True
     # A fifth of the usual step is no other row's.
     within, most = 0.2 * float(np.median(np.diff(np.sort(own)))), 0
     offsets = np.concatenate([[0.0], (ends[:200, None] - own[:2]).ravel()])
@@ -415,7 +398,7 @@ def _nearest(mine_s: FloatArray, their_s: FloatArray) -> IntArray:
         near = np.abs(ends[at] - mine_s - offset) <= within
         if (count := len({*at[near]})) > most and count == near.sum():
             best, most = np.where(near, order[at], -1), count
-    return best
+    return best, True
 
 
 def joined(

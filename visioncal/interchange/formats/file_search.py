@@ -97,8 +97,7 @@ class FileGroup:
         parts = [(file.stem, *reversed(file.parent.parts)) for file in self.files]
         # In folders of their own, files of one name are told apart by these.
         names = next((each for each in zip(*parts, strict=False) if len({*each}) == len(parts)), ())
-        numbers = {"": self.numbers} if self.numbers else {}
-        return Keys.of(len(self.files), {"": names} if names else {}, numbers)
+        return Keys.of(len(self.files), {"": names} if names else {}, numbers=self.numbers)
 
     @cached_property
     def image(self) -> ImageKind | None:
@@ -305,7 +304,7 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         drawn = _DRAWN.search(group.label) is not None
         is_named = re.search("rgb|colou?r", group.label, re.IGNORECASE) is not None
         # What another program drew, and pictures of some of the rows alone, come last.
-        extra = found.lost, HOW.index(found.how), not is_named, -len(group.files)
+        extra = int((found.rows < 0).sum()), HOW.index(found.how), not is_named, -len(group.files)
         return group.is_depth, drawn, found.how == HOW[-1], *extra
 
     ranked = sorted(matches, key=rank)

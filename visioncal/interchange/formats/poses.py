@@ -34,48 +34,31 @@ _UNIT = re.compile(
     rf"|(?<=_)({'|'.join([*UNITS_M, *_ANGLES])}))",
     re.IGNORECASE,
 )
-_POSITION_WORDS = {
-    "translation",
-    "position",
-    "pos",
-    "ort",
-    "posición",
-    "tvec",
-    "tvecs",
-    "trans",
-    "xyz",
-    "t",
-}
-_ROTATION_WORDS = {"rotation", "orientation", "quaternion", "quat", "rotvec", "rot", "r", "ori"}
-_ROTATION_WORDS |= {"winkel", "drehung", "angle", "ángulo", "giro", "rotación"}
-_ROTATION_WORDS |= {"rvec", "rvecs", "rpy", "euler", "vector", "matrix", "xyzw", "wxyz"}
-_POSE_WORDS = {"pose", "poses", "transform", "transforms", "t", "h", "matrix"}
+
+
+def _set(words: str) -> set[str]:
+    return {*words.split()}
+
+
+_POSITION_WORDS = _set("translation position pos ort posición tvec tvecs trans xyz t")
+_ROTATION_WORDS = _set("rotation orientation quaternion quat rotvec rot r ori winkel drehung angle")
+_ROTATION_WORDS |= _set("ángulo giro rotación rvec rvecs rpy euler vector matrix xyzw wxyz")
+_POSE_WORDS = _set("pose poses transform transforms t h matrix")
 # Words of the parent frame and of the child frame, for the robot and for the camera.
 _FRAMES = {
     "robot": (
-        {"base", "world", "root", "basis", "sockel", "welt", "基座"},
-        {"gripper", "flange", "ee", "tcp", "tool", "hand", "tip", "flansch", "greifer", "werkzeug"}
-        | {"brida", "pinza", "herramienta", "bride", "outil", "法兰", "末端"},
+        _set("base world root basis sockel welt 基座"),
+        _set("gripper flange ee tcp tool hand tip flansch greifer werkzeug brida pinza")
+        | _set("herramienta bride outil 法兰 末端"),
     ),
     "camera": (
-        {"cam", "camera", "eye", "sensor", "kamera", "cámara", "camara", "caméra", "相机"},
-        {
-            "target",
-            "board",
-            "marker",
-            "tag",
-            "object",
-            "tafel",
-            "brett",
-            "tablero",
-            "mire",
-            "标定板",
-        },
+        _set("cam camera eye sensor kamera cámara camara caméra 相机"),
+        _set("target board marker tag object tafel brett tablero mire 标定板"),
     ),
 }
 _SIDE_WORDS = {
-    "robot": {"robot", "arm", "effector", "eef", "endeffector", "manipulator"},
-    "camera": {"charuco", "aruco", "chessboard", "checkerboard", "apriltag", "pattern", "cft"},
+    "robot": _set("robot arm effector eef endeffector manipulator"),
+    "camera": _set("charuco aruco chessboard checkerboard apriltag pattern cft"),
 }
 # With these words between two frames the child is named first; otherwise second.
 _CHILD_FIRST = {"2", "to", "in", "wrt"}
@@ -89,11 +72,7 @@ _MOST_COLUMNS = 40
 # Columns that count or time rows.
 _COUNTED = {"view", "index", "id", "nr", "no", "t", "time", "timestamp", "stamp", "stamp_s"}
 # Names of the numbers of a position and of a rotation, the rotations that tell most first.
-_POSITION_NAMES: tuple[tuple[str, ...], ...] = (
-    ("x", "y", "z"),
-    ("tx", "ty", "tz"),
-    ("px", "py", "pz"),
-)
+_POSITION_NAMES = tuple(tuple(names.split()) for names in ("x y z", "tx ty tz", "px py pz"))
 _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
     ("qx", "qy", "qz", "qw"),
     ("q0", "q1", "q2", "q3"),

@@ -16,6 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
+    HOW,
     Fields,
     appearance,
     fields_of_records,
@@ -166,7 +167,7 @@ def _part(group: FileGroup, form: str | None) -> Part:
         return Part(group, fault=error, lenses=lenses)
     places, folder = [file.name for file in group.files], first.parent
     fields = fields_of_records(records, places, group.name, folder, group.numbers)
-    stems = next(iter(group.keys.names.values()), ())
+    stems = tuple(map(str, group.keys.found[HOW[0]].get("", ())))
     return Part(group, (replace(fields, stems=stems),), lenses=lenses)
 
 

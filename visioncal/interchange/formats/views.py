@@ -9,7 +9,7 @@ from typing import Any
 from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.values import as_numbers, mapping, read_plain_text
 from visioncal.core.types import MOUNTS
-from visioncal.interchange.formats.columns import foreign_from
+from visioncal.interchange.formats.columns import VIEWS, foreign_from
 from visioncal.interchange.formats.fields import Fields, fields_of_records, number_in
 from visioncal.interchange.formats.file_search import (
     files_in,
@@ -23,7 +23,6 @@ from visioncal.interchange.formats.foreign import (
     PoseImportOptions,
 )
 from visioncal.interchange.formats.intrinsics import read_intrinsics
-from visioncal.interchange.formats.reading import flattened
 
 # `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame; `pose_cPo_3.yaml`: the
 # object in the camera.
@@ -50,19 +49,8 @@ def _is_zivid(path: Path) -> bool:
 
 def _read_zivid(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads pos01.yaml ... (Zivid SDK, Matrix4x4; older samples, OpenCV's `PoseState`)."""
-    files = _named(path, _ZIVID_NAME)
-    records = []
-    for file in files:
-        content = mapping(read_yaml(file), str(file))
-        stated = content.get("PoseState", content.get("FloatMatrix"))
-        records.append(
-            flattened({"matrix": stated.get("Data") if isinstance(stated, dict) else stated})
-        )
-    fields = _fields(path, files, records)
-    stated = PoseImportOptions(("matrix",), unit="mm")
-    return foreign_from(
-        fields, requested.with_poses(stated, PoseImportOptions()), images=images_of(path)
-    )
+    stated = requested.with_poses(PoseImportOptions(unit="mm"), PoseImportOptions())
+    return VIEWS.read(path, stated)
 
 
 ZIVID = ForeignFormat("zivid", "Zivid's pos01.yaml ... in millimetres", _is_zivid, _read_zivid)
