@@ -31,19 +31,17 @@ from visioncal.core.types import MOUNTS, FloatArray, Progress
 from visioncal.core.verdict import Finding
 from visioncal.estimation.clock_correlation import evenly
 from visioncal.interchange.formats.assemble import assemble, pose_cells, with_observations_only
+from visioncal.interchange.formats.fields import fields_of_records
 from visioncal.interchange.formats.foreign import ForeignRecording, rows_of
+from visioncal.interchange.formats.poses import pose_names
 from visioncal.session import Session, Stream
 from visioncal.session.columns import (
     INSTRUMENT_POSITION,
     INSTRUMENT_QUATERNION,
     MEASURED_CAM_POSE,
     POSE,
-    POSITION,
-    QUATERNION,
-    ROTATIONS,
     joint_columns,
     pose_row,
-    position_columns,
 )
 from visioncal.session.table import parse_csv
 from visioncal.vision.boards.kind import LARGEST_M
@@ -343,40 +341,29 @@ def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
     if not (folder / "views.csv").is_file():
         return None
     table = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")
-    columns = table.columns
-    position_names = position_columns(columns) or POSITION
-    exact_names = {name.lower(): name for name in columns}
-    complete = (
-        tuple(exact_names[name] for name in names)
-        for names in ROTATIONS
-        if exact_names.keys() >= set(names)
-    )
-    rotation_names = QUATERNION if set(QUATERNION) <= set(columns) else next(complete, ())
-    if not rotation_names or not {*position_names} <= {*columns}:
+    cells = [dict(zip(table.columns, row, strict=False)) for row in table.rows]
+    places = tuple(map(table.place, range(len(cells))))
+    texts = ({k: text for k, text in row.items() if is_number(text)} for row in cells)
+    fields = fields_of_records([*texts], places, "views.csv", folder)
+    names = pose_names(fields, (), "robot", (), by_shape=False)
+    if len(names) not in (6, 7):
         return None
-    cells = [dict(zip(columns, row, strict=False)) for row in table.rows]
-    names = (*position_names, *rotation_names)
-    texts = [row.get(name, "") for row in cells for name in names]
-    numbers = [float(text) if is_number(text) else np.nan for text in texts]
-    values = np.array(numbers).reshape(-1, len(names))
+    values = np.hstack([fields.column(name) for name in names])
     positions, rotations = values[:, :3], values[:, 3:]
-    if rotation_names == QUATERNION:
-        if not np.nan_to_num(rotations[:, 3]).any():
-            rotations = rotations[:, :3]
-        elif position_names == POSITION:
-            return None
+    if names == POSE and np.nan_to_num(rotations[:, 3]).any():
+        return None
     form = "quaternion-xyzw"
-    if rotations.shape[1] == 3:
+    if not np.nan_to_num(rotations[:, 3:]).any():
+        rotations = rotations[:, :3]
         largest = float(np.nanmax(np.abs(rotations), initial=0.0))
         # Larger numbers than a whole turn in radians are degrees.
         form = "euler-xyz-deg" if largest > 7.0 else "rotation-vector"
-    kept = [name for name in columns if name not in names]
+    kept = [name for name in table.columns if name not in names]
     plain = []
-    for row_cells, position in zip(cells, positions, strict=True):
+    for row, position in zip(cells, positions, strict=True):
         has_position = np.isfinite(position).all()
         pose = [*map(repr, position.tolist()), *_IDENTITY] if has_position else [""] * len(POSE)
-        plain.append((*(row_cells.get(name, "") for name in kept), *pose))
-    places = tuple(map(table.place, range(len(table.rows))))
+        plain.append((*(row.get(name, "") for name in kept), *pose))
     robot = PoseNumbers(positions, rotations, Reading(form), places)
     return replace(table, columns=(*kept, *POSE), rows=tuple(plain)), robot
 
