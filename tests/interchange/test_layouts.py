@@ -483,6 +483,42 @@ def sentence_above(folder):
     write(folder / "poses.txt", "\n".join([sentence, *lines]))
 
 
+def sorted_as_text(folder):
+    """An array in the order of the pictures' names as texts, 10 before 2."""
+    for at, picture in enumerate(world()[1]):
+        folder.mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / f"{at + 6}.png"), picture)
+    order = sorted(range(9), key=lambda at: str(at + 6))
+    np.save(folder / "poses.npy", world()[0][order])
+
+
+def called_by_words(folder):
+    """Names without a number, with endings of their own by kind."""
+    for at, (pose, picture) in enumerate(zip(*world()[:2], strict=True)):
+        name = "abcdefghi"[(4 * at) % 9] * 3
+        (folder / "shots").mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / f"shots/scene-{name}.png"), picture)
+        write(folder / f"arm/scene-{name}_hand.json", {"pose": pose.tolist()})
+
+
+def a_folder_a_view(folder):
+    """Folders without a number, with files of the same names in each."""
+    for at, (pose, picture) in enumerate(zip(*world()[:2], strict=True)):
+        view = folder / f"take_{'abcdefghi'[(4 * at) % 9]}"
+        view.mkdir(parents=True)
+        cv2.imwrite(str(view / "color.png"), picture)
+        write(view / "state.yaml", json.dumps({"flange": pose.tolist(), "speed": 0.1}))
+
+
+def columns_as_lists(folder):
+    """A list a column in one mapping, whole numbers among them."""
+    shoot(folder, "{:03d}.png")
+    numbers = np.array([seven(pose) for pose in world()[0]]).T.tolist()
+    names = dict(zip(("X", "Y", "Z", "i", "j", "k", "w"), numbers, strict=True))
+    document = {"n": [9], "gain": [3, 1, 2, 0, 4, 8, 7, 6, 5], **names, "iso": [*range(8, -1, -1)]}
+    write(folder / "arm.json", {"log": document})
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -492,6 +528,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         later_names, quaternion_first, three_deep, two_lists, poses_as_texts, keys_are_names,
         another_order, comment_above, beside_a_decoy, matlab, dense_log,
         two_sessions, several_bodies, sentence_above,
+        sorted_as_text, called_by_words, a_folder_a_view, columns_as_lists,
     )
 }  # fmt: skip
 

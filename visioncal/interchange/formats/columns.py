@@ -47,7 +47,7 @@ from visioncal.interchange.formats.poses import (
     without_unit,
 )
 from visioncal.interchange.formats.reading import read_fields
-from visioncal.interchange.formats.sources import Source, look, proposed, unknown
+from visioncal.interchange.formats.sources import look, proposed, unknown
 from visioncal.session.columns import INSTRUMENT_POSITION
 
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
@@ -70,14 +70,14 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     readings = proposed(source, requested)
     for rank, fields, asked in readings:
         try:
-            foreign = foreign_from(fields, asked, images=images, source=source)
+            for more, foreign in _recordings(fields, asked, images):
+                all_notes = (*foreign.notes, *notes)
+                found.append((rank + more, replace(foreign, lens=lens, notes=all_notes)))
         except DataError as error:
             faults.append(error)
-            continue
-        found.append((rank, replace(foreign, lens=lens, notes=(*foreign.notes, *notes))))
     if not found:
         raise faults[0]
-    (rank, first), *others = found
+    (rank, first), *others = sorted(found, key=lambda each: each[0])
     is_clear = not others or others[0][0] > rank
     doubt = None if is_clear else unknown(source, requested, [each for _, each, _ in readings[:1]])
     return replace(first, rivals=tuple((at - rank, other) for at, other in others), doubt=doubt)
@@ -88,20 +88,23 @@ def foreign_from(
     requested: ImportOptions,
     *,
     images: Sequence[FileGroup] = (),
-    source: Source | None = None,
 ) -> ForeignRecording:
     """Builds a recording from rows of named values, by their names or the user's options.
 
-    `images` are those of the source, which describes itself where nothing is known. Raises
-    DataError.
+    `images` are those of the source. Raises DataError.
     """
+    return _recordings(fields, requested, images)[0][1]
+
+
+def _recordings(
+    fields: Fields, requested: ImportOptions, images: Sequence[FileGroup]
+) -> list[tuple[int, ForeignRecording]]:
+    """The recording of `foreign_from`, and less likely ones with images in other orders."""
     names = _pose_fields(fields, requested)
     used = {name for of_side in names.values() for name in of_side}
     joint_fields = requested.joints or joint_names(fields, used)
     used.update(map(fields.find, joint_fields))
     if not names["robot"] and not joint_fields:
-        if source is not None:
-            raise unknown(source, requested, [fields])
         word = named_by(fields.places[0])
         raise DataError(
             f"{fields.name}: which of its fields are the robot's poses is not known; it has "
@@ -132,7 +135,7 @@ def foreign_from(
     pairing, image_name = _images(fields, requested, images, used)
     used.add(image_name)
     columns = _further(fields, columns, used, pairing)
-    return ForeignRecording(
+    foreign = ForeignRecording(
         name=fields.name,
         robot=poses["robot"],
         camera=poses.get("camera"),
@@ -145,6 +148,11 @@ def foreign_from(
         notes=(*notes, *pairing.notes),
         unstated=unstated,
     )
+    others = [
+        replace(foreign, images=other, notes=(*notes, f"The images are taken {words}."))
+        for words, other in pairing.others
+    ]
+    return [(0, foreign), *((1, other) for other in others)]
 
 
 def _pose_fields(fields: Fields, requested: ImportOptions) -> dict[Side, tuple[str, ...]]:

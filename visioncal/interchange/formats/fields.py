@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from itertools import product
+from itertools import product, takewhile
 from pathlib import Path, PureWindowsPath
 from typing import Self
 
@@ -301,8 +301,13 @@ class Keys:
     ) -> Self:
         """From (n,) names by column, and known (n,) `numbers` or `times`."""
         plain = {column: [*map(plain_name, cells)] for column, cells in names.items()}
+        if "" in plain:
+            # Words that all files of a kind have are no part of a view's name.
+            start, end = (_shared(plain[""], step) for step in (1, -1))
+            plain["*"] = [name[start : max(len(name) - end, start)] for name in plain[""]]
         found: list[dict[str, Sequence[object]]] = [
-            {**plain},
+            # Names of digits alone are numbers.
+            {k: cells for k, cells in plain.items() if not "".join(cells).isdecimal()},
             {column: [*map(number_in, cells)] for column, cells in plain.items()},
             {column: [*map(time_in, cells)] for column, cells in plain.items()},
         ]
@@ -310,6 +315,12 @@ class Keys:
         found[2] |= {"": known["times"]} if "times" in known else {}
         sure = ({k: cells for k, cells in each.items() if _are_keys(cells)} for each in found)
         return cls(count, dict(zip(HOW, sure, strict=False)))
+
+
+def _shared(names: Sequence[str], step: int) -> int:
+    """The number of letters with which all names begin, or end where `step` is -1."""
+    letters = zip(*(name[::step] for name in names), strict=False)
+    return sum(1 for _ in takewhile(lambda each: len({*each}) == 1, letters))
 
 
 def _are_keys(cells: Sequence[object]) -> bool:
@@ -337,6 +348,9 @@ def keys_of(fields: Fields) -> Keys:
         # A measured number is no name, and its digits no number.
         if any(cells) and not (numbers[np.isfinite(numbers)] % 1).any():
             names[name] = cells
+    if len({*fields.numbers, *fields.texts}) < 2:
+        # The values of a list of their own are no keys.
+        names = {"": names[""]} if fields.stems else {}
     stamp = stamp_name(fields, ())
     times = {"times": in_seconds(fields.column(stamp)[:, 0]).tolist()} if stamp else {}
     return Keys.of(len(fields), names, numbers=fields.views, **times)

@@ -2,7 +2,7 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -133,6 +133,9 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
                 groups.append(group)
             else:
                 single += group.files
+    by_folder = [*_in_folders(source, single)]
+    groups += by_folder
+    single = [file for file in single if not any(file in group.files for group in by_folder)]
     # Of any names: images of a folder, and records that are called as images are.
     stems = {file.stem for group in groups for file in group.files if group.is_images}
     stems |= {file.stem for file in single if is_image_name(file.name)}
@@ -140,7 +143,7 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
     for file in single:
         kinds[file.parent, file.suffix.lower()].append(file)
     for (folder, ending), files in kinds.items():
-        named = [file for file in files if is_image_name(file.name) or file.stem in stems]
+        named = [file for file in files if is_image_name(file.name) or _has_any(file.stem, stems)]
         is_series = len(named) > 1
         if is_series:
             label = (folder.relative_to(source) / f"*{ending}").as_posix()
@@ -148,6 +151,22 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
         others = (file for file in files if not (is_series and file in named))
         groups += [FileGroup(file.relative_to(source).as_posix(), (file,)) for file in others]
     return tuple(sorted(groups, key=lambda group: _in_order(Path(group.label))))
+
+
+def _in_folders(source: Path, single: Sequence[Path]) -> Iterator[FileGroup]:
+    """Files of one name, in a folder a view."""
+    by_name: dict[tuple[Path, str], list[Path]] = defaultdict(list)
+    for file in single:
+        if file.parent != source:
+            by_name[file.parent.parent, file.name].append(file)
+    for (folder, name), files in by_name.items():
+        if len(files) > 2:
+            label = (folder.relative_to(source) / "*" / name).as_posix()
+            yield FileGroup(label, tuple(sorted(files, key=natural)))
+
+
+def _has_any(stem: str, stems: Collection[str]) -> bool:
+    return stem in stems or any(each in stem for each in stems if len(each) > 1)
 
 
 def _stem(path: Path) -> str:
@@ -289,6 +308,8 @@ class Pairing:
     images: tuple[Path | None, ...]  # (n,) the image of each row; None in a row without.
     depths: tuple[Path | None, ...] = ()  # (n,) its depth picture likewise; empty without any.
     notes: tuple[str, ...] = ()  # What was paired with what, and what was left out.
+    # (n,) images in other orders, where no names pair them, and what they are called.
+    others: tuple[tuple[str, tuple[Path | None, ...]], ...] = ()
 
 
 def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
@@ -344,7 +365,14 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     if left:
         notes.append(f"Left out of the images: {some_of(left)}.")
     depths = () if depth is None else depth[0].taken(depth[1].rows)
-    return Pairing(images, depths, tuple(notes))
+    files = chosen.files if how != HOW[0] and len(chosen.files) == len(fields) else ()
+    orders = {
+        "in natural order": files,
+        "in the order of their names as texts": tuple(sorted(files, key=str)),
+        "in reverse order": files[::-1],
+    }
+    others = tuple((words, each) for words, each in orders.items() if each and each != images)
+    return Pairing(images, depths, tuple(notes), others)
 
 
 def path_inside(base: Path, name: str) -> Path:

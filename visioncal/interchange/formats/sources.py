@@ -187,9 +187,12 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
         by_count = () if requested.joints or joint_names(fields, ()) else _joints(fields, requested)
         asked = replace(requested, joints=requested.joints or by_count)
         joints = asked.joints or joint_names(fields, ())
-        groups = [] if given else ranked_poses(fields, "robot", joints)
-        said = pose_names(fields, (), "robot", joints) if is_seen or not joints else ()
-        if given or said or (joints and (is_seen or not groups)):
+        is_given = bool(requested.robot.names or requested.joints) or not _has(fields, given)
+        camera = () if is_given else pose_names(fields, requested.camera.names, "camera", joints)
+        others = (*joints, *camera) if requested.camera.names else joints
+        groups = [] if is_given else ranked_poses(fields, "robot", others)
+        said = pose_names(fields, (), "robot", others) if is_seen or not joints else ()
+        if is_given or said or (joints and (is_seen or not groups)):
             found.append((later + len(groups) * (not said), fields, asked))
         for rank, item in ((rank, item) for rank, group in enumerate(groups) for item in group):
             # Beside joint angles the pose is what was seen.
