@@ -27,11 +27,12 @@ from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.workspace import postures
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.purposes import Purpose
@@ -50,12 +51,11 @@ WEAK_SIGMA = 0.2
 class RecordedStops:
     """Stops that were recorded already."""
 
-    problem: Problem  # The stops, without errors of the arm. Its first effect is lens and boards.
-    # Edges of the problem: the camera's, the planned board's, then further boards'.
+    fit: Fit  # Their fit, without errors of the arm. Its first effect is lens and boards.
+    # Edges of the fit: the camera's, the planned board's, then further boards'.
     edges: FloatArray
     free: LensBoardParameters  # Free parameters of lens and boards.
     q: FloatArray | None  # (s, n) joint angles of the stops [rad]; None where they are not known.
-    noise: Noise  # Noise of the robot at the stops.
     first_corner: int = 0  # Number of the first corner of the planned board.
     # Posture-dependent errors of the arm at the stops; None where the stops show none.
     arm: ArmErrors | None = None
@@ -69,7 +69,7 @@ class RecordedStops:
     @property
     def shared(self) -> FloatArray:
         """(k, k) information on what the views share, from corners and priors."""
-        return _effect_information(self.problem)
+        return _effect_information(self.fit.problem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,13 +265,13 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
             culprits=["q1_rad"],
             next_step="Record q1_rad ..., or plan without the recorded session.",
         )
-    stops = len(next(iter(recorded.problem.poses.values())))
+    stops = len(next(iter(recorded.fit.flanges.values())))
     joints = np.zeros((stops, cell.robot.joint_count)) if q is None else q
-    problem = _with_arm_errors(cell, purpose, recorded.problem, joints, recorded.arm)
+    problem = _with_arm_errors(cell, purpose, recorded.fit.problem, joints, recorded.arm)
     # Further boards keep their pose relative to the planned one.
     boards = cell.z @ invert(recorded.edges[1]) @ recorded.edges[1:]
     state = State(np.concatenate([cell.x[None], boards]), problem.start_values)
-    information = fisher_information(problem, state, recorded.noise)
+    information = fisher_information(problem, state, recorded.fit.noise)
     edges = 6 * len(problem.unknown)
     information[edges:, edges:] -= _effect_information(problem)
     # Schur complement: the poses of further boards are eliminated.

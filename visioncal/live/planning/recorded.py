@@ -6,19 +6,18 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
-from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.refine import free_parameters_of_camera
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mount, Progress
-from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.fit import Fit
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.normal_equations import fisher_information, normal_equations
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Noise, State
+from visioncal.estimation.normal_equations import fisher_information
+from visioncal.estimation.problem_parts import Noise
+from visioncal.estimation.solve import Solution
 from visioncal.estimation.unknowns import EDGE
 from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.information import RecordedStops
@@ -85,101 +84,82 @@ def start_from_session(
         raise _missing_input_error(run)
     if run.cell_fit_or_none is None:
         raise _too_vague_error(run)
+    fit = _of_stops(run, run.cell_fit_or_none)
     with one_blas_thread():
-        start = _start_from_fit(run, run.cell_fit_or_none)
-        edges, covariance = _posterior_edges(
-            start.problem, start.state, start.noise, run.session.mount
-        )
+        edges, covariance = _posterior_edges(fit, run.session.mount)
     sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
     # Too uncertain to plan stops [rad, m].
     if sigmas[0] > 0.5 or sigmas[1] > 0.5:
         raise _too_vague_error(run)
     # Up to the frame of the reported poses, calibrated where possible.
-    arm, joints = robot, start.arm.joints_rad
-    if start.arm.model is not None:
-        arm = start.arm.model.robot
-    elif joints is not None:
-        arm = ArmModel.of(robot, joints, start.arm.poses).robot
+    first = np.unique(fit.seen.stops, return_index=True)[1]
+    arm = run.robot_arm.at(np.unique(run.cell_fit.fit.seen.stops))
+    if arm.model is not None:
+        robot = arm.model.robot
+    elif arm.joints_rad is not None:
+        robot = ArmModel.of(robot, arm.joints_rad, arm.poses).robot
+    _, board, *_ = fit.frames
+    planned = [frame_name("target", name) for name in run.session.boards].index(board)
+    free = free_parameters_of_camera(fit.linearised)
     cell = PlanCell(
         run.session.mount,
-        arm,
-        start.free.appearance.camera,
-        targets[start.board],
+        robot,
+        free.appearance.camera,
+        targets[planned],
         edges[0],
         edges[1],
         float(sigmas[0]),
         float(sigmas[1]),
-        start.noise,
+        fit.noise,
         run.pixel_px,
         limits or Limits(),
         boxes,
         covariance,
     )
     # Least and greatest distance at which stops show the planned board.
-    problem = start.problem
-    _, board, *_ = problem.unknown
-    of_board = np.array(problem.observations.observed) == board
-    flange = problem.poses[problem.robots[0]][problem.observations.stops[of_board]]
+    of_board = fit.seen.stops[np.array(fit.seen.observed) == board]
+    flange = next(iter(fit.flanges.values()))[of_board]
     low, high = extent_m(cell.target)
     poses, centre = cell.seen_from(flange), np.append(0.5 * (low + high), 0.0)
     distance = np.linalg.norm(poses[:, :3, :3] @ centre + poses[:, :3, 3], axis=1)
     cell = replace(cell, observed_distances_m=(float(distance.min()), float(distance.max())))
-    first_corner = int(first_corners(targets)[start.board])
-    recorded = _recorded_stops(run, start, edges, first_corner)
-    return SessionStart(cell, recorded, refusal, start.views)
-
-
-def _recorded_stops(
-    run: RunState, start: "_RecordedStart", edges: FloatArray, first_corner: int
-) -> RecordedStops:
-    """The session's information at the plan's edges."""
-    arm = start.arm
+    first_corner = int(first_corners(targets)[planned])
     # With few stops, error sizes that noise alone explains are mostly chance.
     is_likely = arm.is_modelled and arm.errors is not None and arm.errors.is_likely
-    recorded = RecordedStops(
-        *(start.problem, edges, start.free, arm.joints_rad, start.noise, first_corner),
-        arm.errors if is_likely else None,
-    )
-    assessment = run.assessment_or_none
-    if assessment is None:
-        return recorded
+    errors = arm.errors if is_likely else None
+    recorded = RecordedStops(fit, edges, free, arm.joints_rad, first_corner, errors)
+    if run.assessment_or_none is not None:
+        recorded = _with_errors(recorded, run.assessment.fit, has_joints=arm.is_modelled)
+    return SessionStart(cell, recorded, refusal, tuple(run.used[at] for at in first.tolist()))
+
+
+def _with_errors(recorded: RecordedStops, fit: Fit, *, has_joints: bool) -> RecordedStops:
+    """Recorded stops with what a fit holds, and with errors of an arm without joint angles."""
     # Gradient at held parameters of lens and boards.
-    fit = assessment.fit
     gradient = fit.equations[1] * (fit.problem.counted & ~fit.unknowns.moved)
-    columns = [fit.problem.effect_columns[effect.name] for effect in start.problem.effects]
+    columns = [fit.problem.effect_columns[effect.name] for effect in recorded.fit.problem.effects]
     held = np.concatenate([np.zeros(0), *(gradient[part] for part in columns)])
     recorded = replace(recorded, held=held[:, None])
     by_arm = fit.beside.get("arm")
-    if arm.is_modelled or by_arm is None:
+    if has_joints or by_arm is None:
         return recorded
-    # Errors of an arm without joint angles.
-    index = fit.unknowns.columns(*((EDGE, name) for name in [*start.problem.unknown][:2]))
+    index = fit.unknowns.columns(*recorded.fit.unknowns.all_of(EDGE)[:2])
     values, vectors = np.linalg.eigh(by_arm[np.ix_(index, index)])
     root = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0]
     return replace(recorded, edge_error_root=root)
 
 
-@dataclass(frozen=True, eq=False)
-class _RecordedStart:
-    """Problem of the recorded stops."""
+def _of_stops(run: RunState, cell_fit: CellFit) -> Fit:
+    """The fit of the stops without errors of the arm, even if it leaves a direction undetermined.
 
-    problem: Problem  # The s stops, without errors of the arm; the planned board comes first.
-    state: State
-    noise: Noise  # Noise of the robot at the stops.
-    free: LensBoardParameters  # Free parameters of lens and boards.
-    arm: RobotArm
-    board: int  # Index of the planned board: the one in the most views.
-    views: tuple[int, ...]  # (s,) first view of each stop.
-
-
-def _start_from_fit(run: RunState, cell_fit: CellFit) -> _RecordedStart:
-    """Recorded stops of a session with a fit, even if that leaves a direction undetermined."""
+    The planned board, which is in the most views, comes first.
+    """
     if cell_fit.linearised_corners is None:
         raise _missing_input_error(run)
     part, arm = cell_fit.fit.problem, run.robot_arm
     observed = part.observations.observed
     planned = max(dict.fromkeys(observed), key=observed.count)
-    stops, first, of = np.unique(part.observations.stops, return_index=True, return_inverse=True)
+    stops, of = np.unique(part.observations.stops, return_inverse=True)
     # Errors of the arm are added again with the purpose's priors.
     bare = part.with_effects(
         [effect for effect in part.effects if effect.name != f"arm of {arm.robot}"]
@@ -195,43 +175,32 @@ def _start_from_fit(run: RunState, cell_fit: CellFit) -> _RecordedStart:
         observations=replace(part.observations, stops=of),
         effects=tuple(effect.of_stops(kept_stops) for effect in bare.effects),
     )
-    noise = cell_fit.noise
-    return _RecordedStart(
-        problem,
-        problem.start(cell_fit.frames),
-        replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
-        free_parameters_of_camera(cell_fit.linearised_corners),
-        arm.at(stops),
-        tuple(frame_name("target", board) for board in run.session.boards).index(planned),
-        tuple(run.used[index] for index in first.tolist()),
-    )
+    noise = replace(cell_fit.noise, robots=np.maximum(cell_fit.noise.robots, _LEAST_NOISE.robots))
+    state = problem.start(cell_fit.frames)
+    return Fit(problem, Solution(state, noise), cell_fit.linearised_corners)
 
 
-def _posterior_edges(
-    problem: Problem, state: State, noise: Noise, mount: Mount
-) -> tuple[FloatArray, FloatArray]:
+def _posterior_edges(fit: Fit, mount: Mount) -> tuple[FloatArray, FloatArray]:
     """Posterior edges with the prior, and the covariance (12, 12) of camera and planned board."""
-    prior = np.full((2, 2, 3), 1e-6)
+    prior, problem = np.full((2, 2, 3), 1e-6), fit.problem
     # The mounted camera or board is within some 0.1 m of the flange.
     prior[0 if mount == "eye-in-hand" else 1, 1] = 0.1**-2.0
     weights = np.zeros((problem.size, problem.size))
     weights[:12, :12] = np.diag(prior.ravel())
     # The problem is nearly linear.
     for _ in range(20):
-        information, gradient = normal_equations(problem, state, noise)
+        information, gradient = fit.equations
         # Twists from the prior to the edges.
-        distance, edges = np.zeros(problem.size), state.edges[:2]
-        distance[3:6], distance[9:12] = (edge[:3, :3].T @ edge[:3, 3] for edge in edges)
+        distance, edges = np.zeros(problem.size), fit.state.edges
+        distance[3:6], distance[9:12] = (edge[:3, :3].T @ edge[:3, 3] for edge in edges[:2])
         step = -covariance_among(information + weights, problem.moving) @ (
             gradient + weights @ distance
         )
         # Shared parameters have converged before; they are marginalised, but not moved.
-        step[6 * len(state.edges) :] = 0.0
-        state = state.moved(step)
-    covariance = covariance_among(
-        fisher_information(problem, state, noise) + weights, problem.counted
-    )
-    return state.edges, covariance[:12, :12]
+        step[6 * len(edges) :] = 0.0
+        fit = fit.at(fit.state.moved(step))
+    information = fisher_information(problem, fit.state, fit.noise) + weights
+    return fit.state.edges, covariance_among(information, problem.counted)[:12, :12]
 
 
 def _missing_input_error(run: RunState) -> DataError:
