@@ -295,7 +295,7 @@ def _estimated(
         of about zero; and the joint's offset [rad].
     """
     prior, problem, offset = check.prior, check.predicted.problem, 0.0
-    stops, size, columns = problem.observations.stops, 6 * len(prior.state.edges), _columns(moved)
+    size, columns = 6 * len(prior.state.edges), _columns(moved)
 
     def side(parts: Iterable[FloatArray | None], count: int) -> FloatArray:
         none = [np.zeros((count, 6, len(cause.units))) for cause in chosen]
@@ -306,13 +306,7 @@ def _estimated(
     by_sensor = side((cause.by_sensor for cause in chosen), len(problem))
     units = np.concatenate([cause.units for cause in chosen])
     together = ChangeHypothesis("all", units, by_sensor, by_flange)
-    belief = CalibrationPosterior(
-        prior.state,
-        prior.covariance,
-        prior.noise(from_corners=not problem.is_combined),
-        prior.freedom,
-        prior.repeated(problem.poses[ROBOT][stops], check.predicted.boards, stops),
-    )
+    belief = prior.belief(problem, check.predicted.boards)
     # What changed is moved step by step until the last step is zero, which takes simultaneous
     # motions exactly.
     for _ in range(_MOST_STEPS):

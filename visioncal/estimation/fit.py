@@ -6,7 +6,7 @@ was made: `problem`, `solution` and `corners` are of the engine, read by its own
 tests of residuals alone. Another engine stands behind the same door if it gives
 
     unknowns, values, frames, camera      what there is, and its estimates
-    level, noise, sigmas_px, shown_px     noise of flanges, sensors and corners
+    robots, noise, sigmas_px, shown_px    noise of flanges, sensors and corners
     seen, measured, expected, closure     sightings, and their forward model
     by_noise, beside, shift               covariances by source; what held values would have moved
     absorbed, equations, with_columns     score tests of further unknowns
@@ -101,7 +101,8 @@ class Fit:
         parts |= {Unknown(EDGE, frame): problem.edge_columns(frame) for frame in problem.unknown}
         if self.corners is not None:
             free, first = self.corners.free, self.lens_columns.start
-            for unknown, values in self.corners.camera_parameters.parts.items():
+            for key, values in self.corners.camera_parameters.parts.items():
+                unknown = Unknown(*key)
                 low, high = np.searchsorted(free, [values.start, values.stop]).tolist()
                 parts[unknown] = slice(first + low, first + high)
                 uncertain[unknown] = free[low:high] - values.start
@@ -152,15 +153,10 @@ class Fit:
         """(s, 4, 4) `base_from_flange` of each robot at the stops, without unknown errors of it."""
         return self.problem.poses
 
-    def level(self, robot: str) -> FloatArray:
-        """(2,) noise of a robot's flange from stop to stop, of rotation [rad] and position [m]."""
-        return np.asarray(self.noise.robots[self.problem.robots.index(robot)])
-
-    def with_level(self, robot: str, level: FloatArray) -> Noise:
-        """The noise with another level (2,) of a robot."""
-        robots = self.noise.robots.copy()
-        robots[self.problem.robots.index(robot)] = level
-        return replace(self.noise, robots=robots)
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """The robots, in the order of their noise levels."""
+        return self.problem.robots
 
     @property
     def measured(self) -> FloatArray:
@@ -230,7 +226,7 @@ class Fit:
         """
         if self.corners is not None:
             optics = self.camera_parameters
-            if (part := optics.parts.get(Unknown(*unknown))) is not None:
+            if (part := optics.parts.get(unknown)) is not None:
                 return optics.values[part]
         at, first = self.unknowns[unknown], 6 * len(self.problem.unknown)
         columns = slice(max(at.start - first, 0), max(at.stop - first, 0))
@@ -282,11 +278,3 @@ class Fit:
     def sigmas(self, unknown: tuple[str, str]) -> FloatArray:
         """(c,) standard deviations of an unknown's uncertain values, from all sources."""
         return np.asarray(np.sqrt(np.diag(self.whole)[self.unknowns[unknown]]))
-
-    def by_columns(self, parts: Mapping[tuple[str, str], FloatArray]) -> FloatArray:
-        """(..., p) Jacobian of a forward model, from its (..., c) Jacobians by some unknowns."""
-        shape = next(iter(parts.values())).shape[:-1]
-        jacobian = np.zeros((*shape, len(self.unknowns.moved)))
-        for unknown, part in parts.items():
-            jacobian[..., self.unknowns[unknown]] = part
-        return jacobian

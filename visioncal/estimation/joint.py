@@ -26,7 +26,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import covariance_of, fit_problem
-from visioncal.estimation.unknowns import BOARD
+from visioncal.estimation.unknowns import BOARD, LENS
 
 # Values that change by less than this share of their sigma have converged.
 _SETTLED = 0.02
@@ -124,7 +124,8 @@ def _stepped(fitted: Fit) -> LinearisedCorners:
         candidate = optics.with_values(free, optics.values[free] + change)
         change = change / 2
         # Focal lengths are positive.
-        if all(candidate.values[at][:2].min() > 0.0 for at in candidate.lenses.values()):
+        lenses = (candidate.parts[LENS, name] for name in candidate.problems)
+        if all(candidate.values[at][:2].min() > 0.0 for at in lenses):
             corners = candidate.linearised()
             if all(sigma <= limit for sigma, limit in zip(corners.sigmas_px, limits, strict=True)):
                 return corners

@@ -210,3 +210,9 @@ class Noise:
     def of_robot(cls, sigma_rad: float, sigma_m: float) -> "Noise":
         """Noise of a single robot's flange, per axis, without sensor levels."""
         return cls(np.array([[sigma_rad, sigma_m]]), np.zeros(0))
+
+    def with_robot(self, at: int, level: FloatArray) -> "Noise":
+        """Returns the noise with another level (2,) of the robot of an index."""
+        robots = self.robots.copy()
+        robots[at] = level
+        return replace(self, robots=robots)

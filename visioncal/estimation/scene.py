@@ -17,7 +17,7 @@ from visioncal.estimation.appearance import (
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.lens_field import LensLevels, LensSizes, lens_modes, zooms
 from visioncal.estimation.linalg import covariance_from
-from visioncal.vision.targets import first_corners, numbered_positions
+from visioncal.vision.targets import numbered_positions
 
 # Frame of a single camera.
 ONLY_CAMERA = "cam"
@@ -176,11 +176,6 @@ class CornerProblem:
         """Columns of all unknowns of one target's corner positions."""
         columns = shape_slices(self.scene.targets, len(self.lens))[target]
         return np.arange(columns.start, columns.stop)
-
-    def corners_of(self, board: int) -> slice:
-        """Rows of one board's corners in `positions`."""
-        starts = [*first_corners(self.scene.targets).tolist(), len(self.positions)]
-        return slice(starts[board], starts[board + 1])
 
     @property
     def has_spare_corners(self) -> bool:

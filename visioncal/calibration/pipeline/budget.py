@@ -155,7 +155,7 @@ def middle_jacobians(fit: Fit, session: Session) -> dict[str, FloatArray]:
     jacobians = {}
     for (plate, target), name in zip(session.plates.items(), session.boards, strict=True):
         values = fit.unknowns.values_of((BOARD, name))
-        moved = {(BOARD, name): shape_basis(target).mean(axis=0)[:, values]}
-        jacobian = fit.by_columns(moved)[:, fit.unknowns.of_kinds(BOARD)]
-        jacobians[frame_name("target", plate)] = jacobian
+        jacobian = np.zeros((3, len(fit.whole)))
+        jacobian[:, fit.unknowns[BOARD, name]] = shape_basis(target).mean(axis=0)[:, values]
+        jacobians[frame_name("target", plate)] = jacobian[:, fit.unknowns.of_kinds(BOARD)]
     return jacobians

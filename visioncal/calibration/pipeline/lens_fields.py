@@ -70,8 +70,8 @@ def lens_field_of(fit: Fit, camera: str) -> LensField | None:
         places, beyond = optics.places(camera), (LENS_ERRORS, camera)
         slope = coefficients.slope[:, np.isin(places, seen.free)]
         columns = np.append(fit.unknowns.columns(lens), fit.unknowns.of_kinds(BOARD))
-        jacobian = fit.by_columns({beyond: coefficients.moving_roots})
-        jacobian[:, columns] = slope
+        jacobian = np.zeros((len(slope), len(covariance)))
+        jacobian[:, columns], jacobian[:, fit.unknowns[beyond]] = slope, coefficients.moving_roots
         change = (fit.camera_parameters.values - optics.values)[np.intersect1d(places, seen.free)]
         fitted = coefficients.moving_roots @ fit.values(beyond)
         mean = (coefficients.mean + slope @ change + fitted) / noise_px

@@ -254,7 +254,8 @@ def _picks(
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
     covariance, parts = fit.whole, dict[str, FloatArray]()
-    level = pick_level = fit.level(robot)
+    index = fit.robots.index(robot)
+    level = pick_level = noise.robots[index]
     if as_noise is not None and bias is not None:
         covariance = covariance - bias @ bias.T
         by_posture, in_time = _arm_covariances(fit.closure(rows), robot, stops, as_noise, bias)
@@ -262,7 +263,7 @@ def _picks(
             by_posture, in_time = (to_base @ array @ to_base.mT for array in (by_posture, in_time))
         parts["arm"] = by_posture + in_time
         if as_noise.white is not None:
-            level, noise = as_noise.white, fit.with_level(robot, as_noise.white)
+            level, noise = as_noise.white, noise.with_robot(index, as_noise.white)
         pick_level = np.hypot(level, _lasting_sigma(as_noise))
     elif errors is not None:
         root = errors.sigma * adjoint(fit.flanges[robot][stops]) @ errors.basis[stops]

@@ -153,8 +153,7 @@ def _follows(model: FrameModel, fitted: Fit, sized: CameraParameters) -> Fit | N
 def _is_shrunk(fitted: Fit) -> bool:
     """Whether a board's size is farther from the stated one than any board's."""
     optics = fitted.camera_parameters
-    scales = [float(optics.values[optics.shape_of(board)[0]]) for board in optics.printed]
-    return any(abs(scale) > _FARTHEST for scale in scales)
+    return bool(np.any(np.abs(optics.values[optics.scales]) > _FARTHEST))
 
 
 def _estimated(
@@ -179,9 +178,7 @@ def _estimated(
         problem = problem.with_effects([*others, effect])
         values[effect.name] = np.zeros(len(effect))
         if errors.white is not None:
-            robots = noise.robots.copy()
-            robots[problem.robots.index(robot)] = errors.white
-            noise = replace(noise, robots=robots)
+            noise = noise.with_robot(problem.robots.index(robot), errors.white)
     in_order = [values[effect.name] for effect in problem.effects]
     state = State(fitted.state.edges, np.concatenate(in_order))
     problem = problem.sized_at(state)

@@ -16,9 +16,10 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.model_evidence import RepeatedStops
+from visioncal.estimation.model_evidence import CalibrationPosterior, RepeatedStops
 from visioncal.estimation.pose_errors import posture_correlation
-from visioncal.estimation.problem_parts import Noise, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.results import Calibration
 from visioncal.results.arm import FUNCTIONS
 from visioncal.results.sections import FittedArm, JointFit
@@ -121,17 +122,20 @@ class CalibrationPrior:
         """Degrees of freedom of the estimated noise; limited, as more make no difference."""
         return min(self.calibration.noise_dof, 1e6)
 
-    def repeated(
-        self, poses: FloatArray, boards: IntArray, stops: IntArray
-    ) -> RepeatedStops | None:
-        """The calibrated observations that those of a check repeat; None for none.
+    def belief(self, problem: Problem, boards: IntArray | None) -> CalibrationPosterior:
+        """What is believed before a check, by its problem.
 
-        Args:
-            poses: (n, 4, 4) flange at each observation of the check.
-            boards: (n,) index of the board that it shows.
-            stops: (n,) its stop.
+        `boards` are the (n,) indices of those that its observations show; None where they are not
+        compared with calibrated stops that they repeat.
         """
-        calibrated, count = self.fit.stops, len(poses)
+        noise = self.noise(from_corners=not problem.is_combined)
+        repeated = None if boards is None else self._repeated(problem, boards)
+        return CalibrationPosterior(self.state, self.covariance, noise, self.freedom, repeated)
+
+    def _repeated(self, problem: Problem, boards: IntArray) -> RepeatedStops | None:
+        """The calibrated observations that those of a check repeat; None for none."""
+        calibrated, stops, count = self.fit.stops, problem.observations.stops, len(problem)
+        poses = problem.poses[ROBOT][stops]
         if calibrated is None or not len(calibrated.views):
             return None
         correlation = posture_correlation(np.concatenate([poses, exp(calibrated.poses)]))

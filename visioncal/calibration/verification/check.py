@@ -22,14 +22,12 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import log, mean_transform
 from visioncal.core.types import FloatArray, Progress
 from visioncal.estimation.model_evidence import (
-    CalibrationPosterior,
     ChangeHypothesis,
     HypothesisEvidence,
     evidence_of,
     undone,
     with_change,
 )
-from visioncal.estimation.problem_parts import ROBOT
 from visioncal.results import Calibration, select_matching
 from visioncal.session import Session
 from visioncal.session.selecting import Choice
@@ -144,7 +142,7 @@ def check(
         board_placed_anew: Whether the board was moved on purpose.
         with_repeats: Whether stops near calibrated ones are compared with these: they are others.
     """
-    problem, repeated = predicted.problem, None
+    problem, boards = predicted.problem, predicted.boards if with_repeats else None
     if board_placed_anew:
         if len(prior.boards) > 1:
             raise DataError(
@@ -158,12 +156,8 @@ def check(
         covariance = prior.covariance.copy()
         covariance[6:12], covariance[:, 6:12] = 0.0, 0.0
         covariance[6:12, 6:12] = _ANYWHERE**2 * np.eye(6)
-        prior = replace(prior, state=seen, covariance=covariance)
-    elif with_repeats:
-        stops = problem.observations.stops
-        repeated = prior.repeated(problem.poses[ROBOT][stops], predicted.boards, stops)
-    noise = prior.noise(from_corners=not problem.is_combined)
-    belief = CalibrationPosterior(prior.state, prior.covariance, noise, prior.freedom, repeated)
+        prior, boards = replace(prior, state=seen, covariance=covariance), None
+    belief = prior.belief(problem, boards)
     causes = causes_of(predicted, prior, board_placed_anew=board_placed_anew)
     with one_blas_thread():
         unchanged = evidence_of(problem, belief)
@@ -193,7 +187,7 @@ def check(
         prior,
         changes,
         remaining,
-        0 if repeated is None else len(repeated.repeats),
+        0 if belief.repeated is None else len(belief.repeated.repeats),
         unchanged,
         float(fdtrc(unchanged.freedom, prior.freedom, unchanged.misfit / unchanged.freedom)),
         compared,

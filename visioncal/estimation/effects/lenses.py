@@ -18,7 +18,7 @@ from visioncal.estimation.lens_field import LensLevels, LensSizes
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.scene import BoardSizes, CornerProblem
-from visioncal.estimation.unknowns import BOARD, LENS, Unknown
+from visioncal.estimation.unknowns import BOARD, LENS
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
 # The effect's name in a problem.
@@ -52,22 +52,13 @@ class CameraParameters:
         )
 
     @cached_property
-    def lenses(self) -> Mapping[str, slice]:
-        """Slice of each camera's intrinsics among the values."""
-        places, at = {}, 0
-        for name, problem in self.problems.items():
-            places[name] = slice(at, at + len(problem.lens))
-            at += len(problem.lens)
-        return places
-
-    @cached_property
-    def parts(self) -> Mapping[Unknown, slice]:
+    def parts(self) -> Mapping[tuple[str, str], slice]:
         """Slice of each lens and each board among the values."""
-        scene = self._one.scene
-        shapes = zip(scene.names, shape_slices(scene.targets, self.boards.start), strict=True)
-        return {Unknown(LENS, name): at for name, at in self.lenses.items()} | {
-            Unknown(BOARD, name): at for name, at in shapes
-        }
+        scene, lenses = self._one.scene, [len(problem.lens) for problem in self.problems.values()]
+        ends = np.cumsum([0, *lenses]).tolist()
+        shapes = shape_slices(scene.targets, self.boards.start)
+        names = [(LENS, name) for name in self.problems] + [(BOARD, name) for name in scene.names]
+        return dict(zip(names, (*map(slice, ends, ends[1:]), *shapes), strict=True))
 
     @property
     def boards(self) -> slice:
@@ -75,25 +66,9 @@ class CameraParameters:
         return slice(sum(len(problem.lens) for problem in self.problems.values()), len(self.values))
 
     @property
-    def printed(self) -> list[int]:
-        """Indices of the printed boards; see `CornerProblem.printed`."""
-        return self._one.printed
-
-    @property
     def scales(self) -> IntArray:
         """Indices of the printed boards' scales."""
         return self.places(next(iter(self.problems)))[self._one.scale]
-
-    def shape_of(self, target: int) -> IntArray:
-        """Indices of the values of one target's shape; of a printed board the scale comes first."""
-        return self.places(next(iter(self.problems)))[self._one.points_of(target)]
-
-    @property
-    def corners(self) -> tuple[FloatArray, ...]:
-        """Corners (c, 3) of each board with its present shape, in its frame [m]."""
-        one = self._one
-        places = one.positions + one.basis @ self.values[self.boards]
-        return tuple(places[one.corners_of(index)] for index in range(len(one.scene.targets)))
 
     @property
     def _one(self) -> CornerProblem:
@@ -127,10 +102,6 @@ class CameraParameters:
         return CameraParameters.of(
             self.problems, {name: np.zeros((0, 4, 4)) for name in self.problems}
         ).values
-
-    def lens_of(self, name: str) -> IntArray:
-        """Indices of one camera's intrinsics."""
-        return np.asarray(np.r_[self.lenses[name]])
 
     def with_sizes(
         self,
@@ -179,12 +150,14 @@ class CameraParameters:
 
     def camera(self, name: str) -> Camera:
         """A camera with its present intrinsics."""
-        return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
+        return with_intrinsics(
+            self.problems[name].scene.camera, self.values[self.parts[LENS, name]]
+        )
 
     @property
     def points(self) -> FloatArray:
         """(c, 3) corners of all boards, each in its board's frame [m]."""
-        return np.concatenate(self.corners)
+        return self._one.positions + self._one.basis @ self.values[self.boards]
 
     def with_values(self, free: IntArray, found: FloatArray) -> "CameraParameters":
         """Returns them with (f,) other values at given indices."""
@@ -231,7 +204,7 @@ class CameraParameters:
 
     def places(self, name: str) -> IntArray:
         """Indices of the values that one camera's corners depend on: its lens and all boards."""
-        return np.asarray(np.r_[self.lenses[name], self.boards])
+        return np.asarray(np.r_[self.parts[LENS, name], self.boards])
 
 
 @dataclass(frozen=True, eq=False)
