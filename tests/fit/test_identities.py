@@ -133,7 +133,7 @@ def model(cell):
 
 
 def test_the_likelihood_has_the_gradient_that_differences_show():
-    mixed, unknowns = model(made(stops=7, cameras=2).cell)
+    mixed, unknowns = model(made(stops=8, cameras=2).cell)
     logs = unknowns.starts()
     found = mixed.at(logs)
     for size in range(len(logs)):
@@ -213,7 +213,7 @@ class Dense:
 
 
 def test_the_likelihood_is_that_of_all_unknowns_at_once():
-    mixed, unknowns = model(made(stops=7, cameras=2).cell)
+    mixed, unknowns = model(made(stops=8, cameras=2).cell)
     dense, logs = Dense(mixed), unknowns.starts()
     differ = logs - 0.7 * np.arange(len(logs)) % 1.0
     # Differences are compared: both leave out the same constant.

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from support.small_cells import PX, ROBOT_RAD, made
 from support.whole_cells import OPTIONS, recorded
 
 from visioncal.core.transforms import invert, log
@@ -77,3 +78,28 @@ def test_a_stop_left_out_is_predicted_as_by_a_refit_without_it():
     wider = np.trace(left_out.predicted - one_by_one.predicted, axis1=1, axis2=2)
     assert (wider > -1e-12).all()
     assert wider[moved].max() > 1e-8
+
+
+@pytest.mark.parametrize("in_hand", [True, False])
+def test_a_camera_that_sways_is_told_from_its_corners_noise_and_from_the_arm(in_hand):
+    squares, views, errors, used = [], [], [], []
+    for seed in range(4):
+        small = made(seed, 20, 3, in_hand=in_hand, sways=2e-3)
+        fit = solve(small.cell).fit
+        used.append(fit.used.mean())
+        views.append([fit.sizes[f"view {name}"] / PX for name in ("cam", "cam_1", "cam_2")])
+        errors.append(fit.sizes["rad flange"] / ROBOT_RAD)
+        for name in ("cam", "cam_2"):
+            away = log(invert(small.edges[name]) @ fit.edge(name))
+            squares.append(away @ np.linalg.solve(fit.covariance(("edge", name)), away) / 6)
+    # A mount that turns alone is further off in three directions than its size in six says: few of
+    # its views are lost, where all were that were further off than corners' noise.
+    assert np.mean(used) > 0.96
+    steady, swaying = np.split(np.median(views, axis=0), [2])
+    # A noise is known by 20 views to a tenth of it.
+    assert steady == pytest.approx(np.ones(2), abs=0.2)
+    assert swaying > 4.0
+    assert np.median(errors) == pytest.approx(1.0, abs=0.2)
+    # Of a mount that turns, two directions have thrice the variance of six equal ones: a variance
+    # of one beside a third of a steady camera. The mean of four each has a sigma of 0.3.
+    assert 0.1 < np.mean(squares) < 1.9

@@ -55,8 +55,11 @@ def pixels(cam_from_target, table, rng):
     return px[0].reshape(-1, 2) + PX * rng.normal(size=(len(points), 2))
 
 
-def made(seed=0, stops=8, cameras=1, *, in_hand=True, given=True):
-    """One arm, with some cameras on its flange that see one board, or fixed ones that see its."""
+def made(seed=0, stops=8, cameras=1, *, in_hand=True, given=True, sways=0.0):
+    """One arm, with some cameras on its flange that see one board, or fixed ones that see its.
+
+    The last of several cameras `sways` on its mount from stop to stop [rad].
+    """
     rng = np.random.default_rng([seed, 59])
     names = ["cam", *(f"cam_{at}" for at in range(1, cameras))]
     x = {name: pose(rng.normal(0, 0.1, 3), [0.03, -0.05, 0.09]) for name in names}
@@ -72,6 +75,8 @@ def made(seed=0, stops=8, cameras=1, *, in_hand=True, given=True):
     for stop in range(stops):
         for name in names:
             edge = np.linalg.inv(x[name]) @ x["cam"]
+            if sways and name == names[-1]:
+                edge = pose(sways * rng.normal(size=3), np.zeros(3)) @ edge
             px = pixels(edge @ boards[stop], TABLE, rng)
             ids = np.arange(len(px))
             corners = Corners(len(sightings), ids, px, 0.0)

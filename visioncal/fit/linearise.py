@@ -31,6 +31,9 @@ from visioncal.model.boards import shape_basis
 from visioncal.vision.camera import project_with_jacobian
 from visioncal.vision.targets import corner_positions
 
+# Added to the information about a pose that corners leave open, over its diagonal.
+_SINGULAR = 1e-12
+
 
 @dataclass(frozen=True, eq=False)
 class Gram:
@@ -258,8 +261,7 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
         rows, own = corner_rows(unknowns, state, pair, at.poses, distances)
         padded = pair.padded(rows).reshape(len(pair.rows), -1, rows.shape[2])
         grams: FloatArray = np.swapaxes(padded, 1, 2) @ padded
-        size, counts = unknowns.size_of(f"px {pair.names[0]}"), np.asarray(2.0 * pair.counts)
-        parts: _Parts = ((size, grams, counts),)
+        parts: _Parts = _corner_parts(unknowns, pair, grams)
     else:
         parts, own = _measured_parts(unknowns, state, pair, at.poses)
     seer, _ = pair.names
@@ -297,6 +299,27 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
 
 
 _Parts: TypeAlias = tuple[tuple[int, FloatArray, FloatArray], ...]
+
+
+def _corner_parts(unknowns: Unknowns, pair: Pair, grams: FloatArray) -> _Parts:
+    """Gram matrices of corners: all with one noise, or what a pose explains with another."""
+    px, view = (unknowns.size_of(f"{name} {pair.names[0]}") for name in ("px", "view"))
+    counts = np.asarray(2.0 * pair.counts)
+    if view < 0:
+        return ((px, grams, counts),)
+    by_pose = grams[:, :, :6] @ of_pose_alone(grams) @ grams[:, :6]
+    within = grams - by_pose
+    # But for rounding, these are zero: no noise within a view looks like its pose.
+    within[:, :6], within[:, :, :6] = 0.0, 0.0
+    return (px, within, counts - 6.0), (view, by_pose, np.full(len(counts), 6.0))
+
+
+def of_pose_alone(grams: FloatArray) -> FloatArray:
+    """(k, 6, 6) inverse information of (k, d + 1, d + 1) Gram matrices about their poses alone."""
+    pose = grams[:, :6, :6]
+    ridge = _SINGULAR * (np.diagonal(pose, axis1=1, axis2=2) + np.ones(6))
+    return np.asarray(np.linalg.inv(pose + ridge[:, :, None] * np.eye(6)), dtype=np.float64)
+
 
 # Noise of poses that were measured by images (at a metre), by the rows that have it.
 _NOISES = (

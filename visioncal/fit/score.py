@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import LENGTHS, Field, field_of_length, orders_of_waves, waves
-from visioncal.fit.linearise import Gram, Pair, corner_rows
+from visioncal.fit.linearise import Gram, Pair, corner_rows, of_pose_alone
 from visioncal.model.effects import Effect
 
 # Sizes that are tried, over one that the data would just show.
@@ -144,10 +144,17 @@ def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
         padded, of_rows = np.swapaxes(pair.padded(each), 1, 2), pair.padded(rows)
         local = np.concatenate([padded @ of_rows[:, :, axis] for axis in (0, 1)], axis=1)
         inner = each[kept[pair.owner]]
-        weight = _weight(fit, gram)
-        product = weight * np.kron(np.eye(2), inner.T @ inner)
+        weight, local = _weight(fit, gram), local[kept]
+        product = weight * np.asarray(np.kron(np.eye(2), inner.T @ inner))
         taken = gram if kept.all() else gram.take(kept)
-        added.append(Added(taken, weight * local[kept], np.asarray(product)))
+        if len(taken.parts) > 1:
+            # What poses explain has another noise than the rest.
+            more, by_pose = _weight(fit, gram, 1) - weight, np.swapaxes(local[:, :, :6], 1, 2)
+            raw = np.asarray(sum(part[1] for part in taken.parts))
+            solved = of_pose_alone(raw) @ by_pose
+            product += more * by_pose.reshape(-1, 2 * count).T @ solved.reshape(-1, 2 * count)
+            local = local + more / weight * np.swapaxes(solved, 1, 2) @ raw[:, :6]
+        added.append(Added(taken, weight * local, product))
     return score(fit, added, 2 * count, fit.of_corners)
 
 
@@ -166,9 +173,9 @@ def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, flo
     return field, size, gain
 
 
-def _weight(fit: Fit, gram: Gram) -> float:
+def _weight(fit: Fit, gram: Gram, part: int = 0) -> float:
     """Inverse variance of the noise of some sightings' rows."""
-    size = gram.parts[0][0]
+    size = gram.parts[part][0]
     return float(np.exp(-2.0 * fit.estimate.logs[size])) if size >= 0 else 1.0
 
 

@@ -1,5 +1,6 @@
 """Fits a cell: from its sightings to edges, lenses, boards, sizes and covariance."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -149,10 +150,14 @@ def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
     members += [random_effect(effect) for effect in effects]
     erring = _erring(cell)
     noise, ratios = list(flange_noise(erring)), [(f"rad {name}", f"m {name}") for name in erring]
+    compared = _compared(cell)
     for name in start.lenses:
         own = [s.corners for s in cell.sightings if s.seer == name and s.corners is not None]
         if any(corners.stated_px is None for corners in own):
             noise.append(Size(f"px {name}", 0.3, 1e-4, 30.0))
+            if name in compared:
+                noise.append(Size(f"view {name}", 0.3, 1e-4, 30.0))
+                ratios.append((f"px {name}", f"view {name}"))
     for name, is_board in _measuring(cell).items():
         parts = ("rad", "m", "roll", "depth") if is_board else ("rad", "m")
         noise += [Size(f"{part} {name}", 3e-3, 1e-8, 0.3) for part in parts]
@@ -197,6 +202,20 @@ def _erring(cell: Cell) -> tuple[str, ...]:
     """Flanges whose errors some sighting shows."""
     passed = {step.robot for pair in cell.pairs for step in cell.tree.path(*pair)}
     return tuple(name for name in cell.arms if name in passed)
+
+
+def _compared(cell: Cell) -> set[str]:
+    """Cameras whose poses of boards can be compared with others at enough stops.
+
+    What mounts, exposure and lens add to a pose, beside what the corners' noise does, is no error
+    of the arm there: it has a size of its own.
+    """
+    seers: dict[int, list[str]] = {}
+    for sighting in cell.sightings:
+        if sighting.corners is not None:
+            seers.setdefault(sighting.stop, []).append(sighting.seer)
+    beside = Counter(name for names in seers.values() if len(names) > 1 for name in set(names))
+    return {name for name, count in beside.items() if count >= _FEWEST_STOPS}
 
 
 def _corners_px(cell: Cell, camera: str) -> FloatArray:
