@@ -61,18 +61,21 @@ def lasting(seed, share):
     return replace(small, cell=replace(small.cell, arms=arms, moments=moments))
 
 
-def test_errors_that_last_are_in_the_covariance():
-    squares = {True: [], False: []}
+def test_errors_that_last_move_the_estimate_and_are_in_the_covariance():
+    squares, lengths = {True: [], False: []}, {True: [], False: []}
     for seed in range(30):
         small = lasting(seed, 0.95)
         fit = solve(small.cell).fit
-        away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
-        for is_considered, one in ((True, fit), (False, replace(fit, considered=None))):
+        for is_considered in (True, False):
+            one = fit if is_considered else replace(fit, considered=None, shift=None)
+            away = log(invert(small.edges["cam"]) @ one.edge("cam"))
             covariance = one.covariance(("edge", "cam"))
             squares[is_considered].append(away @ np.linalg.solve(covariance, away) / 6)
+            lengths[is_considered].append(np.linalg.norm(away[3:]))
     # Independent errors would be claimed to leave less than a third of it.
     assert np.mean(squares[False]) > 2.0
     assert 0.3 < np.mean(squares[True]) < 1.6
+    assert np.mean(lengths[True]) < np.mean(lengths[False])
 
 
 def test_boards_that_are_larger_are_found_beside_errors_of_the_arm():

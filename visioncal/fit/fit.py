@@ -68,20 +68,29 @@ class Fit:
     estimate: Estimate
     # (p, p) covariance by errors that are considered, but not estimated; None where none are.
     considered: FloatArray | None = None
+    # (p,) by which they move the estimate; None where they do not.
+    shift: FloatArray | None = None
 
     @cached_property
     def state(self) -> State:
         """The estimate."""
-        return self.unknowns.moved(self.linearised, self.estimate.values, self.errors)
+        step = self.estimate.values + self.moved_by
+        return self.unknowns.moved(self.linearised, step, self.errors)
+
+    @property
+    def moved_by(self) -> FloatArray:
+        """(p,) the `shift`."""
+        return np.zeros(self.unknowns.count) if self.shift is None else self.shift
 
     @cached_property
     def errors(self) -> Mapping[str, FloatArray]:
         """(s, 6) by which each flange's errors differ from those of `linearised`."""
         found = {}
         for body, own in zip(self.mixed.bodies, self.estimate.bodies, strict=True):
+            errors = own.errors + own.response @ self.moved_by[body.columns]
             for place, name in enumerate(body.flanges):
                 found[name] = np.zeros_like(self.linearised.errors[name])
-                found[name][body.stops] = own.errors[:, 6 * place : 6 * place + 6]
+                found[name][body.stops] = errors[:, 6 * place : 6 * place + 6]
         return found
 
     @cached_property
@@ -267,10 +276,11 @@ class Fit:
         calibration = jacobian @ self.whole @ np.swapaxes(jacobian, 1, 2)
         return Prediction(at.poses, jacobian, calibration, noise)
 
-    def considering(self, added: FloatArray) -> "Fit":
-        """The fit with more (p, p) covariance."""
+    def considering(self, added: FloatArray, shift: FloatArray | None = None) -> "Fit":
+        """The fit with more (p, p) covariance, and an estimate shifted by (p,)."""
         known = 0.0 if self.considered is None else self.considered
-        return replace(self, considered=known + added)
+        moved = self.moved_by + (0.0 if shift is None else shift)
+        return replace(self, considered=known + added, shift=moved)
 
     def seer_from_seen(self, row: int) -> FloatArray:
         """(4, 4) pose of a sighting as predicted at its own stop, with the errors of flanges."""

@@ -1,10 +1,12 @@
-"""Errors of arms that last from stop to stop: they count in the covariance, not in the estimate.
+"""Errors of arms that last from stop to stop: they judge no sighting, and move the result last.
 
 Without joint angles, an arm's errors are functions of its posture and of time that nobody knows.
-The estimate stays that of independent errors, which is nearly as good and rejects no sound view;
-what it would be off by is averaged over processes by posture and by time, each over a grid of sizes
-and of levels of what is independent, by their restricted likelihood (Hoeting, Madigan, Raftery and
-Volinsky 1999). What each stop alone says of its flange follows from the factorisation.
+Which sightings agree and how large the noise is is found as if they were independent. The
+covariance is then averaged over processes by posture and by time, each over a grid of sizes and of
+levels of what is independent, by their restricted likelihood (Hoeting, Madigan, Raftery and
+Volinsky 1999), and so is the estimate over those by time. Estimates under processes by posture are
+further off than that of independent errors: they take a camera's transform for the arm's error.
+What each stop alone says of its flange follows from the factorisation.
 """
 
 from collections.abc import Iterator
@@ -15,6 +17,7 @@ import numpy as np
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.fit.fit import Fit
+from visioncal.fit.mixed import inverse
 from visioncal.fit.unknowns import Key
 from visioncal.model.effects.effect import TWIST
 
@@ -27,14 +30,17 @@ _SIZES, _WHITE = (0.3, 0.6, 1.2, 2.5, 5.0), (1.0, 0.7, 0.4, 0.15)
 _FEWEST, _MOST = 8, 40
 # Size of a board that is not as stated, as a share.
 _LOOSE = 0.01
-# Shares of evidence that do not count.
-_LITTLE = 1e-4
+# Shares of evidence that do not count: of a size, of a process where estimates are averaged.
+_LITTLE, _SHARE = 1e-4, 0.01
+# Most stops at which estimates are averaged; of more, the mean over the stops is nearly as good.
+_SOLVED = 100
 
 
 @dataclass(frozen=True, eq=False)
 class Considered:
-    """What an arm's lasting errors add."""
+    """What an arm's lasting errors change."""
 
+    shift: FloatArray  # (p,) of the estimate, in units of the columns.
     covariance: FloatArray  # (p, p) beyond that of independent errors, in units of the columns.
     # Log-odds of boards of any size against boards as stated; zero where their size is free.
     board_odds: float
@@ -47,6 +53,7 @@ class Process:
     prior: float
     kernel: FloatArray  # (s, s).
     basis: FloatArray  # (s, 6, r) right perturbations of the flange [rad, m].
+    is_of_time: bool = False
 
     def covariance(self, at: IntArray) -> FloatArray:
         """(6 k, 6 k) at some stops."""
@@ -81,9 +88,9 @@ def processes(poses: FloatArray, levels: FloatArray) -> Iterator[Process]:
         yield Process(1 / 4 / len(_RANGES), kernel, both)
     apart = np.abs(order[:, None] - order)
     for memory in _MEMORIES:
-        yield Process(1 / 8 / len(_MEMORIES), np.exp(-apart / memory), flange)
+        yield Process(1 / 8 / len(_MEMORIES), np.exp(-apart / memory), flange, True)
     ramp = (order - order.mean()) / order.std()
-    yield Process(1 / 16, np.outer(ramp, ramp), both)
+    yield Process(1 / 16, np.outer(ramp, ramp), both, True)
 
 
 def _beyond_mean(kernel: FloatArray) -> FloatArray:
@@ -135,13 +142,49 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     # The estimate's response to an error at each stop, which it takes for independent.
     gains = np.linalg.inv(alone.known + np.diag(levels**2)) @ alone.rows[:, :, :p]
     independent = np.einsum("uia,i,uib->ab", gains, levels**2, gains, optimize=True)
-    excess = np.zeros((p, p))
-    for share, (process, size, white) in zip(shares, kinds, strict=True):
-        if share > _LITTLE:
-            through = process.through(gains)
-            excess += share * (size**2 * through - (1.0 - white**2) * independent)
-    covariance = fit.estimate.covariance
-    return Considered(covariance @ excess @ covariance, odds)
+    known, excess, shift = fit.estimate.covariance, np.zeros((p, p)), np.zeros(p)
+    moved = list[tuple[float, FloatArray]]()
+    tried = len(_SIZES) * len(_WHITE)
+    for at in range(0, len(shares), tried):
+        own, process = shares[at : at + tried], kinds[at][0]
+        share = float(own.sum())
+        if process.is_of_time and share > _SHARE and stops <= _SOLVED:
+            # The likeliest size of a process stands for all of its sizes where it is estimated.
+            values, covariance = _estimated(alone, *kinds[at + int(own.argmax())])
+            moved.append((share, values - fit.estimate.values))
+            excess += share * (covariance - known)
+            continue
+        for share, (_, size, white) in zip(own.tolist(), kinds[at : at + tried], strict=True):
+            if share > _LITTLE:
+                added = size**2 * process.through(gains) - (1.0 - white**2) * independent
+                excess += share * (known @ added @ known)
+    for share, away in moved:
+        shift += share * away
+        excess += share * np.outer(away, away)
+    return Considered(shift, excess - np.outer(shift, shift), odds)
+
+
+def _estimated(
+    alone: _Alone, process: Process, size: float, white: float
+) -> tuple[FloatArray, FloatArray]:
+    """The (p,) estimate under a process, and its covariance (p, p)."""
+    every, p = np.arange(len(alone.stops)), alone.rows.shape[2] - 1
+    covariance = _independent(alone, every, white) + size**2 * process.covariance(every)
+    root = np.linalg.cholesky(covariance)
+    solved = np.linalg.solve(root, alone.rows.reshape(-1, p + 1))
+    total = solved.T @ solved + alone.rest
+    found, _ = inverse(total[:p, :p])
+    return found @ total[:p, p], found
+
+
+def _independent(alone: _Alone, some: IntArray, white: float) -> FloatArray:
+    """(6 k, 6 k) covariance of what k stops say by themselves and of errors that do not last."""
+    count = len(some)
+    covariance = np.zeros((6 * count, 6 * count))
+    blocks = covariance.reshape(count, 6, count, 6)
+    own = alone.known[some] + np.diag(white**2 * alone.levels**2)
+    blocks[np.arange(count), :, np.arange(count)] = own
+    return covariance
 
 
 def _alone(fit: Fit, flange: str) -> _Alone | None:
@@ -204,12 +247,8 @@ def _likelihoods(
     boards: list[tuple[int, float]],
 ) -> tuple[float, float]:
     """Restricted log-likelihoods at some stops: with boards as stated, and of any size."""
-    p, count = alone.rows.shape[2] - 1, len(some)
-    covariance = np.zeros((6 * count, 6 * count))
-    blocks = covariance.reshape(count, 6, count, 6)
-    own = alone.known[some] + np.diag(white**2 * alone.levels**2)
-    blocks[np.arange(count), :, np.arange(count)] = own
-    root = np.linalg.cholesky(covariance + added)
+    p = alone.rows.shape[2] - 1
+    root = np.linalg.cholesky(_independent(alone, some, white) + added)
     solved = np.linalg.solve(root, alone.rows[some].reshape(-1, p + 1))
     total = solved.T @ solved + alone.rest
     total[np.arange(p), np.arange(p)] *= 1.0 + 1e-9

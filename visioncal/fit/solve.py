@@ -82,7 +82,7 @@ def solve(cell: Cell) -> Solved:
         fit, left_out = search.run(fit.state, fit.used, fit)
         found = {name: consider(fit, name) for name in bare}
     for one in found.values():
-        fit = fit if one is None else fit.considering(one.covariance)
+        fit = fit if one is None else fit.considering(one.covariance, one.shift)
     return Solved(with_held_lenses(fit), left_out, start, search.effort)
 
 
