@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.small_cells import TABLE, made, pose
+from support.small_cells import PX, TABLE, made, pose
 from test_measured import is_fair
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
+from visioncal.estimation.tree import Branch, Tree
 from visioncal.fit.solve import solve
 from visioncal.model import MeasuredPlace, MeasuredPose, Sighting, read_cell
 from visioncal.model.sightings import is_copy
@@ -16,22 +17,20 @@ from visioncal.simulation import instrument_session
 from visioncal.simulation.instrument_session import InstrumentOptions, session_of
 
 
-def with_prior(small, place_m, sigma_m, turn=None, sigma_rad=1.0):
-    """A made cell with a prior of all of a camera's place on the flange, and of its turn."""
-    stated = [
-        Sighting(
-            -1 - axis,
-            7,
-            "flange",
-            "cam",
-            MeasuredPlace(place_m * np.eye(3)[axis], sigma_m, (axis,)),
-        )
-        for axis in range(3)
-    ]
+def stated(pair, place_m, sigma_m, turn=None, sigma_rad=1.0):
+    """Priors of the components of one frame's place in another, and of its turn."""
+    places = (MeasuredPlace(place_m * np.eye(3)[axis], sigma_m, (axis,)) for axis in range(3))
+    found = [Sighting(-1 - axis, 5, *pair, place) for axis, place in enumerate(places)]
     if turn is not None:
         evidence = MeasuredPose(pose(turn, [0, 0, 0]), (sigma_rad, np.inf))
-        stated.append(Sighting(-4, 7, "flange", "cam", evidence))
-    return small.cell.with_sightings([*small.cell.sightings, *stated])
+        found.append(Sighting(-4, 5, *pair, evidence))
+    return found
+
+
+def with_prior(small, *prior):
+    """A made cell with a prior of a camera on its flange."""
+    more = stated(("flange", "cam"), *prior)
+    return small.cell.with_sightings([*small.cell.sightings, *more])
 
 
 def test_a_prior_is_worth_what_it_says():
@@ -62,6 +61,25 @@ def test_a_component_that_the_views_contradict_goes_alone():
     covariance = solved.fit.covariance(("edge", "cam"))
     # 0.999 of six degrees of freedom.
     assert away @ np.linalg.solve(covariance, away) < 22.5
+
+
+def test_a_camera_that_no_robot_passes_is_placed_by_a_prior_alone():
+    small = made(2, 6, in_hand=False)
+    base_from_board = pose([0.3, 2.0, 0.1], [0.4, 0.2, 0.1])
+    first, rng, looks = small.cell.sightings[0].evidence, np.random.default_rng(2), []
+    for sighting in small.cell.sightings:
+        look = replace(first, px=first.px + PX * rng.normal(size=first.px.shape))
+        looks.append(replace(sighting, evidence=look))
+    branches = {**small.cell.tree.branches, "target": Branch("base")}
+    turn = log(base_from_board)[:3]
+    looks += stated(("base", "target"), base_from_board[:3, 3], 1e-3, turn, 2e-3)
+    cell = replace(small.cell, tree=Tree("cell", branches), sightings=tuple(looks))
+    fit = solve(cell).fit
+    board = fit.edge("target")
+    assert board == pytest.approx(base_from_board, abs=1e-6)
+    covariance = fit.covariance(("edge", "target"))
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(np.repeat([2e-3, 1e-3], 3), rel=0.05)
+    assert np.trace(fit.covariance(("edge", "cam"))[3:, 3:]) > np.trace(covariance[3:, 3:])
 
 
 def test_tables_become_sightings_of_one_component_each():
