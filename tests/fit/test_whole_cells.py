@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from support.small_cells import PX, ROBOT_RAD, made
-from support.whole_cells import OPTIONS, recorded
+from support.whole_cells import FLOOR, OPTIONS, PLATE, recorded
 
 from visioncal.core.transforms import invert, log
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.solve import solve
 from visioncal.model import read_cell
-from visioncal.simulation import simulate
+from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, RobotAt, simulate
 
 
 def test_a_cell_of_two_arms_is_found_as_surely_as_it_says():
@@ -103,3 +103,43 @@ def test_a_camera_that_sways_is_told_from_its_corners_noise_and_from_the_arm(in_
     # Of a mount that turns, two directions have thrice the variance of six equal ones: a variance
     # of one beside a third of a steady camera. The mean of four each has a sigma of 0.3.
     assert 0.1 < np.mean(squares) < 1.9
+
+
+def ring(seed):
+    """Two cameras before one arm that holds a board, and a board on the floor, at 20 stops."""
+    return NetworkOptions(
+        robots=(RobotAt("a", (-0.6, 0.0, 0.0)),),
+        cameras=(
+            CameraAt("left", place_m=(0.0, -1.0, 1.1)),
+            CameraAt("right", place_m=(0, 1, 1.2)),
+        ),
+        boards=(
+            BoardAt("floor", place_m=(0.0, 0.0, 0.05), target=FLOOR),
+            BoardAt("plate", on="a", target=PLATE),
+        ),
+        stops=20,
+        seed=seed,
+    )
+
+
+def test_all_edges_of_a_rig_err_as_their_joint_covariance_says():
+    squares, count = [], 6
+    for seed in range(count):
+        simulated = simulate(ring(seed))
+        session = recorded(simulated)
+        fit = solve(read_cell(session, session.corners)).fit
+        assert fit.used.mean() > 0.95
+        names, at = fit.cell.unknown, simulated.mountings
+        assert set(names) == {"cam_left", "cam_right", "target_floor", "target_plate"}
+        base = invert(at["base_a"])
+        true = [at[name] if name == "target_plate" else base @ at[name] for name in names]
+        away = np.concatenate(
+            [log(invert(t) @ fit.edge(name)) for name, t in zip(names, true, strict=True)]
+        )
+        covariance = fit.covariance(*(("edge", name) for name in names))
+        scale = np.sqrt(np.diag(covariance))
+        whitened = np.linalg.solve(covariance / np.outer(scale, scale), away / scale)
+        squares.append(float(away / scale @ whitened))
+    # Noise levels of 20 stops are known by 60 degrees of freedom each: a share of 1.04.
+    low, high = chi2.ppf([0.001, 0.999], 24 * count) / count
+    assert low < np.mean(squares) / 1.04 < high

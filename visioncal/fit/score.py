@@ -53,9 +53,11 @@ class Score:
 
     def best(self, sigmas: FloatArray, low: float, high: float) -> tuple[float, float]:
         """The most likely of some sizes of columns with (c,) relative sigmas, and its gain."""
-        scaled = self.information * np.outer(sigmas, sigmas)
+        # Columns of a millionth of the variance of others add nothing to see.
+        at = np.flatnonzero(sigmas > 1e-3 * sigmas.max(initial=0.0))
+        scaled = self.information[at[:, None], at] * np.outer(sigmas[at], sigmas[at])
         values, vectors = np.linalg.eigh(scaled)
-        values, pull = np.maximum(values, 0.0), vectors.T @ (sigmas * self.pull)
+        values, pull = np.maximum(values, 0.0), vectors.T @ (sigmas * self.pull)[at]
         # A size of which one direction is as large as its uncertainty.
         unit = 1.0 / np.sqrt(max(float(values.max(initial=0.0)), 1e-300))
         sizes = np.unique(np.clip(unit * _TRIED, low, high))
