@@ -35,7 +35,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import CorrectOptions, ExportOptions, RecoverOptions
 from visioncal.cli.session_options import PlanOptions
 from visioncal.cli.summary import print_conditions, print_steps, print_verdict
-from visioncal.core.codec import read, reading
+from visioncal.core.codec import read
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_json
@@ -57,12 +57,12 @@ class _Act:
     against: tuple[str, str]  # Digest of the earlier calibration's session, and when it was made.
     minutes: Mapping[str, float]  # Of each step that is done.
     stated: tuple[str, ...]  # Causes.
-    record: str | None = None  # The command that records the planned stops, as it was printed.
+    record: str = "visioncal record"  # The command that records the planned stops.
 
     def __post_init__(self) -> None:
-        words = shlex.split(self.record or "visioncal record")
+        words = shlex.split(self.record)
         # Whoever edited the file has no say in what is typed.
-        if words[:2] != ["visioncal", "record"] or self.record not in (None, shlex.join(words)):
+        if words[:2] != ["visioncal", "record"] or self.record != shlex.join(words):
             raise ValueError(f"record is {self.record!r}; a visioncal record is needed")
 
 
@@ -78,8 +78,7 @@ def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
     against, known, file = [old.session_sha256, old.created], dict[str, Any](), folder / _ACT
     if file.is_file():
         known = parse_stored(read_bytes(file), str(file))
-        with reading(str(file), "a recovery", f"Remove it: rm {shlex.quote(str(file))}"):
-            read(_Act, known, "")
+        read(_Act, known, str(file))
     if known.get("against", against) != against:
         raise DataError(
             f"{folder} is the recovery of another calibration than that of "
@@ -160,16 +159,10 @@ def recover_command(options: RecoverOptions) -> None:
     base_moved, flange_moved = moved_along(old, new, causes)
     if options.targets is not None:
         with _step(options, facts, "targets"):
-            to_correct = CorrectOptions(
-                targets=options.targets,
-                calibration=result,
-                out=_cleared(options.folder / _TARGETS),
-                tool=options.tool,
-                payload_kg=options.payload_kg,
-                payload_m=options.payload_m,
-                temperatures=options.temperatures,
-                force=options.force,
-            )
+            names = ("targets", "tool", "payload_kg", "payload_m", "temperatures", "force")
+            given = {name: getattr(options, name) for name in names}
+            out = _cleared(options.folder / _TARGETS)
+            to_correct = CorrectOptions(**given, calibration=result, out=out)
             # A tool's targets find its new mount in the result.
             by_flange = flange_moved if options.tool is None else np.eye(4)
             correct_command(to_correct, (base_moved, by_flange))

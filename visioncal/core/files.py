@@ -505,29 +505,15 @@ def locked(path: Path, *, wait: bool) -> Iterator[bool | None]:
 
 
 def check_journal(database: Path) -> None:
-    """Refuses a journal beside a database of SQLite that names a file: SQLite would delete that.
+    """Refuses a journal of SQLite that names a file: that of several databases, to be deleted.
 
-    Transactions of several databases name one by what ends with this number (SQLite's database file
-    format, section 3), and neither histories nor bags have any.
-
-    Raises:
-        DataError: There is such a journal, or one that is no readable file.
+    SQLite follows links to a database, and looks for its journal there. Raises DataError.
     """
-    # SQLite follows links to the database, and looks for the journal there.
     journal = Path(f"{database.resolve()}-journal")
-    if not journal.exists():
-        return
-    with suppress(OSError):
-        if journal.is_file():
-            with journal.open("rb") as file:
-                file.seek(max(journal.stat().st_size - 8, 0))
-                if file.read() != bytes.fromhex("d9d505f920a163d7"):
-                    return
-    raise DataError(
-        f"{journal} is not of visioncal: it names a file, which SQLite would delete.",
-        culprits=[str(journal)],
-        next_step="Do not open what came with it elsewhere, and remove it.",
-    )
+    end = read_bytes(journal)[-8:] if journal.is_file() else b""
+    if end == bytes.fromhex("d9d505f920a163d7") or (journal.exists() and not journal.is_file()):
+        why = f"{journal} is not of visioncal: it names a file, which SQLite would delete."
+        raise DataError(why, culprits=[str(journal)], next_step="Remove it, and what it came with.")
 
 
 def remove_abandoned(folder: Path) -> None:

@@ -130,11 +130,10 @@ class _Likelihood:
             return 0.0
         without[level] = least
         upper_bound = 2.0 * (self.model.at(without, is_sloped=False).value - found.value)
-        # The other levels are only refitted where it matters: of a focus in any case, as most of
-        # what it explains may be noise of the flange.
-        is_focus = level in (_BREATHING, _JITTER)
-        is_refitted = upper_bound >= SIGNIFICANT and (level == _FIELD or _is_scale(level))
-        if not (is_focus or is_refitted):
+        # The other levels are only refitted where it matters: beside a focus, as most of what it
+        # explains may be noise of the flange.
+        is_large = upper_bound >= SIGNIFICANT and (level == _FIELD or _is_scale(level))
+        if not is_large and level not in (_BREATHING, _JITTER):
             return upper_bound
         refitted = self.minimised(without, (*closed, level), little=_LITTLE_GAIN)
         return 2.0 * (refitted.value - found.value)
@@ -223,9 +222,13 @@ def estimate_sizes(
     sizes = np.where(np.exp(found.logs) > 2.0 * low, np.exp(found.logs), 0.0)
     tested = (_FIELD, _BREATHING, _JITTER, *range(_FOCAL, likelihood.flanges))
     gains = {at: likelihood.gain(found, closed, at) if sizes[at] else 0.0 for at in tested}
-    moves = max(gains[_BREATHING], gains[_JITTER]) > SIGNIFICANT
+    # A focus that surely moves is as likely to do so otherwise as well.
+    focus = 0.5 if max(gains[_BREATHING], gains[_JITTER]) > SIGNIFICANT else _WRONG_SHAPE
     for at in tested[1:]:
-        sizes[at] *= _root_weight(at, gains[at], uneven, moves=moves)
+        wrong, share = (_WRONG_SIZE, uneven**-2) if _is_scale(at) else (_WRONG_SHAPE, 1.0)
+        # Averaged over a size of zero, too.
+        weight = level_weight(share * gains[at], focus if at < _FOCAL else wrong)
+        sizes[at] *= weight**0.5 if weight > _NO_WEIGHT else 0.0
     field, breathing, jitter = (sizes[_FIELD:_ONE] / np.exp(found.logs[_NOISE])).tolist()
     levels = LensLevels(
         *(field, length, breathing, jitter), (gains[_FIELD], gains[_BREATHING], gains[_JITTER])
@@ -236,18 +239,6 @@ def estimate_sizes(
         LensSizes(*sizes[_FOCAL:_BOARDS].tolist()),
         tuple(BoardSizes(*at) for at in boards),
     )
-
-
-def _root_weight(size: int, gain: float, uneven: float, *, moves: bool) -> float:
-    """Root of the weight of a size by its gain: it is averaged over a size of zero, too.
-
-    `moves` is whether the focus surely does: then it is as likely to move otherwise as well.
-    """
-    if _is_scale(size):
-        weight = level_weight(gain / uneven**2, _WRONG_SIZE)
-    else:
-        weight = level_weight(gain, 0.5 if moves and size < _FOCAL else _WRONG_SHAPE)
-    return weight**0.5 if weight > _NO_WEIGHT else 0.0
 
 
 def _is_scale(size: int) -> bool:

@@ -17,7 +17,7 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, CameraKind, FloatArray
 from visioncal.estimation.lens_field import LensLevels, displacements
 from visioncal.results.edge import Covariance, Edge, StoredEdge, StoredPose
-from visioncal.session.document import COEFFICIENTS
+from visioncal.session.document import check_coefficients
 from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian, with_intrinsics
 
 # Places of p1 and p2 among Brown's intrinsics.
@@ -63,10 +63,7 @@ class CameraForm:
     distortion: Vector  # The coefficients in OpenCV's order.
 
     def __post_init__(self) -> None:
-        count, counts = len(self.distortion), COEFFICIENTS[self.model]
-        if count not in counts:
-            needed = " or ".join(map(str, counts))
-            raise ValueError(f"{self.model} has {count} coefficients; {needed} are needed")
+        check_coefficients(self.model, len(self.distortion))
         if min(*self.resolution, *self.matrix[:2]) <= 0:
             raise ValueError("resolution, fx and fy must be above 0")
 

@@ -35,8 +35,16 @@ NotNegative = Annotated[FiniteFloat, Field(ge=0, le=_LARGEST)]
 # Largest side of an image: four times that of the largest sensors [px].
 Side = Annotated[int, Field(gt=0, le=65_535)]
 
-# Numbers of distortion coefficients, by the model.
-COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
+_COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
+
+
+def check_coefficients(model: str, count: int) -> None:
+    """Checks the number of a lens's coefficients of distortion; raises ValueError."""
+    if count not in (counts := _COEFFICIENTS[model]):
+        raise ValueError(
+            f'has {count} coefficients of distortion, but the "{model}" model needs '
+            f"{' or '.join(map(str, counts))} (0 for those that are not used)"
+        )
 
 
 class TableModel(BaseModel):
@@ -91,13 +99,8 @@ class CameraTable(TableModel):
 
     @model_validator(mode="after")
     def _is_one(self) -> Self:
-        counts, count = COEFFICIENTS[self.model], len(self.distortion or ())
-        if self.distortion is not None and count not in counts:
-            needed = " or ".join(map(str, counts))
-            raise ValueError(
-                f'has {count} coefficients of distortion, but the "{self.model}" model needs '
-                f"{needed} (0 for those that are not used)"
-            )
+        if self.distortion is not None:
+            check_coefficients(self.model, len(self.distortion))
         if (self.matrix is None) != (self.distortion is None):
             raise ValueError("has one of matrix and distortion: give both or neither")
         if self.matrix is not None and self.resolution is None:

@@ -139,8 +139,7 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
 
 
 def _refused(kind: str, error: VisioncalError, more: Remedy | None = None) -> Finding:
-    if more is None and error.next_step:
-        more = Remedy(error.next_step)
+    more = more or (Remedy(error.next_step) if error.next_step else None)
     return Finding(kind, error.message, more)
 
 
@@ -149,10 +148,9 @@ def _motion(run: RunState) -> Iterator[Finding]:
     try:
         start = find_start(read_cell(run), run)
         cell, problem = start.cell, start.problem
-        check_determined(
-            problem, start.state, starting_noise(problem), words_of(cell, problem),
-            {frame: look.pixel_px for frame, look in run.cameras.items() if look.pixel_px},
-        )  # fmt: skip
+        noise, words = starting_noise(problem), words_of(cell, problem)
+        px = {frame: look.pixel_px for frame, look in run.cameras.items() if look.pixel_px}
+        check_determined(problem, start.state, noise, words, px)
         if cell.mount is None:
             return
         inliers = initial_inliers(start)

@@ -29,19 +29,15 @@ def explained(
     for misread in state.misread or ():
         # Directions that are undetermined with misread poses mean nothing.
         return type(error)(misread.words, next_step=str(misread.do))
-    plan = more_views(error, state)
-    return (
-        error
-        if plan is None
-        else type(error)(error.message, culprits=error.culprits, next_step=str(plan))
-    )
+    if (plan := more_views(error, state)) is None:
+        return error
+    return type(error)(error.message, culprits=error.culprits, next_step=str(plan))
 
 
 def more_views(error: VisioncalError, state: RunState) -> Remedy | None:
     """The command for more views where these determine too little; None where it has none."""
-    can = state.mount is not None and bool(state.scenes)
-    can &= state.robot is None or state.robot.can_tilt
-    if not (can and isinstance(error, DegenerateError)):
+    can = state.mount is not None and (state.robot is None or state.robot.can_tilt)
+    if not (can and state.scenes and isinstance(error, DegenerateError)):
         return None
     purpose = "" if state.level in ("auto", "hand-eye") else " --for kinematics"
     return add_views_remedy(error.next_step, modelled=state.robot is not None, purpose=purpose)

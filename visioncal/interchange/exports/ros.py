@@ -7,7 +7,7 @@ UR's `base_link` by 180 degrees about z. Our camera frame, z forward and x right
 optical frame.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -47,14 +47,13 @@ def _camera_of(content: Content) -> Camera:
 def _lens_notes(content: Content) -> list[str]:
     estimated = content.lens is not None and content.lens.estimated
     how = "estimated from the session's images" if estimated else "as the session gave it"
-    field_notes = [content.field_error_words] if content.field_error_words else []
-    return [content.origin, f"verdict {content.verdict.status}; the lens is {how}", *field_notes]
+    said = f"verdict {content.verdict.status}; the lens is {how}"
+    return [*filter(None, (content.origin, said, content.field_error_words))]
 
 
-def _warn_of_field(content: Content) -> Iterator[str]:
+def _warn_of_field(content: Content) -> list[str]:
     """Warns of the remaining error of a lens with a field."""
-    if content.field_error_words:
-        yield f"{content.field_error_words}."
+    return [f"{content.field_error_words}."] * bool(content.field_error_words)
 
 
 def _array(matrix: FloatArray) -> dict[str, int | list[float]]:

@@ -305,11 +305,8 @@ class Journal:
 
     def remove_unbegun(self) -> None:
         """Removes the folder of a recording without a view, with nothing else in it."""
-        with suppress(OSError):
-            if {path.name for path in self.folder.iterdir()} == {PROVENANCE, _IMAGES}:
-                (self.folder / _IMAGES).rmdir()
-                (self.folder / PROVENANCE).unlink()
-                self.folder.rmdir()
+        if {path.name for path in self.folder.rglob("*")} == {PROVENANCE, _IMAGES}:
+            shutil.rmtree(self.folder, ignore_errors=True)
 
     @property
     def left_out(self) -> tuple[str, ...]:

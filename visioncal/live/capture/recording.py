@@ -225,6 +225,16 @@ class Capture:
             message = f"{error.message} {stored}"
             raise type(error)(message, culprits=error.culprits, next_step=step) from error
 
+    @contextmanager
+    def until(self, end: type[BaseException]) -> Iterator[None]:
+        """Takes an exception for the regular end; raises DriverError where there is no view."""
+        with suppress(end):
+            yield
+        if not self.journal.views:
+            arm = self.cell.arm.name
+            step = "Let the arm rest, or give its pose, where the camera sees the board."
+            raise DriverError(f"{arm}: it ended before a view.", culprits=[arm], next_step=step)
+
 
 def missed_stops(steps: Sequence[CaptureEvent]) -> dict[int, str]:
     """Stops that gave no view, with the reasons."""
@@ -365,19 +375,12 @@ def follow(capture: Capture, count: int) -> list[CaptureEvent]:
         DataError: A view cannot be written, or too many rests in a row gave none.
     """
     cell, rest = capture.cell, RestWatch(capture.journal, capture.options.still)
-    with capture.halting():
-        try:
-            while not count or len(capture.journal.views) < count:
-                while not rest.begins(cell.state()):
-                    cell.clock.sleep(0.05)
-                capture.view(*capture.next_numbers(), count)
-        except KeyboardInterrupt:
-            # Ctrl-C is the regular end of a recording without a number of views.
-            if not capture.journal.views:
-                raise DriverError(
-                    "ended by Ctrl-C before the first view.",
-                    next_step="Guide the arm to where the camera sees the board, and let it rest.",
-                ) from None
+    # Ctrl-C is the regular end of a recording without a number of views.
+    with capture.halting(), capture.until(KeyboardInterrupt):
+        while not count or len(capture.journal.views) < count:
+            while not rest.begins(cell.state()):
+                cell.clock.sleep(0.05)
+            capture.view(*capture.next_numbers(), count)
     return capture.steps
 
 
@@ -448,15 +451,8 @@ def ask_and_take(capture: Capture, arm: RequestingArm, count: int) -> list[Captu
         DriverError: The arm or the camera failed, Ctrl-C was pressed, or no view was requested.
         DataError: A view cannot be written, or too many in a row gave none.
     """
-    with capture.halting():
-        with suppress(EOFError):
-            while not count or len(capture.journal.views) < count:
-                if not take_requested(capture, arm, count):
-                    break
-        if not capture.journal.views:
-            raise DriverError(
-                f"{arm.name}: the poses ended before the first view.",
-                culprits=[arm.name],
-                next_step="Give the pose at which the camera sees the board.",
-            )
+    with capture.halting(), capture.until(EOFError):
+        while not count or len(capture.journal.views) < count:
+            if not take_requested(capture, arm, count):
+                break
     return capture.steps
