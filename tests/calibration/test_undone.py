@@ -3,6 +3,7 @@
 Cells of poses measured with noise, without images.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,14 +12,18 @@ import pytest
 from support.cells import pairs_session
 from support.commands import visioncal as typed
 from support.following import follow
+from support.marks import slow
+from support.whole_cells import OPTIONS, recorded
 
 import visioncal
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
+from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.interchange.formats.rereading import shift_views, turn_boards
 from visioncal.session import Session
+from visioncal.simulation import simulate
 from visioncal.vision.targets import corner_positions
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -196,6 +201,40 @@ def test_a_small_marker_with_the_other_pose_is_named(tmp_path, monkeypatch):
     # Two sigma of what single tags of 50 mm leave, 5 mm a view.
     away = found.edges["base_from_cam"].matrix[:3, 3] - [0.9, 0.2, 0.8]
     assert np.linalg.norm(away) < 0.01
+
+
+def in_a_cell(seed, kind):
+    """A whole cell whose robot b has one mistake from a stop on, and the views that are wrong."""
+    session = recorded(simulate(replace(OPTIONS, seed=seed, stops=24)))
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    of_b = [at for at, view in enumerate(session.views) if view.text.get("robot") == "b"]
+    stops = sorted({session.views[at].stop for at in of_b})
+    half = len(stops) // 2
+    # Each pose of the second half is that of the stop after it, or of the last one before.
+    source = dict(zip(stops, stops, strict=True))
+    later = stops[half + 1 :] if kind == "shifted_rows" else [stops[half - 1]] * len(stops)
+    source.update(zip(stops[half:], later, strict=False))
+    poses = {session.views[at].stop: dict(cells[at]) for at in of_b}
+    for at in of_b if kind != "nothing" else ():
+        pose = poses[source[session.views[at].stop]]
+        cells[at].update({name: pose[name] for name in session.columns[5:]})
+    wrong = {session.views[at].number for at in of_b if session.views[at].stop in stops[half:]}
+    rows = [[*row.values()] for row in cells]
+    return session.with_content(document=session.document, cells=rows), wrong
+
+
+@pytest.mark.parametrize("seed", [0, *map(slow, range(1, 5))])
+@pytest.mark.parametrize("kind", ["shifted_rows", "copied_poses", "nothing"])
+def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind, seed):
+    session, wrong = in_a_cell(seed, kind)
+    causes = visioncal.calibrate(session).verdict.causes
+    if kind == "nothing":
+        assert not {cause.kind for cause in causes} & {*UNDONE, "exchanged_views"}
+        return
+    assert causes[0].kind == kind
+    assert causes[0].words.startswith("Robot b, in its rows of cam_left and target_plate_b: ")
+    assert {*causes[0].views} <= wrong
+    assert len(causes[0].views) >= 0.7 * len(wrong)
 
 
 @pytest.mark.parametrize("words", ["3", "3-5:0", "3-5:x", "90:2"])

@@ -14,7 +14,7 @@ from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
-from visioncal.calibration.suspects.undoing import undone
+from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy
@@ -56,10 +56,26 @@ def with_misreading(run: RunState) -> RunState:
 
 def with_open_chains(run: RunState) -> RunState:
     """Looks for misread poses before the fit where chains do not close; notes turned boards."""
-    run = undone(run)
+    run = undone(run, likeliest(run)) if run.mount is not None else _with_cell_undone(run)
     if run.mount is None or not closes(run.base_from_flange, run.poses_of_one_board, run.mount):
         run = with_misreading(run)
     return run if run.misread else run.noting((), turned_boards(run))
+
+
+def _with_cell_undone(run: RunState) -> RunState:
+    """As `undone` for each robot of a whole cell with one camera and one target alone."""
+    for robot in run.session.robots:
+        for pair in pairs_of(run, robot):
+            mistake = likeliest(_of_pair(run, robot, pair))
+            if mistake is None:
+                continue
+            whose = f"Robot {robot}, in its rows of {pair.camera} and {pair.target}"
+            # The commands that write a copy take one camera and one robot only.
+            step = "Correct these rows in views.csv, or delete them, and calibrate again."
+            found = mistake.found
+            found = replace(found, words=f"{whose}: {found.words}", do=Remedy(step, CALIBRATE))
+            run = undone(run, replace(mistake, found=found))
+    return run
 
 
 def misreadings(run: RunState) -> Iterator[Finding]:

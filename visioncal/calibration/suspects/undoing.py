@@ -60,12 +60,13 @@ class _Record:
         seen, views = run.poses_of_one_board, [view.number for view in run.session.views]
         robot = np.full((len(views), 4, 4), np.nan)
         rows, camera = [], list[FloatArray]()
-        boards = [*run.session.boards.values()]
+        boards = run.session.boards
         for at, view in enumerate(views):
             if view in run.base_from_flange:
                 robot[at] = run.base_from_flange[view]
             if view in seen and view not in run.held_back | run.spared.keys():
-                turns = rotation_transforms(boards[seen[view].board]) if boards else np.eye(4)[None]
+                board = boards.get(run.session.board_of(run.session.views[at]))
+                turns = np.eye(4)[None] if board is None else rotation_transforms(board)
                 rows.append(at)
                 camera.append((seen[view].cam_from_target[:, None] @ turns).reshape(-1, 4, 4))
         most = max(map(len, camera), default=0)
@@ -151,16 +152,15 @@ class Undoing:
     short: str  # The same as a clause, for each of the views.
 
 
-def undone(run: RunState) -> RunState:
+def undone(run: RunState, found: Undoing | None) -> RunState:
     """Leaves out the views that a mistake of the record explains, and names it."""
-    found = likeliest(run)
     if found is None:
         return run
     views = set(found.found.views)
     left = {view: pose for view, pose in run.poses.items() if view not in views}
     if len(left) <= FEWEST_COMPARED:
         return replace(run, misread=(found.found,))
-    run = replace(run, poses=left, misread=())
+    run = replace(run, poses=left, misread=run.misread or ())
     reasons = (Rejection(view, f"{found.short}, as the other views show") for view in views)
     return run.noting(reasons, (found.found,))
 
