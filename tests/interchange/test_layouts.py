@@ -519,6 +519,30 @@ def columns_as_lists(folder):
     write(folder / "arm.json", {"log": document})
 
 
+def blocks_of_text(folder):
+    """A log of several lines a view, with the picture's name above; grey pictures beside."""
+    shoot(folder, "view{}.png")
+    for at, picture in enumerate(world()[1]):
+        cv2.imwrite(str(folder / f"view{at}.png"), cv2.merge([picture] * 3))
+        cv2.imwrite(str(folder / f"infra{at}.png"), np.roll(picture, 25, axis=1))
+    text = "calibration run of 2024\n"
+    for at in (4 * k % 9 for k in range(9)):
+        place, turn = seven(world()[0][at])[:3], seven(world()[0][at])[3:]
+        text += f"saved view{at}.png\n  position: {' '.join(map(repr, map(float, place)))}\n"
+        text += f"  rotation (xyzw) = [{', '.join(map(repr, map(float, turn)))}]\n\n"
+    write(folder / "run.log", text)
+
+
+def mappings_of_any_names(folder):
+    """Angles in a mapping under names of another kind."""
+    shoot(folder, "{}.png")
+    for at, pose in enumerate(world()[0]):
+        angles = Rotation.from_matrix(pose[:3, :3]).as_euler("ZXZ", degrees=True).tolist()
+        turn = dict(zip(("psi", "theta", "phi"), angles, strict=True))
+        place = dict(zip(("x", "y", "z"), (1e3 * pose[:3, 3]).tolist(), strict=True))
+        write(folder / f"{at}.json", {"arm": {"lage": turn, "stelle": place}})
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -529,6 +553,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         another_order, comment_above, beside_a_decoy, matlab, dense_log,
         two_sessions, several_bodies, sentence_above,
         sorted_as_text, called_by_words, a_folder_a_view, columns_as_lists,
+        blocks_of_text, mappings_of_any_names,
     )
 }  # fmt: skip
 

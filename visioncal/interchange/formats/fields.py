@@ -168,7 +168,7 @@ def arrays_in_texts(values: list[object]) -> list[object]:
     arrays = dict[str, FloatArray]()
     for text in texts:
         with suppress(DataError):
-            numbers = [*_separate(text)]
+            numbers = [*separate(text)]
             if len(numbers) > 2:
                 arrays[text] = np.array(numbers)
             elif len(text) < MOST_NUMBERS and is_marked_pose(text):
@@ -178,7 +178,7 @@ def arrays_in_texts(values: list[object]) -> list[object]:
     return [arrays.get(value) if isinstance(value, str) else value for value in values]
 
 
-def _separate(text: str) -> Iterator[float]:
+def separate(text: str) -> Iterator[float]:
     """The numbers of a text of nothing else, with blanks, commas or semicolons between."""
     words = [word for word in re.split(r"[\s,|\[\](){}]+", text) if word]
     if all(map(is_number, words)) and (";" not in text and ("." in text or ", " in text)):

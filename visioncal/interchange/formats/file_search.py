@@ -325,7 +325,14 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         drawn = _DRAWN.search(group.label) is not None
         is_named = re.search("rgb|colou?r", group.label, re.IGNORECASE) is not None
         # What another program drew, and pictures of some of the rows alone, come last.
-        extra = int((found.rows < 0).sum()), HOW.index(found.how), not is_named, -len(group.files)
+        is_grey = group.image is not None and group.image.words.endswith("grey")
+        extra = (
+            int((found.rows < 0).sum()),
+            HOW.index(found.how),
+            not is_named,
+            is_grey,
+            -len(group.files),
+        )
         return group.is_depth, drawn, found.how == HOW[-1], *extra
 
     ranked = sorted(matches, key=rank)
@@ -366,11 +373,16 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         notes.append(f"Left out of the images: {some_of(left)}.")
     depths = () if depth is None else depth[0].taken(depth[1].rows)
     files = chosen.files if how != HOW[0] and len(chosen.files) == len(fields) else ()
-    orders = {
+    orders: dict[str, tuple[Path | None, ...]] = {
         "in natural order": files,
         "in the order of their names as texts": tuple(sorted(files, key=str)),
         "in reverse order": files[::-1],
     }
+    if how != HOW[0]:
+        for by in (1, -1):
+            rows = match.rows + by
+            rows[(match.rows < 0) | (rows >= len(chosen.files))] = -1
+            orders[f"one {'later' if by > 0 else 'earlier'}"] = chosen.taken(rows)
     others = tuple((words, each) for words, each in orders.items() if each and each != images)
     return Pairing(images, depths, tuple(notes), others)
 

@@ -28,7 +28,39 @@ from visioncal.interchange.formats.fields import (
     fields_of_records,
     holds_pose,
     joined,
+    separate,
 )
+
+_HEADED = re.compile(r"\s*([^\d\W][^:=]*?)\s*[:=]\s*(.*?)\s*")
+
+
+def _blocks(path: Path) -> Fields | None:
+    """Rows of several lines each, which a line of words begins; None where there are none."""
+    records: list[dict[str, object]] = []
+    lines: dict[str, list[list[float]]] = {}
+    places: list[str] = []
+
+    def close() -> None:
+        for key, rows in lines.items():
+            records[-1][key] = np.array([number for row in rows for number in row])
+        lines.clear()
+
+    for at, line in enumerate(read_plain_text(path).splitlines(), start=1):
+        entry = _HEADED.fullmatch(line)
+        numbers = [*separate(line)] or ([*separate(entry[2])] if entry else [])
+        key = entry[1] if entry and numbers else "matrix"
+        if numbers and records:
+            lines.setdefault(key, []).append(numbers)
+        elif line.strip():
+            if lines or not records:
+                close()
+                places.append(f"{path.name}, line {at}")
+                records.append({})
+            image = _IMAGE.search(line)
+            records[-1]["image" if image else "title"] = image[0] if image else line.strip(" #:")
+    close()
+    fields = fields_of_records(records, places, path.stem, path.parent)
+    return fields if len(records) > 2 and fields.numbers else None
 
 
 def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
@@ -66,8 +98,9 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
         flat: dict[str, object] = {}
         plain = {str(name).lower(): value for name, value in record.items()}
         joined = next((names for names in map(str.split, _JOINED) if {*names} == {*plain}), None)
-        if prefix and joined:
-            flat |= flattened([plain[name] for name in joined], prefix)
+        are_numbers = all(type(value) in (int, float) for value in plain.values())
+        if prefix and (joined or (are_numbers and len(plain) in (3, 4))):
+            flat |= flattened([plain[name] for name in joined or plain], prefix)
         for name, value in record.items():
             flat |= flattened(value, f"{prefix}{name}.")
         return flat
@@ -132,7 +165,12 @@ def read_rows(path: Path, form: str | None = None, document: object = None) -> l
             return rows_of_document(literals, path)
     if lines := _pendant(path, form if form in POSE_FORMS else None):
         return [lines]
-    table = read_table(path)
+    try:
+        table = read_table(path)
+    except DataError:
+        if blocks := _blocks(path):
+            return [blocks]
+        raise
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
         raise DataError(
             f"{path} is one 4 x 4 matrix; a file a view in a folder, or a row a view, is needed.",
