@@ -25,6 +25,7 @@ from visioncal.core.transforms import adjoint
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
+from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Linear, Problem
@@ -133,6 +134,10 @@ class Fit:
         """Noise of a corner's coordinate, by camera [px]; empty without images."""
         sigmas = () if self.corners is None else self.corners.sigmas_px
         return dict(zip(self.unknowns.of(LENS), sigmas, strict=True))
+
+    def lens_levels(self, camera: str) -> LensLevels:
+        """Sizes of a lens's errors beyond its model, in units of the noise of its corners."""
+        return self.linearised.camera_parameters.problems[camera].levels or LensLevels()
 
     def shown_px(self, camera: str) -> float | None:
         """Scatter of a camera's corner coordinates [px]; None without images of it."""

@@ -14,7 +14,6 @@ from visioncal.calibration.pipeline.arm_results import (
     with_errors_beside_step,
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
-from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
 from visioncal.calibration.stages.arm_report import ArmReport
 from visioncal.calibration.stages.cell import Cell, ObservationRow
@@ -54,7 +53,6 @@ class FitAssessment:
 
     cell_fit: CellFit  # The fit, with what it is of.
     fit: Fit  # The same with its covariance from all sources.
-    lenses: Mapping[str, LensErrors]  # Lens errors beyond the camera models, by camera.
     steps: tuple[Step, ...]  # Steps that the residuals show, likeliest first.
     arms: Mapping[str, ArmReport]  # What was found of the arms, by robot.
     held_out: HeldOutResiduals  # Residuals of observations that were left out of the fit in turn.
@@ -167,7 +165,6 @@ def assess_fit(
     return FitAssessment(
         cell_fit,
         fit,
-        lens_errors(fit),
         steps,
         {name: arm.report(fit, middles, convention) for name, arm in cell_fit.arms.items()},
         held_out,

@@ -91,16 +91,16 @@ def _use(run: RunState) -> Remedy:
 
 def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
     """Input of the prediction of picks."""
-    answer, cell_fit = run.assessment, run.cell_fit
+    answer, cell_fit, fit = run.assessment, run.cell_fit, run.assessment.fit
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
     return PickInputs(
-        answer.fit,
+        fit,
         answer.held_out,
         middles_of(cell_fit.cell),
-        dict(zip(answer.fit.problem.robots, freedom, strict=True)),
+        dict(zip(fit.robots, freedom, strict=True)),
         cell_fit.arms,
-        middle_jacobians(answer.fit, run.session),
-        {name: lens.noise_px * lens.levels.jitter for name, lens in answer.lenses.items()},
+        middle_jacobians(fit, run.session),
+        {name: px * fit.lens_levels(name).jitter for name, px in fit.sigmas_px.items()},
         _strays(answer, explained),
     )
 

@@ -1,12 +1,9 @@
 """Lens errors beyond the camera models: their size, and the section of the result."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.effects.lenses import LinearisedCorners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.lens_field import LensLevels, depths_m, displacements
 from visioncal.estimation.unknowns import BOARD, LENS, LENS_ERRORS
@@ -16,40 +13,10 @@ from visioncal.results.lens import LensField
 _NEGLIGIBLE, _GRID = 1e-4, 12
 
 
-@dataclass(frozen=True)
-class LensErrors:
-    """Errors of one lens beyond its model."""
-
-    levels: LensLevels  # Their sizes, in units of `noise_px`.
-    noise_px: float  # Standard deviation of a corner's coordinate [px].
-    distance_m: float  # The mean distance of the views [m].
-    focal_px: float  # The focal length [px].
-
-    @property
-    def field_px(self) -> float:
-        """Standard deviation of the displacement field per axis [px]."""
-        return self.levels.field * self.noise_px
-
-
-def lens_errors(fit: Fit) -> dict[str, LensErrors]:
-    """Lens errors of each camera; empty for a session without images."""
-    if (seen := fit.corners) is None:
-        return {}
-    optics = seen.camera_parameters
-    return {
-        name: LensErrors(
-            problem.levels or LensLevels(),
-            seen.sigmas_px[which],
-            _distance_m(seen, which),
-            float(np.mean(optics.camera(name).matrix[:2])),
-        )
-        for which, (name, problem) in enumerate(optics.problems.items())
-    }
-
-
-def _distance_m(seen: LinearisedCorners, which: int) -> float:
-    """The mean distance of one camera's views."""
-    stack = [*seen.camera_parameters.problems.values()][which].stack
+def mean_distance_m(fit: Fit, camera: str) -> float:
+    """The mean distance of one camera's views [m]."""
+    seen, which = fit.linearised, fit.unknowns.of(LENS).index(camera)
+    stack = seen.camera_parameters.problems[camera].stack
     return float(np.mean(depths_m(stack, seen.compressed[which].cam_from_target)))
 
 
@@ -87,7 +54,7 @@ def lens_field_of(fit: Fit, camera: str) -> LensField | None:
         length=levels.length,
         breathing=noise_px * levels.breathing,
         jitter=noise_px * levels.jitter,
-        distance_m=_distance_m(seen, which),
+        distance_m=mean_distance_m(fit, camera),
         coefficients=mean,
         root=root,
         intrinsics_covariance=with_lens,

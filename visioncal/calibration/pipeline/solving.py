@@ -131,7 +131,7 @@ def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
         views = _views_by_camera(observed, cell_fit.poses)
         corners = cell_fit.stated_parameters(observed.scenes, views).linearised()
         problem = cell_fit.problem(corners)
-        start, noise = problem.start(cell_fit.frames), cell_fit.noise
+        start, noise = problem.start(cell_fit.fit.frames), cell_fit.noise
         state = solve_problem(problem, start, noise)[0]
         fit = Solution(state, estimate_noise(problem, state, noise))
         return cell_fit.with_joint_fit(Fit(problem, fit, corners))
@@ -315,7 +315,7 @@ def _converge_arms(cell_fit: CellFit) -> CellFit:
             cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
         else:
             optics = cell_fit.linearised_corners.camera_parameters
-            fitted = fit_jointly(optics, cell_fit, cell_fit.frames)
+            fitted = fit_jointly(optics, cell_fit, cell_fit.fit.frames)
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
                 fitted, _ = with_sizes(cell_fit, fitted)
             cell_fit = cell_fit.with_joint_fit(fitted)

@@ -50,11 +50,6 @@ class CellFit:
         """Whether errors of an arm's links are free."""
         return any(arm.has_free_errors for arm in self.arms.values())
 
-    @property
-    def frames(self) -> dict[str, FloatArray]:
-        """Poses (4, 4) of the unknown frames in their parents."""
-        return self.fit.frames
-
     def with_arm_poses(self) -> Self:
         """Replaces the robots' poses by those of their arms."""
         problem, arms = self.inlier_fit.problem, self.arms.items()

@@ -68,7 +68,7 @@ def refine_jointly(
     Returns:
         The fit, with the errors of its arms.
     """
-    frames, stated = cell_fit.frames, None
+    frames, stated = cell_fit.fit.frames, None
     with diverging():
         if not is_sized:
             # Sizes are estimated from above: near a wrong size, lines of sight restrain another.

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
 from visioncal.core.limits import CONTRADICTION
@@ -112,23 +113,26 @@ def _px(values: FloatArray) -> str:
 
 def _beyond(run: RunState) -> Iterator[Finding]:
     """Significant errors beyond the model: of a part of the image, and changes of the focus."""
-    lenses = run.assessment.lenses
-    for name, lens in lenses.items():
-        levels, (field, *changes) = lens.levels, lens.levels.gains
-        of = "The lens" if len(lenses) == 1 else f"The lens of {name}"
+    fit = run.assessment.fit
+    for name, noise_px in fit.sigmas_px.items():
+        levels, distance_m = fit.lens_levels(name), mean_distance_m(fit, name)
+        field, *changes = levels.gains
+        of = "The lens" if len(fit.sigmas_px) == 1 else f"The lens of {name}"
         if field > SIGNIFICANT:
+            optics, field_px = fit.linearised.camera_parameters, levels.field * noise_px
+            focal_px = float(np.mean(optics.camera(name).matrix[:2]))
             yield Finding(
                 "lens_field",
                 f"{of} departs from its model: corners of one part of the image are off alike, by "
-                f"{figure(lens.field_px)} px. The result counts it, and belongs to this lens.",
+                f"{figure(field_px)} px. The result counts it, and belongs to this lens.",
                 Remedy(
                     "Give matrix and distortion of a model that fits the lens, or keep the work in "
                     "the middle of the image."
                 ),
                 mahalanobis_sq=field,
-                up_to_mm=1e3 * lens.field_px / lens.focal_px * lens.distance_m,
+                up_to_mm=1e3 * field_px / focal_px * distance_m,
             )
-        percents = [100.0 * lens.noise_px * share for share in (levels.breathing, levels.jitter)]
+        percents = [100.0 * noise_px * share for share in (levels.breathing, levels.jitter)]
         when = ("where the distance doubles", "from view to view")
         how = [
             f"by {figure(percent)} % {words}"
@@ -141,7 +145,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
                 f"{of} changes its focal length {' and '.join(how)}. The result counts it.",
                 Remedy("Fix the focus (no autofocus), or work at one distance."),
                 mahalanobis_sq=max(changes),
-                up_to_mm=10.0 * max(percents) * lens.distance_m,
+                up_to_mm=10.0 * max(percents) * distance_m,
             )
 
 

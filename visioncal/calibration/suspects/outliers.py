@@ -67,7 +67,7 @@ def _stops_of(cell_fit: CellFit, key: str) -> list[int]:
 
 def movements(cell_fit: CellFit) -> tuple[Moved, ...]:
     """The frames that moved, in the order of time."""
-    named, edges, moved = versions(cell_fit), cell_fit.frames, list[tuple[int, Moved]]()
+    named, edges, moved = versions(cell_fit), cell_fit.fit.frames, list[tuple[int, Moved]]()
     for frame, parts in _parts(cell_fit).items():
         for (_, before), (start, after) in pairwise(parts):
             last, first = _stops_of(cell_fit, before)[-1], _stops_of(cell_fit, after)[0]

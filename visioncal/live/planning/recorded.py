@@ -176,7 +176,7 @@ def _of_stops(run: RunState, cell_fit: CellFit) -> Fit:
         effects=tuple(effect.of_stops(kept_stops) for effect in bare.effects),
     )
     noise = replace(cell_fit.noise, robots=np.maximum(cell_fit.noise.robots, _LEAST_NOISE.robots))
-    state = problem.start(cell_fit.frames)
+    state = problem.start(cell_fit.fit.frames)
     return Fit(problem, Solution(state, noise), cell_fit.linearised_corners)
 
 
