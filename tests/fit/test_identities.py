@@ -252,7 +252,8 @@ def test_errors_are_as_large_as_the_covariance_says(given, in_hand):
     squares = []
     for seed in range(60):
         small = made(seed, stops=12, given=given, in_hand=in_hand)
-        fit = solve(small.cell).fit
+        # Errors that last, which these arms do not have, would add to it.
+        fit = replace(solve(small.cell).fit, considered=None, shift=None)
         assert fit.used.all() or fit.used.sum() >= 11
         away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
         squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away))

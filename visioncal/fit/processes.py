@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lapack
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
@@ -249,7 +250,7 @@ def _likelihoods(
     """Restricted log-likelihoods at some stops: with boards as stated, and of any size."""
     p = alone.rows.shape[2] - 1
     root = np.linalg.cholesky(_independent(alone, some, white) + added)
-    solved = np.linalg.solve(root, alone.rows[some].reshape(-1, p + 1))
+    solved, _ = lapack.dtrtrs(root, alone.rows[some].reshape(-1, p + 1), lower=1)
     total = solved.T @ solved + alone.rest
     total[np.arange(p), np.arange(p)] *= 1.0 + 1e-9
     values = []
@@ -259,7 +260,7 @@ def _likelihoods(
             loosened[column] = held - _LOOSE**-2.0
         inner = (total - np.diag(loosened))[:p, :p]
         factor = np.linalg.cholesky(inner)
-        pull = np.linalg.solve(factor, total[:p, p])
+        pull, _ = lapack.dtrtrs(factor, total[:p, p], lower=1)
         value = -np.log(np.diag(root)).sum() - np.log(np.diag(factor)).sum()
         prior = sum(-0.5 * np.log(held * _LOOSE**2) for _, held in places)
         values.append(float(value - 0.5 * (total[p, p] - pull @ pull) + prior))
