@@ -5,9 +5,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from support import small_cells
 from support.small_cells import BOARD, PX, ROBOT_M, ROBOT_RAD, TABLE, made, pose
 
 from visioncal.core.transforms import exp, invert, log
+from visioncal.core.types import Target
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.fit.linearise import linearised, pairs_of
 from visioncal.fit.search import Search, nearest
@@ -106,6 +108,24 @@ def test_poses_by_other_software_are_as_sure_as_they_say(in_hand, is_declared):
         away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
         squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away))
     assert is_fair(squares, 6)
+
+
+def test_corners_of_a_single_tag_are_as_sure_as_they_say(monkeypatch):
+    tag = Target("tag", "marker", 1, 1, 0.05, 5e-5, dictionary="DICT_4X4_50", marker_id=0)
+    monkeypatch.setattr(small_cells, "BOARD", tag)
+    monkeypatch.setattr(small_cells, "PX", 0.3)
+    squares, noise = [], []
+    for seed in range(6):
+        small = made(seed, 20)
+        solved = solve(small.cell)
+        # Of eight degrees of freedom a pose takes six, and both poses of a tag fit nearly alike.
+        assert solved.used.all()
+        away = log(invert(small.edges["cam"]) @ solved.fit.edge("cam"))
+        squares.append(away @ np.linalg.solve(solved.fit.covariance(("edge", "cam")), away))
+        noise.append(solved.fit.sizes["px cam"])
+    assert is_fair(squares, 6)
+    # 240 degrees of freedom in all: three sigma.
+    assert np.mean(noise) == pytest.approx(0.3, rel=0.14)
 
 
 def test_distance_and_tilt_are_noisier_in_an_image_than_the_rest():
