@@ -4,8 +4,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visioncal.core.quantiles import f_limit
-from visioncal.core.types import Mask
+from visioncal.core.quantiles import FALSE_REJECTION, f_limit
+from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.linearise import Gram, Pair, linearised, pairs_of
@@ -16,8 +16,8 @@ from visioncal.fit.unknowns import State, Unknowns
 from visioncal.fit.weights import weighed
 from visioncal.model import Cell
 
-# Chance that a sound session loses a sighting.
-_FALSE = 0.01
+# Share of the limit from which sightings are tested again, by noise without them.
+_SUSPECT = 0.4
 # Most linearisations; a step under this share of every sigma is not worth one.
 _ROUNDS, _SETTLED = 8, 0.02
 # Rounds in which sightings come back while the noise is scaled by what most have: the nearest half
@@ -112,22 +112,30 @@ class Search:
         """The fit of the sightings within the reach of noise; steps at one linearisation."""
         count, fewest = len(fit.used), max(int(self.sound.sum()) // 2, 5)
         for turn in range(_WIDENED + count):
-            left_out = fit.left_out()
-            squares = left_out.squares
-            freedom = max(3.0 * fit.used.sum() - 3.0 * len(self.cell.unknown), 6.0)
-            limits = left_out.directions * f_limit(_FALSE / count, left_out.directions, freedom)
+            left_out, beyond = self._left_out(fit)
             # The median of chi-square of six degrees is 5.35.
-            scale = max(float(np.median(squares[fit.used])) / 5.35, 1.0) if turn < _SCALED else 1.0
-            inside = self.sound & (squares < limits * scale)
-            if turn < _WIDENED and (inside & ~fit.used).any():
-                after = fit.used | inside
-            elif (fit.used & ~inside).any() and fit.used.sum() > fewest:
-                after = fit.used.copy()
-                after[np.argmax(np.where(fit.used, squares / limits, 0.0))] = False
-            else:
+            middle = float(np.median(left_out.squares[fit.used])) / 5.35
+            beyond /= max(middle, 1.0) if turn < _SCALED else 1.0
+            reached = self.sound & ~fit.used & (beyond < 1.0)
+            if turn < _WIDENED and reached.any():
+                fit = self._refitted(fit, fit.used | reached)
+                continue
+            worst = int(np.argmax(np.where(fit.used, beyond, 0.0)))
+            if beyond[worst] < _SUSPECT or fit.used.sum() <= fewest:
                 break
-            fit = self._refitted(fit, after)
+            # A sighting that is tested adds to no noise.
+            without = self._refitted(fit, fit.used & (np.arange(count) != worst))
+            if beyond[worst] < 1.0 and self._left_out(without)[1][worst] < 1.0:
+                break
+            fit = without
         return fit, left_out
+
+    def _left_out(self, fit: Fit) -> tuple[LeftOut, FloatArray]:
+        """Sightings left out, and their squares (n,) over the largest of noise."""
+        left_out, count = fit.left_out(), len(fit.used)
+        freedom = max(3.0 * fit.used.sum() - 3.0 * len(self.cell.unknown), 6.0)
+        limits = f_limit(FALSE_REJECTION / count, left_out.directions, freedom)
+        return left_out, left_out.squares / (left_out.directions * limits)
 
     def _refitted(self, fit: Fit, used: Mask) -> Fit:
         """The same linearisation with other sightings."""
@@ -138,9 +146,9 @@ class Search:
 
 
 def nearest(start: Start) -> Mask:
-    """(n,) sightings near a start's prediction; half of each pair, to determine all edges."""
+    """(n,) the half of each pair of frames that is nearest to a start's prediction."""
     near = np.where(start.sound, start.distances, np.inf)
-    used: Mask = near <= 4.0 * float(np.median(near[start.sound]))
+    used = np.zeros(len(near), bool)
     for rows in map(np.array, start.cell.pairs.values()):
         count = int(start.sound[rows].sum())
         used[rows[near[rows].argsort()][: min(count // 2 + 1, count)]] = True
