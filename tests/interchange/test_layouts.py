@@ -8,15 +8,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tomli_w
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.following import follow
 from support.samples import made_up
 
+from visioncal.calibration.stages import detect
+from visioncal.interchange.formats import rereading
 from visioncal.interchange.formats.sources import look
 from visioncal.session import Session
 from visioncal.vision.boards.charuco import charuco_board
+from visioncal.vision.targets import target_document
 
 FIELD = Path(__file__).parents[3] / "shared/data/field/cases"
 
@@ -693,3 +697,22 @@ def test_a_board_of_other_counts_is_named_before_the_form_is_asked_for(tmp_path)
     said = ("--target", "checkerboard_11x8_35mm", "--mount", "eye-in-hand")
     done = visioncal("convert", FIELD / "checkerboard-miscounted", tmp_path / "out", *said)
     assert "Euler angles" in done.good().err
+
+
+def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypatch):
+    session = world()[2]
+    shoot(tmp_path / "in", "img{:02d}.png")
+    poses = np.random.default_rng(0).normal(0.0, 0.5, (9, 6))
+    np.save(tmp_path / "in/poses.npy", poses)
+    write(tmp_path / "board.toml", tomli_w.dumps(target_document(session.target)))
+    find, searched = detect.find_corners, list[int]()
+
+    def counted(image, target, view, **options):
+        searched.append(view)
+        return find(image, target, view, **options)
+
+    monkeypatch.setattr(detect, "find_corners", counted)
+    monkeypatch.setattr(rereading, "_TESTED", (6, 9))
+    options = ("--target", tmp_path / "board.toml", "--mount", "eye-in-hand")
+    assert visioncal("convert", tmp_path / "in", tmp_path / "out", *options).status == 2
+    assert len(searched) == 9

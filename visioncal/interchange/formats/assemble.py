@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
 from visioncal.core.number_format import some_of
-from visioncal.core.types import Mount
+from visioncal.core.types import Mount, Searched
 from visioncal.interchange.formats.fields import named_by
 from visioncal.interchange.formats.foreign import ForeignRecording, ImportOptions, rows_of
 from visioncal.interchange.formats.intrinsics import read_intrinsics, read_target_description
@@ -28,8 +28,17 @@ from visioncal.vision.boards.imaging import image_size, looks_like_image
 from visioncal.vision.targets import target_name
 
 
+@dataclass(frozen=True, eq=False)
 class FileImages(ListedImages[Path]):
     """Image files anywhere on the disk, by their paths in the session."""
+
+    # What was found of the only board in some files before.
+    searches: Mapping[Path, Searched] = field(default_factory=dict)
+
+    def search_of(self, path: str, board: str) -> Searched | None:
+        """What was found of the board in an image before; None where it is to be searched."""
+        del board
+        return self.searches.get(self.files[path]) if path in self.files else None
 
     def load(self, place: Path) -> bytes:
         """Reads the bytes of one image file."""

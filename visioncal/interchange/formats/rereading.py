@@ -27,10 +27,15 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
 from visioncal.core.number_format import ranges
 from visioncal.core.transforms import apply, compose, invert
-from visioncal.core.types import MOUNTS, FloatArray, Progress
+from visioncal.core.types import MOUNTS, FloatArray, Progress, Searched
 from visioncal.core.verdict import Finding
 from visioncal.estimation.clock_correlation import evenly
-from visioncal.interchange.formats.assemble import assemble, pose_cells, with_observations_only
+from visioncal.interchange.formats.assemble import (
+    FileImages,
+    assemble,
+    pose_cells,
+    with_observations_only,
+)
 from visioncal.interchange.formats.fields import fields_of_records
 from visioncal.interchange.formats.foreign import ForeignRecording, rows_of
 from visioncal.interchange.formats.poses import pose_names
@@ -96,8 +101,9 @@ def _measured(session: Session, progress: Progress | None) -> RunState:
     return run_stages(RunState(session, progress), [each for each in STAGES if each.name in names])
 
 
-# Rows by which readings are tested, evenly spread: few first, more where these cannot tell.
-_TESTED = (12, 36)
+# Rows by which readings are tested, evenly spread: few first, more where these cannot tell. Every
+# third of the more is one of the few, whose images are searched once.
+_TESTED = (12, 34)
 
 
 def settled(foreign: ForeignRecording, progress: Progress | None = None) -> ForeignRecording:
@@ -118,15 +124,17 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     readings = [(0, foreign), *foreign.rivals]
     other_orders = [(rank, each) for rank, item in readings for each in _reordered(item)]
     why, other = "too few rows have a pose and what the camera saw", None
+    searches = dict[Path, Searched]()
     for least, most in pairwise((FEWEST_ROWS - 1, *_TESTED)):
         try:
-            seen = _Seen.of(foreign, most, progress)
+            seen = _Seen.of(foreign, most, progress, searches)
         except VisioncalError as error:
             other = error.finding if isinstance(error, OtherBoardError) else None
             why = error.message.rstrip(".")
             continue
         if seen.count <= least:
             break
+        searches |= seen.searches
         for tried in (readings, other_orders):
             found, said = _tested(tried, seen)
             why = said if tried is readings else why
@@ -201,8 +209,17 @@ class _Seen:
     progress: Progress | None
 
     @classmethod
-    def of(cls, foreign: ForeignRecording, most: int, progress: Progress | None) -> Self:
-        """What was seen in at most so many rows; raises VisioncalError."""
+    def of(
+        cls,
+        foreign: ForeignRecording,
+        most: int,
+        progress: Progress | None,
+        searches: Mapping[Path, Searched],
+    ) -> Self:
+        """What was seen in at most so many rows; raises VisioncalError.
+
+        `searches` has what was found in images before.
+        """
         seen = with_observations_only(foreign)
         if not seen.images:
             return cls(None, (), min(len(seen.robot), most), progress)
@@ -211,8 +228,21 @@ class _Seen:
         run = None
         if len(rows) >= FEWEST_ROWS:
             session = assemble(rows_of(replace(seen, rivals=()), rows), mount=MOUNTS[0])
+            if isinstance(session.images, FileImages):
+                images = replace(session.images, searches=searches)
+                session = replace(session, images=images)
             run = _measured(session, progress)
         return cls(run, tuple(seen.images[at] for at in rows), len(rows), progress)
+
+    @property
+    def searches(self) -> dict[Path, Searched]:
+        """What was found in the images, by file."""
+        if self.run is None or not isinstance(images := self.run.session.images, FileImages):
+            return {}
+        views, found = self.run.session.views, self.run.searches
+        return {
+            images.files[view.image]: found[view.number] for view in views if view.number in found
+        }
 
     def guess(self, foreign: ForeignRecording) -> Guess:
         """Tries the readings of one recording's poses; raises VisioncalError."""
