@@ -125,14 +125,21 @@ class Search:
                 break
             # A sighting that is tested adds to no noise.
             without = self._refitted(fit, fit.used & (np.arange(count) != worst))
-            if beyond[worst] < 1.0 and self._left_out(without)[1][worst] < 1.0:
+            if beyond[worst] < 1.0 and self._left_out(without, worst)[1][0] < 1.0:
                 break
             fit = without
         return fit, left_out
 
-    def _left_out(self, fit: Fit) -> tuple[LeftOut, FloatArray]:
-        """Sightings left out, and their squares (n,) over the largest of noise."""
-        left_out, count = fit.left_out(), len(fit.used)
+    def _left_out(self, fit: Fit, row: int | None = None) -> tuple[LeftOut, FloatArray]:
+        """Sightings left out, all or one, and their squares (n,) over the largest of noise."""
+        count = len(fit.used)
+        if row is None:
+            left_out = fit.left_out()
+        else:
+            every = fit.left_out([at.take(at.rows == row) for at in fit.grams if row in at.rows])
+            left_out = LeftOut(
+                every.away[[row]], every.predicted[[row]], every.own[[row]], every.directions[[row]]
+            )
         freedom = max(3.0 * fit.used.sum() - 3.0 * len(self.cell.unknown), 6.0)
         limits = f_limit(FALSE_REJECTION / count, left_out.directions, freedom)
         return left_out, left_out.squares / (left_out.directions * limits)
