@@ -547,6 +547,33 @@ def mappings_of_any_names(folder):
         write(folder / f"{at}.json", {"arm": {"lage": turn, "stelle": place}})
 
 
+def rounds(folder):
+    """Lists of pictures and poses in several rounds, without a name."""
+    shoot(folder / "foto", "img_{}.png")
+    rows = [[f"img_{at}.png", [seven(p)[:3], seven(p)[3:]]] for at, p in enumerate(world()[0])]
+    document = {"velocita": [0.1, 0.1], "giri": [rows[:3], rows[3:5], rows[5:]]}
+    write(folder / "giri.json", document)
+
+
+def pictures_to_numbers(folder):
+    """Six numbers by the name of the picture, and nothing else."""
+    shoot(folder, "zdj_{}.png")
+    angles = Rotation.from_matrix(world()[0][:, :3, :3]).as_euler("xyz", degrees=True)
+    rows = np.hstack([1e3 * world()[0][:, :3, 3], angles]).tolist()
+    write(folder / "pozycje.json", {f"zdj_{at}.png": row for at, row in enumerate(rows)})
+
+
+def lines_with_brackets(folder):
+    """A value a line, whose unit is in brackets."""
+    shoot(folder / "camera", "gauche_{}.png")
+    for at, pose in enumerate(world()[0]):
+        turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+        place, vector = (" ".join(map(repr, v.tolist())) for v in (1e3 * pose[:3, 3], turn))
+        lines = ["Date : 14/03/2021 15:11:07", f"Position (mm) : {place}"]
+        text = "\n".join([*lines, f"Vecteur rotation (rad) : {vector}", "Vitesse (%) : 20"])
+        write(folder / f"bras/pose_{at}.txt", text)
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -557,7 +584,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         another_order, comment_above, beside_a_decoy, matlab, dense_log,
         two_sessions, several_bodies, sentence_above,
         sorted_as_text, called_by_words, a_folder_a_view, columns_as_lists,
-        blocks_of_text, mappings_of_any_names,
+        blocks_of_text, mappings_of_any_names, rounds, pictures_to_numbers, lines_with_brackets,
     )
 }  # fmt: skip
 

@@ -27,6 +27,7 @@ from visioncal.interchange.formats.fields import (
     arrays_in_texts,
     fields_of_records,
     holds_pose,
+    is_image_name,
     joined,
     separate,
 )
@@ -198,7 +199,7 @@ def read_record(path: Path, document: object = None) -> dict[str, object]:
 
 
 _SECTION = re.compile(r"\s*\[+\s*([^\[\]=:,]+?)\s*\]+\s*")
-_ENTRY = re.compile(r"\s*([^\s=:#;,\[{(][^=:#;,\[{(]*?)\s*[=:]\s*(.*?)\s*")
+_ENTRY = re.compile(r"\s*([^\s=:#;,\[{(][^=:#;,\[{]*?)\s*[=:]\s*(.*?)\s*")
 
 
 def _keyed(text: str) -> dict[str, object]:
@@ -274,11 +275,13 @@ def rows_of_document(document: object, path: Path) -> list[Fields]:
         raise DataError(
             f"{path} holds no rows; a list with one entry a pose is needed.", culprits=[str(path)]
         )
-    found = _fields_of_lists(lists, path)
-    if not any(map(holds_pose, found)):
-        # The poses may be in lists of several groups.
-        opened = (_opened(rows, name) for name, rows, _ in lists)
-        found += _fields_of_lists([each for groups in opened for each in groups], path)
+    opened = {name: [*_opened(rows, name)] for name, rows, _ in lists}
+    # Lists of rounds are no rows where their own entries are.
+    rounds = {name for name, rows, _ in lists if opened[name] and isinstance(rows[0], list)}
+    found = _fields_of_lists([each for each in lists if each[0] not in rounds], path)
+    has_pose = any(map(holds_pose, found))
+    inner = [each for name in opened if name in rounds or not has_pose for each in opened[name]]
+    found += _fields_of_lists(inner, path)
     return found
 
 
@@ -318,7 +321,8 @@ def _row_lists(
     elif isinstance(document, Mapping):
         values = [*document.values()]
         arrays = _arrays_of(values)
-        if arrays is not None and len(values) > 2 and appearance(arrays) == "pose":
+        named = all(is_image_name(str(key)) for key in document)
+        if arrays is not None and len(values) > 2 and (named or appearance(arrays) == "pose"):
             yield name, [{name or "pose": value} for value in values], tuple(map(str, document))
             return
         is_counted = len(values) > 1 and all(re.search("[0-9]$", str(key)) for key in document)
@@ -339,6 +343,9 @@ def _opened(
 ) -> Iterator[tuple[str, list[object], tuple[str, ...]]]:
     """The rows in lists of several groups, each with what stands beside the lists of its group."""
     rows = list[object]()
+    if all(isinstance(group, list) for group in groups):
+        each = [row for group in groups if isinstance(group, list) for row in group]
+        rows = [row for row in each if isinstance(row, list) and str in {*map(type, row)}]
     for group in groups if isinstance(groups[0], Mapping) else ():
         if not isinstance(group, Mapping):
             return
