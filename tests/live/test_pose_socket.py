@@ -49,7 +49,7 @@ class FakeCapture:
         self.journal = SimpleNamespace(views=[])
         self.coach = SimpleNamespace(advice=lambda: "")
         self.steps, self.meanwhile = [], meanwhile
-        self.halting = contextlib.nullcontext
+        self.halting, self.until = contextlib.nullcontext, contextlib.suppress
 
     def next_numbers(self):
         """Numbers of the next view."""

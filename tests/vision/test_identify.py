@@ -90,6 +90,8 @@ def test_no_sound_board_is_accused(kind, hard):
         ([404, 6, 3], "gridboard", "blurred"),
         ([404, 8, 7], "gridboard", "steep"),
         ([404, 11, 3], "aprilgrid", "blurred"),
+        # 16 bits are read by chance in a tag of 36.
+        ([606, 5, 3], "aprilgrid", "blurred"),
         ([404, 11, 4], "gridboard", "very blurred"),
         # From the side its rows are columns.
         ([9, 4], "circles", "hidden in part"),

@@ -211,8 +211,11 @@ def _differences(declared: Target, identity: Identity) -> dict[str, object]:
     board = identity.board
     counts: dict[str, object] = {"columns": board.columns, "rows": board.rows}
     names = {board.dictionary, *identity.larger}
-    if identity.is_single and declared.columns * declared.rows > 1 and declared.dictionary in names:
-        # A single marker is no evidence against a board of several: its finder says what it lacks.
+    # A single marker is no evidence against a board of several, whose finder says what it lacks:
+    # one may be covered up to it, or 16 bits be read by chance in markers of more.
+    is_chance = bool(declared.dictionary) and board.dictionary.startswith("DICT_4X4")
+    is_no_evidence = is_chance or declared.dictionary in names
+    if identity.is_single and declared.columns * declared.rows > 1 and is_no_evidence:
         return {}
     if board.kind != declared.kind:
         if {tag for tag, _ in declared.point_tags} & {*identity.marker_ids}:
