@@ -41,7 +41,7 @@ from visioncal.interchange.formats import (
     convert,
     read_foreign,
 )
-from visioncal.interchange.formats.file_search import files_in, images_named
+from visioncal.interchange.formats.file_search import files_in, head, images_named
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.session import Session
 from visioncal.session.columns import POSE
@@ -756,3 +756,12 @@ def test_the_command_converts_and_refuses(folder, tmp_path):
 def test_what_describes_somebody_elses_poses_is_refused_for_a_session(folder, tmp_path):
     typed("convert", folder, tmp_path / "new", "--robot-unit", "mm").refused("is a session already")
     assert not (tmp_path / "new").exists()
+
+
+def test_files_of_the_kernel_are_not_read():
+    """Some, such as /proc/kmsg, wait for ever: a folder that links to the root has them, too."""
+    file = Path("/proc/version")
+    if not file.is_file():
+        pytest.skip("there is no /proc")
+    assert file.read_text()
+    assert head(file) == ""

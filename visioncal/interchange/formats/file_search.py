@@ -223,6 +223,9 @@ def files_in(folder: Path) -> tuple[Path, ...]:
 def head(path: Path) -> str:
     """The beginning of a text file; empty where it is not text."""
     try:
+        # Files of a kernel have no size, and some never answer.
+        if not path.stat().st_size:
+            return ""
         with path.open("rb") as file:
             # Length that suffices to recognise a text file.
             data = file.read(16_384)
