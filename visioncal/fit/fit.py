@@ -164,7 +164,9 @@ class Fit:
         information, pull = weighted[:, :-1, :-1], weighted[:, :-1, -1]
         by_errors, by_columns = spread[:, :, :f], spread[:, :, f:]
         values = by_columns @ self.estimate.values[gram.columns]
-        columns, jacobian = gram.columns, by_columns
+        # Local columns beyond the head are unknowns themselves, or fixed.
+        head = gram.moves.shape[1]
+        columns, jacobian = gram.columns, by_columns[:, :head]
         covariance = np.zeros_like(information)
         if f:
             at = next(i for i, b in enumerate(self.mixed.bodies) if gram.flanges[0] in b.flanges)
@@ -172,19 +174,36 @@ class Fit:
             units = np.searchsorted(body.stops, gram.stops)
             places = [6 * body.flanges.index(name) + np.arange(6) for name in gram.flanges]
             own = np.concatenate(places)
-            columns = body.columns
+            columns, by_errors = body.columns, by_errors[:, :head]
             jacobian = by_errors @ solved.response[units[:, None], own]
-            jacobian[:, :, np.searchsorted(columns, gram.columns)] += by_columns
+            jacobian[:, :, np.searchsorted(columns, gram.columns)] += by_columns[:, :head]
             errors = solved.own[units[:, None, None], own[:, None], own]
-            covariance += by_errors @ errors @ np.swapaxes(by_errors, 1, 2)
-            values = values + (by_errors @ solved.errors[units[:, None], own][:, :, None])[:, :, 0]
+            covariance[:, :head, :head] = by_errors @ errors @ np.swapaxes(by_errors, 1, 2)
+            moved = by_errors @ solved.errors[units[:, None], own][:, :, None]
+            values[:, :head] += moved[:, :, 0]
         common = self.estimate.covariance[columns[:, None], columns]
-        covariance += jacobian @ common @ np.swapaxes(jacobian, 1, 2)
+        of_head = jacobian @ common
+        covariance[:, :head, :head] += of_head @ np.swapaxes(jacobian, 1, 2)
+        is_beyond = gram.picked >= head
+        beyond, unit = gram.picked[is_beyond], gram.units[is_beyond]
+        at_beyond = np.searchsorted(
+            columns, gram.columns[len(gram.columns) - len(gram.picked) :][is_beyond]
+        )
+        both = of_head[:, :, at_beyond] * unit
+        covariance[:, :head, beyond] = both
+        covariance[:, beyond, :head] = np.swapaxes(both, 1, 2)
+        own_part = common[at_beyond[:, None], at_beyond] * np.outer(unit, unit)
+        covariance[:, beyond[:, None], beyond] = own_part
         part = self.used[gram.rows][:, None, None]
-        without = np.linalg.inv(np.eye(gram.local) - part * covariance @ information)
-        pulled = (covariance @ pull[:, :, None])[:, :, 0]
-        values = (without @ (values - part[:, :, 0] * pulled)[:, :, None])[:, :, 0]
-        return _off(weighted, values, without @ covariance)
+        alone, mapped = _alone(weighted)
+        # Of the inverse, the pose needs six rows.
+        rest = np.eye(gram.local) - part * covariance @ information
+        rows = np.swapaxes(
+            np.linalg.solve(np.swapaxes(rest, 1, 2), np.swapaxes(mapped, 1, 2)), 1, 2
+        )
+        pulled = values[:, :, None] - part * (covariance @ pull[:, :, None])
+        away = (alone @ pull[:, :6, None] - rows @ pulled)[:, :, 0]
+        return away, rows @ covariance @ np.swapaxes(mapped, 1, 2), alone
 
     def stops_left_out(self) -> LeftOut:
         """Leaves each stop out in turn: no sighting at a stop tells where the others there are.
@@ -302,13 +321,21 @@ def _off(
         values: (k, d) predicted local columns.
         covariance: (k, d, d) theirs.
     """
-    information, pull = weighted[:, :-1, :-1], weighted[:, :-1, -1]
-    # The pose that the sighting's rows alone have, given what else its rows depend on.
-    pose = information[:, :6, :6]
+    alone, mapped = _alone(weighted)
+    away = (alone @ weighted[:, :6, -1, None] - mapped @ values[:, :, None])[:, :, 0]
+    return away, mapped @ covariance @ np.swapaxes(mapped, 1, 2), alone
+
+
+def _alone(weighted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses by the own rows of k sightings, given what else their rows depend on.
+
+    Returns:
+        Their (k, 6, 6) covariance, and (k, 6, d) derivatives by local columns.
+    """
+    information = weighted[:, :6, :-1]
+    pose = information[:, :, :6]
     scale = np.maximum(np.trace(pose, axis1=1, axis2=2), 1.0)
     diagonal = np.diagonal(pose, axis1=1, axis2=2) + 1e-3 * scale[:, None]
     alone = np.linalg.inv(pose + _RIDGE * diagonal[:, :, None] * np.eye(6))
-    other = alone @ information[:, :6, 6:]
-    mapped = np.concatenate([np.tile(np.eye(6), (len(other), 1, 1)), other], axis=2)
-    away = (alone @ pull[:, :6, None])[:, :, 0] - (mapped @ values[:, :, None])[:, :, 0]
-    return away, mapped @ covariance @ np.swapaxes(mapped, 1, 2), alone
+    other = alone @ information[:, :, 6:]
+    return alone, np.concatenate([np.tile(np.eye(6), (len(other), 1, 1)), other], axis=2)
