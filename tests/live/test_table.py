@@ -14,6 +14,7 @@ import pytest
 
 from visioncal import Session
 from visioncal.core.documents.pendants import read_pose
+from visioncal.core.errors import DataError
 from visioncal.core.types import Corners
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell, posed
@@ -225,6 +226,21 @@ def test_a_resumed_recording_goes_on_in_its_form(tmp_path):
     journal.store({3: typed("abb")})
     session = Session.load(tmp_path / "cell")
     assert (session.robots[""].form, session.need.mm) == (None, 0.5)
+
+
+def test_a_recording_without_a_view_may_go_on_with_other_devices(tmp_path):
+    """Who chose the wrong camera at first was refused until the folder was removed."""
+    folder, other = tmp_path / "cell", replace(FACTS, camera="another")
+    Journal.begin(folder, FACTS, 0.0, 0)
+    journal = Journal.resume(folder, other, 0.0, 0)
+    journal.store({1: taken(10, 0.1)})
+    assert Session.load(folder).camera_name == "another"
+    with pytest.raises(DataError, match='camera was "another" and is "camera"'):
+        Journal.resume(folder, FACTS, 0.0, 0)
+    journal.rewrite([])
+    Journal.resume(folder, FACTS, 0.0, 0).store({1: taken(10, 0.1)})
+    assert Session.load(folder).camera_name == "camera"
+    assert len(Journal.resume(folder, FACTS, 0.0, 0).views) == 1
 
 
 def test_requests_while_a_trial_runs_are_all_done_at_once(recording):

@@ -257,9 +257,7 @@ class Journal:
         journal._check_room(views * width * height, f"{views} views")
         with named_errors(folder):
             (folder / _IMAGES).mkdir(exist_ok=True)
-        facts_now = {"visioncal": __version__, **facts.provenance(), "settings": facts.settings}
-        journal._document = facts_now
-        journal._write(PROVENANCE, tomli_w.dumps(facts_now))
+        journal._write_facts()
         return journal
 
     @classmethod
@@ -271,7 +269,7 @@ class Journal:
         Partly written files of a killed process are removed.
 
         Raises:
-            DataError: The folder holds another recording, or something else.
+            DataError: The folder holds views of another recording, or something else.
         """
         path = folder / PROVENANCE
         for place in (folder, folder / _IMAGES):
@@ -282,7 +280,8 @@ class Journal:
             return cls.begin(folder, facts, unix_offset_s, views)
         before, now = read_toml(path, str(path)), facts.provenance()
         differ = [name for name, value in now.items() if before.get(name) != value]
-        if differ:
+        is_begun = (folder / _TABLE).is_file()
+        if differ and is_begun:
             words = "; ".join(
                 f"{name} was {_short(before.get(name))} and is {_short(now[name])}"
                 for name in differ
@@ -296,7 +295,9 @@ class Journal:
         journal._document = before
         with named_errors(folder):
             (folder / _IMAGES).mkdir(exist_ok=True)
-        if (folder / _TABLE).is_file():
+        if differ:
+            journal._write_facts()
+        if is_begun:
             session = Session.load(folder)
             journal.views, journal._columns = session.views, session.columns
             journal.form = _form_of(session.views)
@@ -405,6 +406,12 @@ class Journal:
             if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise self._full(len(data), path.name) from error
             raise
+
+    def _write_facts(self) -> None:
+        """Begins the provenance of a recording without a view."""
+        facts, settings = self._facts.provenance(), self._facts.settings
+        self._document = {"visioncal": __version__, **facts, "settings": settings}
+        self._write(PROVENANCE, tomli_w.dumps(self._document))
 
     def _check_room(self, needed: int, what: str) -> None:
         with named_errors(self.folder):
