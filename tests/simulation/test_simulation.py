@@ -1,5 +1,6 @@
 """The simulated cell and arm: is its truth true, and do its pictures show it where it says?"""
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -9,6 +10,7 @@ from support.cells import exact
 from support.marks import slow
 from support.moved_arms import robot_with_bodies
 
+from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log, rotation_angle
 from visioncal.robot.torques import body_regressor, joint_torques
 from visioncal.session import Session
@@ -271,6 +273,18 @@ def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
     assert truth.wrong_views == cell.wrong_views
     assert truth.options["robot_sigma_m"] == options.robot_sigma_m
     np.testing.assert_array_equal(truth.camera.distortion, SMALL.distortion)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("transforms", []), ("camera", None), ("wrong_views", 3), ("arm", {"a": [{}]})],
+)
+def test_a_truth_of_other_types_is_refused_by_its_key(key, value, tmp_path):
+    write_session(simulate(CellOptions(views=3)), tmp_path / "cell", images=False)
+    path = tmp_path / "cell.truth.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(DataError, match=f"cell.truth.json.{key}"):
+        read_truth(path)
 
 
 def test_pose_pairs_spread_as_pnp_on_the_noisy_corners_does():

@@ -7,15 +7,17 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
 from visioncal.core.arguments import typed
+from visioncal.core.codec import Array, WrittenForm, read
+from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
-from visioncal.core.files import decode_text, read_bytes, write_atomically
+from visioncal.core.files import read_bytes, write_atomically
 from visioncal.core.transforms import apply, exp
-from visioncal.core.types import Camera, FloatArray
+from visioncal.core.types import Camera, CameraKind, FloatArray
 from visioncal.session import MemoryImages, Session, View, frame_name, target_document
 from visioncal.session.columns import POSE, pose_row
 from visioncal.session.corners import CornerTable
@@ -35,20 +37,29 @@ Progress: TypeAlias = Callable[[float], None]
 # 4).
 _STEP = 1e-6
 _STEPS = exp(_STEP * np.stack([np.eye(6), -np.eye(6)]))
+# Arrays of an arm, of any shape.
+_OF_ARM = WrittenForm(np.ndarray.tolist, lambda value, _: np.array(value, float))
+
+
+def _camera(stored: Mapping[str, Any], _: str) -> Camera:
+    model: CameraKind = "fisheye" if stored["model"] == "fisheye" else "brown"
+    (width, height), values = stored["resolution"], (stored["matrix"], stored["distortion"])
+    return Camera(model, (int(width), int(height)), *(np.array(at, float) for at in values))
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
     """Ground truth of a simulated session."""
 
-    transforms: Mapping[str, FloatArray]  # True edges by their names in results, each (4, 4).
-    camera: Camera  # True intrinsics.
-    base_from_flange: FloatArray  # (m, 4, 4) true flange poses.
-    cam_from_target: FloatArray  # (m, 4, 4) true board poses.
+    # True edges by their names in results, each (4, 4).
+    transforms: Mapping[str, Annotated[FloatArray, Array((4, 4))]]
+    camera: Annotated[Camera, WrittenForm(asdict, _camera)]  # True intrinsics.
+    base_from_flange: Annotated[FloatArray, Array((-1, 4, 4))]  # (m, 4, 4) true flange poses.
+    cam_from_target: Annotated[FloatArray, Array((-1, 4, 4))]  # (m, 4, 4) true board poses.
     wrong_views: tuple[int, ...]  # Views with a wrong report.
     # Real arm: Denavit-Hartenberg parameters by name; a, d [m], alpha, beta, offset [rad], each
-    # (n,).
-    arm: Mapping[str, FloatArray]
+    # (n,), and what bends and waves.
+    arm: Mapping[str, Annotated[FloatArray, _OF_ARM]]
     options: Mapping[str, Any]  # Options of the cell as plain values, including noise levels.
 
 
@@ -70,29 +81,7 @@ def read_truth(path: Path | str) -> Truth:
     path = Path(path)
     if path.suffix != ".json":
         path = truth_path(path)
-    text = decode_text(read_bytes(path), str(path))
-    try:
-        content = json.loads(text)
-        camera = content["camera"]
-        width, height = camera["resolution"]
-        return Truth(
-            transforms={key: np.array(value) for key, value in content["transforms"].items()},
-            camera=Camera(
-                "fisheye" if camera["model"] == "fisheye" else "brown",
-                (int(width), int(height)),
-                np.array(camera["matrix"], dtype=float),
-                np.array(camera["distortion"], dtype=float),
-            ),
-            base_from_flange=np.array(content["base_from_flange"]),
-            cam_from_target=np.array(content["cam_from_target"]),
-            wrong_views=tuple(content["wrong_views"]),
-            arm={key: np.array(value) for key, value in content["arm"].items()},
-            options=content["options"],
-        )
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(
-            f"{path} is not the truth of a simulated session: {error!r}.", culprits=[str(path)]
-        ) from error
+    return read(Truth, parse_stored(read_bytes(path), str(path)), str(path))
 
 
 def truth_of(cell: SimulatedCell) -> dict[str, Any]:
