@@ -66,6 +66,9 @@ def test_no_name_of_a_check_runs_in_the_browser(names, cell, tmp_path, browser):
         verified.mkdir(parents=True)
         said = {"passed": False, "sentences": [f"said {name}"]}
         (verified / "verify.json").write_text(json.dumps(said))
+    # One of other types is passed over.
+    (checks / "other-verified").mkdir()
+    (checks / "other-verified/verify.json").write_text('{"passed": true, "sentences": null}')
     with served("verify", checks, "--against", results) as (url, _), opened(browser, url) as page:
         page.get_by_text(f"Check {checks.name}").wait_for()
         for name in names:

@@ -4,7 +4,7 @@ import socket
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -298,14 +298,22 @@ def _result(check: Path) -> Path:
     return check.with_name(f"{check.name}-verified")
 
 
+@dataclass(frozen=True)
+class _Checked:
+    """What a page shows of a verify.json."""
+
+    passed: bool
+    sentences: tuple[str, ...]
+
+
 def _history(checks: Path) -> list[tuple[Light, str, str]]:
     """The checks of a folder, the newest first: light, name, first reason."""
     lines: list[tuple[Light, str, str]] = []
     found = checks.glob(f"*-verified/{VERIFY}")
     for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True):
-        with suppress(DataError, KeyError, IndexError):
-            document = parse_stored(read_text(path), str(path))
-            light: Light = "green" if document["passed"] else "red"
+        with suppress(DataError):
+            check = read(_Checked, parse_stored(read_text(path), str(path)), str(path))
+            light: Light = "green" if check.passed else "red"
             name = path.parent.name.removesuffix("-verified")
-            lines.append((light, name, document["sentences"][0]))
+            lines += ((light, name, words) for words in check.sentences[:1])
     return lines

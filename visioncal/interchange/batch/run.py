@@ -180,7 +180,7 @@ def kept_row(job: Job) -> Row | None:
         document = json.loads(read_text(job.folder / ROW))
         made_by = _made_by(job, _session(job))
         row = read(Row, document["row"], "row")
-    except (VisioncalError, ValueError, TypeError, KeyError):
+    except (VisioncalError, ValueError, TypeError, KeyError, RecursionError):
         return None
     is_same = {key: document.get(key) for key in made_by} == made_by
     if not is_same or row.entry is None or not (job.folder / CALIBRATION).exists():
