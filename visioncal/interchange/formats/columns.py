@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -61,16 +60,16 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     source = look(path, requested.robot.form)
     if path.is_file() and source.parts[0].fault:
         raise source.parts[0].fault
-    images = source.images
-    if path.is_file() and requested.target and not requested.images:
-        images = images_of(path.parent)
+    is_beside = path.is_file() and requested.target and not requested.images
+    images = images_of(path.parent) if is_beside else source.images
     lens, notes = (None, ()) if requested.intrinsics else source.lens()
     found: list[tuple[int, ForeignRecording]] = []
     faults: list[DataError] = []
     readings = proposed(source, requested)
+    instead = image_groups(requested.images) if requested.images else None
     for rank, fields, asked in readings:
         try:
-            for more, foreign in _recordings(fields, asked, images):
+            for more, foreign in _recordings(fields, asked, images, instead):
                 all_notes = (*foreign.notes, *notes)
                 found.append((rank + more, replace(foreign, lens=lens, notes=all_notes)))
         except DataError as error:
@@ -93,13 +92,20 @@ def foreign_from(
 
     `images` are those of the source. Raises DataError.
     """
-    return _recordings(fields, requested, images)[0][1]
+    instead = image_groups(requested.images) if requested.images else None
+    return _recordings(fields, requested, images, instead)[0][1]
 
 
 def _recordings(
-    fields: Fields, requested: ImportOptions, images: Sequence[FileGroup]
+    fields: Fields,
+    requested: ImportOptions,
+    found: Sequence[FileGroup],
+    instead: Sequence[FileGroup] | None,
 ) -> list[tuple[int, ForeignRecording]]:
-    """The recording of `foreign_from`, and less likely ones with images in other orders."""
+    """The recording of `foreign_from`, and less likely ones with images in other orders.
+
+    Images are those `found` in the source, unless the user names others `instead`.
+    """
     names = _pose_fields(fields, requested)
     used = {name for of_side in names.values() for name in of_side}
     joint_fields = requested.joints or joint_names(fields, used)
@@ -132,7 +138,7 @@ def _recordings(
     if stamps.isdecimal():
         notes.append(f"Column {stamps} is taken for times, as the source does not say.")
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
-    pairing, image_name = _images(fields, requested, images, used)
+    pairing, image_name = _images(fields, requested.image, found, instead, used)
     used.add(image_name)
     columns = _further(fields, columns, used, pairing)
     foreign = ForeignRecording(
@@ -228,12 +234,15 @@ def view_numbers(fields: Fields) -> tuple[int, ...]:
 
 
 def _images(
-    fields: Fields, requested: ImportOptions, found: Sequence[FileGroup], taken: Collection[str]
+    fields: Fields,
+    column: str | None,
+    found: Sequence[FileGroup],
+    asked: Sequence[FileGroup] | None,
+    taken: Collection[str],
 ) -> tuple[Pairing, str]:
     """Pairs the rows with images, and names the field that names them."""
-    asked = image_groups(requested.images) if requested.images else None
     groups = found if asked is None else asked
-    name = fields.find(requested.image) if requested.image else _image_name(fields, groups, taken)
+    name = fields.find(column) if column else _image_name(fields, groups, taken)
     if name in fields.texts:
         cells = _with_folders(fields, name, groups)
         return Pairing(images_named(cells, fields.folder, found, asked)), name
@@ -277,22 +286,17 @@ def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[s
     return max(naming, key=lambda name: is_image_name(free[name][0]), default="")
 
 
-def _recognises(path: Path, *, series: bool) -> bool:
-    data = [group for group in groups_in(path) if group.is_data]
-    is_series = any(len(group.files) > 1 for group in data)
-    return is_series if series else bool(data)
-
-
 VIEWS = ForeignFormat(
     "views",
     "a folder with one or more files a view (pose_01.json, .txt, .npz)",
-    partial(_recognises, series=True),
+    lambda path: any(len(group.files) > 1 for group in groups_in(path) if group.is_data),
     _read,
 )
 TABLE = ForeignFormat(
     "table",
     "a table, JSON, YAML or .npz with a row a view, alone or in the folder of its images",
-    partial(_recognises, series=False),
+    # Describes whatever it cannot read.
+    Path.exists,
     _read,
 )
 

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -123,7 +124,7 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
     if not source.is_dir():
         return (FileGroup(source.name, (source,)),)
     alike: dict[tuple[str, str], list[Path]] = defaultdict(list)
-    for file in _walked(source, _DEPTH):
+    for file in islice(_walked(source, _DEPTH), _MOST_FILES):
         path = file.relative_to(source)
         alike[re.sub(r"[0-9]+", "#", _stem(path)), path.suffix.lower()].append(file)
     groups, single = list[FileGroup](), list[Path]()
@@ -133,23 +134,21 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
                 groups.append(group)
             else:
                 single += group.files
-    by_folder = [*_in_folders(source, single)]
-    groups += by_folder
-    single = [file for file in single if not any(file in group.files for group in by_folder)]
+    groups += _in_folders(source, single)
+    grouped = {file for group in groups for file in group.files}
     # Of any names: images of a folder, and records that are called as images are.
     stems = {file.stem for group in groups for file in group.files if group.is_images}
     stems |= {file.stem for file in single if is_image_name(file.name)}
     kinds: dict[tuple[Path, str], list[Path]] = defaultdict(list)
     for file in single:
-        kinds[file.parent, file.suffix.lower()].append(file)
-    for (folder, ending), files in kinds.items():
-        named = [file for file in files if is_image_name(file.name) or _has_any(file.stem, stems)]
-        is_series = len(named) > 1
-        if is_series:
-            label = (folder.relative_to(source) / f"*{ending}").as_posix()
-            groups.append(FileGroup(label, tuple(sorted(named, key=natural))))
-        others = (file for file in files if not (is_series and file in named))
-        groups += [FileGroup(file.relative_to(source).as_posix(), (file,)) for file in others]
+        if file in grouped:
+            continue
+        is_named = is_image_name(file.name) or _has_any(file.stem, stems)
+        label = f"*{file.suffix.lower()}" if is_named else file.name
+        kinds[file.parent.relative_to(source), label].append(file)
+    for (folder, label), files in kinds.items():
+        path = folder / (label if len(files) > 1 else files[0].name)
+        groups.append(FileGroup(path.as_posix(), tuple(sorted(files, key=natural))))
     return tuple(sorted(groups, key=lambda group: _in_order(Path(group.label))))
 
 
@@ -198,8 +197,8 @@ def _series(source: Path, files: Sequence[Path], ending: str) -> Iterator[FileGr
 
 
 def _walked(folder: Path, depth: int) -> Iterator[Path]:
-    """Files of a folder and of those in it; of at most `_MOST_FILES`."""
-    yield from files_in(folder)[:_MOST_FILES]
+    """Files of a folder and of those in it."""
+    yield from files_in(folder)
     if depth > 1:
         with suppress(OSError):
             for path in sorted(folder.iterdir()):

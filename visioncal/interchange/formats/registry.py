@@ -34,7 +34,8 @@ from visioncal.interchange.formats.views import VISP, ZIVID
 from visioncal.session import Session
 from visioncal.session.selecting import check_one_of_each
 
-# The first that recognises a path reads it, so the least specific come last.
+# The first that recognises a path reads it, so that of anything comes last; `views` must be asked
+# for, as it reads the same.
 FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
     BAG,
     LEROBOT,
@@ -44,8 +45,8 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
     ZIVID,
     EASY_HANDEYE,
     MOVEIT,
-    VIEWS,
     TABLE,
+    VIEWS,
 )
 
 _DEFAULTS = ImportOptions()
