@@ -114,15 +114,17 @@ def is_number(cell: str) -> bool:
     return _NUMBER.fullmatch(cell) is not None
 
 
-def read_table(path: Path) -> TextTable:
+def read_table(path: Path, text: str | None = None) -> TextTable:
     """Reads a table; the separator is a semicolon, a tab, a comma or blanks, in this order.
+
+    `text` is that of the file, where it has been read; None to read it.
 
     Without a header row, a comment right before the first row is the header if it has one word per
     column after any colon; a first line such as `sep=;` declares the separator. With semicolons or
     tabs, decimal commas are read as points. Rows may be lists in brackets, with a name before them.
     Empty rows and empty trailing columns are ignored. Raises DataError.
     """
-    text, where = read_plain_text(path), str(path)
+    text, where = read_plain_text(path) if text is None else text, str(path)
     if sum(map(text.count, ";\t,\n\r ")) > MAX_VALUES:
         raise too_many(where)
     all_lines = [*io.StringIO(text, newline="")]

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import cached_property
 from itertools import product, takewhile
 from pathlib import Path, PureWindowsPath
 from typing import Self
@@ -97,6 +98,20 @@ class Fields:
                 "row empty.",
             )
         return self.numbers[full].reshape(len(self), -1)
+
+    @cached_property
+    def keys(self) -> "Keys":
+        """What identifies the rows."""
+        names = {"": self.stems} if self.stems else {}
+        # The values of a list of their own are no keys.
+        for name, cells in self.texts.items() if len({*self.numbers, *self.texts}) > 1 else ():
+            numbers = self.numbers.get(name, np.zeros(1))
+            # A measured number is no name, and its digits no number.
+            if any(cells) and not (numbers[np.isfinite(numbers)] % 1).any():
+                names[name] = cells
+        stamp = stamp_name(self, ())
+        times = {"times": in_seconds(self.column(stamp)[:, 0]).tolist()} if stamp else {}
+        return Keys.of(len(self), names, numbers=self.views, **times)
 
     def listing(self) -> str:
         """Lists the fields with their numbers of values a row, for messages."""
@@ -289,7 +304,7 @@ def in_seconds(stamps: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Keys:
-    """What tells n rows or files apart, by which those of another source belong to them."""
+    """What identifies n rows or files, and matches them with those of another source."""
 
     count: int
     # By the kind of key, among `HOW`, and the column, which names of files have none of.
@@ -338,22 +353,6 @@ class Match:
 
 
 HOW = ("equal names", "equal numbers", "their times", "their order")
-
-
-def keys_of(fields: Fields) -> Keys:
-    """What tells the rows of a source apart."""
-    names = {"": fields.stems} if fields.stems else {}
-    for name, cells in fields.texts.items():
-        numbers = fields.numbers.get(name, np.zeros(1))
-        # A measured number is no name, and its digits no number.
-        if any(cells) and not (numbers[np.isfinite(numbers)] % 1).any():
-            names[name] = cells
-    if len({*fields.numbers, *fields.texts}) < 2:
-        # The values of a list of their own are no keys.
-        names = {"": names[""]} if fields.stems else {}
-    stamp = stamp_name(fields, ())
-    times = {"times": in_seconds(fields.column(stamp)[:, 0]).tolist()} if stamp else {}
-    return Keys.of(len(fields), names, numbers=fields.views, **times)
 
 
 def matched(first: Keys, second: Keys) -> Match | None:
@@ -427,10 +426,10 @@ def joined(
     clusters: list[list[tuple[Fields, IntArray]]] = []
     each = (piece for part in parts for piece in _by_category(part))
     for part in sorted(each, key=lambda item: (not holds_pose(item), -len(item))):
-        own, is_alone = keys_of(part), True
+        is_alone = True
         for cluster in clusters:
             main = cluster[0][0]
-            match = matched(keys_of(main), own) if main.form == part.form else None
+            match = matched(main.keys, part.keys) if main.form == part.form else None
             # What names pictures may do so for several.
             if match is not None and (is_alone or match.how != HOW[-1]):
                 cluster.append((part, match.rows))
@@ -512,10 +511,10 @@ def stamp_name(fields: Fields, taken: Collection[str]) -> str:
     for name, numbers in fields.numbers.items():
         if name in taken or numbers.ndim > 1:
             continue
-        # Numbers that count rows, possibly with gaps, are no times; those of an epoch are larger.
-        is_time = (numbers % 1 != 0).any() or numbers.max(initial=0.0) >= 1e6
-        if name.lower() in _TIME_NAMES or (
-            is_headerless(fields) and name == "1" and is_time and (np.diff(numbers) > 0).all()
-        ):
+        if name.lower() in _TIME_NAMES:
             return name
+        # Numbers that count rows, possibly with gaps, are no times; those of an epoch are larger.
+        if name == "1" and is_headerless(fields) and (np.diff(numbers) > 0).all():
+            is_time = (numbers % 1 != 0).any() or numbers.max(initial=0.0) >= 1e6
+            return name if is_time else ""
     return ""

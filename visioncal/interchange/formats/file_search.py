@@ -22,7 +22,6 @@ from visioncal.interchange.formats.fields import (
     Keys,
     Match,
     is_image_name,
-    keys_of,
     matched,
     named_by,
     number_in,
@@ -94,9 +93,9 @@ class FileGroup:
 
     @cached_property
     def keys(self) -> Keys:
-        """What tells the files apart."""
+        """What identifies the files."""
         parts = [(file.stem, *reversed(file.parent.parts)) for file in self.files]
-        # In folders of their own, files of one name are told apart by these.
+        # In folders of their own, files of one name are identified by these.
         names = next((each for each in zip(*parts, strict=False) if len({*each}) == len(parts)), ())
         return Keys.of(len(self.files), {"": names} if names else {}, numbers=self.numbers)
 
@@ -319,8 +318,7 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
 
     Depth pictures of the rows are kept beside; raises DataError where nothing fits, or several do.
     """
-    keys = keys_of(fields)
-    matches = [(group, found) for group in groups if (found := matched(keys, group.keys))]
+    matches = [(group, found) for group in groups if (found := matched(fields.keys, group.keys))]
 
     def rank(item: tuple[FileGroup, Match]) -> tuple[object, ...]:
         group, found = item

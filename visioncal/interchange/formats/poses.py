@@ -170,8 +170,9 @@ def _without_names(
         found = _in_sequence(next(iter(column_groups(fields).values()), ()), fields)
         yield from (item for item in found if not {*item.names} & {*taken})
         return
+    joints = {*joint_names(fields, ())}
     for parent, columns in column_groups(fields, taken).items():
-        if {*joint_names(fields, ())} & {*columns} or len(columns) > _MOST_COLUMNS:
+        if joints & {*columns} or len(columns) > _MOST_COLUMNS:
             continue
         flat = np.stack([fields.numbers[name] for name in columns], axis=1)
         for size, at in product((16, 12, 7, 6), range(len(columns) - 5)):
@@ -287,12 +288,12 @@ def pose_names(
     Raises DataError.
     """
     if given:
-        inner = f".{given[0]}."
-        within = (item.names for item in possible_poses(fields) if inner in f".{item.names[0]}.")
-        # A key that holds a position and a rotation.
-        is_whole = len(given) > 1 or inner[1:-1] in {*fields.numbers, *fields.texts}
-        held = None if is_whole else next(within, None)
-        return held or tuple(fields.find(name) for name in given)
+        if len(given) == 1 and given[0] not in {*fields.numbers, *fields.texts}:
+            # A key that holds a position and a rotation.
+            for item in possible_poses(fields):
+                if f".{given[0]}." in f".{item.names[0]}.":
+                    return item.names
+        return tuple(map(fields.find, given))
     first = next(iter(ranked_poses(fields, whose, taken, by_shape=by_shape)), [])
     if first:
         return first[0].names if len(first) == 1 else ()
@@ -339,8 +340,9 @@ def _is_opencv(item: PoseFields) -> bool:
     return any(re.search("[rt]vecs?$", name) for name in item.names)
 
 
-JOINT_KEYS = ("joint_pose", "joints?", "joint_angles", "joint_(?:positions?|values?|states?)", "q")
-
+_JOINTS = re.compile(
+    r"(?:.*[._])?(?:joint_pose|joints?|joint_angles|joint_(?:positions?|values?|states?)|q)"
+)
 _JOINT_NAME = re.compile(
     r"(?:.*\.)?(joint|axis|j|a|q)[ _]?([1-9])((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*"
     r"(?:deg|rad|[°º])[a-z]*\W*)?)",
@@ -487,7 +489,9 @@ def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
     lists = [
         name
         for name, numbers in fields.numbers.items()
-        if numbers.ndim > 1 and name not in taken and _is_of_joints(name)
+        if numbers.ndim > 1
+        and name not in taken
+        and _JOINTS.fullmatch(without_unit(name)[0].lower())
     ]
     if len(lists) == 1:
         return (lists[0],)
@@ -502,12 +506,6 @@ def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
         if len(by_number) >= 5 and [*by_number] == [*range(1, len(by_number) + 1)]:
             return tuple(by_number.values())
     return ()
-
-
-def _is_of_joints(name: str) -> bool:
-    return any(
-        re.fullmatch(rf"(?:.*[._])?{key}", without_unit(name)[0].lower()) for key in JOINT_KEYS
-    )
 
 
 def joints_from(

@@ -35,31 +35,26 @@ from visioncal.interchange.formats.fields import (
 _HEADED = re.compile(r"\s*([^\d\W][^:=]*?)\s*[:=]\s*(.*?)\s*")
 
 
-def _blocks(path: Path) -> Fields | None:
+def _blocks(text: str, path: Path) -> Fields | None:
     """Rows of several lines each, which a line of words begins; None where there are none."""
-    records: list[dict[str, object]] = []
-    lines: dict[str, list[list[float]]] = {}
-    places: list[str] = []
-
-    def close() -> None:
-        for key, rows in lines.items():
-            records[-1][key] = np.array([number for row in rows for number in row])
-        lines.clear()
-
-    for at, line in enumerate(read_plain_text(path).splitlines(), start=1):
+    words, places = list[dict[str, str]](), list[str]()
+    arrays: list[dict[str, list[float]]] = []
+    for at, line in enumerate(text.splitlines(), start=1):
         entry = _HEADED.fullmatch(line)
         numbers = [*separate(line)] or ([*separate(entry[2])] if entry else [])
-        key = entry[1] if entry and numbers else "matrix"
-        if numbers and records:
-            lines.setdefault(key, []).append(numbers)
+        if numbers and words:
+            arrays[-1][entry[1] if entry else "matrix"] += numbers
         elif line.strip():
-            if lines or not records:
-                close()
+            if not words or arrays[-1]:
                 places.append(f"{path.name}, line {at}")
-                records.append({})
+                words.append({})
+                arrays.append(defaultdict(list))
             image = _IMAGE.search(line)
-            records[-1]["image" if image else "title"] = image[0] if image else line.strip(" #:")
-    close()
+            words[-1]["image" if image else "title"] = image[0] if image else line.strip(" #:")
+    records = [
+        {**named, **{key: np.array(row) for key, row in rows.items()}}
+        for named, rows in zip(words, arrays, strict=True)
+    ]
     fields = fields_of_records(records, places, path.stem, path.parent)
     return fields if len(records) > 2 and fields.numbers else None
 
@@ -161,15 +156,16 @@ def read_rows(path: Path, form: str | None = None, document: object = None) -> l
     """All rows of a file, of which a document may have several kinds; see `read_fields`."""
     if path.suffix.lower() in DOCUMENTS:
         return rows_of_document(document or read_document(path), path)
-    for literals in (_literals(path), _keyed(read_plain_text(path))):
+    text = read_plain_text(path)
+    for literals in (_literals(text, path), _keyed(text)):
         with suppress(DataError):
             return rows_of_document(literals, path)
-    if lines := _pendant(path, form if form in POSE_FORMS else None):
+    if lines := _pendant(text, path, form if form in POSE_FORMS else None):
         return [lines]
     try:
-        table = read_table(path)
+        table = read_table(path, text)
     except DataError:
-        if blocks := _blocks(path):
+        if blocks := _blocks(text, path):
             return [blocks]
         raise
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
@@ -189,8 +185,8 @@ def read_record(path: Path, document: object = None) -> dict[str, object]:
     """What the file of one view holds, by name; numbers without a name are its `matrix`."""
     if path.suffix.lower() in DOCUMENTS:
         document = document or read_document(path)
-    elif not (document := _keyed(read_plain_text(path))):
-        table = read_table(path)
+    elif not (document := _keyed(text := read_plain_text(path))):
+        table = read_table(path, text)
         rows = [[float(cell) if is_number(cell) else cell for cell in row] for row in table.rows]
         document = rows[0] if len(rows) == 1 else rows
         if table.has_header and len(rows) == 1:
@@ -390,9 +386,9 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
     return dict(sorted(rows.items()))
 
 
-def _literals(path: Path) -> list[object]:
+def _literals(text: str, path: Path) -> list[object]:
     """Records of JSON or of Python, one a line; empty where a line is none."""
-    lines = [line for line in read_plain_text(path).splitlines() if line.strip()]
+    lines = [line for line in text.splitlines() if line.strip()]
     if not lines or not all(line.lstrip().startswith("{") for line in lines):
         return []
     records = list[object]()
@@ -410,9 +406,8 @@ def _listed(value: object) -> object:
     return [_listed(part) for part in value] if isinstance(value, list | tuple) else value
 
 
-def _pendant(path: Path, form: str | None) -> Fields | None:
+def _pendant(text: str, path: Path, form: str | None) -> Fields | None:
     """Lines with poses in a maker's notation, with names of images; None where there are none."""
-    text = read_plain_text(path)
     is_program = path.suffix.lower() in _PROGRAMS
     if is_program:
         # FANUC writes a pose in several lines.
