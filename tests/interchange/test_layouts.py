@@ -16,7 +16,10 @@ from support.following import follow
 from support.samples import made_up
 
 from visioncal.calibration.stages import detect
-from visioncal.interchange.formats import rereading
+from visioncal.core.documents import tables
+from visioncal.interchange.formats import file_search, reading, rereading
+from visioncal.interchange.formats.foreign import ImportOptions
+from visioncal.interchange.formats.registry import read_foreign
 from visioncal.interchange.formats.sources import look
 from visioncal.session import Session
 from visioncal.vision.boards.charuco import charuco_board
@@ -743,3 +746,29 @@ def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypat
     options = ("--target", tmp_path / "board.toml", "--mount", "eye-in-hand")
     assert visioncal("convert", tmp_path / "in", tmp_path / "out", *options).status == 2
     assert len(searched) == 9
+
+
+def test_a_source_is_searched_and_read_once_for_all_its_readings(tmp_path, monkeypatch):
+    shoot(tmp_path / "shots", "img{:02d}.png")
+    rows = [[*seven(pose), *seven(np.linalg.inv(pose))] for pose in world()[0]]
+    names = " ".join(f"{word}{at}" for word in "mn" for at in range(7))
+    lines = [names, *(" ".join(map(repr, map(float, row))) for row in rows)]
+    write(tmp_path / "in/poses.txt", "\n".join(lines))
+    done = list[str]()
+
+    def counting(module, name):
+        call = getattr(module, name)
+
+        def counted(path):
+            done.append(path.name)
+            return call(path)
+
+        monkeypatch.setattr(module, name, counted)
+
+    counting(file_search, "files_in")
+    counting(reading, "read_plain_text")
+    counting(tables, "read_plain_text")
+    requested = ImportOptions(images=tmp_path / "shots", target="charuco_9x6_30mm")
+    foreign = read_foreign(tmp_path / "in", requested)
+    assert len(foreign.rivals) > 1
+    assert sorted(done) == ["in", "poses.txt", "shots"]
