@@ -68,15 +68,11 @@ def starting_at(member: Vector, size: float) -> Vector:
 
 def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
     """Effects that a lens may have."""
-    stops = len(fit.cell.moments)
     for camera, lens in fit.unknowns.lenses.items():
         if ("lens", camera) not in fit.unknowns:
             continue
-        fx, fy = lens.matrix[:2].tolist()
-        q = 4 + len(lens.distortion)
-        distances = [gram.distances for gram in fit.grams if gram.pair[0] == camera]
-        middle = float(np.median(np.concatenate(distances)))
-        yield LensGrows(camera, (fx, fy), q)
+        yield LensGrows(camera, lens)
         if fit.cell.cameras[camera].focus == "auto":
-            yield Breathing(camera, (fx, fy), q, middle)
-            yield FocusJitter(camera, (fx, fy), q, stops)
+            distances = [gram.distances for gram in fit.grams if gram.pair[0] == camera]
+            yield Breathing(camera, lens, float(np.median(np.concatenate(distances))))
+            yield FocusJitter(camera, lens, len(fit.cell.moments))

@@ -17,14 +17,13 @@ from scipy.linalg import lapack
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.fit.fit import Fit
 from visioncal.fit.mixed import inverse
 from visioncal.fit.unknowns import Key
-from visioncal.model.effects.effect import TWIST
 
-# Lengths of processes by posture [rad], of which one is half a metre, and by time [stops].
+# Lengths of processes by posture [rad], with the lever per radian, and by time [stops].
 _RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
-_REACH_M = 0.5
 # Sizes of a process, and of what is independent beside it, over the level of the noise.
 _SIZES, _WHITE = (0.3, 0.6, 1.2, 2.5, 5.0), (1.0, 0.7, 0.4, 0.15)
 # Stops that are needed; of more than the most, some stand for all in the likelihood.
@@ -75,14 +74,14 @@ class Process:
 def processes(poses: FloatArray, levels: FloatArray) -> Iterator[Process]:
     """Processes at (s, 4, 4) flanges, in units of the (6,) levels of the noise."""
     count, order = len(poses), np.arange(len(poses))
-    size = np.sqrt(np.mean((levels / TWIST) ** 2))
+    size = np.sqrt(np.mean((levels / TWIST_UNITS) ** 2))
     flange = np.broadcast_to(np.diag(levels), (count, 6, 6))
-    of_base = size * adjoint(invert(poses)) * TWIST
+    of_base = size * adjoint(invert(poses)) * TWIST_UNITS
     both = np.concatenate([flange, of_base], axis=2)
     factors = np.concatenate([poses[:, :3, 3] / 0.6, poses[:, :3, 2]], axis=1)
     yield Process(1 / 4, _beyond_mean(factors @ factors.T), of_base)
     turns = poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
-    places = np.concatenate([poses[:, :3, 3] / _REACH_M, turns], axis=1)
+    places = np.concatenate([poses[:, :3, 3] / LEVER_M, turns], axis=1)
     squared = np.sum((places[:, None] - places) ** 2, axis=2)
     for length in _RANGES:
         kernel = _beyond_mean(np.exp(-squared / (2.0 * length**2)))

@@ -22,10 +22,10 @@ from visioncal.core.transforms import (
     rotation_angle,
 )
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
+from visioncal.estimation.arm import LEVER_M
 from visioncal.fit.places import robust_carried
 from visioncal.fit.weights import by_homography, first_weighed
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
-from visioncal.model.effects.effect import LEVER_M
 from visioncal.vision.camera import normalise, project
 from visioncal.vision.targets import corner_positions, rotation_transforms, rotations
 

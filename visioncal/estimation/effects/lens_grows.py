@@ -7,7 +7,7 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.effects.random_effect import RandomEffect, Stops
 
 # Time constants of a camera's warming in one session.
-_CONSTANTS = 3.0
+TIME_CONSTANTS = 3.0
 
 
 class LensGrows(RandomEffect):
@@ -19,13 +19,13 @@ class LensGrows(RandomEffect):
 
     def columns(self, stops: Stops) -> FloatArray:
         """Relative growth of the focal length over the session, towards a final value."""
-        grown = 1.0 - np.exp(-_CONSTANTS * stops.time)
+        grown = 1.0 - np.exp(-TIME_CONSTANTS * stops.time)
         return np.asarray((grown[:, None] * stops.by_focal)[:, :, None])
 
     def says(self, values: FloatArray) -> str:
         """What they mean."""
         way = "grew" if values[0] > 0.0 else "shrank"
-        share = figure(100.0 * abs(float(values[0])) * (1.0 - np.exp(-_CONSTANTS)))
+        share = figure(100.0 * abs(float(values[0])) * (1.0 - np.exp(-TIME_CONSTANTS)))
         return (
             f"The lens's focal length {way} by {share} % during the session, as of a camera that "
             "warms up. The result is that of its beginning."

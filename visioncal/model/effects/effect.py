@@ -6,15 +6,11 @@ from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.core.types import FloatArray
+from visioncal.core.types import Camera, FloatArray
 from visioncal.model.arm import Moments
+from visioncal.vision.camera import intrinsics
 
 Place: TypeAlias = Literal["edge", "lens"]
-
-# Arms err by half a millimetre for each milliradian.
-LEVER_M = 0.5
-# (6,) twists [rad], [m] of a size of one radian.
-TWIST = np.repeat([1.0, LEVER_M], 3)
 
 
 @dataclass(frozen=True)
@@ -36,17 +32,19 @@ class Effect(ABC):
     """
 
     place: ClassVar[Place] = "edge"
+    kind: ClassVar[str]
+    bounds: ClassVar[tuple[float, float, float]]  # `start`, `low` and `high` of its size.
     frame: str  # The edge's child frame, or the camera.
 
     @property
-    @abstractmethod
     def name(self) -> str:
         """Its name: in sizes, budget and result."""
+        return f"{self.kind} {self.frame}"
 
     @property
-    @abstractmethod
     def size(self) -> Size:
-        """Bounds of its size."""
+        """Its size."""
+        return Size(self.name, *self.bounds)
 
     @property
     @abstractmethod
@@ -62,3 +60,15 @@ class Effect(ABC):
             distances: (k,) distance of what is seen from the camera along its axis [m]; ones
                 where a frame moves.
         """
+
+
+@dataclass(frozen=True, eq=False)
+class LensEffect(Effect):
+    """An effect on a lens."""
+
+    place = "lens"
+    lens: Camera
+
+    def none(self, moments: Moments) -> FloatArray:
+        """Columns (k, q, c) of zeros."""
+        return np.zeros((len(moments), len(intrinsics(self.lens)), self.count))

@@ -6,8 +6,9 @@ import numpy as np
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
+from visioncal.estimation.arm import TWIST_UNITS
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import TWIST, Effect, Size
+from visioncal.model.effects.effect import Effect
 from visioncal.robot import Robot
 
 
@@ -19,17 +20,8 @@ class Links(Effect):
     flange, which edges have already, are not among them but for one joint's.
     """
 
+    kind, bounds = "links", (1e-3, 1e-7, 0.1)
     robot: Robot
-
-    @property
-    def name(self) -> str:
-        """See `Effect`."""
-        return f"links {self.frame}"
-
-    @property
-    def size(self) -> Size:
-        """See `Effect`."""
-        return Size(self.name, 1e-3, 1e-7, 0.1)
 
     @property
     def count(self) -> int:
@@ -40,5 +32,5 @@ class Links(Effect):
         """See `Effect`."""
         del distances
         frames = self.robot.link_frames(moments.joints[self.frame])
-        twists = adjoint(invert(frames[:, -1:]) @ frames[:, :-1]) * TWIST
+        twists = adjoint(invert(frames[:, -1:]) @ frames[:, :-1]) * TWIST_UNITS
         return np.asarray(np.moveaxis(twists, 1, 2).reshape(len(frames), 6, self.count))
