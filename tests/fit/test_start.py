@@ -90,3 +90,8 @@ def test_far_boards_tell_a_lens_by_the_robots_motion(monkeypatch):
                 away, covariance = fit.camera("cam").matrix - true, covariance[:4, :4]
             square = away @ np.linalg.solve(covariance, away)
             assert square / len(away) < f_limit(1e-4, len(away), 40)
+
+
+def test_cameras_keep_the_order_of_their_sightings():
+    # By the order in which five names are hashed, one run of 120 would keep it.
+    assert list(start_of(made(cameras=5).cell).lenses) == ["cam", "cam_1", "cam_2", "cam_3", "cam_4"]

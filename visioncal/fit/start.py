@@ -113,7 +113,8 @@ def start_of(cell: Cell) -> Start:
 def start_lenses(cell: Cell) -> dict[str, Camera]:
     """The stated lenses by camera, and those that corners determine (Zhang 2000)."""
     found = {}
-    for frame in {s.seer for s in cell.sightings if s.corners is not None}:
+    # In the order of sightings: results do not depend on how names are hashed.
+    for frame in dict.fromkeys(s.seer for s in cell.sightings if s.corners is not None):
         table = cell.cameras[frame]
         if table.stated is not None:
             found[frame] = table.stated
