@@ -48,6 +48,11 @@ def chosen_rows(record: _T, rows: Any, *others: str) -> _T:  # noqa: ANN401 - an
     return cast(_T, replace(owner, **picked))
 
 
+def evenly(count: int, most: int) -> IntArray:
+    """Numbers up to a count, evenly distributed, and at most so many."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+
+
 def interpolated(at: FloatArray, places: FloatArray, values: FloatArray) -> FloatArray:
     """(m, n) columns of (k, n) values at (k,) places, interpolated linearly at (m,) places."""
     return np.stack([np.interp(at, places, column) for column in values.T], axis=1)

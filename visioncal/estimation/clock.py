@@ -13,7 +13,7 @@ import numpy as np
 
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Camera, FloatArray, IntArray, Mask
+from visioncal.core.types import Camera, FloatArray, IntArray, Mask, evenly
 from visioncal.estimation.chain import chain
 from visioncal.estimation.clock_correlation import (
     FEWEST_FRAMES,
@@ -22,7 +22,6 @@ from visioncal.estimation.clock_correlation import (
     WIDEST_OFFSET_S,
     WINDOW_S,
     ImageTimes,
-    evenly,
 )
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.transforms import invert, rotation_angle
-from visioncal.core.types import FloatArray, IntArray, Mask, Mount, chosen_rows
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount, chosen_rows, evenly
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.trajectory import Trajectory
 
@@ -57,11 +57,6 @@ class Match:
     offset_s: float  # Camera clock minus robot clock [s].
     correlation: float  # Correlation of the angles there.
     at_end: bool = False  # Whether it lies at an end of the search range.
-
-
-def evenly(count: int, most: int) -> IntArray:
-    """Numbers up to a count, evenly distributed, and at most so many."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def turning_matches(

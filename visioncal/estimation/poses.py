@@ -33,10 +33,7 @@ class PlanarPoses:
 
 
 def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
-    """Solves each view's pose in closed form, with OpenCV.
-
-    Coplanar points by IPPE (Collins and Bartoli 2014), others by SQPnP (Terzakis and Lourakis
-    2020).
+    """Solves each view's pose in closed form.
 
     Returns:
         Both solutions; none where the lens cannot be inverted at the corners, or where they do not
@@ -47,26 +44,44 @@ def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
     solved = np.zeros(len(stack.views), dtype=bool)
     for view, (start, count) in enumerate(zip(stack.starts, stack.counts, strict=True)):
         rows = slice(start, start + count)
-        usable = np.isfinite(plane[rows]).all(axis=1)
-        points = stack.points[rows][usable]
-        if not determines_pose(points):
-            continue
-        flat = _flattened(points)
-        _, rotations, translations, _ = cv2.solvePnPGeneric(
-            points if flat is None else flat,
-            plane[rows][usable],
-            np.eye(3),
-            None,
-            flags=cv2.SOLVEPNP_SQPNP if flat is None else cv2.SOLVEPNP_IPPE,
-        )
-        solutions = [
-            compose(np.asarray(cv2.Rodrigues(rotation)[0], float), np.ravel(translation))
-            for rotation, translation in zip(rotations, translations, strict=True)
-        ]
-        if solutions and np.isfinite(solutions).all():
+        solutions = closed_form_poses(stack.points[rows], plane[rows])
+        if len(solutions):
             solved[view] = True
             poses[0, view], poses[1, view] = solutions[0], solutions[-1]
     return PlanarPoses(poses[0], poses[1], solved)
+
+
+def closed_form_poses(points: FloatArray, plane: FloatArray) -> FloatArray:
+    """Poses (j, 4, 4) of a target in closed form, with OpenCV, the better first.
+
+    Coplanar points by IPPE (Collins and Bartoli 2014), others by SQPnP (Terzakis and Lourakis
+    2020).
+
+    Args:
+        points: (n, 3) on the target [m].
+        plane: (n, 2) as they are seen on the plane at unit depth; NaN where the lens cannot be
+            inverted.
+
+    Returns:
+        None where the points do not determine a pose.
+    """
+    usable = np.isfinite(plane).all(axis=1)
+    points, none = points[usable], np.zeros((0, 4, 4))
+    if not determines_pose(points):
+        return none
+    flat = _flattened(points)
+    _, rotations, translations, _ = cv2.solvePnPGeneric(
+        points if flat is None else flat,
+        plane[usable],
+        np.eye(3),
+        None,
+        flags=cv2.SOLVEPNP_SQPNP if flat is None else cv2.SOLVEPNP_IPPE,
+    )
+    solutions = [
+        compose(np.asarray(cv2.Rodrigues(rotation)[0], float), np.ravel(translation))
+        for rotation, translation in zip(rotations, translations, strict=True)
+    ]
+    return np.array(solutions) if solutions and np.isfinite(solutions).all() else none
 
 
 def _flattened(points: FloatArray) -> FloatArray | None:

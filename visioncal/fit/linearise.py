@@ -16,6 +16,8 @@ import numpy as np
 
 from visioncal.core.transforms import (
     adjoint,
+    apply,
+    apply_each,
     compose,
     exp,
     inverse_right_jacobian,
@@ -332,12 +334,11 @@ def corner_rows(
 ) -> tuple[FloatArray, dict[Key, IntArray]]:
     """Rows (n, 2, d + 1) of corners, and the local columns of what is their own."""
     seer, seen = pair.names
-    lens, owner, basis = unknowns.camera(state, seer), pair.owner, pair.basis[pair.ids]
+    lens, basis = unknowns.camera(state, seer), pair.basis[pair.ids]
     points = pair.points[pair.ids] + basis @ state.values["shape", seen]
-    turns = poses[owner, :3, :3]
-    in_camera = (turns @ points[:, :, None])[:, :, 0] + poses[owner, :3, 3]
-    found = project_with_jacobian(lens, in_camera)
-    by_point = found.jacobian_point @ turns
+    own = poses[pair.owner]
+    found = project_with_jacobian(lens, apply_each(own, points))
+    by_point = found.jacobian_point @ own[:, :3, :3]
     columns: dict[Key, FloatArray] = {
         ("lens", seer): found.jacobian_intrinsics,
         ("shape", seen): by_point @ basis,
@@ -346,7 +347,7 @@ def corner_rows(
     for effect in unknowns.effects:
         if effect.place == "lens" and effect.frame == seer:
             moved = effect.columns(pair.moments, distances) @ state.values["effect", effect.name]
-            residual = residual - (found.jacobian_intrinsics @ moved[owner, :, None])[:, :, 0]
+            residual = residual - (found.jacobian_intrinsics @ moved[pair.owner, :, None])[:, :, 0]
     if seer in unknowns.fields:
         # Where corners are predicted: at those seen, a field could explain their noise.
         columns["field", seer] = field = unknowns.fields[seer].at(found.px)
@@ -418,7 +419,7 @@ def _by_sight(rows: FloatArray, poses: FloatArray, middle: FloatArray) -> FloatA
     (k, 4, 4) poses as measured, so that noise does not depend on the unknowns.
     """
     rows = adjoint(invert(compose(np.eye(3), middle))) @ rows
-    places = poses[:, :3, :3] @ middle + poses[:, :3, 3]
+    places = apply(poses, middle[None])[:, 0]
     # One at no distance is wrong: it gets a millimetre.
     far = np.maximum(np.linalg.norm(places, axis=1), 1e-3)
     along = places / far[:, None]

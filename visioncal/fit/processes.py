@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from visioncal.core.transforms import adjoint, invert
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray, IntArray, evenly
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.fit.fit import Fit
 from visioncal.fit.mixed import inverse
@@ -123,7 +123,7 @@ def consider(fit: Fit, flange: str) -> Considered | None:
         return None
     stops, levels, p = len(alone.stops), alone.levels, fit.unknowns.count
     poses = fit.cell.arms[flange].poses[alone.stops]
-    some = np.unique(np.linspace(0, stops - 1, min(stops, _MOST)).astype(np.int64))
+    some = evenly(stops, _MOST)
     boards = _held_boards(fit)
     none = (np.log(1 / 4), *_likelihoods(alone, some, 0.0, 1.0, boards))
     found, kinds = [none], list[tuple[Process, float, float]]()

@@ -14,6 +14,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from visioncal.core.transforms import (
+    apply,
+    apply_each,
     compose,
     invert,
     log,
@@ -21,8 +23,9 @@ from visioncal.core.transforms import (
     nearest_rotation,
     rotation_angle,
 )
-from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, evenly
 from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.poses import closed_form_poses
 from visioncal.fit.places import robust_carried
 from visioncal.fit.weights import by_homography, first_weighed
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
@@ -120,7 +123,7 @@ def start_lenses(cell: Cell) -> dict[str, Camera]:
             found[frame] = table.stated
             continue
         seen = [s for s in cell.sightings if s.seer == frame and s.corners is not None]
-        seen = [seen[at] for at in _spread(len(seen), _IMAGES)]
+        seen = [seen[at] for at in evenly(len(seen), _IMAGES)]
         px, points = [], []
         for sighting in seen:
             if (corners := sighting.corners) is not None:
@@ -186,10 +189,6 @@ def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:
     return at(float(np.exp(found.x)))
 
 
-def _spread(count: int, most: int) -> IntArray:
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
-
-
 def candidates(cell: Cell, lenses: Mapping[str, Camera], sighting: Sighting) -> Candidates | None:
     """Both poses of a flat board, in all turns of a symmetric one; None where it has none."""
     if isinstance(sighting.evidence, MeasuredPose):
@@ -199,23 +198,7 @@ def candidates(cell: Cell, lenses: Mapping[str, Camera], sighting: Sighting) -> 
         return Candidates(place[None], np.zeros(1, dtype=np.int64))
     lens, board = lenses[sighting.seer], cell.boards[sighting.seen]
     px, points = sighting.evidence.px, corner_positions(board)[sighting.evidence.ids]
-    plane = normalise(lens, px)
-    good = np.isfinite(plane).all(axis=1)
-    if good.sum() < 4:
-        return None
-    flag = cv2.SOLVEPNP_SQPNP if points[:, 2].any() else cv2.SOLVEPNP_IPPE
-    try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(
-            points[good], plane[good], np.eye(3), np.zeros(0), flags=flag
-        )
-    except cv2.error:
-        return None
-    poses = np.array(
-        [
-            compose(np.asarray(cv2.Rodrigues(turn)[0], float), np.asarray(shift, float).ravel())
-            for turn, shift in zip(turns, shifts, strict=True)
-        ]
-    )
+    poses = closed_form_poses(points, normalise(lens, px))
     off = np.array([_off_px(lens, pose, points, px) for pose in poses])
     if not np.isfinite(off).any():
         return None
@@ -226,7 +209,7 @@ def candidates(cell: Cell, lenses: Mapping[str, Camera], sighting: Sighting) -> 
 
 
 def _off_px(lens: Camera, pose: FloatArray, points: FloatArray, px: FloatArray) -> float:
-    found = project(lens, points @ pose[:3, :3].T + pose[:3, 3])
+    found = project(lens, apply(pose, points))
     return float(np.sqrt(np.nanmean((found - px) ** 2)))
 
 
@@ -419,7 +402,7 @@ def _placed(
     links: Sequence[tuple[str, str]], parts: Sequence[FloatArray], places: FloatArray
 ) -> _Joint | None:
     """What (m, 3) places determine: rotations of frames at their ends are left as they are."""
-    near = np.einsum("mij,mj->mi", invert(parts[0]), np.insert(places, 3, 1.0, axis=1))[:, :3]
+    near = apply_each(invert(parts[0]), places)
     far = parts[-1][:, :3, 3]
     is_point = float(np.ptp(far, axis=0).max()) < _SAME_M
     if len(links) == 1 and is_point:

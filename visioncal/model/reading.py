@@ -6,6 +6,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray
+from visioncal.estimation.poses import FEWEST_CORNERS
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.model.arm import Arm, Moments, even_progress
 from visioncal.model.cell import Cell
@@ -16,9 +17,6 @@ from visioncal.session import Observation, Session, frame_name
 from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.session.frames import CELL
 from visioncal.session.kinds import name_of, stated_instrument
-
-# Corners that determine a board's pose.
-_FEWEST_CORNERS = 4
 
 
 def read_cell(session: Session, corners: Mapping[int, Corners]) -> Cell:
@@ -97,7 +95,7 @@ def _arms(session: Session, rows: list[Observation], stations: Mapping[int, int]
 def _evidence(session: Session, row: Observation, corners: Corners | None) -> Evidence | None:
     """What a row says; None where that is nothing."""
     if corners is not None:
-        return corners if len(corners.ids) >= _FEWEST_CORNERS else None
+        return corners if len(corners.ids) >= FEWEST_CORNERS else None
     measured = row.view.matrix(MEASURED_CAM_POSE)
     if measured is not None:
         return MeasuredPose(measured)

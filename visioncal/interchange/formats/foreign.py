@@ -10,8 +10,7 @@ import numpy as np
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import known_name
-from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress, chosen_rows
-from visioncal.estimation.clock_correlation import evenly
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress, chosen_rows, evenly
 from visioncal.session import ImageStore
 
 # What a source does not say of its poses: `rotation`, `angles` (their order and unit), `unit` and

@@ -27,9 +27,8 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
 from visioncal.core.number_format import ranges
 from visioncal.core.transforms import apply, compose, invert
-from visioncal.core.types import MOUNTS, FloatArray, Progress, Searched
+from visioncal.core.types import MOUNTS, FloatArray, Progress, Searched, evenly
 from visioncal.core.verdict import Finding
-from visioncal.estimation.clock_correlation import evenly
 from visioncal.interchange.formats.assemble import (
     FileImages,
     assemble,
