@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.fit.linearise import Gram
-from visioncal.fit.mixed import Body, Mixed, Part, Term, prior_term, summed
+from visioncal.fit.mixed import Body, Mixed, Part, Term, body_with, prior_term, summed
 from visioncal.fit.unknowns import RATIO_LOG, RATIO_M, State, Unknowns
 from visioncal.model import Cell
 
@@ -59,17 +59,13 @@ def mixed_model(
 def _terms(gram: Gram, bodies: Sequence[Body]) -> list[Term]:
     """The terms of some sightings, by size."""
     f = 6 * len(gram.flanges)
-    at = next((i for i, body in enumerate(bodies) if set(gram.flanges) & set(body.flanges)), -1)
-    found = []
+    at, found = body_with(bodies, gram.flanges), []
     for size, grams, counts in gram.parts:
         full = gram.in_common(grams)
         parts: tuple[Part, ...] = ()
         if f:
             body = bodies[at]
-            units = np.searchsorted(body.stops, gram.stops)
-            own = np.concatenate(
-                [6 * body.flanges.index(name) + np.arange(6) for name in gram.flanges]
-            )
+            units, own = np.searchsorted(body.stops, gram.stops), body.errors_of(gram.flanges)
             errors = np.zeros((len(body.stops), body.width, body.width))
             cross = np.zeros((len(body.stops), body.width, full.shape[2] - f))
             np.add.at(errors, (units[:, None, None], own[:, None], own), full[:, :f, :f])

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.fit.linearise import Gram, predicted
-from visioncal.fit.mixed import Estimate, Mixed
+from visioncal.fit.mixed import Estimate, Mixed, body_with
 from visioncal.fit.unknowns import Key, State, Unknowns
 from visioncal.model import Cell, Moments
 
@@ -99,6 +99,10 @@ class Fit:
         values = np.exp(self.estimate.logs).tolist()
         return {size.name: at for size, at in zip(self.unknowns.sizes, values, strict=True)}
 
+    def flange_sigmas(self, flange: str) -> FloatArray:
+        """(6,) standard deviations of what a flange errs by at one stop [rad, m]."""
+        return np.repeat([self.sizes[f"rad {flange}"], self.sizes[f"m {flange}"]], 3)
+
     @cached_property
     def freedom(self) -> float:
         """Degrees of freedom by which the flanges' noise is known."""
@@ -169,11 +173,9 @@ class Fit:
         columns, jacobian = gram.columns, by_columns[:, :head]
         covariance = np.zeros_like(information)
         if f:
-            at = next(i for i, b in enumerate(self.mixed.bodies) if gram.flanges[0] in b.flanges)
+            at = body_with(self.mixed.bodies, gram.flanges)
             body, solved = self.mixed.bodies[at], self.estimate.bodies[at]
-            units = np.searchsorted(body.stops, gram.stops)
-            places = [6 * body.flanges.index(name) + np.arange(6) for name in gram.flanges]
-            own = np.concatenate(places)
+            units, own = np.searchsorted(body.stops, gram.stops), body.errors_of(gram.flanges)
             columns, by_errors = body.columns, by_errors[:, :head]
             jacobian = by_errors @ solved.response[units[:, None], own]
             jacobian[:, :, np.searchsorted(columns, gram.columns)] += by_columns[:, :head]
@@ -230,12 +232,13 @@ class Fit:
             for at, row in sightings:
                 gram = self.grams[at].take(np.arange(len(self.grams[at].rows)) == row)
                 own = np.searchsorted(columns, gram.columns)
-                sigmas = [self.sizes[f"{u} {name}"] for name in gram.flanges for u in ("rad", "m")]
+                none = np.zeros(0)
+                sigmas = np.concatenate([none, *map(self.flange_sigmas, gram.flanges)])
                 past = [-self.linearised.errors[name][stop] for name in gram.flanges]
                 spread, f = gram.spread(), 6 * len(gram.flanges)
                 by_errors, by_columns = spread[:, :, :f], spread[:, :, f:]
-                local = by_columns @ values[own] + by_errors @ np.concatenate([np.zeros(0), *past])
-                own_noise = by_errors * np.repeat(sigmas, 3) ** 2
+                local = by_columns @ values[own] + by_errors @ np.concatenate([none, *past])
+                own_noise = by_errors * sigmas**2
                 both = np.concatenate(
                     [own_noise, by_columns @ covariance[own[:, None], own]], axis=2
                 )
@@ -285,8 +288,7 @@ class Fit:
             if ("edge", name) in self.unknowns:
                 jacobian[:, :, self.unknowns.columns("edge", name)] += slope
             if name in self.unknowns.erring:
-                sigmas = np.repeat([self.sizes[f"rad {name}"], self.sizes[f"m {name}"]], 3)
-                noise += (slope * sigmas**2) @ np.swapaxes(slope, 1, 2)
+                noise += (slope * self.flange_sigmas(name) ** 2) @ np.swapaxes(slope, 1, 2)
         for effect in self.unknowns.effects:
             if effect.place == "edge" and effect.frame in at.slopes:
                 columns = effect.columns(moments, np.ones(len(moments)))

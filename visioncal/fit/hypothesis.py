@@ -9,7 +9,7 @@ of its own.
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -79,9 +79,7 @@ class Examined:
         fit, every = self.fit, np.ones(len(self.fit.used), bool)
         mixed = mixed_model(fit.cell, fit.unknowns, fit.linearised, fit.grams, every)
         estimate = mixed.at(fit.estimate.logs, is_sloped=False)
-        return Fit(
-            fit.cell, fit.unknowns, fit.linearised, fit.grams, every, mixed, estimate,
-        )  # fmt: skip
+        return replace(fit, used=every, mixed=mixed, estimate=estimate, considered=None, shift=None)
 
     @cached_property
     def all_sound(self) -> float:

@@ -27,6 +27,7 @@ from visioncal.core.transforms import (
 )
 from visioncal.core.types import Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.tree import PathStep
+from visioncal.fit.mixed import weights_at
 from visioncal.fit.unknowns import Key, State, Unknowns
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Moments, Sighting
 from visioncal.model.boards import shape_basis
@@ -69,7 +70,7 @@ class Gram:
 
     def weighted(self, logs: FloatArray) -> FloatArray:
         """(k, d + 1, d + 1) Gram matrices of rows in units of their noise."""
-        weights = np.append(np.exp(-2.0 * logs), 1.0)
+        weights = weights_at(logs)
         return np.asarray(sum(weights[size] * grams for size, grams, _ in self.parts))
 
     def spread(self) -> FloatArray:

@@ -11,7 +11,7 @@ eliminated unit by unit, so that an evaluation is linear in units and sightings.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -55,6 +55,10 @@ class Body:
     def width(self) -> int:
         """The number m of errors of a unit."""
         return 6 * len(self.flanges)
+
+    def errors_of(self, flanges: Sequence[str]) -> IntArray:
+        """(6 f,) places of the errors of f flanges among a unit's."""
+        return np.concatenate([6 * self.flanges.index(name) + np.arange(6) for name in flanges])
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +106,7 @@ class Mixed:
 
     def assembled(self, logs: FloatArray) -> tuple[list[tuple[FloatArray, FloatArray]], FloatArray]:
         """Information: of each body's units (u, m, m) and (u, m, c + 1); common (p + 1, p + 1)."""
-        weights, p = np.append(np.exp(-2.0 * logs), 1.0), self.count
+        weights, p = weights_at(logs), self.count
         common = np.zeros((p + 1, p + 1))
         units = [
             (
@@ -150,7 +154,7 @@ class Mixed:
 
     def _sloped(self, found: Estimate) -> Estimate:
         """An estimate with its gradient and curvature."""
-        weights, p = np.append(np.exp(-2.0 * found.logs), 1.0), self.count
+        weights, p = weights_at(found.logs), self.count
         gradient, diagonal = np.zeros(self.sizes), np.zeros(self.sizes)
         # Gradients of each size's squares by the common unknowns, errors eliminated; and by these.
         pulls = np.zeros((self.sizes, p))
@@ -192,10 +196,7 @@ class Mixed:
         inner += pulls @ found.covariance @ pulls.T
         scale = weights[:-1]
         curvature = np.diag(diagonal) - 4.0 * inner * np.outer(scale, scale)
-        return Estimate(
-            found.logs, found.value, found.values, found.covariance, found.bodies, gradient,
-            curvature,
-        )  # fmt: skip
+        return replace(found, gradient=gradient, curvature=curvature)
 
     def _with_prior(self, found: Estimate) -> Estimate:
         """An estimate with the prior of the ratios."""
@@ -208,9 +209,7 @@ class Mixed:
             gradient[[first, second]] += [-slope, slope]
             both = np.array([first, second])
             curvature[both[:, None], both] += 2.0 / width**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        return Estimate(
-            found.logs, value, found.values, found.covariance, found.bodies, gradient, curvature
-        )
+        return replace(found, value=value, gradient=gradient, curvature=curvature)
 
     def shares(self, found: Estimate) -> list[tuple[int, FloatArray]]:
         """Covariance (p, p) of the common unknowns by each term; all of them sum to the whole.
@@ -218,7 +217,7 @@ class Mixed:
         As far as the term's rows are noise: `C M C` with M the term's information about the common
         unknowns, errors replaced by their response.
         """
-        weights, found_shares = np.append(np.exp(-2.0 * found.logs), 1.0), []
+        weights, found_shares = weights_at(found.logs), []
         for term in self.terms:
             reduced = np.zeros((self.count, self.count))
             t = term.columns
@@ -233,6 +232,16 @@ class Mixed:
             by = found.covariance @ reduced @ found.covariance
             found_shares.append((term.size, weights[term.size] * by))
         return found_shares
+
+
+def weights_at(logs: FloatArray) -> FloatArray:
+    """(t + 1,) inverse variances of rows by their size; of size -1, one: these are whitened."""
+    return np.append(np.exp(-2.0 * logs), 1.0)
+
+
+def body_with(bodies: Sequence[Body], flanges: Sequence[str]) -> int:
+    """Index of the body of some flanges; -1 where they err in none."""
+    return next((at for at, body in enumerate(bodies) if set(flanges) & set(body.flanges)), -1)
 
 
 def inverse(information: FloatArray) -> tuple[FloatArray, float]:

@@ -19,7 +19,7 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, evenly
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.fit.fit import Fit
-from visioncal.fit.mixed import inverse
+from visioncal.fit.mixed import body_with, inverse
 from visioncal.fit.unknowns import Key
 
 # Lengths of processes by posture [rad], with the lever per radian, and by time [stops].
@@ -124,7 +124,7 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     stops, levels, p = len(alone.stops), alone.levels, fit.unknowns.count
     poses = fit.cell.arms[flange].poses[alone.stops]
     some = evenly(stops, _MOST)
-    boards = _held_boards(fit)
+    boards = [(fit.unknowns.slices[key].start, held) for key, held in held_boards(fit).items()]
     none = (np.log(1 / 4), *_likelihoods(alone, some, 0.0, 1.0, boards))
     found, kinds = [none], list[tuple[Process, float, float]]()
     for process in processes(poses, levels):
@@ -189,13 +189,13 @@ def _independent(alone: _Alone, some: IntArray, white: float) -> FloatArray:
 
 def _alone(fit: Fit, flange: str) -> _Alone | None:
     """What each stop alone says; None where too few say anything."""
-    at = next((i for i, body in enumerate(fit.mixed.bodies) if flange in body.flanges), None)
-    if at is None:
+    at = body_with(fit.mixed.bodies, (flange,))
+    if at < 0:
         return None
     body, p = fit.mixed.bodies[at], fit.unknowns.count
-    own = 6 * body.flanges.index(flange) + np.arange(6)
+    own = body.errors_of((flange,))
     others = np.setdiff1d(np.arange(body.width), own)
-    levels = np.repeat([fit.sizes[f"rad {flange}"], fit.sizes[f"m {flange}"]], 3)
+    levels = fit.flange_sigmas(flange)
     units, rest = fit.mixed.assembled(fit.estimate.logs)
     past = fit.linearised.errors[flange][body.stops]
     for other, (errors, cross) in enumerate(units):
@@ -229,13 +229,13 @@ def _alone(fit: Fit, flange: str) -> _Alone | None:
     return _Alone(body.stops[seen], levels, known, rows, rest)
 
 
-def _held_boards(fit: Fit) -> list[tuple[int, float]]:
-    """Columns of the sizes of boards that are held, and the information of each prior."""
-    found = []
+def held_boards(fit: Fit) -> dict[Key, float]:
+    """Boards whose size is held, and the information of its prior."""
+    found = {}
     for member in fit.unknowns.members:
         size = member.priors[0].size if member.key[0] == "shape" else None
         if size is not None and size.high <= size.low:
-            found.append((fit.unknowns.slices[member.key].start, size.low**-2.0))
+            found[member.key] = size.low**-2.0
     return found
 
 
@@ -264,9 +264,3 @@ def _likelihoods(
         prior = sum(-0.5 * np.log(held * _LOOSE**2) for _, held in places)
         values.append(float(value - 0.5 * (total[p, p] - pull @ pull) + prior))
     return values[0], values[1]
-
-
-def boards_of(fit: Fit) -> list[Key]:
-    """Boards whose size is held."""
-    columns = {column for column, _ in _held_boards(fit)}
-    return [key for key, at in fit.unknowns.slices.items() if at.start in columns]

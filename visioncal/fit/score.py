@@ -14,6 +14,7 @@ from visioncal.core.types import FloatArray
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import LENGTHS, Field, field_of_length, orders_of_waves, waves
 from visioncal.fit.linearise import Gram, Pair, corner_rows, of_pose_alone
+from visioncal.fit.mixed import body_with, weights_at
 from visioncal.model.effects import Effect
 
 # Sizes that are tried, over one that the data would just show.
@@ -80,11 +81,10 @@ def score(fit: Fit, added: Sequence[Added], count: int, freedom: float) -> Score
         own += part.own
         np.add.at(with_common, gram.columns, full[:, f:].sum(axis=0))
         if f:
-            at = next(i for i, b in enumerate(fit.mixed.bodies) if gram.flanges[0] in b.flanges)
+            at = body_with(fit.mixed.bodies, gram.flanges)
             body = fit.mixed.bodies[at]
-            places = [6 * body.flanges.index(name) + np.arange(6) for name in gram.flanges]
             units = np.searchsorted(body.stops, gram.stops)
-            np.add.at(with_errors[at], (units[:, None], np.concatenate(places)), full[:, :f])
+            np.add.at(with_errors[at], (units[:, None], body.errors_of(gram.flanges)), full[:, :f])
     pull -= with_common.T @ estimate.values
     reduced = with_common.copy()
     for body, solved, cross in zip(fit.mixed.bodies, estimate.bodies, with_errors, strict=True):
@@ -177,8 +177,7 @@ def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, flo
 
 def _weight(fit: Fit, gram: Gram, part: int = 0) -> float:
     """Inverse variance of the noise of some sightings' rows."""
-    size = gram.parts[part][0]
-    return float(np.exp(-2.0 * fit.estimate.logs[size])) if size >= 0 else 1.0
+    return float(weights_at(fit.estimate.logs)[gram.parts[part][0]])
 
 
 def _used(fit: Fit) -> list[Gram]:

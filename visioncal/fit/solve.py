@@ -10,7 +10,7 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.candidates import opened
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.held import with_held_lenses
-from visioncal.fit.processes import boards_of, consider
+from visioncal.fit.processes import consider, held_boards
 from visioncal.fit.search import Effort, Search, nearest
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import (
@@ -89,11 +89,10 @@ def solve(cell: Cell) -> Solved:
 def with_free_boards(fit: Fit) -> Unknowns:
     """The unknowns of a fit, with the sizes of boards that are held freed."""
     freed = []
-    for key in boards_of(fit):
-        member, board = fit.unknowns[key], fit.cell.boards.get(key[1])
-        has_shape = member.count > 1
+    for key in held_boards(fit):
+        board, has_shape = fit.cell.boards.get(key[1]), fit.unknowns[key].count > 1
         freed.append(printed_board(key[1], board, has_shape=has_shape, is_sized=True))
-    return fit.unknowns.replacing(*freed)
+    return fit.unknowns.with_members(*freed)
 
 
 def effects_of(cell: Cell) -> tuple[Effect, ...]:

@@ -211,16 +211,10 @@ class Unknowns:
         """A lens at a state."""
         return with_intrinsics(self.lenses[frame], state.values["lens", frame])
 
-    def with_members(self, *more: Unknown) -> "Unknowns":
-        """The unknowns with others, which take the place of those of their names."""
-        keys = {member.key for member in more}
-        kept = (member for member in self.members if member.key not in keys)
-        return replace(self, members=(*kept, *more))
-
-    def replacing(self, *others: Unknown) -> "Unknowns":
-        """The unknowns with others in the places of those of their names."""
-        found = {member.key: member for member in others}
-        return replace(self, members=tuple(found.get(m.key, m) for m in self.members))
+    def with_members(self, *others: Unknown) -> "Unknowns":
+        """The unknowns with others: in the places of those of the same key, or at the end."""
+        found = {member.key: member for member in (*self.members, *others)}
+        return replace(self, members=tuple(found.values()))
 
     def closing(self, names: Iterable[str]) -> "Unknowns":
         """The unknowns with some sizes held at their lower bounds."""
