@@ -552,6 +552,20 @@ def test_the_command_prints_the_document_or_writes_it_once(tmp_path):
     assert np.array_equal(readers.plain(out.read_text()), SAMPLE.edges["flange_from_cam"].matrix)
 
 
+def test_the_heading_and_the_doubt_go_along_with_every_format(tmp_path):
+    doubted = replace(SAMPLE, verdict=Verdict.of("check", "View 7 was left out.", "Others agree."))
+    doubted.save(tmp_path / "calibration.json")
+    for name in ANY_EDGE:
+        done = exporting(tmp_path, "--to", name).good()
+        printed = done.out + done.err
+        for words in (SAMPLE.created, "verdict check; sigma", "p_parent = R p_child + t", "lens"):
+            assert printed.count(words) == 1 or words == "lens" in printed, (name, words)
+        assert printed.count("View 7 was left out.") == 1
+        assert "Others agree" not in printed
+        # A controller that knows no comments is sent none.
+        assert off(name, done.out, SAMPLE.edges["flange_from_cam"].matrix) < 1e-9
+
+
 def test_the_command_for_a_body_is_printed_and_runs(tmp_path):
     SAMPLE.save(tmp_path / "calibration.json")
     camera = RigidTransform.from_matrix(SAMPLE.edges["flange_from_cam"].matrix)

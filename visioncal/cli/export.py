@@ -31,6 +31,8 @@ def export_command(options: ExportOptions) -> None:
     bad = check_usable(written.verdict, "what is exported", force=options.force)
     for warning in (*bad, *written.warnings):
         say(warning, "warning: ", "bold red")
+    for note in written.notes:
+        say(f"note: {note}")
     if options.out is None or options.out == Path("-"):
         typer.echo(written.text, nl=False)
         return

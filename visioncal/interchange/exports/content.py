@@ -268,7 +268,12 @@ class Content(Placement):
 
     @property
     def notes(self) -> list[str]:
-        """Comment lines: origin, quality, meaning of the transform, and its conditions."""
+        """Comment lines: its heading, and its conditions."""
+        return [*self.heading, *(f"only where: {condition.words}" for condition in self.conditions)]
+
+    @property
+    def heading(self) -> list[str]:
+        """Origin, quality and meaning of the transform, in lines."""
         sigma = f"sigma {self.edge.sigma_mm:.2g} mm"
         if self.oriented:
             sigma += f" and {self.edge.sigma_deg:.2g} deg"
@@ -279,10 +284,10 @@ class Content(Placement):
         return [
             self.origin,
             f"verdict {self.verdict.status}; {self.verdict.accuracy(sigma)}",
+            *(doubt.words for doubt in self.verdict.findings[: self.verdict.status != "good"]),
             f"{self.name}, the pose of {self.child} in {self.parent}: p_parent = R p_child + t",
             *([self.optical] if self.optical else []),
             *([_OF_LENS] if is_of_lens else []),
-            *(f"only where: {condition.words}" for condition in self.conditions),
         ]
 
 
@@ -315,6 +320,7 @@ class ExportFormat(Format[Content]):
     """A foreign format of a transform or a lens."""
 
     holds: Holds = "any edge"
+    has_comments: bool = True  # Otherwise the heading of what is written is printed beside it.
     # Its names of our frames; a frame that is missing keeps our name.
     frames: Mapping[str, str] = field(default_factory=dict)
     # Builds the document of all transforms of a cell; None where it holds one.

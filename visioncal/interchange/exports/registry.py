@@ -67,6 +67,8 @@ class Document:
     verdict: Verdict  # The worst verdict of what was written.
     # What else its user should know before it is used, each in plain words.
     warnings: tuple[str, ...] = ()
+    # The heading of what was written, in a format without comments.
+    notes: tuple[str, ...] = ()
 
 
 @typed
@@ -120,7 +122,8 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     worst = worst_of(content.verdict for content in contents)
     conditions = (condition.words for content in contents for condition in content.conditions)
     warnings = (words for content in contents for words in form.warn(content))
-    return Document(text, worst, (*dict.fromkeys(conditions), *warnings))
+    notes = () if form.has_comments else tuple(contents[0].heading)
+    return Document(text, worst, (*dict.fromkeys(conditions), *warnings), notes)
 
 
 def _robot_part(

@@ -136,6 +136,7 @@ ROBOTS = (
             form.name,
             f"{form.words} [{form.unit}, {ROTATION_FORMS[form.rotation].words}]",
             partial(_write, form.name, "{pose}"),
+            has_comments=bool(_LANGUAGES.get(form.name, _NUMBERS)[0]),
         )
         for form in POSE_FORMS.values()
         if form.models

@@ -156,7 +156,9 @@ FILES = (
         _write_opencv,
         warn=_warn_of_field,
     ),
-    ExportFormat("zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid),
+    ExportFormat(
+        "zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid, has_comments=False
+    ),
     ExportFormat(
         "text",
         "the 4x4 matrix as text, as numpy.loadtxt reads it [m]",
