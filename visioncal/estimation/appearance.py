@@ -78,6 +78,11 @@ def shape_basis(target: Target) -> FloatArray:
     return np.eye(3 * len(positions), size).reshape(len(positions), 3, size)
 
 
+def shaped_corners(target: Target, shape: FloatArray) -> FloatArray:
+    """(c, 3) corners of a target of a (s,) shape, in its frame, whose z points into it [m]."""
+    return np.asarray(corner_positions(target) + shape_basis(target) @ shape)
+
+
 def boards_basis(targets: Sequence[Target]) -> FloatArray:
     """Derivatives (c, 3, s) of several targets' corners with respect to all of their shapes."""
     parts = [shape_basis(target) for target in targets]

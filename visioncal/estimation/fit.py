@@ -30,7 +30,7 @@ from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.problem_parts import Effect, Noise, Observations, State
-from visioncal.estimation.solve import Solution, covariance_of, held_shift
+from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.estimation.tree import Tree
 from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, Unknown, Unknowns
 
@@ -178,7 +178,7 @@ class Fit:
         """Whether robot and camera have one noise together, that of each sighting."""
         return self.problem.is_combined
 
-    @property
+    @cached_property
     def expected(self) -> FloatArray:
         """(n, 6, 6) covariance of the sightings' residuals by all unknowns and all noise."""
         linear = self.problem.linear(self.state, ideal=True)
@@ -266,8 +266,14 @@ class Fit:
 
     @cached_property
     def shift(self) -> FloatArray:
-        """(p,) shift of the unknowns, to first order, if the held ones were estimated as well."""
-        return held_shift(self.problem, self.solution)
+        """(p,) shift of the unknowns, to first order, if the held ones were estimated as well.
+
+        Its square is the error of holding them, beside their uncertainty, which `by_noise` has.
+        """
+        held = self.problem.counted & ~self.problem.moving
+        if not held.any():
+            return np.zeros(self.problem.size)
+        return np.asarray(-self.by_noise @ np.where(held, self.equations[1], 0.0))
 
     def bias(self, robot: str, errors: ArmErrors) -> FloatArray:
         """(p, q) Jacobian of the estimates by q errors of an arm that the fit takes for noise."""

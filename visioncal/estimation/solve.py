@@ -160,18 +160,6 @@ def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArra
     return covariance_among(normal_equations(problem, state, noise)[0], problem.moving)
 
 
-def held_shift(problem: Problem, solution: Solution) -> FloatArray:
-    """First-order shift (p,) of the unknowns if the held ones were estimated as well.
-
-    Its square is the error of holding them, beside their uncertainty, which the covariance has.
-    """
-    held = problem.counted & ~problem.moving
-    if not held.any():
-        return np.zeros(problem.size)
-    gradient = normal_equations(problem, solution.state, solution.noise)[1]
-    return np.asarray(-covariance_of(problem, solution) @ np.where(held, gradient, 0.0))
-
-
 def covariance_of(problem: Problem, solution: Solution) -> FloatArray:
     """Covariance (p, p) of the unknowns, held ones by their prior, where all chains close."""
     information = fisher_information(problem, solution.state, solution.noise)

@@ -8,11 +8,10 @@ import numpy as np
 
 from visioncal.core.codec import REST, Array, Matrix, Section, Vector
 from visioncal.core.types import FloatArray, Mask, Target
-from visioncal.estimation.appearance import BOARD_NAMES, board_basis
+from visioncal.estimation.appearance import BOARD_NAMES, shaped_corners
 from visioncal.estimation.effects.rolling_shutter import Shutter
 from visioncal.results.arm import ArmSections
 from visioncal.results.edge import Covariance
-from visioncal.vision.targets import corner_positions
 
 _BEND = "bow_"
 # 95 % intervals by name of the noise level.
@@ -88,8 +87,7 @@ class BoardResult(Section):
 
     def corners(self, target: Target) -> FloatArray:
         """(c, 3) corner positions in the target's frame, whose z points into the board [m]."""
-        flat = corner_positions(target)
-        return np.asarray(flat + board_basis(flat) @ self.values)
+        return shaped_corners(target, self.values)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

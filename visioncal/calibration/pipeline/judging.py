@@ -100,7 +100,6 @@ def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
         dict(zip(fit.robots, freedom, strict=True)),
         cell_fit.arms,
         middle_jacobians(fit, run.session),
-        {name: px * fit.lens_levels(name).jitter for name, px in fit.sigmas_px.items()},
         _strays(answer, explained),
     )
 

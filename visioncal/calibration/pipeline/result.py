@@ -22,7 +22,7 @@ from visioncal.calibration.stages.need import need_met
 from visioncal.calibration.stages.random_effects import of_random_effects
 from visioncal.core.transforms import apply, log
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.appearance import BOARD_NAMES, shape_basis
+from visioncal.estimation.appearance import BOARD_NAMES, shaped_corners
 from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.fit import Fit
@@ -56,7 +56,7 @@ from visioncal.robot import Robot
 from visioncal.session import frame_name
 from visioncal.session.frames import CELL, object_name
 from visioncal.vision.camera import project
-from visioncal.vision.targets import corner_positions, first_corners, target_document
+from visioncal.vision.targets import first_corners, target_document
 
 _OF_LENS = "it serves the camera's lens alone (role = intrinsics)"
 _NO_POSE = (
@@ -288,8 +288,7 @@ def _fit_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
     """
     fit, arm, errors = run.assessment.fit, run.robot_arm, run.robot_arm.errors
     columns = _fitted_columns(fit, [arm])
-    by_noise = fit.whole - sum(fit.beside.values(), np.zeros(()))
-    parts = [part[np.ix_(columns, columns)] for part in (fit.whole, by_noise)]
+    parts = [part[np.ix_(columns, columns)] for part in (fit.whole, fit.by_noise)]
     if errors is None or errors.is_estimated:
         return parts[0], parts[1]
     jacobian = fit.bias(arm.robot, errors)[columns]
@@ -413,14 +412,13 @@ def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]
         if frame_name("target", plate) not in fit.problem.tree.branches:
             continue
         if not target.is_rig:
-            corners = corner_positions(target) + shape_basis(target) @ values
             boards[name] = BoardResult(
                 shape=dict(zip(BOARD_NAMES, values.tolist(), strict=True)),
                 sigma={BOARD_NAMES[at]: float(sigmas[at]) for at in free},
                 estimated=tuple(
                     BOARD_NAMES[at] for at in fit.unknowns.values_of(board, moved=True)
                 ),
-                bend_mm=1e3 * float(np.ptp(corners[:, 2])),
+                bend_mm=1e3 * float(np.ptp(shaped_corners(target, values)[:, 2])),
             )
         elif len(free):
             rigs[name] = RigResult(shape=values.reshape(-1, 3), sigma=sigmas.reshape(-1, 3))

@@ -187,8 +187,6 @@ class PickInputs:
     arms: Mapping[str, RobotArm]  # The robots' arms, at the fit's stops.
     # (3, b) Jacobian of each target's middle by the columns of boards, by its frame [m].
     centre_jacobians: Mapping[str, FloatArray]
-    # Relative change of the focal length of each camera from image to image.
-    jitters: Mapping[str, float]
     # (m, 2) turn [rad] and shift [m] of its views that were rejected, by camera; see `Picks`.
     strays: Mapping[str, FloatArray] = field(default_factory=dict)
 
@@ -284,7 +282,9 @@ def _picks(
     if not whole:
         axes = (in_base[:, :3, :3] @ axes[:, :, None])[:, :, 0]
     # A focal length that is longer by a share shows a thing nearer by the same share.
-    focus_m = fitted.jitters.get(camera, 0.0) * in_camera[:, 2, None] * axes
+    noise_px = fit.sigmas_px.get(camera)
+    jitter = 0.0 if noise_px is None else noise_px * fit.lens_levels(camera).jitter
+    focus_m = jitter * in_camera[:, 2, None] * axes
     by_source["look"][:, 3:, 3:] += focus_m[:, :, None] * focus_m[:, None]
     # A carried camera looks from another posture than the robot then has; before one that is fixed
     # the posture is the same, and the noise of a whole chain is already in it.

@@ -16,14 +16,13 @@ from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Target
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
-from visioncal.estimation.appearance import ASPECT, SCALE, SHEAR, shape_basis
+from visioncal.estimation.appearance import ASPECT, SCALE, SHEAR, shaped_corners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import MeasuredScale, measured_scale, scale_by_stated_arms
 from visioncal.estimation.unknowns import BOARD, LENS
 from visioncal.session import Session
 from visioncal.session.frames import frame_name
 from visioncal.vision.boards import kind_of
-from visioncal.vision.targets import corner_positions
 
 # Manufacturing accuracy of rigs, as a share of their size.
 _SAME_SIZE = 5e-4
@@ -154,7 +153,7 @@ def _shape_findings(fitted: Fit, name: str, target: Target, called: str) -> Iter
         return has_changed(fitted, columns[np.isin(values, chosen)])
 
     drawn = np.where(np.arange(len(shape)) == SCALE, shape, 0.0)
-    corners, even = (corner_positions(target) + shape_basis(target) @ at for at in (shape, drawn))
+    corners, even = (shaped_corners(target, at) for at in (shape, drawn))
     off_m = np.linalg.norm(corners - even, axis=1).max()
     bends = np.setdiff1d(np.arange(len(shape)), [SCALE, ASPECT, SHEAR])
     if not has_moved(ASPECT, *bends, SHEAR) or off_m < _LEAST_BEND_M:
