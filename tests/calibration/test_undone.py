@@ -20,6 +20,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
+from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.interchange.formats.rereading import shift_views, turn_boards
 from visioncal.session import Session
@@ -148,7 +149,7 @@ def test_sound_and_otherwise_wrong_sessions_are_not_accused(mount):
         assert likeliest(located(pairs_session(mount, robot, boards))) is None
 
 
-def test_of_long_sessions_every_row_is_told():
+def test_of_long_sessions_every_row_is_named():
     run = located(pairs_session(MOUNTS[0], *shifted(*poses_of(MOUNTS[0], 200), 90, 3)))
     found = likeliest(run)
     assert found.found.kind == "shifted_rows"
@@ -235,6 +236,18 @@ def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind,
     assert causes[0].words.startswith("Robot b, in its rows of cam_left and target_plate_b: ")
     assert {*causes[0].views} <= wrong
     assert len(causes[0].views) >= 0.7 * len(wrong)
+
+
+def test_beside_a_mistake_of_one_robot_another_one_that_is_misread_is_named():
+    session, _ = in_a_cell(0, "shifted_rows")
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    for row in (row for row in cells if row["robot"] == "a"):
+        w_first = [row[name] for name in ("qw", "qx", "qy", "qz")]
+        row.update(zip(("qx", "qy", "qz", "qw"), w_first, strict=True))
+    rows = [[*row.values()] for row in cells]
+    session = session.with_content(document=session.document, cells=rows)
+    with pytest.raises(DegenerateError, match="Robot a: With the robot's rotations as a quat"):
+        visioncal.calibrate(session)
 
 
 @pytest.mark.parametrize("words", ["3", "3-5:0", "3-5:x", "90:2"])

@@ -75,7 +75,8 @@ def _with_cell_undone(run: RunState) -> RunState:
             found = mistake.found
             found = replace(found, words=f"{whose}: {found.words}", do=Remedy(step, CALIBRATE))
             run = undone(run, replace(mistake, found=found))
-    return run
+    # Other robots' poses may be misread beside it.
+    return replace(run, misread=run.misread or None)
 
 
 def misreadings(run: RunState) -> Iterator[Finding]:
