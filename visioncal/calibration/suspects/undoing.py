@@ -187,20 +187,21 @@ def likeliest(run: RunState) -> Undoing | None:
     every = [declared]
     every += filter(None, (_Edges.by(record, pairs[by], fresh) for by in _SHIFTS[1:]))
     best = max(every, key=lambda edges: float(_evidence(edges.of(own)[None])[0][0]))
-    base, agrees = _evidence(best.of(own)[None])
+    apart = best.of(own)
+    (base,), (agrees,) = _evidence(apart[None])
     rivals = [
-        *_copied(record, best, own, agrees[0]),
-        *_flipped(record, best, own, float(base[0])),
-        *_turned(record, best, own, float(base[0])),
-        *_shifted(record, every, pairs, float(base[0])),
+        *_copied(record, apart, own, agrees),
+        *_flipped(record, best, own, apart, float(base)),
+        *_turned(record, best, own, apart, float(base)),
+        *_shifted(record, every, pairs, float(base)),
     ]
     found = max(rivals, key=lambda rival: rival.odds, default=None)
     return found if found is not None and found.odds > CLEAR else None
 
 
-def _copied(record: _Record, edges: _Edges, own: IntArray, agrees: Mask) -> Iterator[Undoing]:
+def _copied(record: _Record, apart: FloatArray, own: IntArray, agrees: Mask) -> Iterator[Undoing]:
     """Poses that are there once more though the camera saw another view."""
-    closes = edges.of(own)[agrees].mean() < CLOSING_SCORE**2
+    closes = apart[agrees].mean() < CLOSING_SCORE**2
     copied = record.copies & ~agrees & (own >= 0)
     if not copied.any() or not closes:
         return
@@ -222,7 +223,9 @@ def _copied(record: _Record, edges: _Edges, own: IntArray, agrees: Mask) -> Iter
     )
 
 
-def _flipped(record: _Record, edges: _Edges, own: IntArray, base: float) -> Iterator[Undoing]:
+def _flipped(
+    record: _Record, edges: _Edges, own: IntArray, apart: FloatArray, base: float
+) -> Iterator[Undoing]:
     """Views of a flat board with the other one of the two poses that its image nearly fits.
 
     The board's normal is reflected about the line of sight (Collins and Bartoli 2014, IPPE).
@@ -232,7 +235,6 @@ def _flipped(record: _Record, edges: _Edges, own: IntArray, base: float) -> Iter
     mirror = np.eye(3) - 2.0 * sight @ np.swapaxes(sight, -1, -2)
     other = compose(mirror @ seen[..., :3, :3] @ np.diag([1.0, 1.0, -1.0]), seen[..., :3, 3])
     mirrored = replace(edges, record=replace(record, camera=other)).of(own)
-    apart = edges.of(own)
     # Views by how much better the other pose is; any number of them is as likely, and any choice.
     there, here = (np.where(own < 0, 1.0, at.sum(axis=1)) for at in (mirrored, apart))
     order = np.argsort((there + _LEAST**2) / (here + _LEAST**2), kind="stable")
@@ -266,10 +268,12 @@ def _flipped(record: _Record, edges: _Edges, own: IntArray, base: float) -> Iter
     )
 
 
-def _turned(record: _Record, edges: _Edges, own: IntArray, base: float) -> Iterator[Undoing]:
+def _turned(
+    record: _Record, edges: _Edges, own: IntArray, apart: FloatArray, base: float
+) -> Iterator[Undoing]:
     """Boards that were read as if they were turned in their plane."""
     known = np.flatnonzero(own >= 0)
-    turned, apart = edges.turned(own), edges.of(own)
+    turned = edges.turned(own)
     for degrees in (180.0, 90.0, 270.0):
         angle = np.deg2rad(degrees)
         turn = exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))[:3, :3]
