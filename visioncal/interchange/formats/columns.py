@@ -111,13 +111,7 @@ def _recordings(
     joint_fields = requested.joints or joint_names(fields, used)
     used.update(map(fields.find, joint_fields))
     if not names["robot"] and not joint_fields:
-        word = named_by(fields.places[0])
-        raise DataError(
-            f"{fields.name}: which of its fields are the robot's poses is not known; it has "
-            f"{fields.listing()}.",
-            culprits=[fields.name],
-            next_step=f"Name them with --robot-{word}, or the joint angles with --joint-{word}.",
-        )
+        raise _unnamed(fields, "robot", ", or the joint angles with --joint-{}")
     poses: dict[Side, PoseNumbers] = {"robot": PoseNumbers.empty(fields.places)}
     unstated: dict[Side, Unstated] = {}
     joints, notes = _joint_angles(fields, joint_fields, requested, bool(names["robot"]))
@@ -159,6 +153,16 @@ def _recordings(
         for words, other in pairing.others
     ]
     return [(0, foreign), *((1, other) for other in others)]
+
+
+def _unnamed(fields: Fields, whose: Side, others: str = "") -> DataError:
+    word = named_by(fields.places[0])
+    return DataError(
+        f"{fields.name}: which of its fields are the {whose}'s poses is not known; it has "
+        f"{fields.listing()}.",
+        culprits=[fields.name],
+        next_step=f"Name them with --{whose}-{word}{others.format(word)}.",
+    )
 
 
 def _pose_fields(fields: Fields, requested: ImportOptions) -> dict[Side, tuple[str, ...]]:
@@ -350,12 +354,7 @@ def _poses(
     candidates = (pose_names(fields, requested.names, name, ()) for name in (whose, "robot"))
     names = next(filter(None, candidates), ())
     if not names:
-        raise DataError(
-            f"{fields.name}: which of its fields are the {whose}'s poses is not known; it has "
-            f"{fields.listing()}.",
-            culprits=[fields.name],
-            next_step=f"Name them with --{whose}-{named_by(fields.places[0])}.",
-        )
+        raise _unnamed(fields, whose)
     poses, notes, _ = poses_from(fields, names, requested, whose)
     return poses, names, notes
 

@@ -222,7 +222,7 @@ def head(path: Path) -> str:
     """The beginning of a text file; empty where it is not text."""
     try:
         # Files of a kernel have no size, and some never answer.
-        if not path.stat().st_size:
+        if is_image_name(path.name) or not path.stat().st_size:
             return ""
         with path.open("rb") as file:
             # Length that suffices to recognise a text file.
@@ -266,8 +266,8 @@ def images_named(
     source; among `asked`, if given, they are matched by their names, else by the numbers in these.
     Raises DataError.
     """
-    files = [file for group in found if asked is None for file in group.files]
-    files += [file for group in asked or () for file in group.files]
+    files = [file for group in (found if asked is None else asked) for file in group.files]
+    folders = {"", *(file.parent.name for file in files)}
     by_name = {
         (folder, word): file
         for file in files
@@ -283,8 +283,8 @@ def images_named(
         path: Path | None = None
         if name:
             *_, folder, plain = ("", *name.replace("\\", "/").split("/"))
-            folder = folder if any(folder == known for known, _ in by_name) else ""
-            known = by_name.get((folder, plain)) or by_number.get(number_in(plain))
+            known = by_name.get((folder if folder in folders else "", plain))
+            known = known or by_number.get(number_in(plain))
             is_elsewhere = asked is not None or not is_inside(base / name, base)
             path = known if is_elsewhere else None
             path = path or path_inside(base, name if asked is None else plain)

@@ -388,7 +388,6 @@ def poses_from(
         positions, rotations = split_matrices(np.hstack(blocks))
         rotation = "matrix"
         requested = _by_rows(requested, sum(sizes))
-        unit = requested.unit
     else:
         positions, rotations, of_rotation = _split(fields, names, blocks, whose)
         rotation, doubt = _likely_rotation(

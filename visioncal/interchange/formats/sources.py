@@ -227,11 +227,7 @@ def _has(fields: Fields, given: Sequence[str]) -> bool:
 def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = ()) -> DataError:
     """What is said of a source whose poses are not known, with a command that takes it."""
     possible = [(fields, item) for fields in rows for item in possible_poses(fields)]
-    possible.sort(
-        key=lambda both: (
-            [["robot"], []].index(both[1].sides) if both[1].sides in (["robot"], []) else 2
-        )
-    )
+    possible.sort(key=lambda both: (both[1].sides != ["robot"], bool(both[1].sides)))
     step, options = "", list[str]()
     if possible:
         fields, robot = possible[0]

@@ -1,7 +1,6 @@
 """Folders with one file a view: ViSP's YAML with a camera XML, Zivid's with matrices [mm]."""
 
 import re
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,8 @@ from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.values import as_numbers, mapping, read_plain_text
 from visioncal.core.types import MOUNTS
 from visioncal.interchange.formats.columns import VIEWS, foreign_from
-from visioncal.interchange.formats.fields import Fields, fields_of_records, number_in
-from visioncal.interchange.formats.file_search import (
-    files_in,
-    head,
-    images_of,
-)
+from visioncal.interchange.formats.fields import fields_of_records, number_in
+from visioncal.interchange.formats.file_search import files_in, head, images_of
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
     ForeignRecording,
@@ -34,12 +29,6 @@ _ZIVID_NAME = re.compile(r"(pos|pose|robot_pose)_?[0-9]+\.ya?ml", re.IGNORECASE)
 def _named(path: Path, name: re.Pattern[str]) -> tuple[Path, ...]:
     """Files of a folder whose names match; none of another path."""
     return tuple(file for file in files_in(path) if name.fullmatch(file.name))
-
-
-def _fields(path: Path, files: Sequence[Path], records: Sequence[Mapping[str, object]]) -> Fields:
-    """The fields of a folder with one file a view."""
-    views = tuple(number_in(file.name) or 0 for file in files)
-    return fields_of_records(records, [at.name for at in files], path.resolve().name, path, views)
 
 
 def _is_zivid(path: Path) -> bool:
@@ -68,7 +57,8 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         }
         for file in files
     ]
-    fields = _fields(path, files, records)
+    places, views = zip(*((file.name, number_in(file.name) or 0) for file in files), strict=True)
+    fields = fields_of_records(records, places, path.resolve().name, path, views)
     robot, camera = (
         PoseImportOptions((name,), "rotation-vector", "m") for name in ("robot", "camera")
     )
