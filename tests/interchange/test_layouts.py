@@ -20,7 +20,7 @@ from visioncal.core.documents import tables
 from visioncal.interchange.formats import file_search, reading, rereading
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.registry import read_foreign
-from visioncal.interchange.formats.sources import look
+from visioncal.interchange.formats.sources import describe
 from visioncal.session import Session
 from visioncal.vision.boards.charuco import charuco_board
 from visioncal.vision.targets import target_document
@@ -635,7 +635,7 @@ def test_an_unknown_folder_is_described_with_the_command_that_takes_it(tmp_path,
         write(tmp_path / f"in/{at}.json", {"alpha": pose.tolist(), "beta": (pose @ tool).tolist()})
     shoot(tmp_path / "in", "{}.png")
     said = ("--target", sample.document["target"], "--mount", "eye-in-hand")
-    words = look(tmp_path / "in").words()
+    words = describe(tmp_path / "in").words()
     assert "#.png (9 files): images, 640 x 400, 8-bit grey" in words
     assert "alpha: 4 x 4, " in words
     assert words.count("looks like a pose") == 2

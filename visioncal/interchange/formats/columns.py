@@ -46,7 +46,7 @@ from visioncal.interchange.formats.poses import (
     without_unit,
 )
 from visioncal.interchange.formats.reading import read_fields
-from visioncal.interchange.formats.sources import look, proposed, unknown
+from visioncal.interchange.formats.sources import describe, proposed, unknown
 from visioncal.session.columns import INSTRUMENT_POSITION
 
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
@@ -57,7 +57,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     if requested.camera_file is not None:
         fields = read_fields(path, requested.robot.form)
         return with_camera_file(fields, read_fields(requested.camera_file), requested)
-    source = look(path, requested.robot.form)
+    source = describe(path, requested.robot.form)
     if path.is_file() and source.parts[0].fault:
         raise source.parts[0].fault
     is_beside = path.is_file() and requested.target and not requested.images
@@ -254,14 +254,14 @@ def _images(
 
 
 def _with_folders(fields: Fields, name: str, groups: Sequence[FileGroup]) -> tuple[str, ...]:
-    """Names of images, those of the same name with the folder that another column says."""
+    """Names of images, those of the same name with the folder that another column names."""
     cells = fields.texts[name]
     filled = [cell for cell in cells if cell]
     if len({*filled}) == len(filled):
         return cells
     folders = {file.parent.name for group in groups for file in group.files}
-    said = next((each for each in fields.texts.values() if {*each} <= folders), None)
-    return tuple(map("{}/{}".format, said, cells)) if said else cells
+    named = next((each for each in fields.texts.values() if {*each} <= folders), None)
+    return tuple(map("{}/{}".format, named, cells)) if named else cells
 
 
 def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[str]) -> str:

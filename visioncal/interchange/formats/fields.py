@@ -143,7 +143,7 @@ def fields_of_records(
         values = [record.get(key) for record in records]
         arrays = sum(isinstance(value, np.ndarray) and value.ndim > 0 for value in values)
         if 2 * arrays > len(values):
-            # A word where others have numbers says that there were none.
+            # A word where others have numbers marks their absence.
             values = [None if isinstance(value, str) else value for value in values]
         values = arrays_in_texts(values)
         if any(isinstance(value, str) for value in values):
@@ -202,7 +202,7 @@ def separate(text: str) -> Iterator[float]:
 
 
 def appearance(numbers: FloatArray) -> str:
-    """What (n, ...) numbers look like: a `pose`, a `rotation`, a `quaternion`; else empty."""
+    """Whether (n, ...) numbers are those of a `pose`, `rotation` or `quaternion`; else empty."""
     flat = numbers.reshape(len(numbers), -1)
     flat = flat[np.isfinite(flat).all(axis=1)]
     size, matrix = flat.shape[1], ROTATION_FORMS["matrix"]
@@ -229,7 +229,7 @@ def position_first(flat: FloatArray) -> FloatArray:
 
 
 def holds_pose(fields: Fields) -> bool:
-    """Whether numbers of a row look like a pose or a rotation, whatever they are called."""
+    """Whether numbers of a row are those of a pose or a rotation, whatever their names."""
     return any(appearance(numbers) for numbers in fields.numbers.values())
 
 
@@ -361,10 +361,11 @@ def matched(first: Keys, second: Keys) -> Match | None:
     for how in HOW[:3]:
         best: tuple[tuple[int, bool, bool], IntArray] = ((1, False, False), np.zeros(0, int))
         for (a, keys), (b, their) in product(first.found[how].items(), second.found[how].items()):
-            rows, is_equal = _nearest(keys, their) if how == HOW[2] else _equal(keys, their)
+            is_time = how == HOW[2]
+            rows, is_equal = (_nearest(keys, their), True) if is_time else _equal(keys, their)
             common, is_same = int((rows >= 0).sum()), a == b
             # Columns of different names have some numbers in common by chance.
-            is_sure = is_same or how == HOW[2] or any(len(str(key)) > 4 for key in their)
+            is_sure = is_same or is_time or any(len(str(key)) > 4 for key in their)
             fits = common == fewest or (2 * common > fewest and is_sure)
             if fits and (common, is_equal, is_same) > best[0]:
                 best = (common, is_equal, is_same), rows
@@ -390,18 +391,18 @@ def _equal(keys: Sequence[object], their: Sequence[object]) -> tuple[IntArray, b
     return np.array([place.get(key, -1) for key in keys]), True
 
 
-def _nearest(first_s: Sequence[object], second_s: Sequence[object]) -> tuple[IntArray, bool]:
+def _nearest(first_s: Sequence[object], second_s: Sequence[object]) -> IntArray:
     """(n,) the other's row of the nearest time, but for a constant offset; -1 for none."""
     mine_s, their_s = np.array(first_s, dtype=float), np.array(second_s, dtype=float)
     best = np.full(len(mine_s), -1)
     if len(mine_s) > len(their_s):
-        back, _ = _nearest(second_s, first_s)
+        back = _nearest(second_s, first_s)
         best[back[back >= 0]] = np.flatnonzero(back >= 0)
-        return best, True
+        return best
     own, order = mine_s[np.isfinite(mine_s)], np.argsort(their_s)
     ends = their_s[order][np.isfinite(their_s[order])]
     if len(own) < 3 or len(ends) < 3:
-        return best, True
+        return best
     # A fifth of the usual step is no other row's.
     within, most = 0.2 * float(np.median(np.diff(np.sort(own)))), 0
     offsets = np.concatenate([[0.0], (ends[:200, None] - own[:2]).ravel()])
@@ -411,7 +412,7 @@ def _nearest(first_s: Sequence[object], second_s: Sequence[object]) -> tuple[Int
         near = np.abs(ends[at] - mine_s - offset) <= within
         if (count := len({*at[near]})) > most and count == near.sum():
             best, most = np.where(near, order[at], -1), count
-    return best, True
+    return best
 
 
 def joined(
@@ -430,7 +431,7 @@ def joined(
         for cluster in clusters:
             main = cluster[0][0]
             match = matched(main.keys, part.keys) if main.form == part.form else None
-            # What names pictures may do so for several.
+            # Rows that name images may do so for several others.
             if match is not None and (is_alone or match.how != HOW[-1]):
                 cluster.append((part, match.rows))
                 is_alone = False

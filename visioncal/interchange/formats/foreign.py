@@ -131,7 +131,7 @@ class ForeignRecording:
     unstated: Mapping[Side, Unstated] = field(default_factory=dict)
     # The same source otherwise read, the likeliest first; each with how unlikely it is beside this.
     rivals: tuple[tuple[int, "ForeignRecording"], ...] = ()
-    doubt: DataError | None = None  # What is said where nothing decides between these.
+    doubt: DataError | None = None  # The error where nothing decides between these.
 
 
 def frames_to_take(

@@ -71,7 +71,7 @@ _ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "ini
 _MOST_COLUMNS = 40
 # Columns that count or time rows.
 _COUNTED = {"view", "index", "id", "nr", "no", "t", "time", "timestamp", "stamp", "stamp_s"}
-# Names of the numbers of a position and of a rotation, the rotations that tell most first.
+# Names of the numbers of a position and of a rotation, the the least ambiguous rotations first.
 _POSITION_NAMES = tuple(tuple(names.split()) for names in ("x y z", "tx ty tz", "px py pz"))
 _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
     ("qx", "qy", "qz", "qw"),
@@ -98,7 +98,7 @@ class PoseFields:
 
     names: tuple[str, ...]
     words: tuple[str, ...]  # What the names say beside `position` and the like.
-    is_named: bool = True  # Whether the names say that it is a pose.
+    is_named: bool = True  # Whether the names are those of a pose.
 
     @property
     def sides(self) -> list[str]:
@@ -121,9 +121,9 @@ class PoseFields:
 def possible_poses(
     fields: Fields, taken: Collection[str] = (), *, by_shape: bool = True
 ) -> list[PoseFields]:
-    """All fields that may hold poses, by what they are called and what the numbers look like.
+    """All fields that may hold poses, by their names and by the properties of their numbers.
 
-    Those whose names say it come first; `by_shape` is whether others are taken at all.
+    Those named as poses come first; `by_shape` is whether others are taken at all.
     """
     found: list[PoseFields] = []
     places: list[_Piece] = []
@@ -133,9 +133,9 @@ def possible_poses(
         is_turn = piece.size == 3 and bool(_ROTATION_WORDS & words)
         named = _POSE_WORDS | _CHILD_FIRST | _FRAMES["robot"][1]
         is_named = bool(words & named) and not _NO_POSE.search(name)
-        if is_turn or piece.look in ("rotation", "quaternion"):
+        if is_turn or piece.appearance in ("rotation", "quaternion"):
             turns.append(piece)
-        elif piece.look == "pose" or (piece.size in (6, 7, 12, 16) and is_named):
+        elif piece.appearance == "pose" or (piece.size in (6, 7, 12, 16) and is_named):
             found.append(PoseFields(piece.names, piece.words))
         elif piece.size == 6 and not _NO_POSE.search(name):
             found.append(PoseFields(piece.names, piece.words, is_named=False))
@@ -149,12 +149,15 @@ def possible_poses(
         alike = alike or [turn for turn in turns if turn.parent == place.parent]
         if alike:
             turn = max(alike, key=lambda turn: turn.size)
-            said = place.rest if is_named else (*place.words, *turn.words)
-            found.append(PoseFields((*place.names, *turn.names), said, is_named))
+            others = place.rest if is_named else (*place.words, *turn.words)
+            found.append(PoseFields((*place.names, *turn.names), others, is_named))
     known = {name for item in found if item.is_named for name in item.names}
     found += _without_names(fields, {*taken, *known}, places)
-    complete = {item.names: item for item in reversed(found) if item.is_named or by_shape}
-    return sorted(complete.values(), key=lambda item: (not item.is_named, found.index(item)))
+    complete = dict[tuple[str, ...], PoseFields]()
+    for item in found:
+        if item.is_named or by_shape:
+            complete.setdefault(item.names, item)
+    return sorted(complete.values(), key=lambda item: not item.is_named)
 
 
 def _without_names(
@@ -217,7 +220,7 @@ class _Piece:
     names: tuple[str, ...]
     words: tuple[str, ...]
     size: int  # Number of values.
-    look: str  # What these look like.
+    appearance: str  # What these are, as far as they show it.
 
     @property
     def rest(self) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ from visioncal.interchange.formats.rereading import (
     shift_views,
     turn_boards,
 )
-from visioncal.interchange.formats.sources import look, unknown
+from visioncal.interchange.formats.sources import describe, unknown
 from visioncal.interchange.formats.views import VISP, ZIVID
 from visioncal.session import Session
 from visioncal.session.selecting import check_one_of_each
@@ -216,4 +216,4 @@ def _foreign_format(source: Path, form: str | None, requested: ImportOptions) ->
     for candidate in FOREIGN_FORMATS:
         if form in (None, candidate.name) and candidate.recognises(source):
             return candidate
-    raise unknown(look(source), requested)
+    raise unknown(describe(source), requested)

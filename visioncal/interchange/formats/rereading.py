@@ -100,7 +100,7 @@ def _measured(session: Session, progress: Progress | None) -> RunState:
     return run_stages(RunState(session, progress), [each for each in STAGES if each.name in names])
 
 
-# Rows by which readings are tested, evenly spread: few first, more where these cannot tell. Every
+# Rows by which readings are tested, evenly spread: few first, more where these do not decide. Every
 # third of the more is one of the few, whose images are searched once.
 _TESTED = (12, 34)
 
@@ -135,8 +135,8 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
             break
         searches |= seen.searches
         for tried in (readings, other_orders):
-            found, said = _tested(tried, seen)
-            why = said if tried is readings else why
+            found, fault = _tested(tried, seen)
+            why = fault if tried is readings else why
             if found is not None:
                 return found
     return _untested(foreign, why, other)
@@ -269,7 +269,7 @@ class _Seen:
 def _applied(
     foreign: ForeignRecording, guess: Guess, *, is_measured: bool
 ) -> ForeignRecording | None:
-    """The recording as its best reading has it; None where that changes more than is not said."""
+    """The recording as its best reading has it; None where that changes what is stated."""
     best, declared = guess.best.hypothesis, guess.declared.hypothesis
     numbers = {"robot": foreign.robot, "camera": foreign.camera}
     fits = (best.mount, best.order) == (declared.mount, declared.order)
@@ -283,7 +283,7 @@ def _applied(
         }
         changed |= {"rotation"} if found.rotation != stated.rotation else set()
         may = free | ({"rotation"} if "angles" in free else set())
-        # Nine numbers do not say whether they are by rows.
+        # Nine numbers do not show whether they are by rows.
         by_columns = found.transposed and found.rotation == "matrix" and "inverse" in free
         fits &= (found.reading is not None or by_columns) and not found.mirrored and changed <= may
         old = numbers[whose]

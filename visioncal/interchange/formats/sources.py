@@ -1,6 +1,6 @@
 """What an unknown source holds: files by kind, rows of named values, images and lenses.
 
-`look` describes a source and `rows_in` proposes which of its rows are a recording's.
+`describe` reads a source, and `proposed` ranks which of its rows may be a recording's.
 """
 
 import re
@@ -127,7 +127,7 @@ def _sized(numbers: FloatArray) -> str:
     return {3: "a position or three angles", 6: "a pose, or six joints"}.get(size, "")
 
 
-def look(path: Path, form: str | None = None) -> Source:
+def describe(path: Path, form: str | None = None) -> Source:
     """Describes a file or a folder, and those in it; `form` is that of a pendant's lines.
 
     Reads all of what may hold numbers, and the first image of each kind.
@@ -191,16 +191,16 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
         camera = () if is_given else pose_names(fields, requested.camera.names, "camera", joints)
         others = (*joints, *camera) if requested.camera.names else joints
         groups = [] if is_given else ranked_poses(fields, "robot", others)
-        said = pose_names(fields, (), "robot", others) if is_seen or not joints else ()
-        if is_given or said or (joints and (is_seen or not groups)):
-            found.append((later + len(groups) * (not said), fields, asked))
+        named = pose_names(fields, (), "robot", others) if is_seen or not joints else ()
+        if is_given or named or (joints and (is_seen or not groups)):
+            found.append((later + len(groups) * (not named), fields, asked))
         for rank, item in ((rank, item) for rank, group in enumerate(groups) for item in group):
             # Beside joint angles the pose is what was seen.
             if joints and not is_seen and item.sides != ["robot"]:
                 of_item = replace(asked, camera=replace(requested.camera, names=item.names))
             else:
                 of_item = replace(asked, robot=replace(requested.robot, names=item.names))
-            if item.names != said:
+            if item.names != named:
                 found.append((later + rank, fields, of_item))
     faults = [part.fault for part in source.parts if part.fault and not part.lenses]
     if not rows and len(faults) == 1:
@@ -225,7 +225,7 @@ def _has(fields: Fields, given: Sequence[str]) -> bool:
 
 
 def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = ()) -> DataError:
-    """What is said of a source whose poses are not known, with a command that takes it."""
+    """The error of a source whose poses are not known, with a command that reads it."""
     possible = [(fields, item) for fields in rows for item in possible_poses(fields)]
     possible.sort(key=lambda both: (both[1].sides != ["robot"], bool(both[1].sides)))
     step, options = "", list[str]()
