@@ -105,6 +105,8 @@ def test_a_mistake_is_named_and_its_command_mends_it(tmp_path, monkeypatch, kind
     assert cause.kind == kind
     assert words in cause.words
     assert [*cause.views] == views
+    checked = visioncal.doctor(session).findings[0]
+    assert (checked.words, checked.views) == (cause.words, cause.views)
     # The others alone give the result.
     assert not {view.view for view in found.views if view.used} & {*views}
     for name, edge in sound.edges.items():
@@ -229,6 +231,8 @@ def in_a_cell(seed, kind):
 def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind, seed):
     session, wrong = in_a_cell(seed, kind)
     causes = visioncal.calibrate(session).verdict.causes
+    checked = [finding.kind for finding in visioncal.doctor(session).findings]
+    assert checked == ([] if kind == "nothing" else [kind])
     if kind == "nothing":
         assert not {cause.kind for cause in causes} & {*UNDONE, "exchanged_views"}
         return

@@ -17,7 +17,7 @@ from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.stages.other_board import OtherBoardError
-from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards
+from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards, with_undone
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
@@ -68,6 +68,7 @@ def doctor(session: Session | Path | str, *, progress: Progress | None = None) -
     run = initial_state(session, progress=progress)
     with one_blas_thread():
         run, error = _run_stages(run)
+        run = with_undone(run) if error is None else run
         findings = [*_findings(run, error)]
     if not isinstance(session, Session):
         for at, finding in enumerate(findings):
@@ -110,7 +111,9 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
     cause = error.finding if isinstance(error, OtherBoardError) else None
     if cause is None and (error is not None or run.reasons):
         cause = unseen_cause(run)
-    read = [] if error is not None else [*misreadings(run)]
+    read = [*(run.misread or ())]
+    if error is None and run.misread is None:
+        read += misreadings(run)
     hint = " ".join(finding.words for finding in read)
     if error is None and not read:
         read += turned_boards(run)

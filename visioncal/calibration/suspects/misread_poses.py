@@ -56,14 +56,19 @@ def with_misreading(run: RunState) -> RunState:
 
 def with_open_chains(run: RunState) -> RunState:
     """Looks for misread poses before the fit where chains do not close; notes turned boards."""
-    run = undone(run, likeliest(run)) if run.mount is not None else _with_cell_undone(run)
+    run = with_undone(run)
     if run.mount is None or not closes(run.base_from_flange, run.poses_of_one_board, run.mount):
         run = with_misreading(run)
     return run if run.misread else run.noting((), turned_boards(run))
 
 
-def _with_cell_undone(run: RunState) -> RunState:
-    """As `undone` for each robot of a whole cell with one camera and one target alone."""
+def with_undone(run: RunState) -> RunState:
+    """Leaves out the views that mistakes of the record explain, and names these.
+
+    Of a whole cell, each robot is tested with one camera and one target alone.
+    """
+    if run.mount is not None:
+        return undone(run, likeliest(run))
     for robot in run.session.robots:
         for pair in pairs_of(run, robot):
             mistake = likeliest(_of_pair(run, robot, pair))
