@@ -215,6 +215,7 @@ MISSING = {
     "fixture cell/points.csv": "tool that touched the points is not said, nor which points they",
     "record -o new": "--target, --arm and --camera are missing",
     "record -o new --arm manual": "--target and --camera are missing",
+    "record -o new --camera folder:x": "Name them, as --target charuco_9x6_30mm --arm manual; ",
 }
 
 

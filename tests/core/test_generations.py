@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +20,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import (
     check_free,
     decode_text,
+    find_described,
     parse_toml,
     read_bytes,
     read_text_inside,
@@ -31,6 +33,7 @@ from visioncal.present.report import page
 from visioncal.results import Calibration
 from visioncal.simulation import CellOptions, simulate, write_session
 
+MOUNT = {"mount": "eye-in-hand"}
 posix = pytest.mark.skipif(sys.platform == "win32", reason="links and locks are POSIX's")
 
 
@@ -230,6 +233,33 @@ def test_text_may_have_a_byte_order_mark_but_must_be_utf8():
 def test_toml_errors_give_the_line():
     with pytest.raises(DataError, match=r"x\.toml is not valid TOML: .*line 2"):
         parse_toml("a = 1\nb = [1,, 2]", "x.toml")
+
+
+@pytest.mark.parametrize(
+    ("line", "meant"),
+    [
+        ("square_m = 0,03", {"square_m": 0.03}),
+        (r'target = "C:\users\b.toml"', {"target": "C:/users/b.toml"}),
+        ("mount = \N{LEFT DOUBLE QUOTATION MARK}eye-in-hand\N{RIGHT DOUBLE QUOTATION MARK}", MOUNT),
+        ("mount = eye-in-hand", MOUNT),
+        ("asymmetric = True", {"asymmetric": True}),
+        ("b = [1,, 2]", None),
+        ('b = "it', None),
+    ],
+)
+def test_the_line_that_is_meant_is_said_where_it_is_clear(line, meant):
+    caught = raised(DataError, "is not valid TOML", parse_toml, f"a = 1\n{line}\n", "x.toml")
+    said = re.search(r"^Correct line 2 to `(.*?)`\. ", caught.next_step)
+    assert (parse_toml(said[1], "x.toml") if said else None) == meant
+
+
+def test_a_backslash_that_became_another_character_is_named(tmp_path):
+    folder = tmp_path / "cell"
+    sound = {"what": "target", "shipped": {}, "suffixes": (".toml",), "folder": folder}
+    name = parse_toml(r'target = "boards\new.toml"', "x.toml")["target"]
+    caught = raised(DataError, r"boards\\new.toml' does not exist", find_described, name, **sound)
+    assert "with /" in caught.next_step
+    assert all(culprit.isprintable() for culprit in caught.culprits)
 
 
 def test_a_link_that_leads_nowhere_is_not_replaced_unasked(tmp_path):

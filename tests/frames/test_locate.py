@@ -570,6 +570,7 @@ def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(located, ra
 def test_targets_are_printed_and_gaps_join_the_result(proved):
     folder, look, _ = proved
     out = folder / "out"
+    visioncal("touch-test", look, "-c", out, *GAUGE[2:]).refused("Say --tool none, too")
     done = visioncal("touch-test", look, "-c", out, *GAUGE).good()
     assert done.out.count("hover:") == done.out.count("touch:") == 5
     targets = json.loads(visioncal("touch-test", look, "-c", out, *GAUGE, "--json").out)["points"]

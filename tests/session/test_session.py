@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 
 import numpy as np
@@ -435,6 +436,11 @@ def test_what_is_no_session_is_refused(tmp_path):
     for name in ("notes.txt", "calibration.json", "recording.rrd"):
         (tmp_path / name).write_text("{}", encoding="utf-8")
     raised(DataError, "notes.txt.session.toml does not exist", Session.load, tmp_path / "notes.txt")
+    (pictures := tmp_path / "two words").mkdir()
+    caught = raised(DataError, "two words.session.toml does not exist", Session.load, pictures)
+    words = shlex.split(caught.next_step.partition("Run: visioncal ")[2])
+    assert words[:3] == ["convert", str(pictures), f"{pictures}-session"]
+    assert words[-2:] == ["doctor", words[2]]
     for path in (tmp_path, tmp_path / "calibration.json"):
         caught = raised(DataError, "but a result", Session.load, path)
         assert f"name {tmp_path / 'recording.rrd'}" in caught.next_step

@@ -55,11 +55,12 @@ def record_command(options: RecordOptions) -> None:
             "and --target.",
         )
     if missing:
+        examples = {"--target": "charuco_9x6_30mm", "--arm": "manual", "--camera": "uvc:0"}
         raise DataError(
             f"record: {listed(missing)} {'is' if len(missing) == 1 else 'are'} missing.",
             culprits=missing,
-            next_step="Name them, as --target charuco_9x6_30mm --arm manual --camera uvc:0; --page "
-            "asks for them.",
+            next_step="Name them, as "
+            f"{' '.join(f'{name} {examples[name]}' for name in missing)}; --page asks for them.",
         )
     recorded = recorded_cell(plan, options)
     if not drives:

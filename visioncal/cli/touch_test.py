@@ -47,7 +47,8 @@ def touch_test_command(options: TouchTestOptions) -> None:
         )
     touching = _touching(result, calibration, options.tool)
     misplaced_mm = None if options.tool == "none" else options.clearance_mm
-    refuse_given({"--clearance-mm": misplaced_mm}, "it is for --tool none")
+    step = "Leave it out." if options.tool else "Say --tool none, too, or leave it out."
+    refuse_given({"--clearance-mm": misplaced_mm}, "it is for --tool none", step)
     with shown_progress(quiet=options.as_json):
         clearance_m = None if options.clearance_mm is None else 1e-3 * options.clearance_mm
         located = touch_targets(loaded, result, touching, clearance_m)

@@ -120,6 +120,15 @@ UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 MAX_VALUES = 1_000_000
 # Matrices in lists in tables need six.
 MAX_DEPTH = 40
+# What people write of TOML's text and numbers, and what is meant.
+_TOML_MISTAKES = (
+    (r"\\", "/"),
+    (r"(?<=\d),(?=\d)", "."),
+    ("[\u201c-\u201f]", '"'),
+    (r"\bTrue\b", "true"),
+    (r"\bFalse\b", "false"),
+    (r"=\s*([^\W\d][^\"'#=]*?)\s*$", r'= "\1"'),
+)
 _DEEP_KEY = re.compile(
     r"""(?<![\w-])(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
     rf"""(?:[ \t]*+\.[ \t]*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')){{{MAX_DEPTH + 1}}}"""
@@ -244,8 +253,9 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
         raise DataError(
             f"{label} is not valid TOML: {error}.",
             culprits=[label],
-            next_step='Text is written in "double quotes", paths with /, lists in [brackets, like, '
-            "this]; tables and keys are there once.",
+            next_step=f'{_mended_line(text, str(error))}Text is written in "double quotes", paths '
+            "with /, numbers with a point, lists in [brackets, like, this]; tables and keys are "
+            "there once.",
         ) from error
     except RecursionError as error:
         raise too_deep(label) from error
@@ -254,6 +264,18 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
         raise DataError(f"{label} is not valid TOML: {error}.", culprits=[label]) from error
     check_values(document, label)
     return document
+
+
+def _mended_line(text: str, error: str) -> str:
+    """Which line of a TOML file is to be written otherwise, as a sentence; empty where unknown."""
+    found = re.search(r"\(at line (\d+)", error)
+    line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
+    for pattern, right in _TOML_MISTAKES:
+        mended = re.sub(pattern, right, line)
+        with suppress(tomllib.TOMLDecodeError):
+            if found and mended != line and tomllib.loads(mended):
+                return f"Correct line {found[1]} to `{one_line(mended)}`. "
+    return ""
 
 
 def check_values(document: object, label: str, largest: float | None = None) -> None:
@@ -330,12 +352,16 @@ def find_described(
         path = path if folder is None else folder / path
         if path.is_file():
             return path
+        named = str(path) if name_or_path.isprintable() else repr(str(path))
         raise DataError(
-            f"The {what} file {path} {absence(path)}.",
-            culprits=[str(path)],
+            f"The {what} file {named} {absence(path)}.",
+            culprits=[named],
             next_step="Check the path and its spelling."
             if folder is None
-            else "Its path is relative to the file that names it.",
+            else "Its path is relative to the file that names it."
+            if named == str(path)
+            else "Write the path with / in the file that names it: there, a backslash and a letter "
+            "stand for another character.",
         )
     if name_or_path in shipped:
         return shipped[name_or_path]

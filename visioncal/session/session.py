@@ -128,9 +128,18 @@ class Session:
                 beside = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
                 found += [beside[name] for name in get_close_matches(path.name, beside, 1)]
             near = next((file.parent for file in found if file.is_file()), None)
-            if near is None:
+            if near is None and not (path.is_dir() and error.message.endswith("does not exist.")):
                 raise
-            step = f"Name the session's folder: {shlex.quote(str(near))}"
+            named = path if path.name.strip(".") else path.resolve()
+            source, made = (shlex.quote(f"{named}{end}") for end in ("", "-session"))
+            step = (
+                f"Name the session's folder: {shlex.quote(str(near))}"
+                if near is not None
+                else "A folder of pictures and poses becomes a session by the name of their board "
+                "(instead of charuco_9x6_30mm) and the camera's mount (eye-to-hand where it is "
+                f"fixed). Run: visioncal convert {source} {made} --target charuco_9x6_30mm "
+                f"--mount eye-in-hand && visioncal doctor {made}"
+            )
             raise DataError(error.message, culprits=error.culprits, next_step=step) from error
         document = parse_toml(text, "session.toml")
         streams = read_streams(path)
