@@ -8,7 +8,7 @@ from support.small_cells import TABLE, made
 
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.candidates import effects_of_lenses
-from visioncal.fit.lens_field import field_of_length, waves
+from visioncal.fit.lens_field import fields_of_lengths, waves
 from visioncal.fit.linearise import linearised, pairs_of
 from visioncal.fit.score import of_effect, of_waves
 from visioncal.fit.solve import solve
@@ -59,7 +59,7 @@ def test_a_score_is_the_likelihood_that_an_effect_gains(fit):
 def test_a_score_is_the_likelihood_that_a_field_gains(fit):
     pairs = pairs_of(fit.cell)
     px = np.concatenate([pair.px for pair in pairs if pair.names[0] == "cam"])
-    field = field_of_length(0.4, TABLE.resolution[0], px)
+    (field,) = fields_of_lengths(TABLE.resolution[0], px, (0.4,))
     score = of_waves(fit, pairs, "cam")
     for size in (0.02, 0.2):
         found = gain_with(fit, lens_field("cam", field, size), size, fields={"cam": field})
@@ -78,7 +78,7 @@ def test_a_score_finds_the_size_that_the_likelihood_has(fit):
 def test_waves_have_the_covariance_of_a_smooth_field():
     rng = np.random.default_rng(0)
     px = rng.uniform([0, 0], TABLE.resolution, (300, 2))
-    field = field_of_length(0.18, TABLE.resolution[0], px)
+    (field,) = fields_of_lengths(TABLE.resolution[0], px, (0.18,))
     each = waves(px, field.width, field.orders) * field.sigmas
     found = each @ each.T
     squared = np.sum((px[:, None] - px) ** 2, axis=2) / (0.18 * TABLE.resolution[0]) ** 2

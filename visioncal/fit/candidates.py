@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
-from visioncal.fit.linearise import Pair
+from visioncal.fit.linearise import Pair, images_of
 from visioncal.fit.score import best_field, of_effect
 from visioncal.fit.sizes import SIGNIFICANT
 from visioncal.fit.unknowns import State, Unknowns, Vector, lens_field, random_effect
@@ -21,7 +21,7 @@ class Candidate:
     gain: float  # Of the log-likelihood, at its most likely size.
     member: Vector  # Its unknowns, whose size starts there.
     effect: Effect | None = None
-    field: Field | None = None
+    field: Field | None = None  # Beside a lens that is as stated.
 
 
 def opened(fit: Fit, pairs: Sequence[Pair]) -> tuple[Unknowns, State] | None:
@@ -33,8 +33,11 @@ def opened(fit: Fit, pairs: Sequence[Pair]) -> tuple[Unknowns, State] | None:
     if found.effect is not None:
         unknowns = replace(unknowns, effects=(*unknowns.effects, found.effect))
     if found.field is not None:
-        camera = found.member.key[1]
-        unknowns = replace(unknowns, fields={**unknowns.fields, camera: found.field})
+        camera, field = found.member.key[1], found.field
+        if fit.cell.cameras[camera].stated is None:
+            px = np.concatenate([pair.px for pair in images_of(pairs, camera)])
+            field = field.beside(unknowns.lenses[camera], px)
+        unknowns = replace(unknowns, fields={**unknowns.fields, camera: field})
     values = {**fit.state.values, found.member.key: np.zeros(found.member.count)}
     return unknowns, State(values, fit.state.errors)
 
@@ -47,14 +50,11 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
             bounds = effect.size
             size, gain = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
             yield Candidate(gain, starting_at(random_effect(effect), size), effect)
-    for camera, lens in fit.unknowns.lenses.items():
-        own = [pair for pair in pairs if pair.names[0] == camera and pair.corners]
-        if ("lens", camera) not in fit.unknowns or camera in fit.unknowns.fields or not own:
-            continue
-        field, size, gain = best_field(fit, own, camera)
-        if fit.cell.cameras[camera].stated is None:
-            field = field.beside(lens, np.concatenate([pair.px for pair in own]))
-        yield Candidate(gain, lens_field(camera, field, size), None, field)
+    for camera in fit.unknowns.lenses:
+        is_free = ("lens", camera) in fit.unknowns and camera not in fit.unknowns.fields
+        if is_free and images_of(pairs, camera):
+            field, size, gain = best_field(fit, pairs, camera)
+            yield Candidate(gain, lens_field(camera, field, size), field=field)
 
 
 def starting_at(member: Vector, size: float) -> Vector:

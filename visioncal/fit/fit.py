@@ -303,15 +303,6 @@ class Fit:
         moved = self.moved_by + (0.0 if shift is None else shift)
         return replace(self, considered=known + added, shift=moved)
 
-    def seer_from_seen(self, row: int) -> FloatArray:
-        """(4, 4) pose of a sighting as predicted at its own stop, with the errors of flanges."""
-        sighting = self.cell.sightings[row]
-        stop = np.array([sighting.stop])
-        errors = {name: at[stop] for name, at in self.state.errors.items()}
-        path, moments = self.cell.tree.path(*sighting.pair), self.cell.moments.take(stop)
-        at = predicted(self.cell, self.unknowns, self.state, path, moments, errors)
-        return np.asarray(at.poses[0])
-
 
 def _off(
     weighted: FloatArray, values: FloatArray, covariance: FloatArray

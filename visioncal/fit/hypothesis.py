@@ -138,11 +138,9 @@ class Examined:
             weighted = gram.weighted(fit.estimate.logs)[at, :6, :6]
             return pose, np.asarray(np.linalg.pinv(weighted, hermitian=True), dtype=float)
         (pair,) = pairs_of(fit.cell.with_sightings([sighting]))
-        middle = corner_positions(fit.cell.boards[sighting.seen]).mean(axis=0)
         information = np.eye(6)
         for _ in range(8):
-            far = pose[2:3, 3] + pose[2:3, :3] @ middle
-            rows, _ = corner_rows(fit.unknowns, fit.state, pair, pose[None], far)
+            rows, _ = corner_rows(fit.unknowns, fit.state, pair, pose[None])
             by_pose, residual = rows[:, :, :6].reshape(-1, 6), rows[:, :, -1].ravel()
             information = by_pose.T @ by_pose
             information += 1e-9 * np.diag(np.diag(information))

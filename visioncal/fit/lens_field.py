@@ -5,6 +5,7 @@ image whose variances are the kernel's spectrum (Solin and Sarkka 2020). Its len
 its size, by the score of a fit without it.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,11 +26,9 @@ class Field:
     orders: FloatArray  # (e, 2) half waves across and down.
     width: float  # Of the image [px].
     sigmas: FloatArray  # (e,) standard deviations of the waves in a field of size one.
-    length: float  # Over the width.
     # What a lens of which nothing is stated does instead: its model, and (q, 2 e) intrinsics by the
     # field's values. None of a stated lens, which may be off by any field.
-    lens: Camera | None = None
-    instead: FloatArray | None = None
+    instead: tuple[Camera, FloatArray] | None = None
 
     def at(self, px: FloatArray) -> FloatArray:
         """Displacements (n, 2, 2 e) of (n, 2) pixels by coefficients of variance one [px]."""
@@ -37,8 +36,9 @@ class Field:
         count = len(self.orders)
         found = np.zeros((len(px), 2, 2 * count))
         found[:, 0, :count], found[:, 1, count:] = each, each
-        if self.lens is not None and self.instead is not None:
-            found -= by_lens(self.lens, px) @ self.instead
+        if self.instead is not None:
+            lens, intrinsics = self.instead
+            found -= by_lens(lens, px) @ intrinsics
         return found
 
     def above(self, least: float) -> "Field":
@@ -52,7 +52,7 @@ class Field:
         scale = np.linalg.norm(own, axis=0)
         flat = self.at(px).reshape(2 * len(px), -1)
         instead = np.linalg.lstsq(own / scale, flat, rcond=None)[0] / scale[:, None]
-        return replace(self, lens=lens, instead=instead)
+        return replace(self, instead=(lens, instead))
 
 
 def orders_of_waves() -> FloatArray:
@@ -71,16 +71,18 @@ def waves(px: FloatArray, width: float, orders: FloatArray) -> FloatArray:
     return np.asarray(tables[:, 0][:, of[:, 0]] * tables[:, 1][:, of[:, 1]])
 
 
-def field_of_length(length: float, width: float, px: FloatArray) -> Field:
-    """A field whose mean variance at (n, 2) corners is that of its size."""
+def fields_of_lengths(
+    width: float, px: FloatArray, lengths: Sequence[float] = LENGTHS
+) -> Iterator[Field]:
+    """Fields of some lengths, whose mean variance at (n, 2) corners is that of their size."""
     orders = orders_of_waves()
-    squares = np.sum(orders**2, axis=1)
-    sigmas = np.exp(-0.25 * squares * (np.pi * length / _WIDTHS) ** 2)
-    # A wave has half of the mean square of a constant.
-    sigmas *= np.sqrt(0.5) ** np.sum(orders == 0, axis=1)
-    # Some of the corners tell a mean over all.
-    chosen = waves(px[:: len(px) // 4000 + 1], width, orders) * sigmas
-    return Field(orders, width, sigmas / np.sqrt(np.mean(np.sum(chosen**2, axis=1))), length)
+    # Of thousands of corners, some have the mean of all.
+    variances = np.mean(waves(px[:: len(px) // 4000 + 1], width, orders) ** 2, axis=0)
+    for length in lengths:
+        sigmas = np.exp(-0.25 * np.sum(orders**2, axis=1) * (np.pi * length / _WIDTHS) ** 2)
+        # A wave has half of the mean square of a constant.
+        sigmas *= np.sqrt(0.5) ** np.sum(orders == 0, axis=1)
+        yield Field(orders, width, sigmas / np.sqrt(variances @ sigmas**2))
 
 
 def by_lens(lens: Camera, px: FloatArray) -> FloatArray:

@@ -170,6 +170,10 @@ class Pair:
         """(3,) middle of the board; its origin where its corners are not known [m]."""
         return self.points.mean(axis=0) if len(self.points) else np.zeros(3)
 
+    def distances(self, poses: FloatArray) -> FloatArray:
+        """(k,) of the board's middle along the camera's axis [m], at (k, 4, 4) poses."""
+        return apply(poses, self.middle[None])[:, 0, 2]
+
     @cached_property
     def basis(self) -> FloatArray:
         """(c, 3, 10) derivatives of the board's corners by its shape [m]."""
@@ -194,6 +198,11 @@ def pairs_of(cell: Cell) -> tuple[Pair, ...]:
             )  # fmt: skip
             found.append(pair)
     return tuple(found)
+
+
+def images_of(pairs: Sequence[Pair], camera: str) -> list[Pair]:
+    """The pairs that are images of one camera."""
+    return [pair for pair in pairs if pair.names[0] == camera and pair.corners]
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +247,12 @@ def predicted(
     return Predicted(invert(back), slopes, by_effects)
 
 
+def predicted_sightings(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Predicted:
+    """Predicts the k sightings of a pair, with the errors of the flanges at their stops."""
+    errors = {name: errors[pair.stops] for name, errors in state.errors.items()}
+    return predicted(cell, unknowns, state, pair.path, pair.moments, errors)
+
+
 def _edge(cell: Cell, state: State, name: str) -> FloatArray:
     """(4, 4) `parent_from_frame`, unknown or known."""
     found = state.get("edge", name)
@@ -256,12 +271,11 @@ def linearised(
 
 
 def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gram:
-    errors = {name: errors[pair.stops] for name, errors in state.errors.items()}
-    at = predicted(cell, unknowns, state, pair.path, pair.moments, errors)
+    at = predicted_sightings(cell, unknowns, state, pair)
     distances, own = np.ones(len(at.poses)), dict[Key, IntArray]()
     if pair.corners:
-        distances = at.poses[:, 2, 3] + at.poses[:, 2, :3] @ pair.middle
-        rows, own = corner_rows(unknowns, state, pair, at.poses, distances)
+        distances = pair.distances(at.poses)
+        rows, own = corner_rows(unknowns, state, pair, at.poses)
         padded = pair.padded(rows).reshape(len(pair.rows), -1, rows.shape[2])
         grams: FloatArray = np.swapaxes(padded, 1, 2) @ padded
         parts: _Parts = _corner_parts(unknowns, pair, grams)
@@ -331,7 +345,7 @@ _NOISES = (
 
 
 def corner_rows(
-    unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray, distances: FloatArray
+    unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray
 ) -> tuple[FloatArray, dict[Key, IntArray]]:
     """Rows (n, 2, d + 1) of corners, and the local columns of what is their own."""
     seer, seen = pair.names
@@ -347,7 +361,8 @@ def corner_rows(
     residual = pair.px - found.px
     for effect in unknowns.effects:
         if effect.place == "lens" and effect.frame == seer:
-            moved = effect.columns(pair.moments, distances) @ state.values["effect", effect.name]
+            columns_of = effect.columns(pair.moments, pair.distances(poses))
+            moved = columns_of @ state.values["effect", effect.name]
             residual = residual - (found.jacobian_intrinsics @ moved[pair.owner, :, None])[:, :, 0]
     if seer in unknowns.fields:
         # Where corners are predicted: at those seen, a field could explain their noise.

@@ -125,15 +125,16 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     poses = fit.cell.arms[flange].poses[alone.stops]
     some = evenly(stops, _MOST)
     boards = [(fit.unknowns.slices[key].start, held) for key, held in held_boards(fit).items()]
-    none = (np.log(1 / 4), *_likelihoods(alone, some, 0.0, 1.0, boards))
+    independent_at = {white: _independent(alone, some, white) for white in _WHITE}
+    none = (np.log(1 / 4), *_likelihoods(alone, some, independent_at[1.0], boards))
     found, kinds = [none], list[tuple[Process, float, float]]()
     for process in processes(poses, levels):
         covariance = process.covariance(some)
         weight = np.log(process.prior / len(_SIZES) / len(_WHITE))
         for size in _SIZES:
             for white in _WHITE:
-                each = _likelihoods(alone, some, size**2 * covariance, white, boards)
-                found.append((weight, *each))
+                total = independent_at[white] + size**2 * covariance
+                found.append((weight, *_likelihoods(alone, some, total, boards)))
                 kinds.append((process, size, white))
     prior, as_stated, of_any_size = np.array(found).T
     logs, free = prior + as_stated, prior + of_any_size
@@ -240,21 +241,24 @@ def held_boards(fit: Fit) -> dict[Key, float]:
 
 
 def _likelihoods(
-    alone: _Alone,
-    some: IntArray,
-    added: FloatArray | float,
-    white: float,
-    boards: list[tuple[int, float]],
+    alone: _Alone, some: IntArray, covariance: FloatArray, boards: list[tuple[int, float]]
 ) -> tuple[float, float]:
-    """Restricted log-likelihoods at some stops: with boards as stated, and of any size."""
+    """Restricted log-likelihoods with boards as stated, and of any size.
+
+    Args:
+        alone: What each stop alone says.
+        some: (k,) stops that are looked at.
+        covariance: (6 k, 6 k) of what they say, under a process.
+        boards: Columns of the sizes of held boards, and the information of their priors.
+    """
     p = alone.rows.shape[2] - 1
-    root = np.linalg.cholesky(_independent(alone, some, white) + added)
+    root = np.linalg.cholesky(covariance)
     solved, _ = lapack.dtrtrs(root, alone.rows[some].reshape(-1, p + 1), lower=1)
     total = solved.T @ solved + alone.rest
     total[np.arange(p), np.arange(p)] *= 1.0 + 1e-9
     values = []
     loosened = np.zeros(p + 1)
-    for places in ([], boards):
+    for places in ([], boards) if boards else ([],):
         for column, held in places:
             loosened[column] = held - _LOOSE**-2.0
         inner = (total - np.diag(loosened))[:p, :p]
@@ -263,4 +267,4 @@ def _likelihoods(
         value = -np.log(np.diag(root)).sum() - np.log(np.diag(factor)).sum()
         prior = sum(-0.5 * np.log(held * _LOOSE**2) for _, held in places)
         values.append(float(value - 0.5 * (total[p, p] - pull @ pull) + prior))
-    return values[0], values[1]
+    return values[0], values[-1]

@@ -12,9 +12,10 @@ import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.fit.fit import Fit
-from visioncal.fit.lens_field import LENGTHS, Field, field_of_length, orders_of_waves, waves
-from visioncal.fit.linearise import Gram, Pair, corner_rows, of_pose_alone
+from visioncal.fit.lens_field import Field, fields_of_lengths, orders_of_waves, waves
+from visioncal.fit.linearise import Gram, Pair, corner_rows, images_of, of_pose_alone
 from visioncal.fit.mixed import body_with, weights_at
+from visioncal.fit.unknowns import Key
 from visioncal.model.effects import Effect
 
 # Sizes that are tried, over one that the data would just show.
@@ -116,10 +117,9 @@ def of_effect(fit: Fit, effect: Effect) -> Score:
     return score(fit, added, effect.count, freedom)
 
 
-def of_unknown(fit: Fit, kind_and_name: tuple[str, str], maps: FloatArray) -> Score:
+def of_unknown(fit: Fit, key: Key, maps: FloatArray) -> Score:
     """The score of an unknown's columns (d) that differ by (s, d, c) from stop to stop."""
-    added = []
-    own = next(fit.unknowns.columns(*key) for key in fit.unknowns.slices if key == kind_and_name)
+    added, own = list[Added](), fit.unknowns.columns(*key)
     for gram in _used(fit):
         if not np.isin(own, gram.columns).all():
             continue
@@ -134,13 +134,13 @@ def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
     """The score of all waves of a lens's field, along both axes."""
     orders, added = orders_of_waves(), []
     width, count = float(fit.unknowns.lenses[camera].resolution[0]), len(orders)
-    own = [pair for pair in pairs if pair.names[0] == camera and pair.corners]
+    own = images_of(pairs, camera)
     for gram in fit.grams:
         pair = next((one for one in own if np.array_equal(one.rows, gram.rows)), None)
         kept = fit.used[gram.rows]
         if pair is None or not kept.any():
             continue
-        rows, _ = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, gram.distances)
+        rows, _ = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses)
         predicted = pair.px - rows[:, :, -1] / pair.weights[:, None]
         each = waves(predicted, width, orders) * pair.weights[:, None]
         padded, of_rows = np.swapaxes(pair.padded(each), 1, 2), pair.padded(rows)
@@ -163,14 +163,13 @@ def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
 def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, float, float]:
     """The most likely field of a lens, its size [px], and its log-likelihood against none."""
     found, options = of_waves(fit, pairs, camera), list[tuple[float, float, Field]]()
-    px = np.concatenate([p.px for p in pairs if p.names[0] == camera and p.corners])
+    px = np.concatenate([pair.px for pair in images_of(pairs, camera)])
     weight = max(_weight(fit, gram) for gram in fit.grams if gram.pair[0] == camera)
-    for length in LENGTHS:
-        field = field_of_length(length, float(fit.unknowns.lenses[camera].resolution[0]), px)
+    for field in fields_of_lengths(float(fit.unknowns.lenses[camera].resolution[0]), px):
         size, gain = found.best(np.tile(field.sigmas, 2), 1e-4, 5.0)
         # Of a wave below this, all corners together show nothing.
-        field = field.above(_SEEN / (size * np.sqrt(weight * len(px))))
-        options.append((gain, size, field))
+        seen = field.above(_SEEN / (size * np.sqrt(weight * len(px))))
+        options.append((gain, size, seen))
     gain, size, field = max(options, key=lambda option: option[0])
     return field, size, gain
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.estimation.viewnoise import weights_by_view
-from visioncal.fit.linearise import Pair, corner_rows, predicted
+from visioncal.fit.linearise import Pair, corner_rows, predicted_sightings
 from visioncal.fit.unknowns import State, Unknowns
 from visioncal.model import Cell
 from visioncal.vision.camera import normalise
@@ -105,10 +105,8 @@ def weighed(
     for pair in pairs:
         if not pair.corners:
             continue
-        errors = {name: errors[pair.stops] for name, errors in state.errors.items()}
-        poses = predicted(cell, unknowns, state, pair.path, pair.moments, errors).poses
-        distances = poses[:, 2, 3] + poses[:, 2, :3] @ pair.points.mean(axis=0)
-        rows, _ = corner_rows(unknowns, state, pair, poses, distances)
+        poses = predicted_sightings(cell, unknowns, state, pair).poses
+        rows, _ = corner_rows(unknowns, state, pair, poses)
         each = np.split(rows[:, :, [*range(6), -1]], np.cumsum(pair.counts)[:-1])
         for row, own, corners in zip(pair.rows.tolist(), each, pair.corners, strict=True):
             if used[row]:
