@@ -1,9 +1,9 @@
 """A fit: estimates with covariance, sightings left out, the budget, predictions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Self, TypeAlias
 
 import numpy as np
 
@@ -17,6 +17,10 @@ from visioncal.model import Cell, Moments
 _RIDGE = 1e-9
 
 
+# `away`, `predicted` and `own` of some sightings.
+_Deviation: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+
+
 @dataclass(frozen=True, eq=False)
 class LeftOut:
     """Deviation of each of n sightings from what all others predict, once its own rows are gone."""
@@ -27,16 +31,14 @@ class LeftOut:
     directions: IntArray  # (n,) how many of the six it has; in others its covariance is large.
 
     @classmethod
-    def of_none(cls, cell: Cell) -> Self:
-        """The deviations of a cell's n sightings, to be `put`."""
+    def of(cls, cell: Cell, found: Iterable[tuple[IntArray, _Deviation]]) -> Self:
+        """Those of a cell's n sightings, of some rows at a time; zeros of rows that are absent."""
         count = len(cell.sightings)
+        away, predicted, own = (np.zeros((count, *shape)) for shape in ((6,), (6, 6), (6, 6)))
+        for rows, values in found:
+            away[rows], predicted[rows], own[rows] = values
         directions = np.array([sighting.directions for sighting in cell.sightings], np.int64)
-        blocks = np.zeros((count, 6, 6))
-        return cls(np.zeros((count, 6)), blocks, blocks.copy(), directions)
-
-    def put(self, rows: IntArray, found: tuple[FloatArray, FloatArray, FloatArray]) -> None:
-        """Fills in `away`, `predicted` and `own` of some sightings."""
-        self.away[rows], self.predicted[rows], self.own[rows] = found
+        return cls(away, predicted, own, directions)
 
     @cached_property
     def squares(self) -> FloatArray:
@@ -154,17 +156,12 @@ class Fit:
         z, the estimate without them is (1 - C H)^-1 (z - C g), with covariance (1 - C H)^-1 C: it
         follows from the fit alone, nothing is fitted again (cf. Cook and Weisberg 1982, 2.2).
         """
-        found = LeftOut.of_none(self.cell)
-        for gram in self.grams if grams is None else grams:
-            found.put(gram.rows, self._left_out(gram))
-        return found
+        some = self.grams if grams is None else grams
+        return LeftOut.of(self.cell, ((gram.rows, self._left_out(gram)) for gram in some))
 
-    def _left_out(self, gram: Gram) -> tuple[FloatArray, FloatArray, FloatArray]:
-        weighted, spread, f = (
-            gram.weighted(self.estimate.logs),
-            gram.spread(),
-            6 * len(gram.flanges),
-        )
+    def _left_out(self, gram: Gram) -> _Deviation:
+        weighted, spread = gram.weighted(self.estimate.logs), gram.spread()
+        f = 6 * len(gram.flanges)
         information, pull = weighted[:, :-1, :-1], weighted[:, :-1, -1]
         by_errors, by_columns = spread[:, :, :f], spread[:, :, f:]
         values = by_columns @ self.estimate.values[gram.columns]
@@ -208,12 +205,15 @@ class Fit:
         return away, rows @ covariance @ np.swapaxes(mapped, 1, 2), alone
 
     def stops_left_out(self) -> LeftOut:
-        """Leaves each stop out in turn: no sighting at a stop tells where the others there are.
+        """Leaves each stop out in turn: no sighting at a stop predicts the others there.
 
         As `left_out`, but that all rows at a stop are removed from the common unknowns' information
         at once, and its flanges err by what all others say of their noise.
         """
-        found, seen = LeftOut.of_none(self.cell), dict[int, list[tuple[int, int]]]()
+        return LeftOut.of(self.cell, self._by_stop())
+
+    def _by_stop(self) -> Iterator[tuple[IntArray, _Deviation]]:
+        seen = dict[int, list[tuple[int, int]]]()
         weighted = [gram.weighted(self.estimate.logs) for gram in self.grams]
         full = [gram.in_common(own) for gram, own in zip(self.grams, weighted, strict=True)]
         for index, gram in enumerate(self.grams):
@@ -243,8 +243,7 @@ class Fit:
                     [own_noise, by_columns @ covariance[own[:, None], own]], axis=2
                 )
                 within = both @ np.swapaxes(spread, 1, 2)
-                found.put(gram.rows, _off(weighted[at][row : row + 1], local, within))
-        return found
+                yield gram.rows, _off(weighted[at][row : row + 1], local, within)
 
     def _without_stop(
         self, stop: int, columns: IntArray, added: FloatArray
@@ -304,9 +303,7 @@ class Fit:
         return replace(self, considered=known + added, shift=moved)
 
 
-def _off(
-    weighted: FloatArray, values: FloatArray, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _off(weighted: FloatArray, values: FloatArray, covariance: FloatArray) -> _Deviation:
     """How far poses by the own rows of k sightings are from predictions, and both covariances.
 
     Args:

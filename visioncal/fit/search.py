@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.core.quantiles import FALSE_REJECTION, f_limit
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray, Mask, chosen_rows
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.linearise import Gram, Pair, linearised, pairs_of
@@ -136,10 +136,8 @@ class Search:
         if row is None:
             left_out = fit.left_out()
         else:
-            every = fit.left_out([at.take(at.rows == row) for at in fit.grams if row in at.rows])
-            left_out = LeftOut(
-                every.away[[row]], every.predicted[[row]], every.own[[row]], every.directions[[row]]
-            )
+            some = [gram.take(gram.rows == row) for gram in fit.grams if row in gram.rows]
+            left_out = chosen_rows(fit.left_out(some), [row])
         freedom = max(3.0 * fit.used.sum() - 3.0 * len(self.cell.unknown), 6.0)
         limits = f_limit(FALSE_REJECTION / count, left_out.directions, freedom)
         return left_out, left_out.squares / (left_out.directions * limits)
