@@ -23,13 +23,13 @@ from visioncal.core.transforms import (
     nearest_rotation,
     rotation_angle,
 )
-from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, evenly
+from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, Target, evenly
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.poses import closed_form_poses
 from visioncal.fit.places import robust_carried
-from visioncal.fit.weights import by_homography, first_weighed
+from visioncal.fit.weights import by_homography, first_weighed, on_planes
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
-from visioncal.vision.camera import normalise, project
+from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions, rotation_transforms, rotations
 
 # Images of which a lens is estimated, and pairs of poses of which a closed form is, at most.
@@ -78,7 +78,7 @@ def start_of(cell: Cell) -> Start:
     lenses = start_lenses(cell.with_sightings([s for s in cell.sightings if not s.is_held]))
     weighed = first_weighed(cell, lenses)
     cell, sound = weighed.cell, weighed.sound & ~cell.held
-    options = [candidates(cell, lenses, sighting) for sighting in cell.sightings]
+    options = candidates(cell, lenses)
     kept = [at for at, option in enumerate(options) if option is not None]
     cell, sound = cell.with_sightings([cell.sightings[at] for at in kept]), sound[kept]
     known = [option for option in options if option is not None]
@@ -91,7 +91,8 @@ def start_of(cell: Cell) -> Start:
         cell.with_sightings([cell.sightings[at] for at in joined]),
         [known[at] for at in joined],
     )
-    sound = sound[joined] & np.array([s.view not in places.misplaced for s in cell.sightings])
+    is_placed = [s.view not in places.misplaced for s in cell.sightings]
+    sound = sound[joined] & np.array(is_placed, bool)
     edges = {name: places.edge(name) for name in cell.unknown}
     sightings, distances, rivals = list(cell.sightings), np.zeros(len(known)), []
     for at, (sighting, option) in enumerate(zip(cell.sightings, known, strict=True)):
@@ -169,7 +170,8 @@ def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:
 
     def closing(log_focal: float) -> float:
         trial = {frame: at(float(np.exp(log_focal)))}
-        known = [(s, found) for s in cell.sightings if (found := candidates(cell, trial, s))]
+        options = zip(cell.sightings, candidates(cell, trial), strict=True)
+        known = [(s, option) for s, option in options if option is not None]
         places = _Places(cell.with_sightings([sighting for sighting, _ in known]))
         places.join_all([found for _, found in known])
         off = [
@@ -189,16 +191,31 @@ def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:
     return at(float(np.exp(found.x)))
 
 
-def candidates(cell: Cell, lenses: Mapping[str, Camera], sighting: Sighting) -> Candidates | None:
-    """Both poses of a flat board, in all turns of a symmetric one; None where it has none."""
-    if isinstance(sighting.evidence, MeasuredPose):
-        return Candidates(sighting.evidence.matrix[None], np.zeros(1, dtype=np.int64))
-    if isinstance(sighting.evidence, MeasuredPlace):
-        place = compose(np.eye(3), sighting.evidence.place_m)
-        return Candidates(place[None], np.zeros(1, dtype=np.int64))
-    lens, board = lenses[sighting.seer], cell.boards[sighting.seen]
-    px, points = sighting.evidence.px, corner_positions(board)[sighting.evidence.ids]
-    poses = closed_form_poses(points, normalise(lens, px))
+def candidates(cell: Cell, lenses: Mapping[str, Camera]) -> list[Candidates | None]:
+    """Both poses of each flat board, in all turns of a symmetric one; None where it has none."""
+    found, planes = list[Candidates | None](), on_planes(cell, lenses)
+    option: Candidates | None
+    once = np.zeros(1, dtype=np.int64)
+    for at, sighting in enumerate(cell.sightings):
+        evidence = sighting.evidence
+        if isinstance(evidence, MeasuredPose):
+            option = Candidates(evidence.matrix[None], once)
+        elif isinstance(evidence, MeasuredPlace):
+            option = Candidates(compose(np.eye(3), evidence.place_m)[None], once)
+        elif at in planes:
+            board = cell.boards[sighting.seen]
+            option = _of_corners(lenses[sighting.seer], board, evidence, planes[at])
+        else:
+            option = None
+        found.append(option)
+    return found
+
+
+def _of_corners(
+    lens: Camera, board: Target, corners: Corners, plane: FloatArray
+) -> Candidates | None:
+    px, points = corners.px, corner_positions(board)[corners.ids]
+    poses = closed_form_poses(points, plane)
     off = np.array([_off_px(lens, pose, points, px) for pose in poses])
     if not np.isfinite(off).any():
         return None

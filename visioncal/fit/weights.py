@@ -53,14 +53,30 @@ class _Judged:
 
 def first_weighed(cell: Cell, lenses: Mapping[str, Camera]) -> Weighed:
     """Judges all corners by homographies, under the lenses at a start."""
-    judged = {}
+    judged, planes = {}, on_planes(cell, lenses)
     for at, sighting in enumerate(cell.sightings):
         corners = sighting.corners
-        if corners is not None:
-            lens, points = lenses[sighting.seer], corner_positions(cell.boards[sighting.seen])
-            straight = normalise(lens, corners.px) * lens.matrix[:2]
-            judged[at] = by_homography(points[corners.ids], straight, corners.weights)
+        if corners is not None and at in planes:
+            straight = planes[at] * lenses[sighting.seer].matrix[:2]
+            points = corner_positions(cell.boards[sighting.seen])[corners.ids]
+            judged[at] = by_homography(points, straight, corners.weights)
     return _weighed(cell, judged)
+
+
+def on_planes(cell: Cell, lenses: Mapping[str, Camera]) -> dict[int, FloatArray]:
+    """Corners (n, 2) of each image on the plane at unit depth, by row; a camera's all at once."""
+    found = dict[int, FloatArray]()
+    for camera, lens in lenses.items():
+        own = {
+            at: sighting.corners.px
+            for at, sighting in enumerate(cell.sightings)
+            if sighting.seer == camera and sighting.corners is not None
+        }
+        if own:
+            plane = normalise(lens, np.concatenate([*own.values()]))
+            ends = np.cumsum([len(px) for px in own.values()])
+            found |= zip(own, np.split(plane, ends[:-1]), strict=True)
+    return found
 
 
 def by_homography(
