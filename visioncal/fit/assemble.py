@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.robot_likelihood import RATIO_LOG_SIGMA, TYPICAL_RATIO
 from visioncal.fit.linearise import Gram
 from visioncal.fit.mixed import Body, Mixed, Part, Term, body_with, prior_term, summed
-from visioncal.fit.unknowns import RATIO_LOG, RATIO_M, State, Unknowns
+from visioncal.fit.unknowns import State, Unknowns
 from visioncal.model import Cell
 
 
@@ -52,7 +53,7 @@ def mixed_model(
         unknowns.count,
         len(unknowns.sizes),
         ratios,
-        (float(np.log(RATIO_M)), RATIO_LOG),
+        (float(np.log(TYPICAL_RATIO)), RATIO_LOG_SIGMA),
     )
 
 

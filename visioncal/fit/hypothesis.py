@@ -28,8 +28,6 @@ from visioncal.vision.targets import corner_positions
 _WRONG = -3.0 * float(np.log(2.0 * 0.3))
 # Prior probability of each kind of hypothesis.
 _RARE = 0.05
-# Least gain of one undone sighting, of which the undoing explains nothing.
-_NOT = -50.0
 
 
 @dataclass(frozen=True)
@@ -155,7 +153,8 @@ class Examined:
         away, covariance = log(invert(expected) @ seen), self.predicted[row] + own
         square = float(away @ np.linalg.solve(covariance, away))
         value = -0.5 * (square + np.linalg.slogdet(2.0 * np.pi * covariance)[1])
-        return float(max(value - _WRONG, _NOT))
+        # One that the undoing does not explain at all is as good as any such.
+        return float(max(value - _WRONG, -50.0))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from visioncal.core.types import Camera, FloatArray
 from visioncal.vision.camera import project_with_jacobian
 
 # Half waves across at most, and lengths of the field over the width that are tried.
-WAVES, LENGTHS = 16, (0.12, 0.18, 0.27, 0.4)
+_WAVES, LENGTHS = 16, (0.12, 0.18, 0.27, 0.4)
 # Over how many widths the waves are: at their ends they have no slope.
 _WIDTHS = 1.4
 
@@ -57,16 +57,16 @@ class Field:
 
 def orders_of_waves() -> FloatArray:
     """(e, 2) half waves of a field."""
-    across, down = np.meshgrid(np.arange(WAVES + 1), np.arange(WAVES + 1), indexing="ij")
+    across, down = np.meshgrid(np.arange(_WAVES + 1), np.arange(_WAVES + 1), indexing="ij")
     orders = np.column_stack([across.ravel(), down.ravel()])
     squares = np.sum(orders**2, axis=1)
-    return np.asarray(orders[squares <= WAVES**2], dtype=float)
+    return np.asarray(orders[squares <= _WAVES**2], dtype=float)
 
 
 def waves(px: FloatArray, width: float, orders: FloatArray) -> FloatArray:
     """(n, e) waves at (n, 2) pixels."""
     places = (px / width + (_WIDTHS - 1.0) / 2.0) / _WIDTHS
-    tables = np.cos(np.pi * places[:, :, None] * np.arange(WAVES + 1))
+    tables = np.cos(np.pi * places[:, :, None] * np.arange(_WAVES + 1))
     of = orders.astype(np.int64)
     return np.asarray(tables[:, 0][:, of[:, 0]] * tables[:, 1][:, of[:, 1]])
 

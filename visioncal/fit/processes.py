@@ -26,8 +26,9 @@ from visioncal.fit.unknowns import Key
 _RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
 # Sizes of a process, and of what is independent beside it, over the level of the noise.
 _SIZES, _WHITE = (0.3, 0.6, 1.2, 2.5, 5.0), (1.0, 0.7, 0.4, 0.15)
-# Stops that are needed; of more than the most, some stand for all in the likelihood.
-_FEWEST, _MOST = 8, 40
+# Stops that determine errors of an arm's posture; of more than the most, some stand for all in the
+# likelihood.
+ENOUGH_STOPS, _MOST = 8, 40
 # Size of a board that is not as stated, as a share.
 _LOOSE = 0.01
 # Shares of evidence that do not count: of a size, of a process where estimates are averaged.
@@ -217,7 +218,7 @@ def _alone(fit: Fit, flange: str) -> _Alone | None:
             inner, np.swapaxes(between, 1, 2)
         )
     seen = np.flatnonzero(np.linalg.eigvalsh(errors)[:, 0] * levels.min() ** 2 > 1e-6)
-    if len(seen) < _FEWEST:
+    if len(seen) < ENOUGH_STOPS:
         return None
     known = np.asarray(np.linalg.inv(errors[seen]), dtype=float)
     rows = np.zeros((len(seen), 6, p + 1))

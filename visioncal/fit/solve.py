@@ -10,7 +10,7 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.candidates import opened
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.held import with_held_lenses
-from visioncal.fit.processes import consider, held_boards
+from visioncal.fit.processes import ENOUGH_STOPS, consider, held_boards
 from visioncal.fit.search import Effort, Search, nearest
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import (
@@ -33,14 +33,10 @@ from visioncal.vision.camera import intrinsics
 
 # Numbers of corners for each unknown of lenses and boards, below which these are held.
 _SPARE = 10
-# Stops that determine errors of an arm's links.
-_FEWEST_STOPS = 8
 # Log-odds of boards of another size that free it.
 _CLEAR = 7.0
 # Most effects that are opened, one after the other.
 _OPENED = 5
-# Sigma of what is held [rad].
-_HELD = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +93,7 @@ def with_free_boards(fit: Fit) -> Unknowns:
 
 def effects_of(cell: Cell) -> tuple[Effect, ...]:
     """Effects that are always among the unknowns: links of arms with joint angles."""
-    if len({sighting.stop for sighting in cell.sightings}) < _FEWEST_STOPS:
+    if len({sighting.stop for sighting in cell.sightings}) < ENOUGH_STOPS:
         return ()
     return tuple(
         Links(name, arm.model)
@@ -120,8 +116,8 @@ def state_of(start: Start, effects: Sequence[Effect]) -> State:
 def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
     """What is estimated of a cell."""
     cell = start.cell
-    # The turn of a frame of which places alone are known is a convention.
-    held = (Prior(np.arange(3), sigma=_HELD),)
+    # The turn of a frame of which places alone are known is a convention: it is held.
+    held = (Prior(np.arange(3), sigma=1e-9),)
     points = _points(cell)
     members: list[Unknown] = [
         Edge(("edge", name), held if name in points else ()) for name in cell.unknown
@@ -214,7 +210,7 @@ def _compared(cell: Cell) -> set[str]:
         if sighting.corners is not None:
             seers.setdefault(sighting.stop, []).append(sighting.seer)
     beside = Counter(name for names in seers.values() if len(names) > 1 for name in set(names))
-    return {name for name, count in beside.items() if count >= _FEWEST_STOPS}
+    return {name for name, count in beside.items() if count >= ENOUGH_STOPS}
 
 
 def _corners_px(cell: Cell, camera: str) -> FloatArray:

@@ -36,8 +36,6 @@ from visioncal.vision.targets import corner_positions, rotation_transforms, rota
 _IMAGES, _PAIRS = 40, 800
 # Small sets of sightings of which edges are tried; how many are refined.
 _SETS, _BEST = 200, 5
-# Places that differ by less are one, but for rounding.
-_SAME_M = 1e-9
 # Rows by which poses may be shifted; a row is wrong from this multiple of the typical distance on;
 # larger distances than this [m] may be those of wrong rows.
 _SHIFTS, _FAR, _NEAR_M = (1, -1, 2, -2, 3, -3), 6.0, 0.002
@@ -421,7 +419,7 @@ def _placed(
     """What (m, 3) places determine: rotations of frames at their ends are left as they are."""
     near = apply_each(invert(parts[0]), places)
     far = parts[-1][:, :3, 3]
-    is_point = float(np.ptp(far, axis=0).max()) < _SAME_M
+    is_point = float(np.ptp(far, axis=0).max()) < 1e-9  # But for rounding.
     if len(links) == 1 and is_point:
         point = np.median(near - far, axis=0)
         typical = float(np.median(np.linalg.norm(near - far - point, axis=1)))

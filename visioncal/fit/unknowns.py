@@ -22,9 +22,7 @@ Key: TypeAlias = tuple[Kind, str]
 
 # A maker's lens: its centre is in the middle of the image within this share of the width, and p1
 # and p2 are within this.
-CENTRE, TANGENTIAL = 0.02, 1e-3
-# Size of a noise over that of the other, per metre and radian, within this factor's logarithm.
-RATIO_M, RATIO_LOG = 0.6, 1.5
+_CENTRE, _TANGENTIAL = 0.02, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,10 +255,10 @@ def estimated_lens(frame: str, lens: Camera) -> Vector:
     values, width, height = intrinsics(lens), *lens.resolution
     mean = values.copy()
     mean[2:4] = (width - 1) / 2, (height - 1) / 2
-    priors = [Prior(np.array([2, 3]), sigma=CENTRE * width)]
+    priors = [Prior(np.array([2, 3]), sigma=_CENTRE * width)]
     if lens.model == "brown":
         mean[6:8] = 0.0
-        priors.append(Prior(np.array([6, 7]), sigma=TANGENTIAL))
+        priors.append(Prior(np.array([6, 7]), sigma=_TANGENTIAL))
     return Vector(("lens", frame), tuple(priors), mean, np.ones(len(values)))
 
 

@@ -24,11 +24,9 @@ _CORNER_SIGMAS, _VIEW_RATIO = 8.0, 5.0
 # Wrong corners hide each other from this on, since the fit follows them.
 _SUSPECT = 4.0
 # Less does no harm [px]: of a corner, of a view.
-CORNER_PX, _VIEW_PX = 0.5, 1.0
+_CORNER_PX, _VIEW_PX = 0.5, 1.0
 # Fewest corners among which a wrong one shows.
 _FEWEST = 8
-# Rounds of reweighting: each divides what a wrong corner pulls by some.
-_TURNS = 10
 # Residuals of exact corners are rounding errors [px].
 _EXACT_PX = 1e-6
 
@@ -83,7 +81,7 @@ def by_homography(
     points: FloatArray,
     px: FloatArray,
     weights: FloatArray | None = None,
-    least_px: float = CORNER_PX,
+    least_px: float = _CORNER_PX,
 ) -> _Judged:
     """Judges the corners of a flat board by a homography (least median of squares, if need be).
 
@@ -136,12 +134,12 @@ def _by_own_pose(rows: FloatArray) -> _Judged:
     if len(rows) < _FEWEST:
         return _Judged(inside, 0.0, 0)
     lengths = _beside_pose(rows, inside)
-    if not _within(lengths, CORNER_PX, _SUSPECT).all():
-        for _ in range(_TURNS):
-            # Cauchy's weights find the pose of most.
+    if not _within(lengths, _CORNER_PX, _SUSPECT).all():
+        for _ in range(10):
+            # Cauchy's weights find the pose of most: each round divides what a wrong corner pulls.
             far = lengths / (2.0 * max(float(np.median(lengths)), _EXACT_PX))
             lengths = _beside_pose(rows, 1.0 / np.sqrt(1.0 + far**2))
-        inside = _within(lengths, CORNER_PX)
+        inside = _within(lengths, _CORNER_PX)
         lengths = _beside_pose(rows, inside)
     return _Judged(inside, float(np.sum(lengths[inside] ** 2)), 2 * int(inside.sum()) - 6)
 

@@ -6,7 +6,7 @@ from visioncal.core.types import FloatArray
 
 # Derivatives by size, by aspect and shear, and by seven polynomials of second and third order.
 SIZE, PLANE, BEND = slice(0, 1), slice(1, 3), slice(3, 10)
-SHAPES = 10
+SHAPES = BEND.stop
 
 
 def shape_basis(points: FloatArray) -> FloatArray:
