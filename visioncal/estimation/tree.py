@@ -7,6 +7,8 @@ robot between form one body: the stationary frames, and those on each flange.
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
+from visioncal.core.errors import DataError
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray
 
 
@@ -101,4 +103,30 @@ class Tree:
         return (
             *(PathStep(name, self.branches[name].robot, True) for name in up),
             *(PathStep(name, self.branches[name].robot, False) for name in reversed(down)),
+        )
+
+
+def check_prior(name: str, first: str, second: str, tree: Tree) -> None:
+    """Refuses the prior of a frame in another that has no fixed place in it.
+
+    Raises:
+        DataError: A frame is unknown, or a robot moves one of the two relative to the other.
+    """
+    label = f"session.toml: prior.{name}"
+    for frame in (first, second):
+        if frame not in tree.branches:
+            names = list(tree.branches)
+            raise DataError(
+                f"{label}: {frame!r} is no frame of this cell; those are {', '.join(names)}.",
+                culprits=[label],
+                next_step=did_you_mean(frame, names)
+                or "Name a prior A_from_B, as [prior.flange_a_from_cam_left].",
+            )
+    moved_by = [step.robot for step in tree.path(first, second) if step.robot]
+    if moved_by or first == second:
+        why = f"robot {moved_by[0]} moves one before the other" if moved_by else "they are one"
+        raise DataError(
+            f"{label}: {first} and {second} have no fixed place in each other: {why}.",
+            culprits=[label],
+            next_step="State where two frames are that stand in the cell, or on one flange.",
         )

@@ -6,9 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import compose
-from visioncal.estimation.tree import Tree
+from visioncal.estimation.tree import Tree, check_prior
 from visioncal.model.sightings import Evidence, MeasuredPlace, MeasuredPose, Sighting
 from visioncal.session.document import Declaration, PriorTable
 
@@ -50,26 +49,11 @@ def _components(table: PriorTable) -> Iterator[Evidence]:
 
 def _fixed_frames(prior: str, tree: Tree) -> tuple[str, str]:
     """Both frames of a prior."""
-    words, label, found = prior.partition("_from_"), f"session.toml: prior.{prior}", []
+    words, found = prior.partition("_from_"), []
     for name in (words[0], words[2]):
         # Of one of a kind, the kind is enough.
         kind = "point" if name == "probe" else name
         matches = [frame for frame in tree.branches if f"{frame}_".startswith(f"{kind}_")]
-        if name not in tree.branches and len(matches) != 1:
-            raise DataError(
-                f"{label}: {name!r} is no frame of this cell; those are "
-                f"{', '.join(tree.branches)}.",
-                culprits=[label],
-                next_step=did_you_mean(name, tree.branches)
-                or "Name a prior A_from_B, as [prior.flange_a_from_cam_left].",
-            )
-        found.append(name if name in tree.branches else matches[0])
-    moved_by = [step.robot for step in tree.path(found[0], found[1]) if step.robot]
-    if moved_by or found[0] == found[1]:
-        why = f"robot {moved_by[0]} moves one before the other" if moved_by else "they are one"
-        raise DataError(
-            f"{label}: {found[0]} and {found[1]} have no fixed place in each other: {why}.",
-            culprits=[label],
-            next_step="State where two frames are that stand in the cell, or on one flange.",
-        )
+        found.append(matches[0] if name not in tree.branches and len(matches) == 1 else name)
+    check_prior(prior, found[0], found[1], tree)
     return found[0], found[1]

@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.errors import DataError
 from visioncal.core.limits import CONTRADICTION
-from visioncal.core.number_format import did_you_mean, figure
+from visioncal.core.number_format import figure
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.estimation.problem_parts import FramePrior
-from visioncal.estimation.tree import Tree
+from visioncal.estimation.tree import Tree, check_prior
 from visioncal.session.document import PriorTable
 
 _AXES = ("x_m", "y_m", "z_m")
@@ -88,24 +87,7 @@ def prior_of(name: str, table: PriorTable, tree: Tree) -> FramePrior:
         DataError: A frame is unknown, or a robot moves one of the two relative to the other.
     """
     first, _, second = name.partition("_from_")
-    label = f"session.toml: prior.{name}"
-    for frame in (first, second):
-        if frame not in tree.branches:
-            names = [branch for branch in tree.branches if branch != frame]
-            raise DataError(
-                f"{label}: {frame!r} is no frame of this cell; those are {', '.join(names)}.",
-                culprits=[label],
-                next_step=did_you_mean(frame, names)
-                or "Name a prior A_from_B, as [prior.flange_a_from_cam_left].",
-            )
-    moved_by = [step.robot for step in tree.path(first, second) if step.robot]
-    if moved_by or first == second:
-        why = f"robot {moved_by[0]} moves one before the other" if moved_by else "they are one"
-        raise DataError(
-            f"{label}: {first} and {second} have no fixed place in each other: {why}.",
-            culprits=[label],
-            next_step="State where two frames are that stand in the cell, or on one flange.",
-        )
+    check_prior(name, first, second, tree)
     values = {axis: getattr(table, column) for axis, column in enumerate(_AXES)}
     stated = {axis: float(value) for axis, value in values.items() if value is not None}
     prior = FramePrior(first, second, (*stated,), (*stated.values(),), table.sigma_m or 1.0)
