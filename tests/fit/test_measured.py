@@ -135,7 +135,7 @@ def test_distance_and_tilt_are_noisier_in_an_image_than_the_rest():
     assert PX / TABLE.matrix[0] / 20 < fit.sizes["roll cam"] < 20 * PX / TABLE.matrix[0]
 
 
-def test_a_board_of_another_size_is_found_by_an_arm_whose_errors_are_told_apart():
+def test_a_board_of_another_size_is_found_by_an_arm_whose_errors_are_separated():
     small = made(2, 20)
     cell = poses_by_opencv(small, 0.99)
     start = start_of(cell)

@@ -81,7 +81,7 @@ def test_a_stop_left_out_is_predicted_as_by_a_refit_without_it():
 
 
 @pytest.mark.parametrize("in_hand", [True, False])
-def test_a_camera_that_sways_is_told_from_its_corners_noise_and_from_the_arm(in_hand):
+def test_swaying_cameras_are_separated_from_corners_noise_and_from_the_arm(in_hand):
     squares, views, errors, used = [], [], [], []
     for seed in range(4):
         small = made(seed, 20, 3, in_hand=in_hand, sways=2e-3)

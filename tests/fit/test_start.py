@@ -66,7 +66,7 @@ def test_poses_at_random_are_not_taken_for_shifted():
     assert np.flatnonzero(~solve(cell).fit.used).tolist() == sorted(rows.tolist())
 
 
-def test_far_boards_tell_a_lens_by_the_robots_motion(monkeypatch):
+def test_far_boards_determine_a_lens_by_the_robots_motion(monkeypatch):
     def far(rng):
         found = seen_at(rng)
         found[:3, 3] += np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(2.2, 2.8)])

@@ -20,8 +20,8 @@ def command(argv):
     try:
         document = fitted(Path(argv[1]), Path(argv[3]))
     except VisioncalError as error:
-        told = {"class": type(error).__name__, "message": str(error)}
-        return {"status": 2, "out": json.dumps({"error": told})}
+        refusal = {"class": type(error).__name__, "message": str(error)}
+        return {"status": 2, "out": json.dumps({"error": refusal})}
     return {"status": 0, "out": json.dumps(document)}
 
 

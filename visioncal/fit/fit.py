@@ -208,7 +208,7 @@ class Fit:
         """Leaves each stop out in turn: no sighting at a stop predicts the others there.
 
         As `left_out`, but that all rows at a stop are removed from the common unknowns' information
-        at once, and its flanges err by what all others say of their noise.
+        at once, and its flanges err by the noise that all others determine.
         """
         return LeftOut.of(self.cell, self._by_stop())
 

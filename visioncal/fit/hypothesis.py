@@ -20,7 +20,7 @@ from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
 from visioncal.fit.linearise import Gram, corner_rows, pairs_of, predicted
 from visioncal.fit.score import Score, of_unknown
-from visioncal.fit.solve import Solved
+from visioncal.fit.solve import CellFit
 from visioncal.fit.unknowns import Key
 from visioncal.vision.targets import corner_positions
 
@@ -54,7 +54,7 @@ class Hypothesis(ABC):
 class Examined:
     """A fit, and what rejected sightings say beside it."""
 
-    solved: Solved
+    solved: CellFit
 
     @property
     def fit(self) -> Fit:
@@ -245,7 +245,7 @@ class Exchanged(Hypothesis):
                 yield Case(self.kind, "", views, float(gain - among))
 
 
-def ranked(solved: Solved, hypotheses: Iterable[Hypothesis]) -> Sequence[tuple[Case, float]]:
+def ranked(solved: CellFit, hypotheses: Iterable[Hypothesis]) -> Sequence[tuple[Case, float]]:
     """All cases with their probabilities, the likeliest first; what is left is that none is so."""
     seen = Examined(solved)
     cases = [case for hypothesis in hypotheses for case in hypothesis.cases(seen)]

@@ -326,7 +326,7 @@ def _corner_parts(unknowns: Unknowns, pair: Pair, grams: FloatArray) -> _Parts:
         return ((px, grams, counts),)
     by_pose = grams[:, :, :6] @ of_pose_alone(grams) @ grams[:, :6]
     within = grams - by_pose
-    # But for rounding, these are zero: no noise within a view looks like its pose.
+    # But for rounding, these are zero: noise within a view is orthogonal to its pose.
     within[:, :6], within[:, :, :6] = 0.0, 0.0
     return (px, within, counts - 6.0), (view, by_pose, np.full(len(counts), 6.0))
 
@@ -370,7 +370,7 @@ def corner_rows(
         residual = residual - field @ state.values["field", seer]
     lines = [by_point @ -skew(points), by_point, *columns.values(), residual[:, :, None]]
     rows = np.concatenate(lines, axis=2)
-    # Corners behind the camera say nothing.
+    # Corners behind the camera have no information.
     rows = np.where(np.isfinite(rows).all(axis=(1, 2), keepdims=True), rows, 0.0)
     rows *= pair.weights[:, None, None]
     ends = 6 + np.cumsum([0, *(value.shape[2] for value in columns.values())])
@@ -382,8 +382,8 @@ def _measured_parts(
 ) -> tuple[_Parts, dict[Key, IntArray]]:
     """Gram matrices of measured poses and places, and the local column of a board's size.
 
-    Who measured poses by an image of a board that is larger by a share s than was said made their
-    distances shorter: they are divided by 1 + s.
+    Poses that were measured by images of a board that is larger by a share s than as stated have
+    distances that are too short: those predicted are divided by 1 + s.
     """
     (seer, seen), rows = pair.names, np.zeros((len(pair.rows), 6, 8))
     first, size = pair.sightings[0].evidence, 1.0
@@ -429,10 +429,10 @@ def _measured_parts(
 def _by_sight(rows: FloatArray, poses: FloatArray, middle: FloatArray) -> FloatArray:
     """Rows (k, 6, w) of poses about a board's middle, in axes of which the last is along the sight.
 
-    An image tells tilt and distance worse than the turn about the line of sight and what is across
-    it. The smaller the board is in it, the worse: rows are in units of what noise is at a metre,
-    from where it grows with the distance, and along the sight with its square. Both are of the
-    (k, 4, 4) poses as measured, so that noise does not depend on the unknowns.
+    An image determines tilt and distance less surely than the turn about the line of sight and what
+    is across it. The smaller the board is in it, the worse: rows are in units of what noise is at a
+    metre, from where it grows with the distance, and along the sight with its square. Both are of
+    the (k, 4, 4) poses as measured, so that noise does not depend on the unknowns.
     """
     rows = adjoint(invert(compose(np.eye(3), middle))) @ rows
     places = apply(poses, middle[None])[:, 0]

@@ -24,7 +24,7 @@ _RIDGES = (1e-12, 1e-9, 1e-6, 1e-3)
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What a term's rows say of the errors of a body's units."""
+    """A term's rows by the errors of a body's units."""
 
     body: int
     columns: IntArray  # (c,) of the common unknowns.

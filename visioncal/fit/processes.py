@@ -34,7 +34,7 @@ _LOOSE = 0.01
 # Shares of evidence that do not count: of a size, of a process where estimates are averaged.
 _LITTLE, _SHARE = 1e-4, 0.01
 # Most stops at which estimates are averaged; of more, the mean over the stops is nearly as good.
-_SOLVED = 100
+_AVERAGED = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     for at in range(0, len(shares), tried):
         own, process = shares[at : at + tried], kinds[at][0]
         share = float(own.sum())
-        if process.is_of_time and share > _SHARE and stops <= _SOLVED:
+        if process.is_of_time and share > _SHARE and stops <= _AVERAGED:
             # The likeliest size of a process stands for all of its sizes where it is estimated.
             values, covariance = _estimated(alone, *kinds[at + int(own.argmax())])
             moved.append((share, values - fit.estimate.values))

@@ -18,7 +18,7 @@ from visioncal.model import Cell
 
 # Share of the limit from which sightings are tested again, by noise without them.
 _SUSPECT = 0.4
-# Most linearisations; a step under this share of every sigma is not worth one.
+# Most linearisations; a step under this share of every sigma is negligible.
 _ROUNDS, _SETTLED = 8, 0.02
 # Rounds in which sightings come back while the noise is scaled by what most have: the nearest half
 # has less noise than all.

@@ -12,7 +12,7 @@ from visioncal.fit.mixed import Estimate, Mixed
 SIGNIFICANT = 13.8
 # Most change of a size's logarithm in one search: in the elimination, far sizes cancel to nothing.
 _FAR = 3.0
-# Most change in one step; gain of -2 log L that is not worth one.
+# Most change in one step; gain of -2 log L that is negligible.
 _STEP, _LITTLE = 1.5, 1e-3
 _STEPS = 40
 # Least curvature, over that of each size alone.

@@ -40,8 +40,8 @@ _OPENED = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """The fit of a cell."""
+class CellFit:
+    """The fit of a cell, and how it came about."""
 
     fit: Fit
     left_out: LeftOut
@@ -54,7 +54,7 @@ class Solved:
         return self.fit.used
 
 
-def solve(cell: Cell) -> Solved:
+def solve(cell: Cell) -> CellFit:
     """Fits a cell."""
     start = start_of(cell)
     effects = effects_of(start.cell)
@@ -79,7 +79,7 @@ def solve(cell: Cell) -> Solved:
         found = {name: consider(fit, name) for name in bare}
     for one in found.values():
         fit = fit if one is None else fit.considering(one.covariance, one.shift)
-    return Solved(with_held_lenses(fit), left_out, start, search.effort)
+    return CellFit(with_held_lenses(fit), left_out, start, search.effort)
 
 
 def with_free_boards(fit: Fit) -> Unknowns:
@@ -132,7 +132,7 @@ def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
         elif table.intrinsics != "hold":
             given = given_lens(table, name, _corners_px(cell, name), is_spare=has_shape)
             members += [] if given is None else [given]
-    # Errors of an arm without joints follow its posture, and look like a board's size.
+    # Errors of an arm without joints follow its posture: they are confounded with a board's size.
     is_sized = all(arm.has_joints for arm in cell.arms.values())
     pictured = {s.seen for s in cell.sightings if s.corners is not None}
     for name in dict.fromkeys(

@@ -2,7 +2,7 @@
 
 Edges are joined pair by pair, the surest first; each by the nearest half of its sightings, so that
 wrong ones may be nearly as many as right ones. A flat board has two poses, and a symmetric one
-looks the same after a turn: all stay candidates until edges tell which agree.
+has the same image after a turn: all stay candidates until edges decide between them.
 """
 
 from collections.abc import Mapping, Sequence

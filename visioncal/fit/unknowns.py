@@ -220,10 +220,10 @@ class Unknowns:
 
 
 def given_lens(table: CameraTable, frame: str, px: FloatArray, *, is_spare: bool) -> Vector | None:
-    """A stated lens, as far as it may be off; None where nothing says how far.
+    """A stated lens, as far as it may be off; None where no sigma is known.
 
     Its focal lengths and centre are off by the stated sigma, if there is one. Where `is_spare`, (n,
-    2) corners are enough to tell the rest: by a maker's prior if it is to be refined, else by a
+    2) corners determine the rest: by a maker's prior if it is to be refined, else by a
     size of focal lengths, centre and distortion each. In units of intrinsics that move the corners
     by one pixel (rms), but where these are stated.
     """
@@ -263,9 +263,9 @@ def estimated_lens(frame: str, lens: Camera) -> Vector:
 
 
 def printed_board(frame: str, board: Target | None, *, has_shape: bool, is_sized: bool) -> Vector:
-    """A printed board, or None of which nothing is said: its size, its shape where `has_shape`.
+    """A printed board, or None of which nothing is stated: its size, its shape if `has_shape`.
 
-    `is_sized` where errors of the arms cannot look like its size: then that is estimated.
+    `is_sized` where errors of the arms are not confounded with its size: then that is estimated.
     """
     share = board.square_sigma_m / board.square_m if board else DEFAULT_RELATIVE_SIGMA
     low = max(share, 1e-7)

@@ -1,4 +1,4 @@
-"""Arms, and the moments at which a cell is looked at."""
+"""Arms, and the moments of a cell."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Arm:
 
     @property
     def has_joints(self) -> bool:
-        """Whether errors of its links can be told from its posture."""
+        """Whether errors of its links can be determined from its postures."""
         return self.joints is not None and self.model is not None
 
 

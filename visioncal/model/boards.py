@@ -13,8 +13,8 @@ def shape_basis(points: FloatArray) -> FloatArray:
     """Derivatives (c, 3, 10) of a board's (c, 3) corners by its shape [m].
 
     Size, aspect and shear are shares of its lengths; a bend is the height at a distance of half of
-    its longer side from its middle [m], less the plane that fits it best, which no pose tells
-    from it.
+    its longer side from its middle [m], less the plane that fits it best: that is confounded with
+    the board's pose.
     """
     middle, half = (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0).max() / 2
     u, v = ((points - middle) / half)[:, :2].T

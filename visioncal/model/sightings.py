@@ -21,7 +21,7 @@ class MeasuredPose:
 
     @property
     def is_of_board(self) -> bool:
-        """Whether a program found it in an image: by the size that it was told of the board."""
+        """Whether a program found it in an image, by the board's stated size."""
         return self.sigmas == (None, None)
 
 
@@ -84,7 +84,7 @@ class Sighting:
 
     @property
     def directions(self) -> int:
-        """How many of the six directions of a pose it tells."""
+        """How many of the six directions of a pose it determines."""
         if isinstance(self.evidence, MeasuredPlace):
             return len(self.evidence.axes)
         if isinstance(self.evidence, MeasuredPose):
