@@ -9,7 +9,7 @@ import cv2
 import pytest
 import tomli_w
 from PIL import Image
-from support.commands import Done
+from support.commands import Done, visioncal
 from support.edited import rewritten
 from support.following import follow
 from support.fuzz.broken_sessions import BROKEN, edit, sound_session
@@ -197,6 +197,23 @@ def nothing(_folder: Path) -> None:
     pass
 
 
+def test_the_part_of_a_lens_that_does_not_fit_is_named(place):
+    sound = sound_session(place / "cell")
+    document = tomllib.loads((sound / "session.toml").read_text("utf-8"))
+    fx, fy, cx, cy = document["camera"]["matrix"]
+    k1, k2, p1, p2, k3 = document["camera"]["distortion"]
+    for given, is_distorted in (
+        # As some programs order the coefficients; and of an image that is cut out of another.
+        ({"distortion": [k1, k2, k3, p1, p2]}, True),
+        ({"matrix": [fx, fy, cx + 30.0, cy - 20.0]}, False),
+    ):
+        camera = document["camera"] | given
+        (sound / "session.toml").write_text(tomli_w.dumps(document | {"camera": camera}), "utf-8")
+        said = visioncal(*calibrate("cell")).good().said
+        assert "The given intrinsics do not fit" in said
+        assert ("the distortion, k1, k2, p1, p2, k3, moved corners by" in said) == is_distorted
+
+
 def calibrate(path: str) -> tuple[str, ...]:
     return "calibrate", path, "-o", "out"
 
@@ -241,6 +258,9 @@ DONE_WRONG = {
     "a comma in the matrix": (text("914.2", "914,2"), CELL, 2, "must be [fx, fy, cx, cy] [px]"),
     "a focal length in mm": (text(FOCAL, "3.6, 3.6,"), CELL, 2, "fx and fy are in pixels"),
     "a lens of twice the size": (text(FOCAL, "1828.4, 1827.2,"), CELL, 0, "good"),
+    "images squeezed to another width": (
+        lambda it: (resized(it, 1, (1066, 800)), text("1280", "1066")(it)), CELL, 0, "good",
+    ),
     "[cam] for [camera]": (text("[camera]", "[cam]"), CELL, 0, "good"),
     "a path as Windows writes it": (
         text("charuco_9x6_30mm", "C:\\Zelle\\b.toml"), CELL, 2, "paths with /",
@@ -261,7 +281,16 @@ DONE_WRONG = {
         nothing, ("verify", "cell", "--against", "cell"), 2, "Run visioncal",
     ),
 }  # fmt: skip
-QUICK = ("a typing error", "no ", "a row", "[cam]", "a focal", "one pose", "a path")
+QUICK = (
+    "images squeezed",
+    "a typing error",
+    "no ",
+    "a row",
+    "[cam]",
+    "a focal",
+    "one pose",
+    "a path",
+)
 
 
 @pytest.mark.parametrize(

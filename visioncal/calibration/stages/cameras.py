@@ -27,7 +27,7 @@ from visioncal.vision.targets import first_corners
 T = TypeVar("T", bound=Observed)
 
 # Stated intrinsics belong to another camera where estimated ones fit clearly better, and either
-# their focal lengths differ by more than any focusing [share] or the stated ones fit badly.
+# a focal length differs by more than any focusing [share] or the stated ones fit badly.
 _OTHER_FOCAL = 0.1
 
 
@@ -195,7 +195,7 @@ def _other_lens(
         # The images do not determine a lens, or show another board than the stated one.
         return None
     change = np.abs(lens.camera.matrix[:2] / stated.matrix[:2] - 1.0)
-    is_other = change.min() > _OTHER_FOCAL or stated_px > CalibrationLimits().pixel_px[1]
+    is_other = change.max() > _OTHER_FOCAL or stated_px > CalibrationLimits().pixel_px[1]
     if not is_other or CLEAR_RATIO * lens.sigma_px > stated_px:
         return None
     poses = estimate_poses(corners, targets, lens.camera, len(lens.covariance))

@@ -1,6 +1,7 @@
 """Lenses: stated ones that do not fit, errors beyond their models, and changes of focus."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import moved_mahalanobis_sq
 from visioncal.estimation.lens_levels import SIGNIFICANT
 from visioncal.estimation.scene import ONLY_CAMERA
+from visioncal.results.compare import intrinsics_names
 from visioncal.vision.camera import intrinsics, normalise, project
 
 # Changes of intrinsics or corners below this show in no image [px].
@@ -72,10 +74,21 @@ def _of_camera(fitted: Fit, camera: str) -> Iterator[Finding]:
         moves = (fitted.values(lens) - intrinsics(problem.scene.camera))[:4]
         sigmas_px = problem.stated_sigma[:4]
         moved = f"fx, fy, cx, cy moved by {_px(moves)} px."
-        rays = normalise(problem.scene.camera, stack.px)
+        stated, refined = problem.scene.camera, optics.camera(camera)
+        rays = normalise(stated, stack.px)
         rays = np.column_stack([rays, np.ones(len(rays))])
-        before, after = (project(at, rays) for at in (problem.scene.camera, optics.camera(camera)))
-        moved_px = np.nanmax(np.linalg.norm(after - before, axis=1), initial=0.0)
+        # By the matrix alone, the rest is the distortion's.
+        before, unbent, after = (
+            project(at, rays)
+            for at in (stated, replace(refined, distortion=stated.distortion), refined)
+        )
+        moved_px, bent_px = (
+            float(np.nanmax(np.linalg.norm(after - at, axis=1), initial=0.0))
+            for at in (before, unbent)
+        )
+        if bent_px > max(np.abs(moves).max(), _LEAST_MOVE_PX):
+            names = ", ".join(intrinsics_names(stated)[4:])
+            moved = f"the distortion, {names}, moved corners by up to {figure(bent_px)} px; {moved}"
         is_wrong = problem.scene.matrix_sigma_px is None
         is_wrong |= bool(np.any(np.abs(moves) > CONTRADICTION * sigmas_px))
         if is_wrong and moved_px > _LEAST_MOVE_PX:
