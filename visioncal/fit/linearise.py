@@ -255,12 +255,8 @@ def predicted_sightings(cell: Cell, unknowns: Unknowns, state: State, pair: Pair
 
 def _edge(cell: Cell, state: State, name: str) -> FloatArray:
     """(4, 4) `parent_from_frame`, unknown or known."""
-    found = state.get("edge", name)
-    if found is None:
-        found = cell.known_edge(name)
-    if found is None:
-        raise KeyError(name)
-    return found
+    known = cell.tree.branches[name].known
+    return state.values["edge", name] if known is None else known
 
 
 def linearised(

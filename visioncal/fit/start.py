@@ -73,22 +73,19 @@ class Start:
 
 def start_of(cell: Cell) -> Start:
     """Starts a fit; sightings without a pose, or whose frames are not connected, are left out."""
-    lenses = start_lenses(cell.with_sightings([s for s in cell.sightings if not s.is_held]))
+    lenses = start_lenses(cell.only(np.flatnonzero(~cell.held).tolist()))
     weighed = first_weighed(cell, lenses)
     cell, sound = weighed.cell, weighed.sound & ~cell.held
     options = candidates(cell, lenses)
     kept = [at for at, option in enumerate(options) if option is not None]
-    cell, sound = cell.with_sightings([cell.sightings[at] for at in kept]), sound[kept]
+    cell, sound = cell.only(kept), sound[kept]
     known = [option for option in options if option is not None]
     # What is held out helps no fit.
-    own = [at for at, sighting in enumerate(cell.sightings) if not sighting.is_held]
-    places = _Places(cell.with_sightings([cell.sightings[at] for at in own]))
+    own = np.flatnonzero(~cell.held).tolist()
+    places = _Places(cell.only(own))
     places.join_all([known[at] for at in own])
     joined = [at for at, s in enumerate(cell.sightings) if places.are_joined(*s.pair)]
-    cell, known = (
-        cell.with_sightings([cell.sightings[at] for at in joined]),
-        [known[at] for at in joined],
-    )
+    cell, known = cell.only(joined), [known[at] for at in joined]
     is_placed = [s.view not in places.misplaced for s in cell.sightings]
     sound = sound[joined] & np.array(is_placed, bool)
     edges = {name: places.edge(name) for name in cell.unknown}

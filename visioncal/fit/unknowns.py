@@ -110,10 +110,6 @@ class State:
     values: Mapping[Key, FloatArray]
     errors: Mapping[str, FloatArray]  # (s, 6) right perturbations of each flange's pose.
 
-    def get(self, kind: Kind, name: str) -> FloatArray | None:
-        """The value of something; None where it has none."""
-        return self.values.get((kind, name))
-
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:

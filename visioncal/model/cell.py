@@ -1,12 +1,12 @@
 """A cell: a tree of frames, the arms that move in it, and what was seen."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from visioncal.core.types import FloatArray, Mask, Target
+from visioncal.core.types import Mask, Target
 from visioncal.estimation.tree import Tree
 from visioncal.model.arm import Arm, Moments
 from visioncal.model.sightings import Sighting
@@ -65,6 +65,6 @@ class Cell:
         """The cell with others."""
         return replace(self, sightings=tuple(sightings))
 
-    def known_edge(self, frame: str) -> FloatArray | None:
-        """(4, 4) `parent_from_frame` of an edge that is known; None of others."""
-        return self.tree.branches[frame].known
+    def only(self, rows: Iterable[int]) -> "Cell":
+        """The cell with some of its sightings."""
+        return self.with_sightings([self.sightings[row] for row in rows])
