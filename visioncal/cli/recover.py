@@ -5,10 +5,10 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import numpy as np
 import typer
@@ -35,7 +35,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import CorrectOptions, ExportOptions, RecoverOptions
 from visioncal.cli.session_options import PlanOptions
 from visioncal.cli.summary import print_conditions, print_steps, print_verdict
-from visioncal.core.codec import read
+from visioncal.core.codec import REST, read, write
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_json
@@ -49,24 +49,26 @@ from visioncal.session import Session
 _ACT, _TABLE, _TARGETS = "recover.json", "views.csv", "targets.csv"
 
 
-@dataclass(frozen=True)
+@dataclass(kw_only=True)
 class _Act:
-    """What recover.json holds."""
+    """What recover.json holds; it grows with each step."""
 
-    schema: Literal[1]
+    schema: Literal[1] = 1
     against: tuple[str, str]  # Digest of the earlier calibration's session, and when it was made.
-    minutes: Mapping[str, float]  # Of each step that is done.
+    minutes: dict[str, float]  # Of each step that is done.
     stated: tuple[str, ...]  # Causes.
-    record: str = "visioncal record"  # The command that records the planned stops.
+    record: str | None = None  # The command that records the planned stops; None before the plan.
+    # What a newer version has noted, unchanged.
+    further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        words = shlex.split(self.record)
+        words = shlex.split(self.record or "visioncal record")
         # Whoever edited the file has no say in what is typed.
-        if words[:2] != ["visioncal", "record"] or self.record != shlex.join(words):
+        if words[:2] != ["visioncal", "record"] or self.record not in (None, shlex.join(words)):
             raise ValueError(f"record is {self.record!r}; a visioncal record is needed")
 
 
-def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
+def _opened(options: RecoverOptions, old: Calibration) -> _Act:
     """What recover.json says of a recovery, or its begin; raises DataError."""
     folder, taught = options.folder, options.targets
     if taught is not None and taught.resolve() == (folder / _TARGETS).resolve():
@@ -75,19 +77,18 @@ def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
             culprits=["--targets"],
             next_step="Give the taught targets another name, or put them elsewhere.",
         )
-    against, known, file = [old.session_sha256, old.created], dict[str, Any](), folder / _ACT
+    against, file = (old.session_sha256, old.created), folder / _ACT
+    act = _Act(against=against, minutes={}, stated=())
     if file.is_file():
-        known = parse_stored(read_bytes(file), str(file))
-        read(_Act, known, str(file))
-    if known.get("against", against) != against:
+        act = read(_Act, parse_stored(read_bytes(file), str(file)), str(file))
+    if act.against != against:
         raise DataError(
             f"{folder} is the recovery of another calibration than that of "
             f"{old.session_name!r}, {old.created}.",
             culprits=[str(folder), "--against"],
             next_step="Name that one, or another folder.",
         )
-    facts: dict[str, Any] = {"schema": 1, "against": against, "minutes": {}, "stated": []} | known
-    facts["stated"] = options.cause or facts["stated"]
+    act.stated = tuple(options.cause or act.stated)
     if old.cell is None and old.mount == "instrument":
         raise DataError(
             f"{options.against} was measured by an instrument, and recover works by what a camera "
@@ -96,18 +97,18 @@ def _opened(options: RecoverOptions, old: Calibration) -> dict[str, Any]:
             next_step="Calibrate anew: visioncal calibrate SESSION -o OUT",
         )
     if old.cell is None:
-        recovery.parts_changed(old, facts["stated"])
-    return facts
+        recovery.parts_changed(old, act.stated)
+    return act
 
 
 @contextmanager
-def _step(options: RecoverOptions, facts: dict[str, Any], name: str) -> Iterator[None]:
+def _step(options: RecoverOptions, act: _Act, name: str) -> Iterator[None]:
     """Writes down how long a step took, once it is done."""
     begun = time.monotonic()
     yield
-    facts["minutes"][name] = round((time.monotonic() - begun) / 60.0, 3)
+    act.minutes[name] = round((time.monotonic() - begun) / 60.0, 3)
     options.folder.mkdir(parents=True, exist_ok=True)
-    write_json(options.folder / _ACT, facts)
+    write_json(options.folder / _ACT, write(_Act, act))
 
 
 def recover_command(options: RecoverOptions) -> None:
@@ -119,11 +120,11 @@ def recover_command(options: RecoverOptions) -> None:
     """
     loaded, result = load_result(options.against), options.folder / "result"
     path = options.stops or options.folder / "stops"
-    facts = _opened(options, loaded)
-    stated = causes = tuple(facts["stated"])
-    session, old = select_matching(_recorded(options, facts, path), loaded, options.choice)
+    act = _opened(options, loaded)
+    stated = causes = act.stated
+    session, old = select_matching(_recorded(options, act, path), loaded, options.choice)
     with (
-        _step(options, facts, "result"),
+        _step(options, act, "result"),
         shown_progress(quiet=False) as progress,
         with_run_paths(path),
     ):
@@ -158,7 +159,7 @@ def recover_command(options: RecoverOptions) -> None:
         )
     base_moved, flange_moved = moved_along(old, new, causes)
     if options.targets is not None:
-        with _step(options, facts, "targets"):
+        with _step(options, act, "targets"):
             names = ("targets", "tool", "payload_kg", "payload_m", "temperatures", "force")
             given = {name: getattr(options, name) for name in names}
             out = _cleared(options.folder / _TARGETS)
@@ -167,12 +168,11 @@ def recover_command(options: RecoverOptions) -> None:
             by_flange = flange_moved if options.tool is None else np.eye(4)
             correct_command(to_correct, (base_moved, by_flange))
     for name in options.to or ():
-        with _step(options, facts, f"export {name}"):
+        with _step(options, act, f"export {name}"):
             out = _cleared(options.folder / "exports" / name)
             export_command(ExportOptions(source=result, to=name, out=out, force=options.force))
-    minutes = facts["minutes"]
-    steps = ", ".join(f"{name} {value:.2f}" for name, value in minutes.items())
-    answer(f"{steps}; {sum(minutes.values()):.2f} in all", "minutes: ")
+    steps = ", ".join(f"{name} {value:.2f}" for name, value in act.minutes.items())
+    answer(f"{steps}; {sum(act.minutes.values()):.2f} in all", "minutes: ")
     report_written(written, status=exit_status(new.verdict))
 
 
@@ -183,16 +183,16 @@ def _cleared(file: Path) -> Path:
     return file
 
 
-def _recorded(options: RecoverOptions, facts: dict[str, Any], path: Path) -> Session:
+def _recorded(options: RecoverOptions, act: _Act, path: Path) -> Session:
     """The recorded stops; without them, plans them, says how to record, and exits."""
     table, planned = path if path.suffix == ".rrd" else path / _TABLE, options.folder / "plan"
     session = Session.load(path) if table.is_file() else None
     if session is not None and len(session.views) >= options.count:
         if options.stops is None and planned.is_dir():
             taken_s = table.stat().st_mtime - planned.stat().st_mtime
-            facts["minutes"]["stops"] = round(max(taken_s, 0.0) / 60.0, 3)
+            act.minutes["stops"] = round(max(taken_s, 0.0) / 60.0, 3)
         return session
-    if options.stops is None and "record" not in facts:
+    if options.stops is None and act.record is None:
         asked = PlanOptions(
             **{name: getattr(options, name) for name in ("camera", "robot", "target")},
             source=str(options.against),
@@ -200,13 +200,13 @@ def _recorded(options: RecoverOptions, facts: dict[str, Any], path: Path) -> Ses
             stops=options.count,
             out=planned,
         )
-        with _step(options, facts, "plan"):
+        with _step(options, act, "plan"):
             try:
-                facts["record"] = plan_command(asked, path)
+                act.record = plan_command(asked, path)
             except DataError as error:
                 warn(f"no stops are planned: {error.message}")
     taken, places = 0 if session is None else len(session.views), planned / STOPS
-    record = facts.get("record", f"visioncal record --page -o {shlex.quote(str(path))}")
+    record = act.record or f"visioncal record --page -o {shlex.quote(str(path))}"
     reason = f"{taken} of {options.count} stops are in {path}."
     how = (
         "Keep clear: an arm whose joint slipped stands elsewhere than it reads. Drive to those"
