@@ -496,12 +496,12 @@ def test_an_act_is_ended_and_gone_on_with_at_each_step(cell, tmp_path):
     # A step of the act is no error.
     assert "error" not in begun.err
     assert "BOARD stands for the target's name" in begun.err
-    told = json.loads((act / "recover.json").read_text())
+    begun_act = json.loads((act / "recover.json").read_text())
     for edited, words in EDITED_ACTS:
-        (act / "recover.json").write_text(json.dumps(told | edited) if edited else words)
+        (act / "recover.json").write_text(json.dumps(begun_act | edited) if edited else words)
         refused = visioncal(*command).refused("recover.json" if not edited else words)
         assert "rm -rf" not in refused.err.partition("needed.")[2]
-    (act / "recover.json").write_text(json.dumps(told))
+    (act / "recover.json").write_text(json.dumps(begun_act))
     # The recording was cut off after nine stops, and is whole later.
     stops.mkdir()
     (stops / "session.toml").write_text((cell / "moved/session.toml").read_text())

@@ -298,7 +298,7 @@ def test_a_focus_that_chance_explains_leaves_the_flange_its_noise():
         session = cell_session(cell, "cell", seen="corners")
         camera = session.document["camera"] | {"focus": "fixed"}
         fixed = replace(session, document=session.document | {"camera": camera})
-        found, known = (calibrate(told).noise["robot_translation_mm"] for told in (session, fixed))
+        found, known = (calibrate(each).noise["robot_translation_mm"] for each in (session, fixed))
         # What is left of it is far less than the uncertainty of the noise, a sixth.
         assert found == pytest.approx(known, rel=0.02)
 

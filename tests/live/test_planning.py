@@ -187,8 +187,8 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
     design = next_best(begun, HAND_EYE, q)
     # How well the sizes of the arm's errors and of the noise are known cannot be told beforehand.
     beside = ("size of arm errors", "noise_level")
-    untold = sum((known.assessment.fit.beside.get(name, 0.0) for name in beside), 0.0)
-    covariance = known.assessment.fit.whole - untold
+    not_known = sum((known.assessment.fit.beside.get(name, 0.0) for name in beside), 0.0)
+    covariance = known.assessment.fit.whole - not_known
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
     world = predict_worlds([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
     # A result holds the board's size; in the plan it is open, and takes up errors of the arm. What
