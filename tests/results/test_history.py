@@ -165,6 +165,37 @@ def limited(path):
     refused(path, "the disk is full")
 
 
+CHECK = {
+    "calibration": {"session": "cell", "sha256": "ab"},
+    "session": {"name": "later", "sha256": "cd"},
+    "created": "2026-11-20T10:00:00+00:00",
+    "status": "good",
+    "sentences": ["It is valid."],
+    "triggers": [],
+    "misfit": 1.0,
+    "p_value": 0.5,
+}
+
+
+@pytest.mark.parametrize(
+    ("edited", "key"),
+    [
+        ({"status": "fine"}, "status"),
+        ({"sentences": [3]}, "reason"),
+        ({"misfit": "x"}, "figures.misfit"),
+        ({"session": {"name": "later", "sha256": {}}}, "sha256"),
+    ],
+)
+def test_a_check_of_other_types_spoils_no_history(edited, key, tmp_path):
+    """What was entered stays: the history could not be read from then on."""
+    path, check = tmp_path / SITE_FILE, tmp_path / "verify.json"
+    check.write_text(json.dumps(CHECK))
+    visioncal("history", path, "--add", check).good()
+    check.write_text(json.dumps(CHECK | edited))
+    visioncal("history", path, "--add", check).refused(f"verify.json: {key} is")
+    assert [each.reason for each in History(path).entries()] == ["It is valid."]
+
+
 def test_a_full_disk_takes_nothing_away(tmp_path):
     """The largest file that the system allows is that of the entries that are there."""
     history = History(tmp_path / "history.db")

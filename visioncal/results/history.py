@@ -199,17 +199,19 @@ def entry_of_frame(name: str, frame: Frame, calibration: Calibration | None) -> 
 def entry_of_check(document: Mapping[str, Any], label: str = "verify.json") -> Entry:
     """The entry of a check by its verify.json; raises DataError for one of an older version."""
     with reading(label, "a check", "Verify once more, by this version."):
-        return Entry(
-            cell=one_line(document["calibration"]["session"]),
-            at=_utc(document["created"]),
-            kind="verified",
-            status=document["status"],
-            reason=next(iter(document["sentences"]), ""),
-            session=one_line(document["session"]["name"]),
-            sha256=document["session"]["sha256"],
-            against=document["calibration"]["sha256"],
-            figures={"misfit": document["misfit"], "p_value": document["p_value"]},
-        )
+        facts = {
+            "cell": one_line(document["calibration"]["session"]),
+            "at": _utc(document["created"]),
+            "kind": "verified",
+            "status": document["status"],
+            "reason": next(iter(document["sentences"]), ""),
+            "session": one_line(document["session"]["name"]),
+            "sha256": document["session"]["sha256"],
+            "against": document["calibration"]["sha256"],
+            "figures": {"misfit": document["misfit"], "p_value": document["p_value"]},
+        }
+        # What cannot be read again stays in a history for ever.
+        return read(Entry, facts, "")
 
 
 def _utc(created: str) -> str:
