@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
@@ -274,7 +274,7 @@ def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[s
     files = [file for group in pictures for file in group.files]
     named = {file.stem: file for file in files} | {file.name: file for file in files}
     naming = {
-        name: tuple(named.get(cell.replace("\\", "/").rpartition("/")[2]) for cell in cells)
+        name: tuple(named.get(PureWindowsPath(cell).name) for cell in cells)
         for name, cells in free.items()
         if any(cells) and all(not cell or is_image_name(cell) or cell in named for cell in cells)
     }

@@ -18,7 +18,7 @@ from visioncal.core.documents.pendants import is_marked_pose, line_numbers, read
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
-from visioncal.core.types import FloatArray, IntArray, chosen_rows
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.session.images import IMAGE_ENDINGS
 
 _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
@@ -205,15 +205,23 @@ def appearance(numbers: FloatArray) -> str:
     """Whether (n, ...) numbers are those of a `pose`, `rotation` or `quaternion`; else empty."""
     flat = numbers.reshape(len(numbers), -1)
     flat = flat[np.isfinite(flat).all(axis=1)]
-    size, matrix = flat.shape[1], ROTATION_FORMS["matrix"]
+    size = flat.shape[1]
     if not len(flat) or size not in (4, 7, 9, 12, 16):
         return ""
     if size in (4, 7):
         is_unit = _are_unit(flat[:, -4:]) or _are_unit(flat[:, :4])
         return ("quaternion" if size == 4 else "pose") * is_unit
-    rotations = flat if size == 9 else split_matrices(flat)[1]
-    is_rotation = bool(np.isfinite(matrix.read(rotations)).all(axis=(1, 2)).mean() > 0.5)
-    return ("rotation" if size == 9 else "pose") * is_rotation
+    is_rotation = _are_rotations(flat if size == 9 else split_matrices(flat)[1])
+    return ("rotation" if size == 9 else "pose") * bool(is_rotation.mean() > 0.5)
+
+
+def _are_rotations(flat: FloatArray) -> Mask:
+    """Which of (n, 9) numbers are rotation matrices by rows."""
+    # Of others the nearest rotations, which take long to compute, are not needed.
+    rows_away = np.abs(np.linalg.norm(flat.reshape(-1, 3, 3), axis=2) - 1.0)
+    found = np.asarray((rows_away < _NORM_TOLERANCE).all(axis=1))
+    found[found] = np.isfinite(ROTATION_FORMS["matrix"].read(flat[found])).all(axis=(1, 2))
+    return found
 
 
 def _are_unit(numbers: FloatArray) -> bool:
@@ -238,12 +246,8 @@ def split_matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
     last = np.array([0.0, 0, 0, 1])
     if flat.shape[1] == 12:
         matrices = flat.reshape(-1, 3, 4)
-        after_position = ROTATION_FORMS["matrix"].read(flat[:, 3:])
-        upper_rows = ROTATION_FORMS["matrix"].read(matrices[:, :, :3].reshape(-1, 9))
-        if (
-            np.isfinite(after_position).all(axis=(1, 2)).sum()
-            > np.isfinite(upper_rows).all(axis=(1, 2)).sum()
-        ):
+        upper_rows = matrices[:, :, :3].reshape(-1, 9)
+        if _are_rotations(flat[:, 3:]).sum() > _are_rotations(upper_rows).sum():
             return flat[:, :3].copy(), flat[:, 3:].copy()
     else:
         square = flat.reshape(-1, 4, 4)

@@ -316,31 +316,24 @@ def ranked_poses(
     fields: Fields, whose: str, taken: Collection[str] = (), *, by_shape: bool = True
 ) -> list[list[PoseFields]]:
     """Fields that may hold the poses of the `robot` or `camera`, in groups, the likeliest first."""
+    groups: dict[tuple[int, bool], list[PoseFields]] = defaultdict(list)
+    # Those of frames of that side come first.
     possible = possible_poses(fields, taken, by_shape=by_shape)
-    of_side = [item for item in possible if item.sides == [whose]]
-    plain = [item for item in possible if not item.sides]
-    seen = [item for item in plain if item.is_named and _is_opencv(item)]
-    groups = [
-        [item for item in of_side if item.is_named and not item.is_reversed(whose)],
-        [item for item in of_side if item.is_named],
-        [item for item in plain if item.is_named and item not in seen] * (whose == "robot"),
-        seen,
-        [item for item in (*of_side, *plain) if not item.is_named] * (whose == "robot"),
-        [item for item in possible if len(item.sides) > 1] * (whose == "robot"),
-    ]
-    taken_up, ranked = set[PoseFields](), list[list[PoseFields]]()
-    for group in groups:
-        fresh = [item for item in group if item not in taken_up]
-        wanted = [item for item in fresh if not {*item.words} & _ASKED_FOR]
-        ranked += [
-            each for each in (wanted, [item for item in fresh if item not in wanted]) if each
-        ]
-        taken_up.update(fresh)
-    return ranked
-
-
-def _is_opencv(item: PoseFields) -> bool:
-    return any(re.search("[rt]vecs?$", name) for name in item.names)
+    for item in sorted(possible, key=lambda item: item.sides != [whose]):
+        is_own, is_plain = item.sides == [whose], not item.sides
+        # OpenCV gives vectors of the target.
+        is_seen = is_plain and any(re.search("[rt]vecs?$", name) for name in item.names)
+        fits = (
+            is_own and item.is_named and not item.is_reversed(whose),
+            is_own and item.is_named,
+            is_plain and item.is_named and not is_seen and whose == "robot",
+            is_seen and item.is_named,
+            (is_own or is_plain) and whose == "robot",
+            len(item.sides) > 1 and whose == "robot",
+        )
+        if any(fits):
+            groups[fits.index(True), bool({*item.words} & _ASKED_FOR)].append(item)
+    return [groups[rank] for rank in sorted(groups)]
 
 
 _JOINTS = re.compile(

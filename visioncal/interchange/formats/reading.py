@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -261,6 +262,10 @@ def best_of(found: Sequence[Fields]) -> Fields:
     return max(found, key=lambda fields: (holds_pose(fields), len(fields.numbers)))
 
 
+# A name in a document, rows, and their keys where these are a mapping's.
+_Rows: TypeAlias = tuple[str, list[object], tuple[str, ...]]
+
+
 def rows_of_document(document: object, path: Path) -> list[Fields]:
     """Rows of a document at any depth, of lists and of mappings of records; raises DataError."""
     numbered = _numbered(document) if isinstance(document, Mapping) else {}
@@ -281,9 +286,7 @@ def rows_of_document(document: object, path: Path) -> list[Fields]:
     return found
 
 
-def _fields_of_lists(
-    lists: Sequence[tuple[str, list[object], tuple[str, ...]]], path: Path
-) -> list[Fields]:
+def _fields_of_lists(lists: Sequence[_Rows], path: Path) -> list[Fields]:
     records = [rows for _, rows, _ in lists if isinstance(rows[0], Mapping)]
     return [
         replace(_fields_of_rows(f"{name}." * (records != [rows]), rows, path), stems=keys)
@@ -299,9 +302,7 @@ def _fields_of_rows(
     return fields_of_records(flat, places, path.stem, path.parent, views)
 
 
-def _row_lists(
-    document: object, name: str = ""
-) -> Iterator[tuple[str, list[object], tuple[str, ...]]]:
+def _row_lists(document: object, name: str = "") -> Iterator[_Rows]:
     """All that may be rows in a document: lists, and mappings of records that are alike, by key."""
     if isinstance(document, list | np.ndarray) and len(document) > 0:
         rows = [*document]
@@ -334,9 +335,7 @@ def _row_lists(
             yield from _row_lists(value, f"{name}.{key}" if name else str(key))
 
 
-def _opened(
-    groups: Sequence[object], name: str
-) -> Iterator[tuple[str, list[object], tuple[str, ...]]]:
+def _opened(groups: Sequence[object], name: str) -> Iterator[_Rows]:
     """The rows in lists of several groups, each with what stands beside the lists of its group."""
     rows = list[object]()
     if all(isinstance(group, list) for group in groups):
