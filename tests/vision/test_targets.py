@@ -385,6 +385,15 @@ def test_a_cell_is_calibrated_with_it(tmp_path, board, mount):
     assert min(errors) < 32.9
 
 
+def test_sound_circles_of_few_pixels_are_not_said_to_be_of_another_diameter(tmp_path):
+    options = CellOptions(views=17, mount="eye-to-hand", seed=77, camera=CAMERAS["fisheye"])
+    cell = simulate(replace(options, target=BOARDS["circles"], robot="generic-6r-1800"))
+    write_session(cell, tmp_path / "s")
+    result = run(Session.load(tmp_path / "s")).calibration
+    assert result.verdict.status == "good"
+    assert not any(finding.kind == "print_size" for finding in result.verdict.findings)
+
+
 def test_circles_of_another_diameter_are_named_until_it_is_written(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     true = BOARDS["circles"]

@@ -14,7 +14,7 @@ from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, Target
+from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation.appearance import ASPECT, SCALE, SHEAR, shaped_corners
 from visioncal.estimation.fit import Fit
@@ -23,6 +23,7 @@ from visioncal.estimation.unknowns import BOARD, LENS
 from visioncal.session import Session
 from visioncal.session.frames import frame_name
 from visioncal.vision.boards import kind_of
+from visioncal.vision.targets import corner_positions
 
 # Manufacturing accuracy of rigs, as a share of their size.
 _SAME_SIZE = 5e-4
@@ -71,7 +72,8 @@ def _of_prints(run: RunState) -> Iterator[Finding]:
         size = float(np.median(sizes))
         sigma = float(1.4826 * np.median(np.abs(sizes - size)) / len(sizes) ** 0.5)
         off = abs(size - target.diameter_m)
-        if off > max(CONTRADICTION * sigma, _INK * target.diameter_m):
+        least = _INK * target.diameter_m + float(np.median([_eroded_m(at, target) for at in seen]))
+        if off > max(CONTRADICTION * sigma, least):
             write, command = board_correction(run.session, name, f"diameter_m = {size:.4g}")
             yield Finding(
                 "print_size",
@@ -80,6 +82,17 @@ def _of_prints(run: RunState) -> Iterator[Finding]:
                 f"{1e3 * target.diameter_m:g} mm as stated. Their centres were fitted so; {write}.",
                 Remedy(f"{write[0].upper()}{write[1:]}.", command),
             )
+
+
+def _eroded_m(corners: Corners, target: Target) -> float:
+    """How much narrower blur draws circles of few pixels: their curved edge moves inwards [m]."""
+    seen_px, printed_m = (
+        float(np.linalg.norm(np.ptp(places, axis=0)))
+        for places in (corners.px, corner_positions(target))
+    )
+    px_per_m = seen_px / printed_m
+    # Renderings show twice blur^2 / radius.
+    return 4.0 * corners.blur_px**2 / (px_per_m**2 * target.diameter_m)
 
 
 def _of_measured_poses(run: RunState) -> Iterator[Finding]:
