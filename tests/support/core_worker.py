@@ -36,7 +36,8 @@ def fitted(path, out):
     corners = dict(session.corners)
     if any(view.image and not view.has_corners for view in session.views):
         corners |= dict(detect(session).corners)
-    solved = solve(read_cell(session, corners))
+    session, sweeps = on_one_clock(session)
+    solved = solve(read_cell(session, corners, sweeps))
     fit = solved.fit
     SOLVED[str(out / "calibration.json")] = fit
     names = {}
@@ -68,6 +69,31 @@ def fitted(path, out):
     out.mkdir(parents=True, exist_ok=True)
     (out / "calibration.json").write_text(json.dumps(document))
     return document
+
+
+def on_one_clock(session):
+    """A session with the poses of robots at the times of its rows, and what was seen in motion."""
+    from visioncal.calibration.run import STAGES, initial_state
+    from visioncal.calibration.stages.clocks import waits_for_clock
+    from visioncal.model import Swept
+    from visioncal.session import frame_name
+
+    if not waits_for_clock(session):
+        return session, ()
+    known = initial_state(session)
+    for stage in STAGES[: [stage.name for stage in STAGES].index("clock") + 1]:
+        known = stage.run(known)
+    sweeps = [
+        Swept(
+            pair.camera,
+            frame_name("flange", pair.robot),
+            clocked.speeds,
+            clocked.prior_sigma_s(erring=pair.robot in known.timed.robot_documents),
+        )
+        for pair, clocked in known.clocks.items()
+        if clocked.speeds
+    ]
+    return known.timed, sweeps
 
 
 def located(calibration, looks):

@@ -1,13 +1,13 @@
 """Arms, and the moments of a cell."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.robot import Robot
+from visioncal.robot import Loads, Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,11 +19,43 @@ class Arm:
     poses: FloatArray
     joints: FloatArray | None = None  # (s, n) joint angles [rad]; None unless known at all stops.
     model: Robot | None = None  # Its geometry, if known.
+    # What it carries at the stops, and the side from which it approached them; None where unknown.
+    loads: Loads | None = None
 
     @property
     def has_joints(self) -> bool:
         """Whether errors of its links can be determined from its postures."""
         return self.joints is not None and self.model is not None
+
+    @property
+    def sides(self) -> FloatArray | None:
+        """(s, n) side from which each joint came to the stops: 1 from above, -1 from below.
+
+        Where none is stated, that of its last motion; 0 before the first. None without joints.
+        """
+        if self.joints is None:
+            return None
+        if self.loads is not None and self.loads.side.any():
+            return np.repeat(self.loads.side[:, None], self.joints.shape[1], axis=1)
+        stood = np.flatnonzero(np.isfinite(self.poses[:, 0, 0]))
+        moved = np.diff(self.joints[stood], axis=0, prepend=self.joints[stood[:1]])
+        # Encoders of a joint that stands still are noisy: it came from where it did before.
+        signs = -np.sign(np.where(np.abs(moved) > 1e-4, moved, 0.0))
+        last = np.maximum.accumulate(np.where(signs, np.arange(len(signs))[:, None], 0), axis=0)
+        sides = np.zeros_like(self.joints)
+        sides[stood] = np.take_along_axis(signs, last, axis=0)
+        return sides
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """Sightings by one camera while one robot moved, at poses of that robot by another clock."""
+
+    camera: str
+    flange: str
+    # (6,) twist per second of the flange by view, in its own frame [rad/s, m/s].
+    rates: Mapping[int, FloatArray]
+    sigma_s: float  # Standard deviation of the time between both clocks that was taken [s].
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +67,35 @@ class Moments:
     # (k,) share of the session: -1 at its first stop, 0 at its last. Picks come after it.
     progress: FloatArray
     stops: IntArray  # (k,) indices of the cell's stops; -1 of other moments.
+    # (k, n) sides from which joints came, as of `Arm.sides`; in the middle of their play elsewhere.
+    sides: Mapping[str, FloatArray] = field(default_factory=dict)
+    # What arms carry beside their own weight; those without carry nothing.
+    loads: Mapping[str, Loads] = field(default_factory=dict)
+    # (k, 6) twist per second of a flange, in its own frame [rad/s, m/s], while a camera looked: by
+    # the camera and the flange. At rest elsewhere.
+    rates: Mapping[tuple[str, str], FloatArray] = field(default_factory=dict)
+    # (k,) [s]; NaN, or None of all, where unknown: as at the end of the session.
+    stamps_s: FloatArray | None = None
 
     @classmethod
-    def of(cls, arms: Mapping[str, Arm], progress: FloatArray) -> Self:
+    def of(
+        cls,
+        arms: Mapping[str, Arm],
+        progress: FloatArray,
+        rates: Mapping[tuple[str, str], FloatArray] | None = None,
+        stamps_s: FloatArray | None = None,
+    ) -> Self:
         """The moments of all stops."""
-        known = {name: arm.joints for name, arm in arms.items() if arm.joints is not None}
-        poses = {name: arm.poses for name, arm in arms.items()}
-        return cls(poses, known, progress, np.arange(len(progress)))
+        return cls(
+            {name: arm.poses for name, arm in arms.items()},
+            {name: arm.joints for name, arm in arms.items() if arm.joints is not None},
+            progress,
+            np.arange(len(progress)),
+            {name: arm.sides for name, arm in arms.items() if arm.sides is not None},
+            {name: arm.loads for name, arm in arms.items() if arm.loads is not None},
+            rates or {},
+            stamps_s,
+        )
 
     def take(self, stops: IntArray) -> Self:
         """Some of them, in an order."""
@@ -50,6 +104,10 @@ class Moments:
             {name: joints[stops] for name, joints in self.joints.items()},
             self.progress[stops],
             self.stops[stops],
+            {name: sides[stops] for name, sides in self.sides.items()},
+            {name: loads.chosen(stops) for name, loads in self.loads.items()},
+            {names: rates[stops] for names, rates in self.rates.items()},
+            None if self.stamps_s is None else self.stamps_s[stops],
         )
 
     def __len__(self) -> int:

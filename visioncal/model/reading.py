@@ -1,6 +1,6 @@
 """Reading a session as a cell."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray
 from visioncal.estimation.poses import FEWEST_CORNERS
 from visioncal.estimation.tree import Branch, Tree
-from visioncal.model.arm import Arm, Moments, even_progress
+from visioncal.model.arm import Arm, Moments, Swept, even_progress
 from visioncal.model.cell import Cell
 from visioncal.model.priors import stated_sightings
 from visioncal.model.sightings import Evidence, MeasuredPlace, MeasuredPose, Sighting, is_copy
@@ -17,15 +17,19 @@ from visioncal.session import Observation, Session, frame_name
 from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.session.frames import CELL
 from visioncal.session.kinds import name_of, stated_instrument
+from visioncal.session.table import loads_of
 
 
-def read_cell(session: Session, corners: Mapping[int, Corners]) -> Cell:
+def read_cell(
+    session: Session, corners: Mapping[int, Corners], sweeps: Sequence[Swept] = ()
+) -> Cell:
     """Reads a session.
 
     Args:
         session: The session; rows of the lens alone are left out, and a copy of an earlier reading
-            of its stop.
+            of its stop. Rows of sweeps have the robot's poses at their times.
         corners: The corners in its images by view, each numbered on its own board.
+        sweeps: What was seen while a robot moved.
 
     Raises:
         DataError: No row has an observation, or frames are ambiguous.
@@ -58,13 +62,21 @@ def read_cell(session: Session, corners: Mapping[int, Corners]) -> Cell:
                 sightings.append(one)
     tree = _tree(session, [*arms], sightings)
     sightings += stated_sightings(session.declaration, tree, sightings)
+    rates = {(sweep.camera, sweep.flange): np.zeros((len(stations), 6)) for sweep in sweeps}
+    stamps_s = np.full(len(stations), np.nan)
+    for row in rows:
+        stop = stations[row.station]
+        stamps_s[stop] = np.nan if row.view.stamp_s is None else row.view.stamp_s
+        for sweep in sweeps:
+            if row.seer == sweep.camera and row.view.number in sweep.rates:
+                rates[sweep.camera, sweep.flange][stop] = sweep.rates[row.view.number]
     return Cell(
         tree,
         arms,
         {frame_name("camera", name): table for name, table in session.cameras.items()},
         {frame_name("target", name): plate for name, plate in session.plates.items()},
         tuple(sightings),
-        Moments.of(arms, even_progress(len(stations))),
+        Moments.of(arms, even_progress(len(stations)), rates, stamps_s),
     )
 
 
@@ -74,10 +86,14 @@ def _arms(session: Session, rows: list[Observation], stations: Mapping[int, int]
         poses = np.full((len(stations), 4, 4), np.nan)
         model = models.get(name)
         joints = np.full((len(stations), model.joint_count if model else 0), np.nan)
+        numbers: list[Mapping[str, float]] = [{}] * len(stations)
+        approaches = [""] * len(stations)
         for row in rows:
             if name not in row.robots:
                 continue
             at, angles = stations[row.station], row.robots[name].joints_rad
+            numbers[at] = row.robots[name].numbers
+            approaches[at] = row.robots[name].text.get("approach", "")
             if model is not None and angles is not None:
                 joints[at] = angles
             reported = row.robots[name].base_from_flange()
@@ -89,7 +105,8 @@ def _arms(session: Session, rows: list[Observation], stations: Mapping[int, int]
             np.isfinite(joints[np.isfinite(poses[:, 0, 0])]).all()
         )
         known: FloatArray | None = np.nan_to_num(joints) if is_known else None
-        yield Arm(frame_name("flange", name), poses, known, model)
+        loads = loads_of(numbers, approaches)
+        yield Arm(frame_name("flange", name), poses, known, model, loads)
 
 
 def _evidence(session: Session, row: Observation, corners: Corners | None) -> Evidence | None:
