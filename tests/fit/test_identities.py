@@ -15,7 +15,7 @@ from visioncal.fit.solve import solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
 from visioncal.fit.unknowns import State
 from visioncal.model import MeasuredPlace, MeasuredPose, Sighting
-from visioncal.model.effects.effect import Effect, Size
+from visioncal.model.effects import Clock, Effect, Rolling, Size
 
 
 class Tilt(Effect):
@@ -84,15 +84,19 @@ def somewhere(cell, effects=()):
     return start.cell, unknowns, moved
 
 
-EFFECTS = (Tilt("flange"), Tilt("cam"), Breath("cam"))
+CLOCK, ROLLING = Clock("flange", "cam", 0.01), Rolling("cam", 1024)
+EFFECTS = (Tilt("flange"), Tilt("cam"), Breath("cam"), CLOCK, ROLLING)
 
 
 @pytest.mark.parametrize("in_hand", [True, False])
 def test_rows_have_the_slopes_that_differences_show(in_hand):
     small = made(stops=7, in_hand=in_hand).cell
+    rates = {("cam", "flange"): np.random.default_rng(6).normal(0, 0.5, (7, 6))}
+    small = replace(small, moments=replace(small.moments, rates=rates))
     cell, unknowns, state = somewhere(small, EFFECTS)
-    # Slopes leave out that distances, on which this one depends, depend on the pose.
-    state = replace(state, values={**state.values, ("effect", "breath cam"): np.zeros(2)})
+    # Slopes leave out that distances and motion, on which these depend, depend on the pose.
+    still = {("effect", "breath cam"): np.zeros(2), ("effect", ROLLING.name): np.zeros(1)}
+    state = replace(state, values=state.values | still)
     cell = measured(cell)
     logs = np.zeros(len(unknowns.sizes))
     pairs = pairs_of(cell)

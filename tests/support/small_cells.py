@@ -34,6 +34,7 @@ class Made:
 
     cell: Cell
     edges: dict[str, np.ndarray]
+    robot: np.ndarray  # (s, 4, 4) where the flange truly is.
 
 
 def seen_at(rng):
@@ -91,7 +92,7 @@ def made(seed=0, stops=8, cameras=1, *, in_hand=True, given=True, sways=0.0):
         Tree("cell", branches), arms, dict.fromkeys(names, table), {"target": BOARD},
         tuple(sightings), Moments.of(arms, even_progress(stops)),
     )  # fmt: skip
-    return Made(cell, {**x, "target": z})
+    return Made(cell, {**x, "target": z}, robot)
 
 
 def replace_lens(table):

@@ -10,8 +10,9 @@ from visioncal.fit.lens_field import Field
 from visioncal.fit.linearise import Pair, images_of
 from visioncal.fit.score import best_field, of_effect
 from visioncal.fit.sizes import SIGNIFICANT
+from visioncal.fit.trials import gain_of
 from visioncal.fit.unknowns import State, Unknowns, Vector, lens_field, random_effect
-from visioncal.model.effects import Breathing, Effect, FocusJitter, LensGrows
+from visioncal.model.effects import Breathing, Effect, FocusJitter, LensGrows, Rolling
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,10 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
             bounds = effect.size
             size, gain = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
             yield Candidate(gain, starting_at(random_effect(effect), size), effect)
+    for effect in tried_effects(fit):
+        if effect.name not in known:
+            gain = gain_of(fit, pairs, effect)
+            yield Candidate(gain, random_effect(effect), effect)
     for camera in fit.unknowns.lenses:
         is_free = ("lens", camera) in fit.unknowns and camera not in fit.unknowns.fields
         if is_free and images_of(pairs, camera):
@@ -76,3 +81,9 @@ def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
             distances = [gram.distances for gram in fit.grams if gram.pair[0] == camera]
             yield Breathing(camera, lens, float(np.median(np.concatenate(distances))))
             yield FocusJitter(camera, lens, len(fit.cell.moments))
+
+
+def tried_effects(fit: Fit) -> Iterator[Effect]:
+    """Effects of known sizes, which no score has."""
+    for camera in dict.fromkeys(sweep.camera for sweep in fit.cell.sweeps):
+        yield Rolling(camera, fit.unknowns.lenses[camera].resolution[1])

@@ -136,9 +136,11 @@ class Examined:
             weighted = gram.weighted(fit.estimate.logs)[at, :6, :6]
             return pose, np.asarray(np.linalg.pinv(weighted, hermitian=True), dtype=float)
         (pair,) = pairs_of(fit.cell.with_sightings([sighting]))
+        gram, at = self._gram(row)
+        twists = pair.twists({name: slope[[at]] for name, slope in gram.by_effects.items()})
         information = np.eye(6)
         for _ in range(8):
-            rows, _ = corner_rows(fit.unknowns, fit.state, pair, pose[None])
+            rows, _ = corner_rows(fit.unknowns, fit.state, pair, pose[None], twists)
             by_pose, residual = rows[:, :, :6].reshape(-1, 6), rows[:, :, -1].ravel()
             information = by_pose.T @ by_pose
             information += 1e-9 * np.diag(np.diag(information))

@@ -31,6 +31,7 @@ from visioncal.fit.mixed import weights_at
 from visioncal.fit.unknowns import Key, State, Unknowns
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Moments, Sighting
 from visioncal.model.boards import shape_basis
+from visioncal.model.effects import Rolling
 from visioncal.vision.camera import project_with_jacobian
 from visioncal.vision.targets import corner_positions
 
@@ -174,6 +175,16 @@ class Pair:
         """(k,) of the board's middle along the camera's axis [m], at (k, 4, 4) poses."""
         return apply(poses, self.middle[None])[:, 0, 2]
 
+    def twists(self, by_effects: Mapping[str, FloatArray]) -> FloatArray:
+        """(k, 6) twists per second of what is seen, in its own frame.
+
+        By the (k, 6, 6) right perturbations of `seer_from_seen` by those of each edge in the path.
+        """
+        rates = self.moments.rates
+        pairs = ((slope, rates.get((self.names[0], name))) for name, slope in by_effects.items())
+        each = [(slope @ rate[:, :, None])[:, :, 0] for slope, rate in pairs if rate is not None]
+        return np.asarray(sum(each, np.zeros((len(self.rows), 6))))
+
     @cached_property
     def basis(self) -> FloatArray:
         """(c, 3, 10) derivatives of the board's corners by its shape [m]."""
@@ -271,7 +282,7 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
     distances, own = np.ones(len(at.poses)), dict[Key, IntArray]()
     if pair.corners:
         distances = pair.distances(at.poses)
-        rows, own = corner_rows(unknowns, state, pair, at.poses)
+        rows, own = corner_rows(unknowns, state, pair, at.poses, pair.twists(at.by_effects))
         padded = pair.padded(rows).reshape(len(pair.rows), -1, rows.shape[2])
         grams: FloatArray = np.swapaxes(padded, 1, 2) @ padded
         parts: _Parts = _corner_parts(unknowns, pair, grams)
@@ -283,7 +294,7 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
     edges = [name for name in frames if ("edge", name) in unknowns]
     by_pose = [at.slopes[name] for name in (*flanges, *edges)]
     columns = [unknowns.columns("edge", name) for name in edges]
-    by_lens = list[FloatArray]()
+    by_lens, of_lens = list[FloatArray](), list[IntArray]()
     for effect in unknowns.effects:
         known = unknowns.columns("effect", effect.name)
         if effect.place == "edge" and effect.frame in frames:
@@ -292,7 +303,8 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
             columns.append(known)
         elif effect.place == "lens" and effect.frame == seer and pair.corners:
             by_lens.append(effect.columns(pair.moments, distances))
-            columns.append(known)
+            of_lens.append(known)
+    columns += of_lens
     moves = np.concatenate([np.zeros((len(pair.rows), 6, 0)), *by_pose], axis=2)
     if by_lens:
         lens, old = np.concatenate(by_lens, axis=2), moves
@@ -341,12 +353,22 @@ _NOISES = (
 
 
 def corner_rows(
-    unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray
+    unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray, twists: FloatArray
 ) -> tuple[FloatArray, dict[Key, IntArray]]:
-    """Rows (n, 2, d + 1) of corners, and the local columns of what is their own."""
+    """Rows (n, 2, d + 1) of corners, and the local columns of what is their own.
+
+    At (k, 4, 4) `seer_from_seen` that move by (k, 6) `twists` per second.
+    """
     seer, seen = pair.names
     lens, basis = unknowns.camera(state, seer), pair.basis[pair.ids]
     points = pair.points[pair.ids] + basis @ state.values["shape", seen]
+    delays: dict[Key, FloatArray] = {
+        ("effect", effect.name): effect.shares(pair.px)[:, None] * twists[pair.owner]
+        for effect in unknowns.effects
+        if isinstance(effect, Rolling) and effect.frame == seer
+    }
+    for key, moved in delays.items():
+        points = apply_each(exp(state.values[key] * moved), points)
     own = poses[pair.owner]
     found = project_with_jacobian(lens, apply_each(own, points))
     by_point = found.jacobian_point @ own[:, :3, :3]
@@ -354,6 +376,8 @@ def corner_rows(
         ("lens", seer): found.jacobian_intrinsics,
         ("shape", seen): by_point @ basis,
     }
+    by_pose = np.concatenate([by_point @ -skew(points), by_point], axis=2)
+    columns |= {key: by_pose @ moved[:, :, None] for key, moved in delays.items()}
     residual = pair.px - found.px
     for effect in unknowns.effects:
         if effect.place == "lens" and effect.frame == seer:
@@ -364,7 +388,7 @@ def corner_rows(
         # Where corners are predicted: at those seen, a field could explain their noise.
         columns["field", seer] = field = unknowns.fields[seer].at(found.px)
         residual = residual - field @ state.values["field", seer]
-    lines = [by_point @ -skew(points), by_point, *columns.values(), residual[:, :, None]]
+    lines = [by_pose, *columns.values(), residual[:, :, None]]
     rows = np.concatenate(lines, axis=2)
     # Corners behind the camera have no information.
     rows = np.where(np.isfinite(rows).all(axis=(1, 2), keepdims=True), rows, 0.0)

@@ -140,7 +140,8 @@ def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
         kept = fit.used[gram.rows]
         if pair is None or not kept.any():
             continue
-        rows, _ = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses)
+        twists = pair.twists(gram.by_effects)
+        rows, _ = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, twists)
         predicted = pair.px - rows[:, :, -1] / pair.weights[:, None]
         each = waves(predicted, width, orders) * pair.weights[:, None]
         padded, of_rows = np.swapaxes(pair.padded(each), 1, 2), pair.padded(rows)

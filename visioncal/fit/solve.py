@@ -28,7 +28,7 @@ from visioncal.fit.unknowns import (
 )
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
 from visioncal.model.boards import SHAPES
-from visioncal.model.effects import Effect, Links, Size
+from visioncal.model.effects import Clock, Effect, Links, Size
 from visioncal.vision.camera import intrinsics
 
 # Numbers of corners for each unknown of lenses and boards, below which these are held.
@@ -92,14 +92,16 @@ def with_free_boards(fit: Fit) -> Unknowns:
 
 
 def effects_of(cell: Cell) -> tuple[Effect, ...]:
-    """Effects that are always among the unknowns: links of arms with joint angles."""
+    """Effects that are always among the unknowns: clocks; links of arms with joint angles."""
+    clocks = (Clock(sweep.flange, sweep.camera, sweep.sigma_s) for sweep in cell.sweeps)
     if len({sighting.stop for sighting in cell.sightings}) < ENOUGH_STOPS:
-        return ()
-    return tuple(
+        return tuple(clocks)
+    links = (
         Links(name, arm.model)
         for name, arm in cell.arms.items()
         if arm.has_joints and arm.model is not None
     )
+    return (*clocks, *links)
 
 
 def state_of(start: Start, effects: Sequence[Effect]) -> State:

@@ -119,8 +119,8 @@ def weighed(
     for pair in pairs:
         if not pair.corners:
             continue
-        poses = predicted_sightings(cell, unknowns, state, pair).poses
-        rows, _ = corner_rows(unknowns, state, pair, poses)
+        seen = predicted_sightings(cell, unknowns, state, pair)
+        rows, _ = corner_rows(unknowns, state, pair, seen.poses, pair.twists(seen.by_effects))
         each = np.split(rows[:, :, [*range(6), -1]], np.cumsum(pair.counts)[:-1])
         for row, own, corners in zip(pair.rows.tolist(), each, pair.corners, strict=True):
             if used[row]:

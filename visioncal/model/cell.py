@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.types import Mask, Target
 from visioncal.estimation.tree import Tree
-from visioncal.model.arm import Arm, Moments
+from visioncal.model.arm import Arm, Moments, Swept
 from visioncal.model.sightings import Sighting
 from visioncal.session.document import CameraTable
 
@@ -27,6 +27,7 @@ class Cell:
     boards: Mapping[str, Target]  # By frame.
     sightings: tuple[Sighting, ...]
     moments: Moments  # At all s stops.
+    sweeps: tuple[Swept, ...] = ()  # What was seen while robots moved.
 
     @cached_property
     def pairs(self) -> dict[tuple[str, str], list[int]]:

@@ -77,6 +77,7 @@ def read_cell(
         {frame_name("target", name): plate for name, plate in session.plates.items()},
         tuple(sightings),
         Moments.of(arms, even_progress(len(stations)), rates, stamps_s),
+        tuple(sweeps),
     )
 
 

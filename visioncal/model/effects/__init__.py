@@ -1,8 +1,10 @@
 """What moves a frame, or changes a lens, beside noise: one file an effect."""
 
 from visioncal.model.effects.breathing import Breathing as Breathing
+from visioncal.model.effects.clock import Clock as Clock
 from visioncal.model.effects.effect import Effect as Effect
 from visioncal.model.effects.effect import Size as Size
 from visioncal.model.effects.focus_jitter import FocusJitter as FocusJitter
 from visioncal.model.effects.lens_grows import LensGrows as LensGrows
 from visioncal.model.effects.links import Links as Links
+from visioncal.model.effects.rolling import Rolling as Rolling
