@@ -5,15 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.small_cells import made
+from support.small_cells import TABLE, made
+from support.without_poses import without_poses
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import IntArray
 from visioncal.fit.assemble import mixed_model
+from visioncal.fit.fit import Fit
+from visioncal.fit.lens_field import fields_of_lengths
 from visioncal.fit.linearise import linearised, pairs_of
 from visioncal.fit.solve import solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
-from visioncal.fit.unknowns import State
+from visioncal.fit.unknowns import State, lens_field
 from visioncal.model import MeasuredPlace, MeasuredPose, Sighting
 from visioncal.model.effects import Clock, Effect, Rolling, Size
 
@@ -88,6 +91,26 @@ CLOCK, ROLLING = Clock("flange", "cam", 0.01), Rolling("cam", 1024)
 EFFECTS = (Tilt("flange"), Tilt("cam"), Breath("cam"), CLOCK, ROLLING)
 
 
+def with_field(unknowns, state, pairs):
+    """A field of the lens, that is zero: where it is not, it moves with the pixels."""
+    px = np.concatenate([pair.px for pair in pairs if pair.corners])
+    (field,) = fields_of_lengths(TABLE.resolution[0], px, (0.4,))
+    field = field.shown(px, 0.5).beside(unknowns.lenses["cam"], px)
+    assert 4 < field.count < 40
+    member = lens_field("cam", field, 0.1)
+    unknowns = replace(unknowns.with_members(member), fields={"cam": field})
+    values = {**state.values, member.key: np.zeros(field.count)}
+    return unknowns, State(values, state.errors)
+
+
+def pulled(gram, logs):
+    """(k, c) products of the residual with errors and unknowns, sighting by sighting."""
+    weights = np.append(np.exp(-2.0 * logs), 1.0)
+    pulls = sum(weights[part.size] * part.pulls for part in gram.parts)
+    local = np.concatenate([gram.heads(logs)[:, :, -1], pulls], axis=1)
+    return gram.by_unknowns(local[:, None])[:, 0]
+
+
 @pytest.mark.parametrize("in_hand", [True, False])
 def test_rows_have_the_slopes_that_differences_show(in_hand):
     small = made(stops=7, in_hand=in_hand).cell
@@ -98,15 +121,16 @@ def test_rows_have_the_slopes_that_differences_show(in_hand):
     still = {("effect", "breath cam"): np.zeros(2), ("effect", ROLLING.name): np.zeros(1)}
     state = replace(state, values=state.values | still)
     cell = measured(cell)
-    logs = np.zeros(len(unknowns.sizes))
     pairs = pairs_of(cell)
+    unknowns, state = with_field(unknowns, state, pairs)
+    logs = np.zeros(len(unknowns.sizes))
 
     def costs(at):
-        return [gram.weighted(logs)[:, -1, -1] for gram in linearised(cell, unknowns, at, pairs)]
+        return [gram.squares(logs) for gram in linearised(cell, unknowns, at, pairs)]
 
     grams = linearised(cell, unknowns, state, pairs)
     assert unknowns.count > 6 * 2 + 9 + 10
-    slopes = [gram.in_common(gram.weighted(logs))[:, :-1, -1] for gram in grams]
+    slopes = [pulled(gram, logs) for gram in grams]
     for column in range(unknowns.count):
         step = np.zeros(unknowns.count)
         # In the columns' units, all of which change the residuals alike.
@@ -130,10 +154,21 @@ def test_rows_have_the_slopes_that_differences_show(in_hand):
             assert found == pytest.approx(slope[:, axis], rel=2e-4, abs=1e-5 * a.max() + 1e-2)
 
 
-def model(cell):
+def linear(cell):
+    """A linearised cell, with a field: a fit at the sizes where a search begins."""
     cell, unknowns, state = somewhere(cell)
-    grams = linearised(cell, unknowns, state, pairs_of(cell))
-    return mixed_model(cell, unknowns, state, grams, np.ones(len(cell.sightings), bool)), unknowns
+    unknowns, state = with_field(unknowns, state, pairs_of(cell))
+    grams, used = (
+        linearised(cell, unknowns, state, pairs_of(cell)),
+        np.ones(len(cell.sightings), bool),
+    )
+    mixed = mixed_model(cell, unknowns, state, grams, used)
+    return Fit(cell, unknowns, state, grams, used, mixed, mixed.at(unknowns.starts()))
+
+
+def model(cell):
+    found = linear(cell)
+    return found.mixed, found.unknowns
 
 
 def test_the_likelihood_has_the_gradient_that_differences_show():
@@ -230,14 +265,18 @@ def test_the_likelihood_is_that_of_all_unknowns_at_once():
 
 
 def test_a_sighting_left_out_is_predicted_as_by_a_refit():
-    solved = solve(made(stops=8, cameras=2, seed=5).cell)
-    fit, left_out = solved.fit, solved.left_out
+    small = made(stops=8, cameras=2, seed=5).cell
+    solved = solve(small)
+    assert_left_out_as_by_refits(solved.fit, solved.left_out)
+    fit = linear(small)
+    assert_left_out_as_by_refits(fit, fit.left_out())
+
+
+def assert_left_out_as_by_refits(fit, left_out):
+    """Of some sightings."""
     for row in (0, 5, 11):
-        used = fit.used.copy()
-        used[row] = False
-        mixed = mixed_model(fit.cell, fit.unknowns, fit.linearised, fit.grams, used)
-        other = replace(fit, mixed=mixed, used=used, estimate=mixed.at(fit.estimate.logs))
-        refit = other.left_out()
+        rows = np.arange(len(fit.used)) == row
+        refit = without_poses(fit, rows).left_out()
         sigma = np.sqrt(np.diagonal(left_out.own[row]))
         assert left_out.away[row] == pytest.approx(refit.away[row], abs=1e-3 * sigma.min())
         assert left_out.squares[row] == pytest.approx(refit.squares[row], rel=1e-3)

@@ -166,17 +166,17 @@ def test_measured_rows_have_the_slopes_that_differences_show():
     state = unknowns.moved(State(state.values, errors), 1e-2 * rng.normal(size=unknowns.count), {})
     logs, pairs = np.zeros(len(unknowns.sizes)), pairs_of(cell)
     grams = linearised(cell, unknowns, state, pairs)
-    counts = [sum(count.sum() for *_, count in gram.parts) for gram in grams]
+    counts = [sum(part.counts.sum() for part in gram.parts) for gram in grams]
     assert counts == [36, 1, 3]
     for column in range(unknowns.count):
         step = 1e-6 * (np.arange(unknowns.count) == column)
         ahead, behind = (
-            [g.weighted(logs)[:, -1, -1] for g in linearised(cell, unknowns, at, pairs)]
+            [gram.squares(logs) for gram in linearised(cell, unknowns, at, pairs)]
             for at in (unknowns.moved(state, sign * step, {}) for sign in (1, -1))
         )
         for gram, a, b in zip(grams, ahead, behind, strict=True):
             at = np.flatnonzero(gram.columns == column)
-            slope = gram.in_common(gram.weighted(logs))[:, :-1, -1]
+            slope = gram.by_unknowns(gram.heads(logs)[:, None, :, -1])[:, 0]
             expected = slope[:, 6 * len(gram.flanges) + at].sum(axis=1)
             assert -(a - b) / 4e-6 == pytest.approx(expected, rel=2e-3, abs=1e-6)
 

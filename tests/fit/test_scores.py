@@ -67,6 +67,25 @@ def test_a_score_is_the_likelihood_that_a_field_gains(fit):
         assert found == pytest.approx(wanted, rel=1e-3, abs=2e-3)
 
 
+def test_functions_that_corners_do_not_show_are_in_no_likelihood(fit):
+    pairs = pairs_of(fit.cell)
+    px = np.concatenate([pair.px for pair in pairs if pair.names[0] == "cam"])
+    (field,) = fields_of_lengths(TABLE.resolution[0], px, (0.27,))
+    size, sigma = 0.1, fit.sizes["px cam"]
+    # Of each function that is left out, all corners together have an information below this.
+    shown = field.shown(px, 1e-3 * (sigma / size) ** 2)
+    assert shown.count < field.count / 3
+    whole, part = (
+        gain_with(fit, lens_field("cam", at, size), size, fields={"cam": at})
+        for at in (field, shown)
+    )
+    # A function changes a likelihood by about its information.
+    assert part == pytest.approx(whole, abs=1e-3 * (field.count - shown.count))
+    # At corners nothing is left out; beyond the image, all that a field may be.
+    assert shown.variance(px).max() < 0.02
+    assert shown.variance(np.array([[-300.0, -300.0]])) > 0.5
+
+
 def test_a_score_finds_the_size_that_the_likelihood_has(fit):
     grows = next(e for e in effects_of_lenses(fit) if e.name == "lens grows cam")
     score = of_effect(fit, grows)

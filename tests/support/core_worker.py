@@ -103,6 +103,8 @@ def located(calibration, looks):
     keys = [key for key in fit.unknowns.slices if key[1] == camera]
     values, covariance = fit.state.values, fit.covariance(*keys)
     px_sigma = fit.sizes.get(f"px {camera}", 0.0)
+    own = fit.unknowns.fields.get(camera)
+    left = 0.0 if own is None else fit.sizes[f"field {camera}"] ** 2
     found = []
     for look in looks:
         spread = np.zeros((3, len(covariance)))
@@ -121,7 +123,9 @@ def located(calibration, looks):
             step = 1e-3 * (np.arange(2) == axis)
             moved = {**look, "px": np.array(look["px"]) + step}
             slope = (place(fit, camera, values, moved) - centre) / 1e-3
-            total += px_sigma**2 * np.outer(slope, slope)
+            # Where no corner was seen, a field may be anything of its size.
+            unseen = 0.0 if own is None else left * float(own.variance(moved["px"][None])[0])
+            total += (px_sigma**2 + unseen) * np.outer(slope, slope)
         if look["pose"] is not None:
             from visioncal.core.transforms import exp
 
@@ -137,14 +141,12 @@ def located(calibration, looks):
 
 def place(fit, camera, values, look):
     """(3,) where a pixel's ray meets its plane, in the base."""
-    from visioncal.vision.camera import normalise, with_intrinsics
+    from visioncal.fit.unknowns import State
+    from visioncal.vision.camera import normalise
 
-    lens, px = (
-        with_intrinsics(fit.unknowns.lenses[camera], values["lens", camera]),
-        np.array(look["px"]),
-    )
+    lens, px = fit.unknowns.camera(State(values, {}), camera), np.array(look["px"])
     if camera in fit.unknowns.fields:
-        px = px - fit.unknowns.fields[camera].at(px[None])[0] @ values["field", camera]
+        px = px - fit.unknowns.fields[camera].moved(px[None], values["field", camera])[0]
     ray = np.append(normalise(lens, px[None])[0], 1.0)
     base_from_cam = values["edge", camera]
     if look["pose"] is not None:

@@ -61,19 +61,19 @@ def _terms(gram: Gram, bodies: Sequence[Body]) -> list[Term]:
     """The terms of some sightings, by size."""
     f = 6 * len(gram.flanges)
     at, found = body_with(bodies, gram.flanges), []
-    for size, grams, counts in gram.parts:
-        full = gram.in_common(grams)
+    for products in gram.parts:
+        of_errors, common = gram.in_common(products)
         parts: tuple[Part, ...] = ()
         if f:
             body = bodies[at]
             units, own = np.searchsorted(body.stops, gram.stops), body.errors_of(gram.flanges)
             errors = np.zeros((len(body.stops), body.width, body.width))
-            cross = np.zeros((len(body.stops), body.width, full.shape[2] - f))
-            np.add.at(errors, (units[:, None, None], own[:, None], own), full[:, :f, :f])
-            np.add.at(cross, (units[:, None], own), full[:, :f, f:])
+            cross = np.zeros((len(body.stops), body.width, len(common)))
+            np.add.at(errors, (units[:, None, None], own[:, None], own), of_errors[:, :, :f])
+            np.add.at(cross, (units[:, None], own), of_errors[:, :, f:])
             parts = (Part(at, gram.columns, errors, cross),)
-        common = full[:, f:, f:].sum(axis=0)
-        found.append(Term(size, float(counts.sum()), gram.columns, common, parts))
+        count = float(products.counts.sum())
+        found.append(Term(products.size, count, gram.columns, common, parts))
     return found
 
 

@@ -12,6 +12,7 @@ from visioncal.fit.linearise import Gram, predicted
 from visioncal.fit.mixed import Estimate, Mixed, body_with
 from visioncal.fit.unknowns import Key, State, Unknowns
 from visioncal.model import Cell, Moments
+from visioncal.vision.camera import with_intrinsics
 
 # Added to information that determines nothing, over its diagonal.
 _RIDGE = 1e-9
@@ -23,7 +24,7 @@ _Deviation: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Deviation of each of n sightings from what all others predict, once its own rows are gone."""
+    """Deviation of each of n sightings from what all others predict, once its own pose is gone."""
 
     away: FloatArray  # (n, 6) as a right perturbation of `seer_from_seen`.
     predicted: FloatArray  # (n, 6, 6) covariance of the prediction.
@@ -129,8 +130,8 @@ class Fit:
         return self.state.values["edge", name]
 
     def camera(self, name: str) -> Camera:
-        """A lens."""
-        return self.unknowns.camera(self.state, name)
+        """A lens alone, without its field: what matrix and distortion explain best."""
+        return with_intrinsics(self.unknowns.lenses[name], self.state.values["lens", name])
 
     def covariance(self, *keys: Key) -> FloatArray:
         """Joint covariance of some unknowns, in SI units or pixels: of edges, 6 x 6 blocks."""
@@ -150,72 +151,53 @@ class Fit:
         return found
 
     def left_out(self, grams: Sequence[Gram] | None = None) -> LeftOut:
-        """Leaves each used sighting out in turn; others are predicted as they are.
+        """Leaves the pose of each used sighting out in turn; others are predicted as they are.
 
-        Of rows with information H and gradient g about local columns of covariance C and estimate
-        z, the estimate without them is (1 - C H)^-1 (z - C g), with covariance (1 - C H)^-1 C: it
-        follows from the fit alone, nothing is fitted again (cf. Cook and Weisberg 1982, 2.2).
+        Its corners say of lens, board and field what they say beside a pose of their own. Of a pose
+        that its rows alone determine as z with covariance A, and the fit as x with C, the estimate
+        without it is (1 - C / A)^-1 (x - C / A z), with covariance (1 - C / A)^-1 C: it follows
+        from the fit alone, nothing is fitted again (cf. Cook and Weisberg 1982, 2.2).
         """
         some = self.grams if grams is None else grams
         return LeftOut.of(self.cell, ((gram.rows, self._left_out(gram)) for gram in some))
 
     def _left_out(self, gram: Gram) -> _Deviation:
-        weighted, spread = gram.weighted(self.estimate.logs), gram.spread()
-        f = 6 * len(gram.flanges)
-        information, pull = weighted[:, :-1, :-1], weighted[:, :-1, -1]
-        by_errors, by_columns = spread[:, :, :f], spread[:, :, f:]
-        values = by_columns @ self.estimate.values[gram.columns]
-        # Local columns beyond the head are unknowns themselves, or fixed.
-        head = gram.moves.shape[1]
-        columns, jacobian = gram.columns, by_columns[:, :head]
-        covariance = np.zeros_like(information)
+        heads, f = gram.heads(self.estimate.logs), 6 * len(gram.flanges)
+        alone, mapped = _alone(heads)
+        by_unknowns = gram.by_unknowns(mapped)
+        columns, by_errors, jacobian = gram.columns, by_unknowns[:, :, :f], by_unknowns[:, :, f:]
+        values = jacobian @ self.estimate.values[columns]
+        covariance = np.zeros_like(alone)
         if f:
             at = body_with(self.mixed.bodies, gram.flanges)
             body, solved = self.mixed.bodies[at], self.estimate.bodies[at]
             units, own = np.searchsorted(body.stops, gram.stops), body.errors_of(gram.flanges)
-            columns, by_errors = body.columns, by_errors[:, :head]
-            jacobian = by_errors @ solved.response[units[:, None], own]
-            jacobian[:, :, np.searchsorted(columns, gram.columns)] += by_columns[:, :head]
+            through = by_errors @ solved.response[units[:, None], own]
+            through[:, :, np.searchsorted(body.columns, columns)] += jacobian
+            columns, jacobian = body.columns, through
             errors = solved.own[units[:, None, None], own[:, None], own]
-            covariance[:, :head, :head] = by_errors @ errors @ np.swapaxes(by_errors, 1, 2)
-            moved = by_errors @ solved.errors[units[:, None], own][:, :, None]
-            values[:, :head] += moved[:, :, 0]
+            covariance = by_errors @ errors @ np.swapaxes(by_errors, 1, 2)
+            values += (by_errors @ solved.errors[units[:, None], own][:, :, None])[:, :, 0]
         common = self.estimate.covariance[columns[:, None], columns]
-        of_head = jacobian @ common
-        covariance[:, :head, :head] += of_head @ np.swapaxes(jacobian, 1, 2)
-        is_beyond = gram.picked >= head
-        beyond, unit = gram.picked[is_beyond], gram.units[is_beyond]
-        at_beyond = np.searchsorted(
-            columns, gram.columns[len(gram.columns) - len(gram.picked) :][is_beyond]
-        )
-        both = of_head[:, :, at_beyond] * unit
-        covariance[:, :head, beyond] = both
-        covariance[:, beyond, :head] = np.swapaxes(both, 1, 2)
-        own_part = common[at_beyond[:, None], at_beyond] * np.outer(unit, unit)
-        covariance[:, beyond[:, None], beyond] = own_part
+        covariance = covariance + jacobian @ common @ np.swapaxes(jacobian, 1, 2)
         part = self.used[gram.rows][:, None, None]
-        alone, mapped = _alone(weighted)
-        # Of the inverse, the pose needs six rows.
-        rest = np.eye(gram.local) - part * covariance @ information
-        rows = np.swapaxes(
-            np.linalg.solve(np.swapaxes(rest, 1, 2), np.swapaxes(mapped, 1, 2)), 1, 2
-        )
-        pulled = values[:, :, None] - part * (covariance @ pull[:, :, None])
-        away = (alone @ pull[:, :6, None] - rows @ pulled)[:, :, 0]
-        return away, rows @ covariance @ np.swapaxes(mapped, 1, 2), alone
+        own_pose = alone @ heads[:, :6, -1, None]
+        share = part * np.linalg.solve(alone, covariance).swapaxes(1, 2)
+        rest, known = np.eye(6) - share, values[:, :, None]
+        away = own_pose - np.linalg.solve(rest, known - share @ own_pose)
+        return away[:, :, 0], np.asarray(np.linalg.solve(rest, covariance), dtype=float), alone
 
     def stops_left_out(self) -> LeftOut:
         """Leaves each stop out in turn: no sighting at a stop predicts the others there.
 
-        As `left_out`, but that all rows at a stop are removed from the common unknowns' information
-        at once, and its flanges err by the noise that all others determine.
+        As `left_out`, but that all poses at a stop are removed at once from the information about
+        common unknowns, and its flanges err by the noise that all others determine.
         """
         return LeftOut.of(self.cell, self._by_stop())
 
     def _by_stop(self) -> Iterator[tuple[IntArray, _Deviation]]:
         seen = dict[int, list[tuple[int, int]]]()
-        weighted = [gram.weighted(self.estimate.logs) for gram in self.grams]
-        full = [gram.in_common(own) for gram, own in zip(self.grams, weighted, strict=True)]
+        heads = [gram.heads(self.estimate.logs) for gram in self.grams]
         for index, gram in enumerate(self.grams):
             for row, stop in enumerate(gram.stops.tolist()):
                 seen.setdefault(stop, []).append((index, row))
@@ -223,11 +205,14 @@ class Fit:
             columns = np.unique(np.concatenate([self.grams[at].columns for at, _ in sightings]))
             added = np.zeros((len(columns) + 1, len(columns) + 1))
             for at, row in sightings:
-                gram = self.grams[at]
-                if self.used[gram.rows[row]]:
+                gram = self.grams[at].take(np.arange(len(self.grams[at].rows)) == row)
+                if self.used[gram.rows[0]]:
+                    _, mapped = _alone(own_heads := heads[at][row : row + 1])
                     own = np.append(np.searchsorted(columns, gram.columns), len(columns))
-                    f = 6 * len(gram.flanges)
-                    added[own[:, None], own] += full[at][row, f:, f:]
+                    by_pose, f = gram.by_unknowns(mapped)[0], 6 * len(gram.flanges)
+                    of_pose = gram.by_unknowns(own_heads[:, :6, :-1])[0, :, f:]
+                    rows = np.column_stack([of_pose, own_heads[0, :6, -1]])
+                    added[own[:-1, None], own] += by_pose[:, f:].T @ rows
             values, covariance = self._without_stop(stop, columns, added)
             for at, row in sightings:
                 gram = self.grams[at].take(np.arange(len(self.grams[at].rows)) == row)
@@ -235,15 +220,14 @@ class Fit:
                 none = np.zeros(0)
                 sigmas = np.concatenate([none, *map(self.flange_sigmas, gram.flanges)])
                 past = [-self.linearised.errors[name][stop] for name in gram.flanges]
-                spread, f = gram.spread(), 6 * len(gram.flanges)
-                by_errors, by_columns = spread[:, :, :f], spread[:, :, f:]
-                local = by_columns @ values[own] + by_errors @ np.concatenate([none, *past])
-                own_noise = by_errors * sigmas**2
-                both = np.concatenate(
-                    [own_noise, by_columns @ covariance[own[:, None], own]], axis=2
-                )
-                within = both @ np.swapaxes(spread, 1, 2)
-                yield gram.rows, _off(weighted[at][row : row + 1], local, within)
+                alone, mapped = _alone(own_heads := heads[at][row : row + 1])
+                both, f = gram.by_unknowns(mapped), 6 * len(gram.flanges)
+                by_errors, by_columns = both[:, :, :f], both[:, :, f:]
+                predicted = by_columns @ values[own] + by_errors @ np.concatenate([none, *past])
+                by_all = by_columns @ covariance[own[:, None], own] @ by_columns.swapaxes(1, 2)
+                within = (by_errors * sigmas**2) @ by_errors.swapaxes(1, 2) + by_all
+                away = (alone @ own_heads[:, :6, -1, None])[:, :, 0] - predicted
+                yield gram.rows, (away, within, alone)
 
     def _without_stop(
         self, stop: int, columns: IntArray, added: FloatArray
@@ -303,26 +287,13 @@ class Fit:
         return replace(self, considered=known + added, shift=moved)
 
 
-def _off(weighted: FloatArray, values: FloatArray, covariance: FloatArray) -> _Deviation:
-    """How far poses by the own rows of k sightings are from predictions, and both covariances.
-
-    Args:
-        weighted: (k, d + 1, d + 1) Gram matrices of the sightings.
-        values: (k, d) predicted local columns.
-        covariance: (k, d, d) theirs.
-    """
-    alone, mapped = _alone(weighted)
-    away = (alone @ weighted[:, :6, -1, None] - mapped @ values[:, :, None])[:, :, 0]
-    return away, mapped @ covariance @ np.swapaxes(mapped, 1, 2), alone
-
-
-def _alone(weighted: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses by the own rows of k sightings, given what else their rows depend on.
+def _alone(heads: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses by (k, h, d + 1) products of k sightings' own rows, given what else these depend on.
 
     Returns:
         Their (k, 6, 6) covariance, and (k, 6, d) derivatives by local columns.
     """
-    information = weighted[:, :6, :-1]
+    information = heads[:, :6, :-1]
     pose = information[:, :, :6]
     scale = np.maximum(np.trace(pose, axis1=1, axis2=2), 1.0)
     diagonal = np.diagonal(pose, axis1=1, axis2=2) + 1e-3 * scale[:, None]

@@ -91,11 +91,12 @@ class Examined:
     def _alone(self, row: int) -> float:
         """Log-density of a sighting's rows with the best pose of its own."""
         gram, at = self._gram(row)
-        full = gram.weighted(self.fit.estimate.logs)[at]
+        logs = self.fit.estimate.logs
+        full, square = gram.heads(logs)[at], float(gram.squares(logs)[at])
         information = full[:6, :6] + 1e-9 * np.diag(np.diag(full)[:6])
-        least = full[-1, -1] - full[:6, -1] @ np.linalg.solve(information, full[:6, -1])
-        logs = np.append(self.fit.estimate.logs, 0.0)
-        counts = sum(float(counts[at]) * logs[size] for size, _, counts in gram.parts)
+        least = square - full[:6, -1] @ np.linalg.solve(information, full[:6, -1])
+        logs = np.append(logs, 0.0)
+        counts = sum(float(part.counts[at]) * logs[part.size] for part in gram.parts)
         _, log_det = np.linalg.slogdet(information)
         return float(-0.5 * least - counts + 0.5 * (6.0 * np.log(2.0 * np.pi) - log_det))
 
@@ -133,15 +134,15 @@ class Examined:
         fit, sighting = self.fit, self.fit.cell.sightings[row]
         if not isinstance(sighting.evidence, Corners):
             gram, at = self._gram(row)
-            weighted = gram.weighted(fit.estimate.logs)[at, :6, :6]
-            return pose, np.asarray(np.linalg.pinv(weighted, hermitian=True), dtype=float)
+            own = gram.heads(fit.estimate.logs)[at, :6, :6]
+            return pose, np.asarray(np.linalg.pinv(own, hermitian=True), dtype=float)
         (pair,) = pairs_of(fit.cell.with_sightings([sighting]))
         gram, at = self._gram(row)
         twists = pair.twists({name: slope[[at]] for name, slope in gram.by_effects.items()})
         information = np.eye(6)
         for _ in range(8):
-            rows, _ = corner_rows(fit.unknowns, fit.state, pair, pose[None], twists)
-            by_pose, residual = rows[:, :, :6].reshape(-1, 6), rows[:, :, -1].ravel()
+            rows = corner_rows(fit.unknowns, fit.state, pair, pose[None], twists)
+            by_pose, residual = rows.head[:, :, :6].reshape(-1, 6), rows.residual.ravel()
             information = by_pose.T @ by_pose
             information += 1e-9 * np.diag(np.diag(information))
             step = np.linalg.solve(information, by_pose.T @ residual)

@@ -2,7 +2,8 @@
 
 It is a Gaussian process with a squared exponential kernel, by waves over somewhat more than the
 image whose variances are the kernel's spectrum (Solin and Sarkka 2020). Its length is chosen with
-its size, by the score of a fit without it.
+its size, by the score of a fit without it. Of all waves, those combinations are kept that corners
+show (Karhunen and Loeve): as functions of the image alone, they are far fewer.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,38 +22,49 @@ _WIDTHS = 1.4
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """A field of one lens, with e waves an axis."""
+    """A field of one lens, of r functions along each axis of the image."""
 
     orders: FloatArray  # (e, 2) half waves across and down.
     width: float  # Of the image [px].
     sigmas: FloatArray  # (e,) standard deviations of the waves in a field of size one.
-    # What a lens of which nothing is stated does instead: its model, and (q, 2 e) intrinsics by the
-    # field's values. None of a stated lens, which may be off by any field.
-    instead: tuple[Camera, FloatArray] | None = None
+    basis: FloatArray  # (e, r) the waves of each function; a field's values have variance one.
+    # (q, 2 r) intrinsics that do the same as the field's values, by which the lens is less than as
+    # estimated: what matrix and distortion alone explain best is theirs. None of a stated lens,
+    # which may be off by any field.
+    instead: FloatArray | None = None
 
-    def at(self, px: FloatArray) -> FloatArray:
-        """Displacements (n, 2, 2 e) of (n, 2) pixels by coefficients of variance one [px]."""
+    @property
+    def count(self) -> int:
+        """The number 2 r of its values: those along x, then those along y."""
+        return 2 * int(self.basis.shape[1])
+
+    def functions(self, px: FloatArray) -> FloatArray:
+        """(n, r) displacements of (n, 2) pixels along one axis, by the values of that axis [px]."""
+        return np.asarray(waves(px, self.width, self.orders) @ self.basis)
+
+    def moved(self, px: FloatArray, values: FloatArray) -> FloatArray:
+        """Displacements (n, 2) of (n, 2) pixels by the field's values (2 r,) [px]."""
+        return np.asarray(self.functions(px) @ values.reshape(2, -1).T)
+
+    def variance(self, px: FloatArray) -> FloatArray:
+        """(n,) of (n, 2) pixels' displacements by the functions that are not kept, at size one."""
         each = waves(px, self.width, self.orders) * self.sigmas
-        count = len(self.orders)
-        found = np.zeros((len(px), 2, 2 * count))
-        found[:, 0, :count], found[:, 1, count:] = each, each
-        if self.instead is not None:
-            lens, intrinsics = self.instead
-            found -= by_lens(lens, px) @ intrinsics
-        return found
+        return np.asarray(np.sum(each**2, axis=1) - np.sum(self.functions(px) ** 2, axis=1))
 
-    def above(self, least: float) -> "Field":
-        """The field without the waves whose standard deviations are below a value."""
-        kept = self.sigmas > least
-        return replace(self, orders=self.orders[kept], sigmas=self.sigmas[kept])
+    def shown(self, px: FloatArray, least: float) -> "Field":
+        """The field of functions whose squares, summed over (n, 2) corners, are above a value."""
+        each = waves(px, self.width, self.orders) * self.sigmas
+        squares, vectors = np.linalg.eigh(each.T @ each)
+        return replace(self, basis=self.sigmas[:, None] * vectors[:, squares > least])
 
     def beside(self, lens: Camera, px: FloatArray) -> "Field":
         """The field orthogonal to what an estimated lens does at (n, 2) corners."""
-        own = by_lens(lens, px).reshape(2 * len(px), -1)
-        scale = np.linalg.norm(own, axis=0)
-        flat = self.at(px).reshape(2 * len(px), -1)
-        instead = np.linalg.lstsq(own / scale, flat, rcond=None)[0] / scale[:, None]
-        return replace(self, instead=(lens, instead))
+        own, each = by_lens(lens, px), self.functions(px)
+        scale = np.linalg.norm(own, axis=(0, 1))
+        inner = np.einsum("nai,naj->ij", own / scale, own / scale)
+        pull = np.concatenate([own[:, axis].T @ each for axis in (0, 1)], axis=1)
+        instead = np.linalg.pinv(inner, hermitian=True) @ (pull / scale[:, None])
+        return replace(self, instead=instead / scale[:, None])
 
 
 def orders_of_waves() -> FloatArray:
@@ -82,7 +94,8 @@ def fields_of_lengths(
         sigmas = np.exp(-0.25 * np.sum(orders**2, axis=1) * (np.pi * length / _WIDTHS) ** 2)
         # A wave has half of the mean square of a constant.
         sigmas *= np.sqrt(0.5) ** np.sum(orders == 0, axis=1)
-        yield Field(orders, width, sigmas / np.sqrt(variances @ sigmas**2))
+        sigmas /= np.sqrt(variances @ sigmas**2)
+        yield Field(orders, width, sigmas, np.diag(sigmas))
 
 
 def by_lens(lens: Camera, px: FloatArray) -> FloatArray:

@@ -10,7 +10,6 @@ grows with the number of corners.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 
@@ -40,13 +39,49 @@ _SINGULAR = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
+class Products:
+    """Gram matrices of the rows of k sightings that have one size.
+
+    Local columns are a head of h (pose: 6, lens, board), then a field's 2 r, then the residual: d +
+    1 in all. A field's functions are the same along both axes of the image.
+    """
+
+    size: int  # -1 for rows that are whitened already.
+    counts: FloatArray  # (k,) numbers of rows.
+    heads: FloatArray  # (k, h, d + 1) of the head's columns with all.
+    functions: FloatArray  # (k, r, r) of a field's functions with each other, along either axis.
+    pulls: FloatArray  # (k, 2 r) of the field's columns with the residual.
+    squares: FloatArray  # (k,) of the residual.
+    # (k, 6, 2 r) whitened rows by poses alone, whose products are to be added to `functions`.
+    posed: FloatArray
+    sign: float = 1.0  # Of these products.
+
+    def summed(self) -> FloatArray:
+        """(d + 1, d + 1) Gram matrix of all."""
+        h, r = self.heads.shape[1], self.functions.shape[1]
+        found = np.zeros((h + 2 * r + 1, h + 2 * r + 1))
+        found[:h] = self.heads.sum(axis=0)
+        found[:, :h] = found[:h].T
+        found[h : h + r, h : h + r] = found[h + r : -1, h + r : -1] = self.functions.sum(axis=0)
+        found[h:-1, h:-1] += self.sign * np.tensordot(self.posed, self.posed, ((0, 1), (0, 1)))
+        found[h:-1, -1] = found[-1, h:-1] = self.pulls.sum(axis=0)
+        found[-1, -1] = self.squares.sum()
+        return found
+
+    def take(self, mask: Mask) -> "Products":
+        """Those of some sightings."""
+        return replace(
+            self, counts=self.counts[mask], heads=self.heads[mask], squares=self.squares[mask],
+            functions=self.functions[mask], pulls=self.pulls[mask], posed=self.posed[mask],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
 class Gram:
     """The k sightings of one frame by another.
 
-    Local columns are (pose: 6, lens: q, shape: 10, field: e), then the residual: d + 1 in all;
-    poses and places that were measured have the pose alone, and a board's size. Common ones are the
-    c that act on the pose or the lens through `moves`, of which the first f are errors of flanges,
-    then those that are `picked`.
+    Common columns are the c that act on the pose or the lens through `moves`, of which the first f
+    are errors of flanges, then those that act on local columns alike in all sightings.
     """
 
     pair: tuple[str, str]  # Seer and seen.
@@ -54,48 +89,53 @@ class Gram:
     stops: IntArray  # (k,)
     moments: Moments  # (k) theirs.
     distances: FloatArray  # (k,) of the board's middle along the camera's axis [m]; ones elsewhere.
-    # By size (-1 for none): (k, d + 1, d + 1) Gram matrices, and (k,) numbers of rows.
-    parts: tuple[tuple[int, FloatArray, FloatArray], ...]
+    parts: tuple[Products, ...]  # By size.
     flanges: tuple[str, ...]  # Those in the path that err.
-    moves: FloatArray  # (k, h, f + c) of the first h local columns by errors and common columns.
-    picked: IntArray  # (n,) local columns that are unknowns themselves.
-    units: FloatArray  # (n,) what one unit of these is.
+    moves: FloatArray  # (k, m, f + c) of the first m local columns by errors and common columns.
+    fixed: FloatArray  # (d, n) of the local columns by the others.
     columns: IntArray  # (c + n,) of the unknowns.
     poses: FloatArray  # (k, 4, 4) `seer_from_seen` as predicted.
     by_effects: Mapping[str, FloatArray]  # (k, 6, 6) of the pose by effects on each edge.
 
     @property
-    def local(self) -> int:
-        """The number d of local columns."""
-        return int(self.parts[0][1].shape[1]) - 1
+    def head(self) -> int:
+        """The number h of local columns of pose, lens and board."""
+        return int(self.parts[0].heads.shape[1])
 
-    def weighted(self, logs: FloatArray) -> FloatArray:
-        """(k, d + 1, d + 1) Gram matrices of rows in units of their noise."""
+    def heads(self, logs: FloatArray) -> FloatArray:
+        """(k, h, d + 1) products of the head's columns, of rows in units of their noise."""
         weights = weights_at(logs)
-        return np.asarray(sum(weights[size] * grams for size, grams, _ in self.parts))
+        return np.asarray(sum(weights[part.size] * part.heads for part in self.parts))
 
-    def spread(self) -> FloatArray:
-        """(k, d, f + c + n) derivatives of the local columns by errors and unknowns."""
-        own = np.zeros((len(self.rows), self.local, self.moves.shape[2] + len(self.picked)))
-        own[:, : self.moves.shape[1], : self.moves.shape[2]] = self.moves
-        own[:, self.picked, self.moves.shape[2] + np.arange(len(self.picked))] = self.units
-        return own
+    def squares(self, logs: FloatArray) -> FloatArray:
+        """(k,) squares of the residuals, in units of their noise."""
+        weights = weights_at(logs)
+        return np.asarray(sum(weights[part.size] * part.squares for part in self.parts))
 
-    def in_common(self, grams: FloatArray) -> FloatArray:
-        """Gram matrices (k, f + c + n + 1, same) by errors, unknowns and residual of local ones."""
-        head, moves = self.moves.shape[1], self.moves
-        last = np.append(self.picked, self.local)
-        units = np.append(self.units, 1.0)
-        heads = np.swapaxes(moves, 1, 2) @ grams[:, :head]
-        both = heads[:, :, last] * units
-        own = grams[:, last[:, None], last] * (units[:, None] * units)
-        return np.concatenate(
-            [
-                np.concatenate([heads[:, :, :head] @ moves, both], axis=2),
-                np.concatenate([np.swapaxes(both, 1, 2), own], axis=2),
-            ],
-            axis=1,
+    def by_unknowns(self, local: FloatArray) -> FloatArray:
+        """(k, a, f + c + n) by errors and unknowns, of (k, a, d) by local columns."""
+        moved = local[:, :, : self.moves.shape[1]] @ self.moves
+        return np.concatenate([moved, local @ self.fixed], axis=2)
+
+    def in_common(self, part: Products) -> tuple[FloatArray, FloatArray]:
+        """Gram matrices by errors, unknowns and residual.
+
+        Returns:
+            Those of errors with all (k, f, f + c + n + 1); those of unknowns and residual, summed
+            over the sightings (c + n + 1, c + n + 1).
+        """
+        f, moves = 6 * len(self.flanges), self.moves
+        by_local = np.swapaxes(moves, 1, 2) @ part.heads[:, : moves.shape[1]]
+        by_all = np.concatenate(
+            [self.by_unknowns(by_local[:, :, :-1]), by_local[:, :, -1:]], axis=2
         )
+        c, fixed = moves.shape[2] - f, np.pad(self.fixed, (0, 1))
+        fixed[-1, -1] = 1.0
+        common = np.zeros((len(self.columns) + 1, len(self.columns) + 1))
+        common[:c] = by_all[:, f:, f:].sum(axis=0)
+        common[:, :c] = common[:c].T
+        common[c:, c:] = fixed.T @ part.summed() @ fixed
+        return by_all[:, :f], common
 
     def take(self, mask: Mask) -> "Gram":
         """Some of the sightings."""
@@ -103,8 +143,7 @@ class Gram:
             self,
             rows=self.rows[mask], stops=self.stops[mask], moves=self.moves[mask],
             moments=self.moments.take(np.flatnonzero(mask)), distances=self.distances[mask],
-            parts=tuple((size, grams[mask], counts[mask]) for size, grams, counts in self.parts),
-            poses=self.poses[mask],
+            parts=tuple(part.take(mask) for part in self.parts), poses=self.poses[mask],
             by_effects={name: slope[mask] for name, slope in self.by_effects.items()},
         )  # fmt: skip
 
@@ -279,13 +318,11 @@ def linearised(
 
 def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gram:
     at = predicted_sightings(cell, unknowns, state, pair)
-    distances, own = np.ones(len(at.poses)), dict[Key, IntArray]()
+    distances = np.ones(len(at.poses))
     if pair.corners:
         distances = pair.distances(at.poses)
-        rows, own = corner_rows(unknowns, state, pair, at.poses, pair.twists(at.by_effects))
-        padded = pair.padded(rows).reshape(len(pair.rows), -1, rows.shape[2])
-        grams: FloatArray = np.swapaxes(padded, 1, 2) @ padded
-        parts: _Parts = _corner_parts(unknowns, pair, grams)
+        rows = corner_rows(unknowns, state, pair, at.poses, pair.twists(at.by_effects))
+        parts, own = _corner_parts(unknowns, pair, rows), rows.own
     else:
         parts, own = _measured_parts(unknowns, state, pair, at.poses)
     seer, _ = pair.names
@@ -312,36 +349,62 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
         moves[:, :6, : old.shape[2]], moves[:, 6:, old.shape[2] :] = old, lens
     free = {key: places for key, places in own.items() if key in unknowns}
     kept = {key: places[: unknowns[key].count] for key, places in free.items()}
-    units = [unknowns[key].units[: len(places)] for key, places in kept.items()]
     columns += [unknowns.columns(*key)[: len(places)] for key, places in kept.items()]
+    places = np.concatenate([np.zeros(0, int), *kept.values()]).astype(np.int64)
+    fixed = np.zeros((parts[0].heads.shape[2] - 1, len(places)))
+    units = [unknowns[key].units[: len(places)] for key, places in kept.items()]
+    fixed[places, np.arange(len(places))] = np.concatenate([np.zeros(0), *units])
+    instead = unknowns.fields[seer].instead if ("field", seer) in kept else None
+    if instead is not None:
+        # A field's columns are last.
+        fixed[own["lens", seer], -instead.shape[1] :] = -instead
     return Gram(
-        pair.names, pair.rows, pair.stops, pair.moments, distances, parts, flanges, moves,
-        np.concatenate([np.zeros(0, int), *kept.values()]).astype(np.int64),
-        np.concatenate([np.zeros(0), *units]),
-        np.concatenate([np.zeros(0, int), *columns]),
-        at.poses, at.by_effects,
+        pair.names, pair.rows, pair.stops, pair.moments, distances, parts, flanges, moves, fixed,
+        np.concatenate([np.zeros(0, int), *columns]), at.poses, at.by_effects,
     )  # fmt: skip
 
 
-_Parts: TypeAlias = tuple[tuple[int, FloatArray, FloatArray], ...]
-
-
-def _corner_parts(unknowns: Unknowns, pair: Pair, grams: FloatArray) -> _Parts:
-    """Gram matrices of corners: all with one noise, or what a pose explains with another."""
+def _corner_parts(unknowns: Unknowns, pair: Pair, rows: "CornerRows") -> tuple[Products, ...]:
+    """Products of corners: all with one noise, or what a pose explains with another."""
     px, view = (unknowns.size_of(f"{name} {pair.names[0]}") for name in ("px", "view"))
-    counts = np.asarray(2.0 * pair.counts)
+    counts, padded = np.asarray(2.0 * pair.counts), pair.padded
+    left, head = (
+        np.swapaxes(padded(rows.head).reshape(len(counts), -1, rows.count), 1, 2),
+        rows.count,
+    )
+    by_axis = [np.swapaxes(padded(rows.head[:, axis]), 1, 2) for axis in (0, 1)]
+    functions, residual = padded(rows.functions), padded(rows.residual)
+    pulls = np.swapaxes(residual, 1, 2) @ functions
+    heads = [left @ np.swapaxes(left, 1, 2), *(own @ functions for own in by_axis)]
+    heads.append(left @ residual.reshape(len(counts), -1, 1))
+    products = Products(
+        px, counts, np.concatenate(heads, axis=2), np.swapaxes(functions, 1, 2) @ functions,
+        pulls.reshape(len(counts), -1), np.sum(residual**2, axis=(1, 2)),
+        np.zeros((len(counts), 0, 2 * functions.shape[2])),
+    )  # fmt: skip
     if view < 0:
-        return ((px, grams, counts),)
-    by_pose = grams[:, :, :6] @ of_pose_alone(grams) @ grams[:, :6]
-    within = grams - by_pose
+        return (products,)
+    root = np.linalg.cholesky(of_pose_alone(products.heads))
+    by_pose = np.swapaxes(root, 1, 2) @ products.heads[:, :6]
+    own = np.swapaxes(by_pose[:, :, :head], 1, 2) @ by_pose
+    posed, last = by_pose[:, :, head:-1], by_pose[:, :, -1]
+    of_poses = Products(
+        view, np.full(len(counts), 6.0), own, np.zeros_like(products.functions),
+        np.einsum("kar,ka->kr", posed, last), np.sum(last**2, axis=1), posed,
+    )  # fmt: skip
+    within = products.heads - own
     # But for rounding, these are zero: noise within a view is orthogonal to its pose.
     within[:, :6], within[:, :, :6] = 0.0, 0.0
-    return (px, within, counts - 6.0), (view, by_pose, np.full(len(counts), 6.0))
+    rest = replace(
+        products, counts=counts - 6.0, heads=within, pulls=products.pulls - of_poses.pulls,
+        squares=products.squares - of_poses.squares, posed=posed, sign=-1.0,
+    )  # fmt: skip
+    return rest, of_poses
 
 
-def of_pose_alone(grams: FloatArray) -> FloatArray:
-    """(k, 6, 6) inverse information of (k, d + 1, d + 1) Gram matrices about their poses alone."""
-    pose = grams[:, :6, :6]
+def of_pose_alone(heads: FloatArray) -> FloatArray:
+    """(k, 6, 6) inverse information of (k, h, d + 1) products about their poses alone."""
+    pose = heads[:, :6, :6]
     ridge = _SINGULAR * (np.diagonal(pose, axis1=1, axis2=2) + np.ones(6))
     return np.asarray(np.linalg.inv(pose + ridge[:, :, None] * np.eye(6)), dtype=np.float64)
 
@@ -352,10 +415,25 @@ _NOISES = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class CornerRows:
+    """Rows of n corners, by local columns."""
+
+    head: FloatArray  # (n, 2, h) by pose, lens, board, and a delay of the image's rows.
+    functions: FloatArray  # (n, r) by a field, along either axis.
+    residual: FloatArray  # (n, 2).
+    own: dict[Key, IntArray]  # Local columns of what is a sighting's own.
+
+    @property
+    def count(self) -> int:
+        """The number h of the head's columns."""
+        return int(self.head.shape[2])
+
+
 def corner_rows(
     unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray, twists: FloatArray
-) -> tuple[FloatArray, dict[Key, IntArray]]:
-    """Rows (n, 2, d + 1) of corners, and the local columns of what is their own.
+) -> CornerRows:
+    """The rows of all corners of a pair.
 
     At (k, 4, 4) `seer_from_seen` that move by (k, 6) `twists` per second.
     """
@@ -384,23 +462,27 @@ def corner_rows(
             columns_of = effect.columns(pair.moments, pair.distances(poses))
             moved = columns_of @ state.values["effect", effect.name]
             residual = residual - (found.jacobian_intrinsics @ moved[pair.owner, :, None])[:, :, 0]
+    functions = np.zeros((len(residual), 0))
     if seer in unknowns.fields:
         # Where corners are predicted: at those seen, a field could explain their noise.
-        columns["field", seer] = field = unknowns.fields[seer].at(found.px)
-        residual = residual - field @ state.values["field", seer]
-    lines = [by_pose, *columns.values(), residual[:, :, None]]
-    rows = np.concatenate(lines, axis=2)
+        functions = unknowns.fields[seer].functions(found.px)
+        residual = residual - functions @ state.values["field", seer].reshape(2, -1).T
+    head = np.concatenate([by_pose, *columns.values()], axis=2)
     # Corners behind the camera have no information.
-    rows = np.where(np.isfinite(rows).all(axis=(1, 2), keepdims=True), rows, 0.0)
-    rows *= pair.weights[:, None, None]
+    behind = ~(np.isfinite(head).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1))
+    head[behind], functions[behind], residual[behind] = 0.0, 0.0, 0.0
     ends = 6 + np.cumsum([0, *(value.shape[2] for value in columns.values())])
-    return rows, {key: np.arange(ends[at], ends[at + 1]) for at, key in enumerate(columns)}
+    places = {key: np.arange(ends[at], ends[at + 1]) for at, key in enumerate(columns)}
+    if functions.shape[1]:
+        places["field", seer] = ends[-1] + np.arange(2 * functions.shape[1])
+    weights = pair.weights[:, None]
+    return CornerRows(head * weights[:, :, None], functions * weights, residual * weights, places)
 
 
 def _measured_parts(
     unknowns: Unknowns, state: State, pair: Pair, poses: FloatArray
-) -> tuple[_Parts, dict[Key, IntArray]]:
-    """Gram matrices of measured poses and places, and the local column of a board's size.
+) -> tuple[tuple[Products, ...], dict[Key, IntArray]]:
+    """Products of measured poses and places, and the local column of a board's size.
 
     Poses that were measured by images of a board that is larger by a share s than as stated have
     distances that are too short: those predicted are divided by 1 + s.
@@ -442,7 +524,9 @@ def _measured_parts(
         part = rows[:, own]
         grams = np.swapaxes(part, 1, 2) @ part
         index = unknowns.size_of(f"{name} {seer}") if name else -1
-        parts.append((index, grams, 1.0 * part.any(axis=2).sum(axis=1)))
+        counts, squares = 1.0 * part.any(axis=2).sum(axis=1), grams[:, -1, -1]
+        none, no_field = np.zeros((len(rows), 0)), np.zeros((len(rows), 0, 0))
+        parts.append(Products(index, counts, grams[:, :-1], no_field, none, squares, no_field))
     return tuple(parts), {("shape", seen): np.arange(6, 7)} if is_of_board else {}
 
 

@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import lapack
 
 from visioncal.core.types import FloatArray, IntArray
 
 # Shares of a unit diagonal that are added where a factor does not exist.
-_RIDGES = (1e-12, 1e-9, 1e-6, 1e-3)
+_RIDGES = (1e-12, 1e-9, 1e-6, 1e-3, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,16 +253,13 @@ def inverse(information: FloatArray) -> tuple[FloatArray, float]:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information * np.outer(scale, scale)
     for ridge in _RIDGES:
-        try:
-            root = np.linalg.cholesky(scaled + ridge * np.eye(len(scaled)))
-        except np.linalg.LinAlgError:
-            continue
-        break
-    else:
-        root = np.linalg.cholesky(scaled + np.eye(len(scaled)))
-    whitening = np.linalg.inv(root) * scale
+        root, failed = lapack.dpotrf(scaled + ridge * np.eye(len(scaled)), lower=1)
+        if not failed:
+            break
+    half, _ = lapack.dpotri(root, lower=1)
+    covariance = (np.tril(half) + np.tril(half, -1).T) * np.outer(scale, scale)
     log_det = 2.0 * float(np.log(np.diag(root)).sum() - np.log(scale).sum())
-    return np.asarray(whitening.T @ whitening), log_det
+    return np.asarray(covariance), log_det
 
 
 def prior_term(size: int, columns: IntArray, offsets: FloatArray, sigma: float) -> Term:

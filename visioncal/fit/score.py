@@ -20,7 +20,7 @@ from visioncal.model.effects import Effect
 
 # Sizes that are tried, over one that the data would just show.
 _TRIED = np.exp(np.linspace(-3.0, 5.0, 17))
-# Least size of a wave, over the uncertainty of a mean of all corners.
+# Least size of a function of the field, over the uncertainty with which all corners show it.
 _SEEN = 0.5
 
 
@@ -77,7 +77,7 @@ def score(fit: Fit, added: Sequence[Added], count: int, freedom: float) -> Score
     with_errors = [np.zeros((len(body.stops), body.width, count)) for body in fit.mixed.bodies]
     for part in added:
         gram, f = part.gram, 6 * len(part.gram.flanges)
-        full = np.swapaxes(part.local[:, :, :-1] @ gram.spread(), 1, 2)
+        full = np.swapaxes(gram.by_unknowns(part.local[:, :, :-1]), 1, 2)
         pull += part.local[:, :, -1].sum(axis=0)
         own += part.own
         np.add.at(with_common, gram.columns, full[:, f:].sum(axis=0))
@@ -104,13 +104,12 @@ def of_effect(fit: Fit, effect: Effect) -> Score:
         if effect.place == "edge" and effect.frame in gram.by_effects:
             columns = effect.columns(gram.moments, np.ones(len(gram.rows)))
             first, moves = 0, gram.by_effects[effect.frame] @ columns
-        elif effect.place == "lens" and effect.frame == gram.pair[0] and gram.local > 6:
+        elif effect.place == "lens" and effect.frame == gram.pair[0] and gram.head > 6:
             first, moves = 6, effect.columns(gram.moments, gram.distances)
         else:
             continue
-        weighted = gram.weighted(fit.estimate.logs)
         rows = slice(first, first + moves.shape[1])
-        local = np.swapaxes(moves, 1, 2) @ weighted[:, rows]
+        local = np.swapaxes(moves, 1, 2) @ gram.heads(fit.estimate.logs)[:, rows]
         own = (local[:, :, rows] @ moves).sum(axis=0)
         added.append(Added(gram, local, own))
     freedom = fit.freedom if effect.place == "edge" else fit.of_corners
@@ -118,15 +117,17 @@ def of_effect(fit: Fit, effect: Effect) -> Score:
 
 
 def of_unknown(fit: Fit, key: Key, maps: FloatArray) -> Score:
-    """The score of an unknown's columns (d) that differ by (s, d, c) from stop to stop."""
+    """The score of columns (d) of an edge or a lens that differ by (s, d, c) from stop to stop."""
     added, own = list[Added](), fit.unknowns.columns(*key)
     for gram in _used(fit):
         if not np.isin(own, gram.columns).all():
             continue
         places = 6 * len(gram.flanges) + np.array([np.argmax(gram.columns == c) for c in own])
-        moves = gram.spread()[:, :, places] @ maps[gram.stops]
-        local = np.swapaxes(moves, 1, 2) @ gram.weighted(fit.estimate.logs)[:, :-1]
-        added.append(Added(gram, local, (local[:, :, :-1] @ moves).sum(axis=0)))
+        head = gram.head
+        local = np.eye(head, gram.fixed.shape[0])[None].repeat(len(gram.rows), axis=0)
+        moves = gram.by_unknowns(local)[:, :, places] @ maps[gram.stops]
+        local = np.swapaxes(moves, 1, 2) @ gram.heads(fit.estimate.logs)
+        added.append(Added(gram, local, (local[:, :, :head] @ moves).sum(axis=0)))
     return score(fit, added, maps.shape[2], fit.freedom)
 
 
@@ -141,10 +142,11 @@ def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
         if pair is None or not kept.any():
             continue
         twists = pair.twists(gram.by_effects)
-        rows, _ = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, twists)
-        predicted = pair.px - rows[:, :, -1] / pair.weights[:, None]
+        rows = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, twists)
+        predicted = pair.px - rows.residual / pair.weights[:, None]
         each = waves(predicted, width, orders) * pair.weights[:, None]
-        padded, of_rows = np.swapaxes(pair.padded(each), 1, 2), pair.padded(rows)
+        full = np.concatenate([rows.head, rows.residual[:, :, None]], axis=2)
+        padded, of_rows = np.swapaxes(pair.padded(each), 1, 2), pair.padded(full)
         local = np.concatenate([padded @ of_rows[:, :, axis] for axis in (0, 1)], axis=1)
         inner = each[kept[pair.owner]]
         weight, local = _weight(fit, gram), local[kept]
@@ -153,7 +155,7 @@ def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
         if len(taken.parts) > 1:
             # What poses explain has another noise than the rest.
             more, by_pose = _weight(fit, gram, 1) - weight, np.swapaxes(local[:, :, :6], 1, 2)
-            raw = np.asarray(sum(part[1] for part in taken.parts))
+            raw = np.asarray(sum(part.heads for part in taken.parts))
             solved = of_pose_alone(raw) @ by_pose
             product += more * by_pose.reshape(-1, 2 * count).T @ solved.reshape(-1, 2 * count)
             local = local + more / weight * np.swapaxes(solved, 1, 2) @ raw[:, :6]
@@ -168,16 +170,15 @@ def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, flo
     weight = max(_weight(fit, gram) for gram in fit.grams if gram.pair[0] == camera)
     for field in fields_of_lengths(float(fit.unknowns.lenses[camera].resolution[0]), px):
         size, gain = found.best(np.tile(field.sigmas, 2), 1e-4, 5.0)
-        # Of a wave below this, all corners together show nothing.
-        seen = field.above(_SEEN / (size * np.sqrt(weight * len(px))))
-        options.append((gain, size, seen))
+        options.append((gain, size, field))
     gain, size, field = max(options, key=lambda option: option[0])
-    return field, size, gain
+    # Of a function below this, all corners together show nothing.
+    return field.shown(px, _SEEN**2 / (size**2 * weight)), size, gain
 
 
 def _weight(fit: Fit, gram: Gram, part: int = 0) -> float:
     """Inverse variance of the noise of some sightings' rows."""
-    return float(weights_at(fit.estimate.logs)[gram.parts[part][0]])
+    return float(weights_at(fit.estimate.logs)[gram.parts[part].size])
 
 
 def _used(fit: Fit) -> list[Gram]:

@@ -202,8 +202,11 @@ class Unknowns:
         return State(values, {**state.errors, **added})
 
     def camera(self, state: State, frame: str) -> Camera:
-        """A lens at a state."""
-        return with_intrinsics(self.lenses[frame], state.values["lens", frame])
+        """A lens at a state, as it projects beside its field."""
+        values, at = state.values["lens", frame], self.fields.get(frame)
+        if at is not None and at.instead is not None:
+            values = values - at.instead @ state.values["field", frame]
+        return with_intrinsics(self.lenses[frame], values)
 
     def with_members(self, *others: Unknown) -> "Unknowns":
         """The unknowns with others: in the places of those of the same key, or at the end."""
@@ -283,7 +286,7 @@ def random_effect(effect: Effect) -> Vector:
 
 def lens_field(frame: str, at: Field, size_px: float) -> Vector:
     """The field of a lens, whose size is near some value [px]."""
-    size, count = Size(f"field {frame}", size_px, 1e-4, 5.0), 2 * len(at.sigmas)
+    size, count = Size(f"field {frame}", size_px, 1e-4, 5.0), at.count
     prior = Prior(np.arange(count), size)
     return Vector(("field", frame), (prior,), np.zeros(count), np.ones(count))
 

@@ -120,8 +120,9 @@ def weighed(
         if not pair.corners:
             continue
         seen = predicted_sightings(cell, unknowns, state, pair)
-        rows, _ = corner_rows(unknowns, state, pair, seen.poses, pair.twists(seen.by_effects))
-        each = np.split(rows[:, :, [*range(6), -1]], np.cumsum(pair.counts)[:-1])
+        rows = corner_rows(unknowns, state, pair, seen.poses, pair.twists(seen.by_effects))
+        by_pose = np.concatenate([rows.head[:, :, :6], rows.residual[:, :, None]], axis=2)
+        each = np.split(by_pose, np.cumsum(pair.counts)[:-1])
         for row, own, corners in zip(pair.rows.tolist(), each, pair.corners, strict=True):
             if used[row]:
                 judged[row] = _by_own_pose(own * (corners.stated_px or 1.0))
