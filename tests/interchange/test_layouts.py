@@ -577,6 +577,91 @@ def lines_with_brackets(folder):
         write(folder / f"bras/pose_{at}.txt", text)
 
 
+def with_others(first=0, last=0):
+    """The robot's poses between others where it took no picture, by whether they are these."""
+    away = [np.array(world()[0][4]) for _ in range(first + last)]
+    for at, pose in enumerate(away):
+        pose[:3, 3] += 0.1 + 0.02 * at
+    return [*away[:first], *world()[0], *away[first:]]
+
+
+def krl_lines(names, poses):
+    for name, pose in zip(names, poses, strict=True):
+        turns = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX", degrees=True)
+        numbers = zip("XYZABC", [*(1e3 * pose[:3, 3]), *turns], strict=True)
+        yield f"DECL E6POS {name}={{{','.join(f'{n} {v:.9f}' for n, v in numbers)},S 2,T 35}}"
+
+
+def krl_with_a_retract(folder):
+    """A program whose last point has no picture."""
+    shoot(folder, "P{}.png")
+    write(
+        folder / "calib.dat", "\n".join(krl_lines(map("XP{}".format, range(10)), with_others(0, 1)))
+    )
+
+
+def krl_from_one(folder):
+    """Points from 1 on, the first and the last without a picture, and pictures from 0 on."""
+    shoot(folder / "pics", "{}.png")
+    names = map("XP{}".format, range(1, 12))
+    write(folder / "calib.dat", "\n".join(krl_lines(names, with_others(1, 1))))
+
+
+def krl_with_a_home_of_another_name(folder):
+    """Points in steps of ten between two of other names, and pictures counted by the camera."""
+    shoot(folder, "IMG_{:04d}.png")
+    names = ["XHOME", *(f"XP{at}" for at in range(10, 100, 10)), "XBACK"]
+    write(folder / "calib.dat", "\n".join(krl_lines(names, with_others(1, 1))))
+
+
+def rapid_with_a_home(folder):
+    """A first target without a picture."""
+    shoot(folder / "Pictures", "HE{}0.png")
+    lines = ["MODULE Calib"]
+    for name, pose in zip(
+        ["pHome", *(f"pHE{at}0" for at in range(9))], with_others(1), strict=True
+    ):
+        qx, qy, qz, qw = (f"{number:.9f}" for number in seven(pose)[3:])
+        place = ",".join(f"{1e3 * number:.9f}" for number in pose[:3, 3])
+        lines.append(
+            f"  CONST robtarget {name}:=[[{place}],[{qw},{qx},{qy},{qz}],[0,0,0,0],[9E9]];"
+        )
+    write(folder / "calib.mod", "\n".join([*lines, "ENDMODULE"]))
+
+
+def lines_of_lost_pictures(folder):
+    """A line a picture, of which three were deleted."""
+    lost, names = iter(with_others(3)[:3]), iter(range(9))
+    lines = list[str]()
+    for number in range(1, 13):
+        at = None if number in (3, 4, 9) else next(names)
+        pose = next(lost) if at is None else world()[0][at]
+        lines.append(",".join(map(repr, map(float, seven(pose)))))
+        if at is not None:
+            folder.mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / f"{number}.jpg"), world()[1][at])
+    write(folder / "poses.txt", "\n".join(lines))
+
+
+def lines_before_the_first_picture(folder):
+    """Two lines more than pictures, which are counted from one."""
+    for at, picture in enumerate(world()[1], 1):
+        folder.mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / f"shot{at}.png"), picture)
+    np.savetxt(folder / "poses.txt", [seven(pose) for pose in with_others(2)])
+
+
+def urscript_with_a_start(folder):
+    """Named poses of a script, the first of another name."""
+    shoot(folder, "wp{}.png")
+    names = ["start_p", *(f"Waypoint_{at}_p" for at in range(9))]
+    lines = ["def calib():"]
+    for name, pose in zip(names, with_others(1), strict=True):
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_rotvec()]
+        lines.append(f"  global {name}=p[{', '.join(f'{number:.12f}' for number in numbers)}]")
+    write(folder / "calib.script", "\n".join([*lines, "end"]))
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -588,6 +673,8 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         two_sessions, several_bodies, sentence_above,
         sorted_as_text, called_by_words, a_folder_a_view, columns_as_lists,
         blocks_of_text, mappings_of_any_names, rounds, pictures_to_numbers, lines_with_brackets,
+        krl_with_a_retract, krl_from_one, krl_with_a_home_of_another_name, rapid_with_a_home,
+        lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
     )
 }  # fmt: skip
 
@@ -621,6 +708,9 @@ def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
         assert "Left out of the images: rgb/frame_#_corners.png (9 files)" in done.err
     if make in (sixes, blanks, inverted):
         assert "Found by the images: With the robot's" in done.err
+    if make is rapid_with_a_home:
+        assert "1 of 10 rows are left out, as they have neither" in done.err
+        assert "calib.mod, line 2 (pHome)" in done.err
     if make in (nested, array, messages, unnamed_angles):
         assert session.camera is not None
 
@@ -645,6 +735,26 @@ def test_an_unknown_folder_is_described_with_the_command_that_takes_it(tmp_path,
     assert len(followed.done) == 1
     found = [view.base_from_flange().as_matrix() for view in Session.load("out").views]
     np.testing.assert_allclose(found, poses, atol=1e-12)
+
+
+@pytest.mark.parametrize(("names", "pictures"), [("", "{}.png"), ("P", "P{}.png")])
+def test_poses_are_never_paired_by_count_alone(tmp_path, monkeypatch, names, pictures):
+    """Poses of another robot beside one picture less: nothing says which one has none."""
+    monkeypatch.setattr(rereading, "_TESTED", (6, 9))
+    shoot(tmp_path / "in", pictures)
+    poses = [np.array(pose) for pose in with_others(1, 1)]
+    for at, pose in enumerate(poses):
+        pose[:3, :3] = Rotation.random(random_state=at).as_matrix()
+    if names:
+        points = (f"{names}{at}" for at in range(20, 31))
+        write(tmp_path / "in/calib.dat", "\n".join(krl_lines(points, poses)))
+    else:
+        np.savetxt(tmp_path / "in/poses.txt", [seven(pose) for pose in poses])
+    said = ("--target", world()[2].document["target"], "--mount", "eye-in-hand")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said)
+    done.refused("9 images", "11 poses", "neither names nor numbers", "--image-column")
+    assert "remove the last" not in done.err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_tracker_s_joints_and_points_in_two_files_are_a_session_of_its(tmp_path):

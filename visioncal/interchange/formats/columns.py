@@ -78,8 +78,11 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         raise faults[0]
     (rank, first), *others = sorted(found, key=lambda each: each[0])
     is_clear = not others or others[0][0] > rank
-    doubt = None if is_clear else unknown(source, requested, [each for _, each, _ in readings[:1]])
-    return replace(first, rivals=tuple((at - rank, other) for at, other in others), doubt=doubt)
+    if not is_clear:
+        first = replace(
+            first, doubt=unknown(source, requested, [each for _, each, _ in readings[:1]])
+        )
+    return replace(first, rivals=tuple((at - rank, other) for at, other in others))
 
 
 def foreign_from(
@@ -134,6 +137,8 @@ def _recordings(
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
     pairing, image_name = _images(fields, requested.image, found, instead, used)
     used.add(image_name)
+    if pairing.is_open and names["robot"]:
+        unstated["robot"] |= {"images"}
     columns = _further(fields, columns, used, pairing)
     foreign = ForeignRecording(
         name=fields.name,
@@ -147,6 +152,7 @@ def _recordings(
         columns=columns,
         notes=(*notes, *pairing.notes),
         unstated=unstated,
+        doubt=pairing.doubt,
     )
     others = [
         replace(foreign, images=other, notes=(*notes, f"The images are taken {words}."))

@@ -43,7 +43,8 @@ class Fields:
     # (n,) texts by name, of every column of a table and of single numbers.
     texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     views: tuple[int, ...] = ()  # (n,) the rows' numbers, where their files' names have them.
-    stems: tuple[str, ...] = ()  # (n,) names of the rows' files without their ending.
+    # (n,) names of the rows' files without their ending, or of a program's points.
+    stems: tuple[str, ...] = ()
     # Error messages of fields whose rows differ in shape, by name.
     shape_errors: Mapping[str, str] = field(default_factory=dict)
     form: str = ""  # A name among `POSE_FORMS` where the rows state the form of the robot's poses.

@@ -1,7 +1,7 @@
 """Finds files: those of a source in groups of one kind, and the image of each row."""
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -311,14 +311,25 @@ class Pairing:
     notes: tuple[str, ...] = ()  # What was paired with what, and what was left out.
     # (n,) images in other orders, where no names pair them, and what they are called.
     others: tuple[tuple[str, tuple[Path | None, ...]], ...] = ()
+    is_open: bool = False  # Whether what the images show says which of these is right.
+    doubt: DataError | None = None  # The error where nothing else says it.
 
 
 def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     """Pairs rows with one kind of image: by equal names or numbers, else in natural order.
 
-    Depth pictures of the rows are kept beside; raises DataError where nothing fits, or several do.
+    Where one side has more, numbers may differ by a constant, which the images determine if several
+    fit. Depth pictures of the rows are kept beside; raises DataError where nothing fits, or several
+    kinds do.
     """
-    matches = [(group, found) for group in groups if (found := matched(fields.keys, group.keys))]
+    matches, steps = list[tuple[FileGroup, Match]](), dict[str, list[Match]]()
+    for group in groups:
+        found = matched(fields.keys, group.keys)
+        fewest = min(len(fields), len(group.files))
+        if found is None or (found.how == HOW[1] and (found.rows >= 0).sum() < fewest):
+            steps[group.label] = [*_in_step(fields, group)]
+            found = found or next(iter(steps[group.label]), None)
+        matches += [(group, found)] if found else []
 
     def rank(item: tuple[FileGroup, Match]) -> tuple[object, ...]:
         group, found = item
@@ -337,17 +348,7 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
 
     ranked = sorted(matches, key=rank)
     if not ranked:
-        largest = max(groups, key=lambda group: len(group.files))
-        first, last = largest.files[0].name, largest.files[-1].name
-        raise DataError(
-            f"{largest.files[0].parent} has {counted(len(largest.files), 'image')} ({first} ... "
-            f"{last}), but there are {len(fields)} poses ({fields.places[0]} ... "
-            f"{fields.places[-1]}); one image a pose is needed.",
-            culprits=[str(largest.files[0].parent)],
-            next_step=f"Name each row's image with --image-{named_by(fields.places[0]).rstrip('s')}"
-            ", or remove what is over. Where that is not known, remove the last, and doctor "
-            "says from where on rows and images are shifted.",
-        )
+        raise _unpaired(fields, max(groups, key=lambda group: len(group.files)))
     rivals = [group for group, _ in ranked if rank((group, _)) == rank(ranked[0])]
     if len(rivals) > 1:
         raise DataError(
@@ -372,19 +373,75 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     if left:
         notes.append(f"Left out of the images: {some_of(left)}.")
     depths = () if depth is None else depth[0].taken(depth[1].rows)
-    files = chosen.files if how != HOW[0] and len(chosen.files) == len(fields) else ()
+    others = steps.get(chosen.label, [])
+    orders = _orders(fields, chosen, match, others).items()
+    rest = tuple((words, each) for words, each in orders if each and each != images)
+    is_sure = len(others) < 2 or match is not others[0]
+    doubt = None if is_sure else _unpaired(fields, chosen)
+    return Pairing(images, depths, tuple(notes), rest, bool(others), doubt)
+
+
+def _orders(
+    fields: Fields, chosen: FileGroup, match: Match, others: Sequence[Match]
+) -> dict[str, tuple[Path | None, ...]]:
+    """The rows' images in other orders, where no names pair them, and what they are called."""
+    if match.how == HOW[0]:
+        return {}
+    files = chosen.files if len(chosen.files) == len(fields) else ()
     orders: dict[str, tuple[Path | None, ...]] = {
         "in natural order": files,
         "in the order of their names as texts": tuple(sorted(files, key=str)),
         "in reverse order": files[::-1],
     }
-    if how != HOW[0]:
-        for by in (1, -1):
-            rows = match.rows + by
-            rows[(match.rows < 0) | (rows >= len(chosen.files))] = -1
-            orders[f"one {'later' if by > 0 else 'earlier'}"] = chosen.taken(rows)
-    others = tuple((words, each) for words, each in orders.items() if each and each != images)
-    return Pairing(images, depths, tuple(notes), others)
+    for by in () if others else (1, -1):
+        rows = match.rows + by
+        rows[(match.rows < 0) | (rows >= len(chosen.files))] = -1
+        orders[f"one {'later' if by > 0 else 'earlier'}"] = chosen.taken(rows)
+    for rows in (other.rows for other in others):
+        at = int(np.argmax(rows >= 0))
+        words = f"from {chosen.files[rows[at]].name} with {fields.places[at]} on"
+        orders[words] = chosen.taken(rows)
+    return orders
+
+
+def _unpaired(fields: Fields, group: FileGroup) -> DataError:
+    """The error where nothing says which image is a row's."""
+    folder, first, last = group.files[0].parent, group.files[0].name, group.files[-1].name
+    word = named_by(fields.places[0]).rstrip("s")
+    return DataError(
+        f"{folder} has {counted(len(group.files), 'image')} ({first} ... {last}), but there are "
+        f"{len(fields)} poses ({fields.places[0]} ... {fields.places[-1]}), and neither names nor "
+        "numbers say which belong together.",
+        culprits=[str(folder)],
+        next_step=f"Write each pose's image beside it, and name that with --image-{word}, or "
+        "remove what is over, wherever it is.",
+    )
+
+
+def _in_step(fields: Fields, group: FileGroup) -> Iterator[Match]:
+    """Pairings by numbers that differ by a constant, the least first; all of the fewer find one.
+
+    Rows without numbers count from one. Else points of the usual name are paired by their order.
+    """
+    place = {number: at for at, number in enumerate(group.numbers)}
+    for own in (*fields.keys.found[HOW[1]].values(), range(1, len(fields) + 1)):
+        numbers = [number for number in own if isinstance(number, int)]
+        fewer, more = sorted(({*numbers}, {*place}), key=len)
+        if not 2 < len(fewer) <= len(more) < 2 * len(fewer):
+            continue
+        first, last, sign = min(fewer), max(fewer), 1 if len(numbers) <= len(place) else -1
+        near = sorted((number - first for number in more), key=abs)
+        # The last one tells most that do not fit; more than a few fit by chance.
+        fits = (by for by in near if last + by in more and all(k + by in more for k in fewer))
+        if steps := [*islice(fits, 9)]:
+            for by in steps:
+                at = (place.get(k + sign * by, -1) if isinstance(k, int) else -1 for k in own)
+                yield Match(HOW[1], np.array([*at]))
+            return
+    kinds = [re.sub("[0-9]+", "", name) for name in fields.stems]
+    usual = np.isin(kinds, [kind for kind, _ in Counter(kinds).most_common(1)])
+    if 2 < usual.sum() == len(group.files):
+        yield Match(HOW[-1], np.where(usual, np.cumsum(usual) - 1, -1))
 
 
 def path_inside(base: Path, name: str) -> Path:

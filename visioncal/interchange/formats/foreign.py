@@ -13,8 +13,8 @@ from visioncal.core.number_format import known_name
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress, chosen_rows, evenly
 from visioncal.session import ImageStore
 
-# What a source does not say of its poses: `rotation`, `angles` (their order and unit), `unit` and
-# `inverse`.
+# What a source does not say of its poses: `rotation`, `angles` (their order and unit), `unit`,
+# `inverse`, and which `images` are theirs.
 Unstated: TypeAlias = frozenset[str]
 Side: TypeAlias = Literal["robot", "camera"]
 

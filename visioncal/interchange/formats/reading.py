@@ -143,6 +143,8 @@ _PYTHON = re.compile(rf"\b(?:{'|'.join(_NAMES_OF)})\b")
 # What a program declares beside targets.
 _FRAMES = re.compile("tool|wobj|load|base", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//", "!")
+# The name of a taught point: `DECL E6POS XP1={`, `CONST robtarget p10:=`, `P[1]{`, `P1: X ..`.
+_POINT = re.compile(r"[\w\s]*?(\w+(?:\[[^\]]*\])?)\s*(?::?=|[:{])")
 
 
 def read_fields(path: Path, form: str | None = None) -> Fields:
@@ -158,7 +160,9 @@ def read_rows(path: Path, form: str | None = None, document: object = None) -> l
     if path.suffix.lower() in DOCUMENTS:
         return rows_of_document(document or read_document(path), path)
     text = read_plain_text(path)
-    for literals in (_literals(text, path), _keyed(text)):
+    # Points that a program declares look like keys and values.
+    is_program = path.suffix.lower() in _PROGRAMS
+    for literals in () if is_program else (_literals(text, path), _keyed(text)):
         with suppress(DataError):
             return rows_of_document(literals, path)
     if lines := _pendant(text, path, form if form in POSE_FORMS else None):
@@ -422,8 +426,12 @@ def _pendant(text: str, path: Path, form: str | None) -> Fields | None:
     first = next((at for at, (_, line) in enumerate(lines[:2]) if is_marked_pose(line)), None)
     if first is None:
         return None
-    records, forms = [], dict[str, str]()
-    for place, line in lines[first:]:
+    lines = lines[first:]
+    points = [match[1] if (match := _POINT.match(line)) else "" for _, line in lines]
+    is_named = len({*points}) == len(points)
+    records, places, forms = [], list[str](), dict[str, str]()
+    for (place, line), point in zip(lines, points, strict=True):
+        places.append(f"{place} ({point})" if is_named else place)
         pose, image = read_pose(_IMAGE.sub(" ", line), place, form), _IMAGE.search(line)
         forms.setdefault(pose.form.name, place)
         numbers = write_pose(pose.pose, pose.form)
@@ -435,6 +443,5 @@ def _pendant(text: str, path: Path, form: str | None) -> Fields | None:
             culprits=[*forms.values()],
             next_step="Put the poses of one robot into a file of their own.",
         )
-    places = [place for place, _ in lines[first:]]
     fields = fields_of_records(records, places, path.stem, path.parent)
-    return replace(fields, form=next(iter(forms)))
+    return replace(fields, stems=tuple(points) if is_named else (), form=next(iter(forms)))
