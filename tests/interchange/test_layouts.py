@@ -662,6 +662,56 @@ def urscript_with_a_start(folder):
     write(folder / "calib.script", "\n".join([*lines, "end"]))
 
 
+PREAMBLE = (
+    *("Projekt;Zelle 4;;;;;;", "Roboter;Yaskawa GP7, YRC1000;;;;;;", "Stand;1,5;;;;;;"),
+    *("Winkel wie am Pendant: Rx, Ry, Rz (°);;;;;;;", ";;;;;;;", ""),
+)
+
+
+def below_a_preamble(folder):
+    """A table of Windows with decimal commas below rows of as many cells."""
+    shoot(folder / "Bilder", "Bild_{}.png")
+    turns = Rotation.from_matrix(world()[0][:, :3, :3]).as_euler("xyz", degrees=True)
+    rows = np.hstack([1e3 * world()[0][:, :3, 3], turns])
+    lines = ["Nr.;Bild;X [mm];Y [mm];Z [mm];Rx [°];Ry [°];Rz [°]"]
+    for at, row in enumerate(rows):
+        numbers = ";".join(f"{number:.10f}".replace(".", ",") for number in row)
+        lines.append(f"{at + 1};Bild_{at}.png;{numbers}")
+    (folder / "Messung.csv").write_bytes("\r\n".join([*PREAMBLE, *lines]).encode("cp1252"))
+
+
+def below_tabs(folder):
+    """Three rows of a preamble between tabs, and a header without a number or an image."""
+    shoot(folder, "shot{}.png")
+    turns = Rotation.from_matrix(world()[0][:, :3, :3]).as_quat()
+    rows = np.hstack([world()[0][:, :3, 3], turns]).tolist()
+    lines = ["operator\tM. K.\t\t\t\t\t", "date\t2026-07-14\t\t\t\t\t", "version\t3\t\t\t\t\t"]
+    lines += ["x\ty\tz\tqx\tqy\tqz\tqw", *("\t".join(map(repr, row)) for row in rows)]
+    write(folder / "log.txt", "\n".join(lines))
+
+
+def halcon(folder):
+    """A file a picture as HALCON's write_pose has it, in each of its representations."""
+    shoot(folder, "calib_image_{:02d}.png")
+    codes = (0, 2, 4, 1, 3, 5, 8, 10, 13)
+    for at, (code, pose) in enumerate(zip(codes, world()[0], strict=True)):
+        turned = Rotation.from_matrix(pose[:3, :3])
+        place = -pose[:3, :3].T @ pose[:3, 3] if code > 7 else pose[:3, 3]
+        if code & 4:
+            vector = turned.as_rotvec() * (-1 if code % 2 else 1)
+            turns = vector / np.linalg.norm(vector) * np.tan(np.linalg.norm(vector) / 2)
+        elif code % 2:
+            # The product of the negated turns is the inverse of that in the other order.
+            turns = turned.inv().as_euler("zyx" if code & 2 else "ZYX", degrees=True)
+            turns = turns[::-1]
+        else:
+            turns = turned.as_euler("xyz" if code & 2 else "XYZ", degrees=True)
+        text = f"#\n# 3D POSE PARAMETERS: rotation and translation\n#\n\nf {code}\n\n"
+        for name, numbers in (("r", turns), ("t", place)):
+            text += f"# {name}:\n{name} {' '.join(map(repr, np.asarray(numbers).tolist()))}\n\n"
+        write(folder / f"robot_pose_{at:02d}.dat", text)
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -674,6 +724,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         sorted_as_text, called_by_words, a_folder_a_view, columns_as_lists,
         blocks_of_text, mappings_of_any_names, rounds, pictures_to_numbers, lines_with_brackets,
         krl_with_a_retract, krl_from_one, krl_with_a_home_of_another_name, rapid_with_a_home,
+        below_a_preamble, below_tabs, halcon,
         lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
     )
 }  # fmt: skip
@@ -755,6 +806,25 @@ def test_poses_are_never_paired_by_count_alone(tmp_path, monkeypatch, names, pic
     done.refused("9 images", "11 poses", "neither names nor numbers", "--image-column")
     assert "remove the last" not in done.err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("f 7\nr 1 2 3\nt 0 0 1\n", "f is 7"), ("f 2\nr 1 2\nt 0 0 1\n", "2 and 3")]
+)
+def test_a_pose_of_halcon_of_no_known_type_is_refused(tmp_path, text, words):
+    halcon(tmp_path / "in")
+    write(tmp_path / "in/robot_pose_03.dat", text)
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    done.refused("robot_pose_03.dat", words)
+
+
+def test_a_table_of_uneven_rows_hears_of_commas_only_where_it_has_some(tmp_path):
+    write(tmp_path / "in.txt", "1 2 3 4 5 6 7\n1 2 3 4 5 6 7\n1 2 3\n")
+    done = visioncal("convert", tmp_path / "in.txt", tmp_path / "out", "--mount", "eye-in-hand")
+    assert "ommas" not in done.refused("3 cells", "as many cells").err
+    write(tmp_path / "in.txt", "1 2 3 4 5 6 7\n1 2 3 4 5 6 7\n1,5 2 3\n")
+    done = visioncal("convert", tmp_path / "in.txt", tmp_path / "out", "--mount", "eye-in-hand")
+    done.refused("Where commas are decimal")
 
 
 def test_a_tracker_s_joints_and_points_in_two_files_are_a_session_of_its(tmp_path):

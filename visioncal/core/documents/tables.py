@@ -122,7 +122,8 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
     Without a header row, a comment right before the first row is the header if it has one word per
     column after any colon; a first line such as `sep=;` declares the separator. With semicolons or
     tabs, decimal commas are read as points. Rows may be lists in brackets, with a name before them.
-    Empty rows and empty trailing columns are ignored. Raises DataError.
+    Empty rows, empty trailing columns, and titles or a preamble above the header are ignored.
+    Raises DataError.
     """
     text, where = read_plain_text(path) if text is None else text, str(path)
     if sum(map(text.count, ";\t,\n\r ")) > MAX_VALUES:
@@ -162,7 +163,9 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
             raise DataError(
                 f"{where}, line {at}: {len(row)} cells; {width} are needed, as in the first row.",
                 culprits=[f"{where}, line {at}"],
-                next_step="Where commas are decimal, separate the columns by semicolons or tabs.",
+                next_step="Where commas are decimal, separate the columns by semicolons or tabs."
+                if separator == "," or "," in all_lines[at - 1]
+                else "Give every row as many cells, and begin lines of other content with #.",
             )
     return TextTable(
         path.name, _named(columns, width, where), tuple(rows), numbers, columns is not None
@@ -172,12 +175,15 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
 def _below_titles(
     rows: list[tuple[int, tuple[str, ...]]],
 ) -> list[tuple[int, tuple[str, ...]]]:
-    """Rows without titles above, which have other numbers of cells than all that follows."""
+    """Rows without what stands above: titles of other widths, or rows filled in few cells."""
     widths = [len(cells) for _, cells in rows]
-    usual = Counter(widths).most_common(1)[0][0]
-    above = widths.index(usual)
-    is_title = 0 < above < 9 and len(rows) > above + 2 and {*widths[above:]} == {usual}
-    return rows[above:] if is_title else rows
+    filled = [sum(map(bool, cells)) for _, cells in rows]
+    usual, half = Counter(widths).most_common(1)[0][0], sorted(filled)[len(rows) // 2] / 2
+    above = next(at for at, width in enumerate(widths) if width == usual and filled[at] > half)
+    # Without a header, rows of few cells may be rows all the same.
+    is_header = not any(map(is_number, rows[above][1])) or usual not in widths[:above]
+    is_title = above and len(rows) > above + 2 and {*widths[above:]} == {usual}
+    return rows[above:] if is_title and is_header else rows
 
 
 def _named(columns: Sequence[str] | None, width: int, where: str) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.documents.jsons import Array, read_arrays, read_json
@@ -20,6 +21,7 @@ from visioncal.core.documents.tables import TextTable, is_number, read_table
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_values
+from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
     MOST_NUMBERS,
@@ -32,6 +34,7 @@ from visioncal.interchange.formats.fields import (
     joined,
     separate,
 )
+from visioncal.session.columns import pose_row
 
 _HEADED = re.compile(r"\s*([^\d\W][^:=]*?)\s*[:=]\s*(.*?)\s*")
 
@@ -190,13 +193,45 @@ def read_record(path: Path, document: object = None) -> dict[str, object]:
     """What the file of one view holds, by name; numbers without a name are its `matrix`."""
     if path.suffix.lower() in DOCUMENTS:
         document = document or read_document(path)
-    elif not (document := _keyed(text := read_plain_text(path))):
+    elif not (document := _keyed(text := read_plain_text(path)) or _halcon(text, path)):
         table = read_table(path, text)
         rows = [[float(cell) if is_number(cell) else cell for cell in row] for row in table.rows]
         document = rows[0] if len(rows) == 1 else rows
         if table.has_header and len(rows) == 1:
             document = dict(zip(table.columns, rows[0], strict=True))
     return flattened(document if isinstance(document, Mapping) else {"matrix": document})
+
+
+_HALCON = re.compile(r"^[ \t]*([frt])[ \t]+(\S.*)$", re.MULTILINE)
+
+
+def _halcon(text: str, path: Path) -> dict[str, object]:
+    """A pose of HALCON's write_pose (`f` code, `r` rotation, `t` position [m]); empty for none.
+
+    Codes are those of MVTec, "HALCON Operator Reference", create_pose: 0 Rx Ry Rz (`gba`), 2 Rz Ry
+    Rx (`abg`) [deg], 4 a vector of length tan(angle / 2); plus 1 with negated angles, plus 8 where
+    the position is subtracted before the rotation. Raises DataError.
+    """
+    words = {match[1]: match[2].split() for match in _HALCON.finditer(text)}
+    if words.keys() != {*"frt"} or not all(is_number(w) for each in words.values() for w in each):
+        return {}
+    code, turns, place = (np.array(words[name], dtype=float) for name in "frt")
+    kind, sizes = int(code[0]) & 6, (len(code), len(turns), len(place))
+    if sizes != (1, 3, 3) or code[0] not in range(14) or kind == 6:
+        raise DataError(
+            f"{path}: f is {' '.join(words['f'])}, and r and t have {sizes[1]} and {sizes[2]} "
+            "numbers; a pose of HALCON has a type f among 0 to 5 and 8 to 13, and 3 of each.",
+            culprits=[str(path)],
+            next_step="Write it anew with write_pose.",
+        )
+    turns = -turns if code[0] % 2 else turns
+    rotation = (
+        Rotation.from_quat([*turns, 1.0])
+        if kind == 4
+        else Rotation.from_euler("xyz" if kind == 2 else "XYZ", turns, degrees=True)
+    )
+    place = rotation.apply(-place) if code[0] >= 8 else place
+    return dict(pose_row(compose(rotation.as_matrix(), place)))
 
 
 _SECTION = re.compile(r"\s*\[+\s*([^\[\]=:,]+?)\s*\]+\s*")
