@@ -1,6 +1,6 @@
 """What may act beside noise: opened one at a time, where the score of a fit without it is clear."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,16 @@ from visioncal.fit.score import best_field, of_effect
 from visioncal.fit.sizes import SIGNIFICANT
 from visioncal.fit.trials import gain_of
 from visioncal.fit.unknowns import State, Unknowns, Vector, lens_field, random_effect
-from visioncal.model.effects import Breathing, Effect, FocusJitter, LensGrows, Rolling
+from visioncal.model.effects import (
+    Breathing,
+    Effect,
+    FocusJitter,
+    LensGrows,
+    Play,
+    Rolling,
+    Springs,
+    Weight,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +34,11 @@ class Candidate:
     field: Field | None = None  # Beside a lens that is as stated.
 
 
-def opened(fit: Fit, pairs: Sequence[Pair]) -> tuple[Unknowns, State] | None:
+def opened(
+    fit: Fit, pairs: Sequence[Pair], among: Iterable[Candidate]
+) -> tuple[Unknowns, State] | None:
     """Unknowns with the candidate that explains most, and their state; None where none is clear."""
-    found = max(candidates(fit, pairs), key=lambda one: one.gain, default=None)
+    found = max(among, key=lambda one: one.gain, default=None)
     if found is None or 2.0 * found.gain < SIGNIFICANT:
         return None
     unknowns = fit.unknowns.with_members(found.member)
@@ -45,12 +56,8 @@ def opened(fit: Fit, pairs: Sequence[Pair]) -> tuple[Unknowns, State] | None:
 
 def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """All that are not open yet, with their scores."""
+    yield from scored(fit, (*effects_of_lenses(fit), *effects_of_arms(fit)))
     known = {effect.name for effect in fit.unknowns.effects}
-    for effect in effects_of_lenses(fit):
-        if effect.name not in known:
-            bounds = effect.size
-            size, gain = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
-            yield Candidate(gain, starting_at(random_effect(effect), size), effect)
     for effect in tried_effects(fit):
         if effect.name not in known:
             gain = gain_of(fit, pairs, effect)
@@ -60,6 +67,16 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
         if is_free and images_of(pairs, camera):
             field, size, gain = best_field(fit, pairs, camera)
             yield Candidate(gain, lens_field(camera, field, size), field=field)
+
+
+def scored(fit: Fit, effects: Iterable[Effect]) -> Iterator[Candidate]:
+    """Those of some effects that are not open yet."""
+    known = {effect.name for effect in fit.unknowns.effects}
+    for effect in effects:
+        if effect.name not in known:
+            bounds = effect.size
+            size, gain = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
+            yield Candidate(gain, starting_at(random_effect(effect), size), effect)
 
 
 def starting_at(member: Vector, size: float) -> Vector:
@@ -81,6 +98,18 @@ def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
             distances = [gram.distances for gram in fit.grams if gram.pair[0] == camera]
             yield Breathing(camera, lens, float(np.median(np.concatenate(distances))))
             yield FocusJitter(camera, lens, len(fit.cell.moments))
+
+
+def effects_of_arms(fit: Fit) -> Iterator[Effect]:
+    """Effects on the joints of arms whose postures are known."""
+    for name in fit.unknowns.erring:
+        arm = fit.cell.arms[name]
+        if arm.has_joints and arm.model is not None:
+            yield Play(name, arm.model)
+            if arm.model.masses is None:
+                yield Weight(name, arm.model)
+            if arm.model.masses is not None or (arm.loads is not None and arm.loads.any):
+                yield Springs(name, arm.model)
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:

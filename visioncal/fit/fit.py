@@ -274,7 +274,8 @@ class Fit:
                 noise += (slope * self.flange_sigmas(name) ** 2) @ np.swapaxes(slope, 1, 2)
         for effect in self.unknowns.effects:
             if effect.place == "edge" and effect.frame in at.slopes:
-                columns = effect.columns(moments, np.ones(len(moments)))
+                values = self.state.values["effect", effect.name]
+                columns = effect.slopes(moments, values)
                 own = self.unknowns.columns("effect", effect.name)
                 jacobian[:, :, own] += at.by_effects[effect.frame] @ columns
         calibration = jacobian @ self.whole @ np.swapaxes(jacobian, 1, 2)

@@ -284,8 +284,7 @@ def predicted(
         twist = errors.get(name, np.zeros((count, 6)))
         for effect in unknowns.effects:
             if effect.place == "edge" and effect.frame == name:
-                columns = effect.columns(moments, np.ones(count))
-                twist = twist + columns @ state.values["effect", effect.name]
+                twist = twist + effect.twists(moments, state.values["effect", effect.name])
         edge = moments.poses[name] if step.robot else _edge(cell, state, name)
         moved = exp(twist)
         edge = edge @ moved
@@ -335,8 +334,9 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
     for effect in unknowns.effects:
         known = unknowns.columns("effect", effect.name)
         if effect.place == "edge" and effect.frame in frames:
-            slope = at.by_effects[effect.frame]
-            by_pose.append(slope @ effect.columns(pair.moments, distances))
+            values = state.values["effect", effect.name]
+            slopes = effect.slopes(pair.moments, values)
+            by_pose.append(at.by_effects[effect.frame] @ slopes)
             columns.append(known)
         elif effect.place == "lens" and effect.frame == seer and pair.corners:
             by_lens.append(effect.columns(pair.moments, distances))

@@ -71,6 +71,10 @@ class Search:
                 break
         return fit, left_out
 
+    def with_all(self, fit: Fit) -> Fit:
+        """The fit with all sightings that may agree, whether they do or not."""
+        return self._refitted(fit, self.sound)
+
     def weighed(self, fit: Fit) -> "Search | None":
         """The search with corners judged by a fit; None where these are as sure as they were."""
         # Under the lens of a start, a sound view may have seemed none.
@@ -86,13 +90,18 @@ class Search:
         grams = linearised(self.cell, self.unknowns, state, self.pairs)
         self.effort.linearisations += 1
         mixed = mixed_model(self.cell, self.unknowns, state, grams, used)
-        unknowns = self.unknowns if last is None else self.unknowns.closing(last.unknowns.closed)
+        # What other unknowns leave of the noise may show what it hid.
+        is_again = last is not None and last.unknowns.members == self.unknowns.members
+        known = {} if last is None else last.sizes
+        closed = frozenset() if last is None else last.unknowns.closed
+        unknowns = self.unknowns.closing(closed if is_again else ())
         starts, (low, high) = unknowns.starts(), unknowns.bounds()
         begin = starts.copy()
-        for name, value in () if last is None else last.sizes.items():
+        for name, value in known.items():
             at = unknowns.size_of(name)
-            # Not from a bound: there, a size has no slope.
-            begin[at] = np.clip(np.log(value), low[at] + 2.0, high[at])
+            if is_again or name not in closed:
+                # Not from a bound: there, a size has no slope.
+                begin[at] = np.clip(np.log(value), low[at] + 2.0, high[at])
         found = most_likely(mixed, begin, low, high)
         random = {size for size, *_ in unknowns.priors() if size >= 0}
         found, more = significant(mixed, found, starts, low, high, sorted(random))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
-from visioncal.fit.candidates import opened
+from visioncal.fit.candidates import candidates, effects_of_arms, opened, scored
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.held import with_held_lenses
 from visioncal.fit.processes import ENOUGH_STOPS, consider, held_boards
@@ -60,8 +60,9 @@ def solve(cell: Cell) -> CellFit:
     effects = effects_of(start.cell)
     search = Search.of(start.cell, unknowns_of(start, effects), start.sound)
     fit, left_out = search.run(state_of(start, effects), nearest(start))
+    search, fit, left_out = _explained(search, fit, left_out)
     for _ in range(_OPENED):
-        wider = opened(fit, search.pairs)
+        wider = opened(fit, search.pairs, candidates(fit, search.pairs))
         if wider is None:
             break
         search = search.with_unknowns(wider[0])
@@ -80,6 +81,24 @@ def solve(cell: Cell) -> CellFit:
     for one in found.values():
         fit = fit if one is None else fit.considering(one.covariance, one.shift)
     return CellFit(with_held_lenses(fit), left_out, start, search.effort)
+
+
+def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit, LeftOut]:
+    """A fit, or that with an arm's effect by which most of many sightings agree that did not.
+
+    Play has one of two values at each stop, and neither half of these shows it.
+    """
+    lost = int((search.sound & ~fit.used).sum())
+    wider = None
+    if lost > search.sound.sum() / 10:
+        whole = search.with_all(fit)
+        wider = opened(whole, search.pairs, scored(whole, effects_of_arms(whole)))
+    if wider is not None:
+        other = search.with_unknowns(wider[0])
+        found, left = other.run(wider[1], search.sound, whole)
+        if (search.sound & ~found.used).sum() < lost / 2:
+            return other, found, left
+    return search, fit, left_out
 
 
 def with_free_boards(fit: Fit) -> Unknowns:

@@ -7,4 +7,7 @@ from visioncal.model.effects.effect import Size as Size
 from visioncal.model.effects.focus_jitter import FocusJitter as FocusJitter
 from visioncal.model.effects.lens_grows import LensGrows as LensGrows
 from visioncal.model.effects.links import Links as Links
+from visioncal.model.effects.play import Play as Play
 from visioncal.model.effects.rolling import Rolling as Rolling
+from visioncal.model.effects.springs import Springs as Springs
+from visioncal.model.effects.springs import Weight as Weight

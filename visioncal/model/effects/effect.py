@@ -62,6 +62,15 @@ class Effect(ABC):
                 where a frame moves.
         """
 
+    def twists(self, moments: Moments, values: FloatArray) -> FloatArray:
+        """(k, 6) right perturbations of an edge by (c,) values."""
+        return np.asarray(self.columns(moments, np.ones(len(moments))) @ values)
+
+    def slopes(self, moments: Moments, values: FloatArray) -> FloatArray:
+        """Derivatives (k, 6, c) of `twists` at (c,) values: the columns where these are linear."""
+        del values
+        return self.columns(moments, np.ones(len(moments)))
+
 
 @dataclass(frozen=True, eq=False)
 class LensEffect(Effect):
