@@ -22,6 +22,7 @@ from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.guess.fit import STARTS, robust_fits
 from visioncal.calibration.guess.joints import guess_joints
 from visioncal.calibration.guess.readings import changes
+from visioncal.calibration.guess.search import in_one_turn
 from visioncal.calibration.run import STAGES
 from visioncal.core.conventions import Reading
 from visioncal.core.errors import DataError, DegenerateError
@@ -615,3 +616,44 @@ def test_a_shift_moves_the_joints(tmp_path, with_poses):
         inverse = replace(best, robot=replace(best.robot, inverse=True))
         with pytest.raises(DataError, match="known by its joint angles alone"):
             reread(DoubtfulSession.of(foreign), replace(guess.best, hypothesis=inverse))
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_another_mount_and_a_board_of_another_size_are_found_together(mount):
+    poses = cell_poses(MOUNTS[1 - MOUNTS.index(mount)])
+    camera = poses.camera.poses()
+    camera[:, :3, 3] /= 1.16
+    guess = guessed(replace(poses, mount=mount, camera=numbers(camera)))
+    assert guess.stands_out, guess.sentence
+    assert guess.best.hypothesis.mount == poses.mount
+    # The start of a fit, which takes the rest: views of 0.1 px tell a size to less than a percent.
+    assert guess.best.board_scale == pytest.approx(1.16, rel=0.01)
+    assert "the board 1.1" in guess.sentence
+
+
+def test_distances_that_are_several_times_too_long_are_mended_by_the_printed_command(
+    tmp_path, monkeypatch
+):
+    poses = cell_poses("eye-to-hand")
+    camera = poses.camera.poses()
+    camera[:, :3, 3] *= 5.714
+    pairs_session("eye-to-hand", poses.true_robot, camera).save(tmp_path / "cell")
+    monkeypatch.chdir(tmp_path)
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert "times as large" in followed.runs[0].out
+    assert followed.last.status == 0
+    x = Calibration.load(tmp_path / "out").transforms["base_from_cam"].as_matrix()
+    true = SOLVERS["park"](invert(poses.true_robot), poses.camera.poses()).x
+    # Two fits of the same poses differ by less than their noise of half a millimetre.
+    assert np.linalg.norm(x[:3, 3] - true[:3, 3]) < 1.5e-3
+
+
+def test_of_rivals_of_a_symmetric_board_those_turn_as_the_robot_does():
+    poses, half = cell_poses(views=14), np.diag([-1.0, -1.0, 1.0])
+    seen = poses.camera.poses()[:, None, :3, :3]
+    rivals = np.concatenate([seen, seen @ half], axis=1)
+    mixed = np.random.default_rng(3).integers(0, 2, len(rivals))
+    rivals = rivals[np.arange(len(rivals))[:, None], [[one, 1 - one] for one in mixed]]
+    chosen = in_one_turn(poses.true_robot[:, :3, :3], rivals)
+    # All of them may be turned, which is another frame of the board.
+    assert len({*(chosen ^ mixed).tolist()}) == 1

@@ -30,11 +30,12 @@ class SideReading(Reading):
     # Whether rotations are transposed while positions are not those of an inverse.
     transposed: bool = False
     mirrored: bool = False  # Whether the frame is left-handed.
+    scale: float = 1.0  # Factor of all distances, beside the unit.
 
     @property
     def reading(self) -> Reading | None:
         """The equivalent `Reading` of the recorded numbers; None where there is none."""
-        if self.written or self.transposed or self.mirrored:
+        if self.written or self.transposed or self.mirrored or self.scale != 1.0:
             return None
         return Reading(self.rotation, self.unit, self.inverse)
 
@@ -51,7 +52,7 @@ class SideReading(Reading):
     def poses(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 4, 4) transforms [m]; NaN in rows without a pose."""
         rotations = self.rotations(numbers)
-        positions = UNITS_M[self.unit] * numbers.positions
+        positions = self.scale * UNITS_M[self.unit] * numbers.positions
         if self.mirrored:
             rotations, positions = rotations * np.outer(_MIRROR, _MIRROR), positions * _MIRROR
         if self.transposed:

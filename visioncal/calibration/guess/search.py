@@ -38,6 +38,11 @@ EVIDENCE = 0.5
 CLEAR, _CHANGE, IMPOSSIBLE = 3.0, 4.0, 20.0
 # Plausible distances between camera and board [m].
 _BOARD_DISTANCE_M = (0.02, 30.0)
+# Turns of robot and camera agree from here on [rad]. A print differs by less than the first
+# logarithm from its stated size; a fit follows the second. Rounds in which nearest rows are found.
+_TURNS_AGREE_RAD, _PRINTED, _FOLLOWED, _CONCENTRATED = 0.1, 0.03, 0.2, 4
+# Directions with a smaller singular value, relative to the largest, are not determined.
+_DETERMINED = 1e-3
 # The screening and the first fits hand on at most so many readings, whose scores are near the best
 # one's but for a quarter of a degree, which noisy poses of few views add to any bound.
 _HANDED_ON, _SLACK = 100, 5e-3
@@ -72,7 +77,8 @@ class Recording:
     def is_likely(self, tried: Hypothesis) -> bool:
         """Whether the unit of the camera's positions puts the target at a likely distance."""
         low, high = _BOARD_DISTANCE_M
-        return bool(low < UNITS_M[tried.camera.unit] * self._distance < high)
+        unit_m = tried.camera.scale * UNITS_M[tried.camera.unit]
+        return bool(low < unit_m * self._distance < high)
 
     @cached_property
     def _distance(self) -> float:
@@ -107,7 +113,8 @@ class Candidate:
         """Factor for the board's sizes, where images were measured; else 1."""
         readings = self.hypothesis, self.recording.declared
         unit_m, declared_m = (UNITS_M[reading.camera.unit] for reading in readings)
-        return unit_m / declared_m if self.recording.is_measured else 1.0
+        scale = self.hypothesis.camera.scale * unit_m / declared_m
+        return scale if self.recording.is_measured else 1.0
 
 
 def chains(
@@ -183,9 +190,85 @@ def search(recording: Recording) -> list[Candidate]:
             break
     near = _near([*labels], scores)
     refined = [declared, *(reading for reading in near if reading != declared)]
-    first, *others = fitted(recording, refined, rows, STARTS)
+    found = fitted(recording, refined, rows, STARTS)
+    first, *others = (replace(item, labels=labels[item.hypothesis]) for item in found)
+    others += _of_another_size([first, *others], rows)
     others.sort(key=lambda item: -item.log_posterior)
-    return [replace(item, labels=labels[item.hypothesis]) for item in (first, *others)]
+    return [first, *others]
+
+
+def _of_another_size(candidates: Iterable[Candidate], rows: IntArray) -> list[Candidate]:
+    """The readings whose turns agree and whose distances do, once the camera's are multiplied."""
+    scaled: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
+    for item in candidates:
+        if item.fit.rms[1] > _TURNS_AGREE_RAD:
+            continue
+        scale, changed = _distance_scale(item), bool(item.hypothesis.changes)
+        if scale is None or abs(np.log(scale)) < (_PRINTED if changed else _FOLLOWED):
+            continue
+        whose = "the board" if item.recording.is_measured else "the camera's distances"
+        change = Change(f"{whose} {scale:.4g} times as large", "camera", {"scale": scale}, 2)
+        scaled[change.of(item.hypothesis)] = (*map(change.of, item.labels),)
+        recording = item.recording
+    if not scaled:
+        return []
+    found = fitted(recording, scaled, rows, STARTS)
+    return [replace(item, labels=scaled[item.hypothesis]) for item in found]
+
+
+def _distance_scale(candidate: Candidate) -> float | None:
+    """Factor of the camera's distances by which those of most rows agree; None without motion.
+
+    The target's places over the factor are linear in its inverse. A regression on the factor itself
+    would give zero where it only turns: this makes all places the same.
+    """
+    (robot,), (camera,) = chains(candidate.recording, [candidate.hypothesis], candidate.of_rows)
+    turned, count = robot[:, :3, :3], len(robot)
+    seen = (turned @ candidate.fit.x[:3, :3] @ camera[:, :3, 3:])[:, :, 0]
+    same = np.broadcast_to(-np.eye(3), (count, 3, 3))
+    by_edges = np.concatenate([turned, same, robot[:, :3, 3:]], axis=2)
+    kept = np.argsort(candidate.fit.angle, kind="stable")[: len(candidate.fit.kept)]
+    solution = np.zeros(7)
+    for _ in range(_CONCENTRATED):
+        rows, some = by_edges[kept].reshape(-1, 7), seen[kept].reshape(-1)
+        solution, _, rank, _ = np.linalg.lstsq(rows, -some, rcond=_DETERMINED)
+        if rank < 7:
+            return None
+        away = np.linalg.norm(seen + by_edges @ solution, axis=1)
+        kept = np.argsort(away, kind="stable")[: len(kept)]
+    return 1.0 / float(solution[6]) if solution[6] > 0.0 else None
+
+
+def in_one_turn(robot: FloatArray, camera: FloatArray) -> IntArray:
+    """Of rivals of each pose of a target those that turn from view to view as the robot does.
+
+    Args:
+        robot: (m, 3, 3) rotations of the robot.
+        camera: (m, c, 3, 3) those of the target by its c rivals in the camera, the likeliest first.
+
+    Returns:
+        (m,) indices of the rivals. Turns of the target that are the same in all views stay open.
+    """
+    count, rivals = camera.shape[:2]
+    some = thinned(np.arange(count))
+    by_robot, by_camera = (
+        np.einsum("iab,jab->ij", side.reshape(-1, 3, 3), side[some].reshape(-1, 3, 3))
+        for side in (robot, camera)
+    )
+    turns = [np.arccos(np.clip(0.5 * (each - 1.0), -1.0, 1.0)) for each in (by_robot, by_camera)]
+    away = np.abs(turns[1].reshape(count, rivals, -1, rivals) - turns[0][:, None, :, None])
+    away = np.minimum(away, _TURNS_AGREE_RAD)
+    best, least = np.zeros(count, dtype=np.int64), np.inf
+    for reference in range(len(some)):
+        chosen = away[:, :, reference, 0].argmin(axis=1)
+        for _ in range(_CONCENTRATED):
+            costs = np.take_along_axis(away, chosen[some][None, None, :, None], 3).sum(axis=(2, 3))
+            chosen = costs.argmin(axis=1)
+        if (total := float(costs.min(axis=1).sum())) < least:
+            best, least = chosen, total
+    # Rows that do not turn alike, as of misread angles, choose none.
+    is_alike = least < 0.5 * _TURNS_AGREE_RAD * count * len(some)
+    return best if is_alike else np.zeros(count, dtype=np.int64)
 
 
 def _undone(

@@ -1,9 +1,14 @@
 """Input of the search for misread poses: the camera's poses by images, the robot's numbers."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from visioncal.calibration.guess import Guess, guess_reading
+from visioncal.calibration.guess.readings import SideReading
+from visioncal.calibration.guess.search import in_one_turn
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.types import FloatArray
 from visioncal.robot import Robot
@@ -41,11 +46,29 @@ def guess_from_camera_poses(
             robot = PoseNumbers.of_poses(joint_poses, robot.places)
     return guess_reading(
         robot,
-        _camera_numbers(run) if camera is None else camera,
+        _camera_numbers(run, robot) if camera is None else camera,
         run.session.mount if knows_mount else None,
         chain=joint_poses,
         is_measured=bool(run.corners),
     )
+
+
+def alike_turning(
+    robot: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses]
+) -> dict[int, FloatArray]:
+    """`cam_from_target` by view with a (3, 3) rotation of the robot: the rival that turns alike."""
+    views = [at for at in sorted(seen) if at in robot and np.isfinite(robot[at]).all()]
+    if not views:
+        return {}
+    most = max(len(seen[view].cam_from_target) for view in views)
+    each = np.arange(most)
+    rivals = np.array(
+        [seen[view].cam_from_target[np.minimum(each, len(seen[view].cam_from_target) - 1)]
+         for view in views]
+    )  # fmt: skip
+    turned = np.array([robot[view] for view in views])
+    chosen = in_one_turn(turned, rivals[..., :3, :3])
+    return {view: rivals[at, chosen[at]] for at, view in enumerate(views)}
 
 
 def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | None:
@@ -73,13 +96,16 @@ def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), _places_of(session))
 
 
-def _camera_numbers(run: RunState) -> PoseNumbers:
-    """Poses of one board, the best of each view by its image, or as measured in the session."""
+def _camera_numbers(run: RunState, robot: PoseNumbers) -> PoseNumbers:
+    """Poses of one board, of each view by its image that which turns as the robot, or measured."""
     by_view, views = run.poses_of_one_board, run.session.views
     poses = np.full((len(views), 4, 4), np.nan)
+    turned = SideReading(robot.reading.rotation).rotations(robot)
+    by_robot = {view.number: turn for view, turn in zip(views, turned, strict=True)}
+    seen = alike_turning(by_robot, by_view)
     for at, view in enumerate(views):
         if view.number in by_view:
-            poses[at] = by_view[view.number].cam_from_target[0]
+            poses[at] = seen.get(view.number, by_view[view.number].cam_from_target[0])
     if run.corners:
         return PoseNumbers.of_poses(poses, _places_of(run.session))
     numbers = numbers_in(run.session, MEASURED_CAM_POSE)

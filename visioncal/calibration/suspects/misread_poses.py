@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import robust_fits
 from visioncal.calibration.guess.search import FEWEST_ROWS, PAIRS_SHARE, relative_angles, thinned
-from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses
+from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -205,8 +205,8 @@ def _both_sides(
     base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses]
 ) -> FloatArray:
     """(m, 2, 4, 4) poses of the robot, and of the target by each image alone, with both."""
-    views = [view for view in sorted(seen) if view in base_from_flange]
-    both = [(base_from_flange[view], seen[view].cam_from_target[0]) for view in views]
+    turned = {view: pose[:3, :3] for view, pose in base_from_flange.items()}
+    both = [(base_from_flange[view], pose) for view, pose in alike_turning(turned, seen).items()]
     return np.array(both).reshape(-1, 2, 4, 4)
 
 

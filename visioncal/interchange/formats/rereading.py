@@ -275,7 +275,8 @@ def _applied(
     fits = (best.mount, best.order) == (declared.mount, declared.order)
     for whose in ("robot", "camera"):
         found, stated = getattr(best, whose), getattr(declared, whose)
-        if found == stated:
+        # Images are the same whatever the size of their board, of which calibrating tells.
+        if found == stated or (is_measured and replace(found, scale=1.0) == stated):
             continue
         free = foreign.unstated.get(whose, frozenset())
         changed = {
