@@ -33,24 +33,41 @@ class Candidate:
     effect: Effect | None = None
     field: Field | None = None  # Beside a lens that is as stated.
 
+    @property
+    def lens(self) -> str:
+        """The camera about whose lens alone it is; empty of others."""
+        if self.effect is None:
+            return self.member.key[1]
+        return self.effect.frame if self.effect.place == "lens" else ""
+
 
 def opened(
     fit: Fit, pairs: Sequence[Pair], among: Iterable[Candidate]
 ) -> tuple[Unknowns, State] | None:
-    """Unknowns with the candidate that explains most, and their state; None where none is clear."""
-    found = max(among, key=lambda one: one.gain, default=None)
-    if found is None or 2.0 * found.gain < SIGNIFICANT:
+    """Unknowns with the candidate that explains most, and their state; None where none is clear.
+
+    With one of a lens come those of other lenses, one each: they explain other images.
+    """
+    clear = [one for one in among if 2.0 * one.gain >= SIGNIFICANT]
+    if not clear:
         return None
-    unknowns = fit.unknowns.with_members(found.member)
-    if found.effect is not None:
-        unknowns = replace(unknowns, effects=(*unknowns.effects, found.effect))
-    if found.field is not None:
-        camera, field = found.member.key[1], found.field
-        if fit.cell.cameras[camera].stated is None:
-            px = np.concatenate([pair.px for pair in images_of(pairs, camera)])
-            field = field.beside(unknowns.lenses[camera], px)
-        unknowns = replace(unknowns, fields={**unknowns.fields, camera: field})
-    values = {**fit.state.values, found.member.key: np.zeros(found.member.count)}
+    clear.sort(key=lambda one: -one.gain)
+    found = {clear[0].lens: clear[0]}
+    for one in clear[1:]:
+        if clear[0].lens and one.lens:
+            found.setdefault(one.lens, one)
+    unknowns, values = fit.unknowns, dict(fit.state.values)
+    for one in found.values():
+        unknowns = unknowns.with_members(one.member)
+        values[one.member.key] = np.zeros(one.member.count)
+        if one.effect is not None:
+            unknowns = replace(unknowns, effects=(*unknowns.effects, one.effect))
+        if one.field is not None:
+            field = one.field
+            if fit.cell.cameras[one.lens].stated is None:
+                px = np.concatenate([pair.px for pair in images_of(pairs, one.lens)])
+                field = field.beside(unknowns.lenses[one.lens], px)
+            unknowns = replace(unknowns, fields={**unknowns.fields, one.lens: field})
     return unknowns, State(values, fit.state.errors)
 
 
