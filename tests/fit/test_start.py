@@ -70,7 +70,7 @@ def test_far_boards_determine_a_lens_by_the_robots_motion(monkeypatch):
     def far(rng):
         found = seen_at(rng)
         found[:3, 3] += np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(2.2, 2.8)])
-        found[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.15, 3)).as_matrix()
+        found[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.25, 3)).as_matrix()
         return found
 
     monkeypatch.setattr("support.small_cells.seen_at", far)

@@ -132,7 +132,7 @@ class Mixed:
         units, common = self.assembled(logs)
         value, inner = 2.0 * sum(t.count * logs[t.size] for t in self.terms if t.size >= 0), []
         for body, (errors, cross) in zip(self.bodies, units, strict=True):
-            root = np.linalg.inv(np.linalg.cholesky(errors))
+            root = np.linalg.inv(_factor(errors))
             value -= 2.0 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
             solved = (root @ cross).reshape(-1, cross.shape[2])
             at = np.append(body.columns, p)
@@ -260,6 +260,17 @@ def inverse(information: FloatArray) -> tuple[FloatArray, float]:
     covariance = (np.tril(half) + np.tril(half, -1).T) * np.outer(scale, scale)
     log_det = 2.0 * float(np.log(np.diag(root)).sum() - np.log(scale).sum())
     return np.asarray(covariance), log_det
+
+
+def _factor(errors: FloatArray) -> FloatArray:
+    """Cholesky factors of (u, m, m) information about errors; wild rows may cancel to nothing."""
+    diagonal = np.diagonal(errors, axis1=1, axis2=2)[:, :, None] * np.eye(errors.shape[1])
+    for ridge in (0.0, *_RIDGES):
+        try:
+            return np.asarray(np.linalg.cholesky(errors + ridge * diagonal), dtype=float)
+        except np.linalg.LinAlgError:
+            continue
+    return np.sqrt(diagonal)
 
 
 def prior_term(size: int, columns: IntArray, offsets: FloatArray, sigma: float) -> Term:

@@ -11,6 +11,7 @@ from visioncal.fit.candidates import candidates, effects_of_arms, opened, scored
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.held import with_held_lenses
 from visioncal.fit.processes import ENOUGH_STOPS, consider, held_boards
+from visioncal.fit.refuse import refuse_open, refuse_unjoined
 from visioncal.fit.search import Effort, Search, nearest
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import (
@@ -55,11 +56,18 @@ class CellFit:
 
 
 def solve(cell: Cell) -> CellFit:
-    """Fits a cell."""
+    """Fits a cell.
+
+    Raises:
+        DataError: Too few views show a lens of which nothing is stated.
+        DegenerateError: The sightings leave a direction of a frame open.
+    """
     start = start_of(cell)
+    refuse_unjoined(cell, start.cell)
     effects = effects_of(start.cell)
     search = Search.of(start.cell, unknowns_of(start, effects), start.sound)
     fit, left_out = search.run(state_of(start, effects), nearest(start))
+    refuse_open(fit)
     search, fit, left_out = _explained(search, fit, left_out)
     for _ in range(_OPENED):
         wider = opened(fit, search.pairs, candidates(fit, search.pairs))

@@ -13,6 +13,9 @@ import cv2
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from visioncal.core.errors import DataError
+from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.number_format import counted
 from visioncal.core.transforms import (
     apply,
     apply_each,
@@ -89,6 +92,8 @@ def start_of(cell: Cell) -> Start:
     is_placed = [s.view not in places.misplaced for s in cell.sightings]
     sound = sound[joined] & np.array(is_placed, bool)
     edges = {name: places.edge(name) for name in cell.unknown}
+    seers = {sighting.seer for sighting in cell.sightings}
+    lenses = {name: lens for name, lens in lenses.items() if name in seers}
     sightings, distances, rivals = list(cell.sightings), np.zeros(len(known)), []
     for at, (sighting, option) in enumerate(zip(cell.sightings, known, strict=True)):
         off = away(places.predicted(sighting), option.poses)
@@ -110,7 +115,11 @@ def start_of(cell: Cell) -> Start:
 
 
 def start_lenses(cell: Cell) -> dict[str, Camera]:
-    """The stated lenses by camera, and those that corners determine (Zhang 2000)."""
+    """The stated lenses by camera, and those that corners determine (Zhang 2000).
+
+    Raises:
+        DataError: Too few views show a lens of which nothing is stated.
+    """
     found = {}
     # In the order of sightings: results do not depend on how names are hashed.
     for frame in dict.fromkeys(s.seer for s in cell.sightings if s.corners is not None):
@@ -119,6 +128,13 @@ def start_lenses(cell: Cell) -> dict[str, Camera]:
             found[frame] = table.stated
             continue
         seen = [s for s in cell.sightings if s.seer == frame and s.corners is not None]
+        if len(seen) < FEWEST_VIEWS:
+            raise DataError(
+                f"intrinsics: {counted(len(seen), 'view', ('shows', 'show'))} the target, and at "
+                f"least {FEWEST_VIEWS} are needed.",
+                culprits=["views"],
+                next_step="Add views, or give matrix and distortion in [camera].",
+            )
         seen = [seen[at] for at in evenly(len(seen), _IMAGES)]
         px, points = [], []
         for sighting in seen:
@@ -505,7 +521,9 @@ def _hand_eye(robot: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArr
     left = (a[..., :3, :3] - np.eye(3)).reshape(len(robot), -1, 3)
     right = (rotation[:, None] @ b[..., :3, 3:] - a[..., :3, 3:]).reshape(len(robot), -1, 1)
     normal = np.swapaxes(left, 1, 2) @ left
-    place = np.linalg.pinv(normal, hermitian=True) @ np.swapaxes(left, 1, 2) @ right
+    # A direction about which poses turn by less than a microradian is left at nothing.
+    normal += 1e-12 * len(first) * np.eye(3)
+    place: FloatArray = np.linalg.solve(normal, np.swapaxes(left, 1, 2) @ right).astype(float)
     x = compose(rotation, place[..., 0])
     placed = robot @ x[:, None] @ seen
     middle = np.median(placed[..., :3, 3], axis=1)

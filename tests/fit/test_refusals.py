@@ -1,0 +1,76 @@
+"""Cells that leave something open: refused in words, never by a traceback."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.refusals import raised
+from support.small_cells import made
+from support.whole_cells import OPTIONS, recorded
+
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import exp, invert
+from visioncal.fit.solve import solve
+from visioncal.model import Arm, MeasuredPose, Moments, read_cell
+from visioncal.model.arm import even_progress
+from visioncal.simulation import simulate
+
+
+def held(cell, first=0):
+    """The cell whose sightings are predicted only, from one on."""
+    own = [replace(one, is_held=at >= first) for at, one in enumerate(cell.sightings)]
+    return cell.with_sightings(own)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("given", [True, False])
+def test_cells_with_too_few_sightings_are_refused(given, cameras):
+    cell = made(stops=8, cameras=cameras, given=given).cell
+    for count in (0, 1, 2):
+        # The first error of a lens of which nothing is stated is about the lens.
+        kind, words = (
+            (DegenerateError, "usable stop") if given or not count else (DataError, "views?")
+        )
+        caught = raised(kind, words, solve, cell.only(range(count)))
+        assert "Add" in caught.next_step
+        assert caught.culprits
+        if count:
+            raised(kind, words, solve, held(cell, count))
+    refused = raised(DegenerateError, f"all {8 * cameras} views are held out", solve, held(cell))
+    assert refused.culprits[:2] == ("the camera",) + (
+        ("cam_1",) if cameras > 1 else ("the target",)
+    )
+
+
+@pytest.mark.parametrize(
+    ("turn", "words"),
+    [
+        ((0.0, 0.0, 0.4), "offset along the tool's z .* turn about the tool's z"),
+        ((0.0, 0.0, 0.0), "differ in position only"),
+    ],
+)
+def test_motion_that_leaves_a_direction_open_is_refused_by_its_name(turn, words):
+    small, rng = made(stops=10), np.random.default_rng(8)
+    robot = small.robot[0] @ exp(rng.normal(size=(10, 6)) * [*turn, 0.1, 0.1, 0.1])
+    seen = invert(robot @ small.edges["cam"]) @ small.edges["target"]
+    views = [
+        replace(one, evidence=MeasuredPose(at, (1e-4, 1e-4)))
+        for one, at in zip(small.cell.sightings, seen, strict=True)
+    ]
+    arms = {"flange": Arm("flange", robot)}
+    cell = replace(small.cell, arms=arms, moments=Moments.of(arms, even_progress(10)))
+    caught = raised(DegenerateError, words, solve, cell.with_sightings(views))
+    assert "tilted by 20 to 40 degrees" in caught.next_step
+
+
+def test_cells_of_which_a_part_is_tied_to_nothing_are_refused():
+    session = recorded(simulate(OPTIONS))
+    cell = read_cell(session, session.corners)
+    floor = [
+        at for at, one in enumerate(cell.sightings) if one.pair == ("cam_left", "target_floor")
+    ]
+    caught = raised(DegenerateError, "nothing ties cam_left to", solve, cell.only(floor))
+    assert "see a board" in caught.next_step
+    # No number of sightings may end in a traceback.
+    for count in (1, 3, 6, 9):
+        raised(DegenerateError, "not determined", solve, cell.only(range(count)))
