@@ -712,6 +712,43 @@ def halcon(folder):
         write(folder / f"robot_pose_{at:02d}.dat", text)
 
 
+def console(folder):
+    """A log of matrices, with the picture's name below, numbers between, and a last position."""
+    shoot(folder / "texture", "frame_{:02d}.png")
+    text = "Version: 1.17.3\nListening on port 59153...\nExposure: 12.5\n"
+    for at, pose in enumerate(with_others(0, 1)):
+        matrix = np.vstack([np.column_stack([pose[:3, :3], 1e3 * pose[:3, 3]]), [0, 0, 0, 1]])
+        text += ">>> Robot position:\n"
+        text += "".join(f"  {'  '.join(map(repr, row))}\n" for row in matrix.tolist())
+        if at < 9:
+            text += f"Dropped 0 frames\nTriggered, Frame Id: {at}\nRetrieved.\n"
+            text += f"Texture saved: texture/frame_{at:02d}.png\nScore: 0.9{at}\n"
+    write(folder / "TestLog.txt", text + "Client disconnected.\n")
+
+
+def console_of_a_maker(folder):
+    """The controller's answers as they were received, above the pictures' names."""
+    shoot(folder, "scan{}.png")
+    text = "Connected.\n"
+    for at, pose in enumerate(world()[0]):
+        turns = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX", degrees=True)
+        numbers = zip("XYZABC", [*(1e3 * pose[:3, 3]), *turns], strict=True)
+        cells = " ".join(f'{name}="{value:.9f}"' for name, value in numbers)
+        text += f"<State><Position {cells}></Position></State>\nTriggering a scan...\n"
+        text += f"saved <File>scan{at}.png</File> in 0.4 s\n"
+    write(folder / "run.log", text)
+
+
+def pictures_above_poses(folder):
+    """A log of a pendant's lines, each below its picture's name; the last move was not made."""
+    shoot(folder, "{}.png")
+    text = "run 3 of 2026-07-14\n"
+    for at, pose in enumerate(world()[0]):
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_rotvec()]
+        text += f"wrote {at}.png\n  actual p[{', '.join(f'{n:.12f}' for n in numbers)}]\n"
+    write(folder / "run.txt", text + "wrote thumbs\n")
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -724,7 +761,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         sorted_as_text, called_by_words, a_folder_a_view, columns_as_lists,
         blocks_of_text, mappings_of_any_names, rounds, pictures_to_numbers, lines_with_brackets,
         krl_with_a_retract, krl_from_one, krl_with_a_home_of_another_name, rapid_with_a_home,
-        below_a_preamble, below_tabs, halcon,
+        below_a_preamble, below_tabs, halcon, console, console_of_a_maker, pictures_above_poses,
         lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
     )
 }  # fmt: skip

@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias
 
@@ -39,28 +40,67 @@ from visioncal.session.columns import pose_row
 _HEADED = re.compile(r"\s*([^\d\W][^:=]*?)\s*[:=]\s*(.*?)\s*")
 
 
-def _blocks(text: str, path: Path) -> Fields | None:
-    """Rows of several lines each, which a line of words begins; None where there are none."""
-    words, places = list[dict[str, str]](), list[str]()
-    arrays: list[dict[str, list[float]]] = []
-    for at, line in enumerate(text.splitlines(), start=1):
-        entry = _HEADED.fullmatch(line)
-        numbers = [*separate(line)] or ([*separate(entry[2])] if entry else [])
-        if numbers and words:
-            arrays[-1][entry[1] if entry else "matrix"] += numbers
-        elif line.strip():
-            if not words or arrays[-1]:
-                places.append(f"{path.name}, line {at}")
-                words.append({})
-                arrays.append(defaultdict(list))
-            image = _IMAGE.search(line)
-            words[-1]["image" if image else "title"] = image[0] if image else line.strip(" #:")
-    records = [
-        {**named, **{key: np.array(row) for key, row in rows.items()}}
-        for named, rows in zip(words, arrays, strict=True)
-    ]
+# Lines with their places.
+_Lines: TypeAlias = Sequence[tuple[str, str]]
+
+
+def _numbers_in(line: str) -> tuple[str, list[float]]:
+    """The numbers of a line of nothing else but a name before them, and this name."""
+    entry, numbers = _HEADED.fullmatch(line), [*separate(line)]
+    return ("matrix", numbers) if numbers or not entry else (entry[1], [*separate(entry[2])])
+
+
+def _stops(lines: _Lines) -> list[_Lines]:
+    """The lines of a log, those of each picture by themselves; all where none are named.
+
+    Where the first picture has as many numbers above it as usual, each ends the lines that are its
+    own; else each begins them.
+    """
+    named = [_IMAGE.search(line) is not None for _, line in lines]
+    counts = [6 if is_marked_pose(line) else len(_numbers_in(line)[1]) for _, line in lines]
+    above = sum(counts[: named.index(True)]) if any(named) else 0
+    ends = 2 * above * sum(named) > sum(counts)
+    begins, has_image, has_numbers = [0], False, False
+    for at, (is_image, count) in enumerate(zip(named, counts, strict=True)):
+        if (count and has_image) if ends else (is_image and has_numbers):
+            begins.append(at)
+            has_image = has_numbers = False
+        has_image, has_numbers = has_image or is_image, has_numbers or count > 0
+    return [lines[at:end] for at, end in pairwise([*begins, len(lines)])]
+
+
+def _pictured(stop: _Lines) -> str:
+    """The first picture that lines name; empty without one."""
+    return next((match[0] for _, line in stop if (match := _IMAGE.search(line))), "")
+
+
+def _blocks(lines: _Lines, path: Path) -> Fields | None:
+    """Rows of several lines each, of a picture or below a line of words; None where none are."""
+    stops = _stops(lines)
+    if not any(map(_pictured, stops)):
+        has = [bool(_numbers_in(line)[1]) for _, line in lines]
+        begins = [at for at, own in enumerate(has) if not own and (at == 0 or has[at - 1])]
+        stops = [lines[at:end] for at, end in pairwise([*begins, len(lines)])]
+    records, places = list[dict[str, object]](), [stop[0][0] for stop in stops]
+    for stop in stops:
+        arrays, title = defaultdict[str, list[float]](list), ""
+        for name, numbers, line in ((*_numbers_in(line), line) for _, line in stop):
+            arrays[name] += numbers
+            title = title if numbers else line.strip(" #:")
+        image = _pictured(stop)
+        records.append({"image": image} if image else {"title": title})
+        records[-1] |= {name: np.array(row) for name, row in arrays.items() if row}
     fields = fields_of_records(records, places, path.stem, path.parent)
     return fields if len(records) > 2 and fields.numbers else None
+
+
+def _placed(text: str, path: Path, comments: tuple[str, ...] = ()) -> _Lines:
+    """The filled lines of a text, but for comments."""
+    return [
+        (f"{path.name}, line {at}", line)
+        for at, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.strip().startswith(comments)
+    ]
 
 
 def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
@@ -139,7 +179,7 @@ _PROGRAMS = (".dat", ".src", ".ls", ".mod", ".script")
 ENDINGS = (".csv", ".tsv", ".txt", ".log", ".jsonl", *_PROGRAMS, *DOCUMENTS)
 # Field names of a pose by its number of values.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
-_IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
+_IMAGE = re.compile(r"[^\s,;\"'<>=]+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
 # Words of JSON, and the same of Python.
 _NAMES_OF = {"true": "True", "false": "False", "null": "None", "NaN": "None"}
 _PYTHON = re.compile(rf"\b(?:{'|'.join(_NAMES_OF)})\b")
@@ -173,7 +213,7 @@ def read_rows(path: Path, form: str | None = None, document: object = None) -> l
     try:
         table = read_table(path, text)
     except DataError:
-        if blocks := _blocks(text, path):
+        if blocks := _blocks(_placed(text, path), path):
             return [blocks]
         raise
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
@@ -450,13 +490,18 @@ def _pendant(text: str, path: Path, form: str | None) -> Fields | None:
     if is_program:
         # FANUC writes a pose in several lines.
         text = re.sub(r"\{[^{}]*\}", lambda block: " ".join(block[0].split()), text)
-    lines = [
-        (f"{path.name}, line {at}", line)
-        for at, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.strip().startswith(_COMMENTS)
-    ]
+    lines = _placed(text, path, _COMMENTS)
     if is_program:
         lines = [each for each in lines if is_marked_pose(each[1]) and not _FRAMES.search(each[1])]
+    elif (pictures := [line for _, line in lines if _IMAGE.search(line)]) and not any(
+        map(is_marked_pose, pictures)
+    ):
+        # Named above or below their poses.
+        lines = [
+            (place, f"{line} {_pictured(stop)}")
+            for stop in _stops(lines)
+            for place, line in [each for each in stop if is_marked_pose(each[1])][:1]
+        ]
     # The first line may be a header.
     first = next((at for at, (_, line) in enumerate(lines[:2]) if is_marked_pose(line)), None)
     if first is None:
