@@ -116,7 +116,7 @@ def test_a_mount_that_nothing_tells_is_asked_for():
     tool, far = np.eye(4), np.linalg.norm(edges.z[:3, 3]) / np.linalg.norm(edges.x[:3, 3])
     tool[:3, 3] = (far - 1.0) * edges.x[:3, 3]
     robot = poses.true_robot @ invert(tool)
-    with pytest.raises(DataError, match=r"eye-in-hand \(as declared\).*--mount"):
+    with pytest.raises(DataError, match=r"eye-in-hand \(as first read\).*--mount"):
         guess_reading(numbers(robot), poses.camera, None)
     guess = guess_reading(numbers(robot), poses.camera, None, chain=poses.true_robot)
     assert guess.best is guess.declared
@@ -564,7 +564,7 @@ def test_what_is_of_one_log_changes_rows_together(cell, tmp_path, moved):
 
 def test_nothing_is_written_without_a_word_or_a_reading(cell, tmp_path):
     done = converted(cell, tmp_path / "same", "--yes").good()
-    assert "fit as declared" in done.err
+    assert "fit as first read" in done.err
     assert Session.load(tmp_path / "same").digest() == Session.load(cell).digest()
     rewritten(cell, lambda _, row: row | {at: repr(1e3 * float(row[at])) for at in POSE[:3]})
     converted(cell, tmp_path / "fixed").refused("the robot's positions in mm", "--yes")

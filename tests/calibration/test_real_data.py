@@ -79,7 +79,7 @@ def test_a_six_axis_arm_by_a_laser(real_data):
 @pytest.mark.parametrize(
     ("name", "views", "said"),
     [
-        ("ric_charuco_eye_to_hand", None, "fit as declared"),
+        ("ric_charuco_eye_to_hand", None, "fit as first read"),
         # Of each image one of two poses is taken, so that no reading explains half of them.
         ("ur3e_checkerboard_to_hand_cam1", 20, ""),
     ],

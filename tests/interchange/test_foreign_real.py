@@ -122,7 +122,7 @@ def test_pose_pairs_give_what_opencv_gets_of_them(
     real_data, calibrated, tmp_path, source, unit, count, park_mm, scatter
 ):
     result, said = calibrated(real_data / source, "--robot-unit", unit, "--mount", "eye-in-hand")
-    assert "Found by the poses: The poses fit as declared" in said
+    assert "Found by the poses: The poses fit as first read" in said
     assert len(result.views) == count
     # Half a unit of the last digit that is written of each.
     x_mm, rms_mm, rms_deg = by_opencv(Session.load(tmp_path / "session"))
@@ -228,7 +228,7 @@ def test_a_mount_that_poses_cannot_tell_is_asked_for(real_data, tmp_path):
     # Its target faces the camera, so that the inverse of the camera's poses is a cell as well.
     source = real_data / "pose_pairs_small/moveit_eye_to_hand_50.json"
     convert(source, tmp_path / "s", "--guess", "--yes").refused(
-        "eye-to-hand (as declared)", "--mount"
+        "eye-to-hand (as first read)", "--mount"
     )
     assert not (tmp_path / "s").exists()
 

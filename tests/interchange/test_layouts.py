@@ -864,6 +864,24 @@ def test_a_table_of_uneven_rows_hears_of_commas_only_where_it_has_some(tmp_path)
     done.refused("Where commas are decimal")
 
 
+def test_a_guess_needs_no_second_step_where_it_contradicts_nothing_stated(tmp_path):
+    sixes(tmp_path / "in")
+    said = ("--target", world()[2].document["target"], "--mount", "eye-in-hand")
+    for name, more in (("plain", ()), ("guess", ("--guess",))):
+        visioncal("convert", tmp_path / "in", tmp_path / name, *said, *more).good()
+    plain, guess = (Session.load(tmp_path / name) for name in ("plain", "guess"))
+    assert guess.digest() == plain.digest()
+    stated = (*said, "--robot-form", "kuka", "--guess")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "stated", *stated)
+    done.refused("better than what is stated", "--yes")
+    visioncal("convert", tmp_path / "in", tmp_path / "stated", *stated, "--yes").good()
+    found = [
+        view.base_from_flange().as_matrix() for view in Session.load(tmp_path / "stated").views
+    ]
+    # Nine decimals are written.
+    np.testing.assert_allclose(found, world()[0], atol=1e-9)
+
+
 def test_a_tracker_s_joints_and_points_in_two_files_are_a_session_of_its(tmp_path):
     rng = np.random.default_rng(1)
     joints, points = rng.uniform(-90, 90, (12, 6)), rng.uniform(500, 900, (12, 3))
@@ -922,7 +940,7 @@ def test_rows_of_joints_and_of_a_tracker_belong_together_by_their_id(tmp_path):
 @pytest.mark.parametrize(
     ("name", "target", "words"),
     [
-        ("npz-base2ee", "checkerboard_4x7_33mm", "The poses fit as declared"),
+        ("npz-base2ee", "checkerboard_4x7_33mm", "The poses fit as first read"),
         ("rpy-unstated", "checkerboard_11x8_20mm", "as Euler angles xyz about fixed axes in rad"),
     ],
 )

@@ -91,16 +91,16 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
         if guess.declared.fit.closes:
             return guess.declared
         raise DataError(
-            "Nothing was written: the chain does not close as declared, and no other reading "
+            "Nothing was written: the chain does not close as first read, and no other reading "
             "stands out.",
             next_step="Check that the poses and what the camera saw are of the same views and the "
             "same robot, and that positions stand before rotations (where not, name the columns in "
-            "that order: --robot-columns 4,5,6,1,2,3). Without --guess it is written as declared; "
+            "that order: --robot-columns 4,5,6,1,2,3). Without --guess it is written as it is; "
             "visioncal doctor then looks for what happened midway.",
         )
     if not yes:
         raise DataError(
-            "Nothing was written: another reading closes the chain better than the declared one.",
+            "Nothing was written: another reading closes the chain better than what is stated.",
             culprits=[guess.best.words],
             next_step="Take it with --yes.",
         )

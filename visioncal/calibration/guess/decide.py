@@ -222,10 +222,10 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
     closes = f"robot and camera agree to {_figures(best)}"
     if best is not declared:
         otherwise = f"to {_figures(declared)}" if declared.fit.agreeing else "in no view"
-        return f"With {best.words}, {closes}; as declared, {otherwise}."
+        return f"With {best.words}, {closes}; as first read, {otherwise}."
     if not declared.fit.is_readable:
         return (
-            "As declared, the rotations of the robot or of the camera are none, and no other "
+            "As first read, the rotations of the robot or of the camera are none, and no other "
             "reading of the numbers stands out."
         )
     rivals = [candidate for candidate in ranked if candidate is not declared]
@@ -234,11 +234,11 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
     if _turns_about_one_axis(declared):
         return (
             "The motion cannot distinguish readings: all views turn about one axis at most. As "
-            f"declared, {closes}."
+            f"first read, {closes}."
         )
     if not declared.fit.closes:
-        return f"No reading that was tried stands out: as declared, {closes}."
-    return f"The poses fit as declared: {closes}."
+        return f"No reading that was tried stands out: as first read, {closes}."
+    return f"The poses fit as first read: {closes}."
 
 
 def _figures(candidate: Candidate) -> str:

@@ -98,8 +98,8 @@ class Candidate:
 
     @property
     def words(self) -> str:
-        """The differences from the declared reading, in words."""
-        return "; ".join(self.hypothesis.changes) or "as declared"
+        """The differences from the first reading, which the source may not state, in words."""
+        return "; ".join(self.hypothesis.changes) or "as first read"
 
     @property
     def log_posterior(self) -> float:

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -80,8 +80,8 @@ def convert(
         requested: Options for a foreign recording.
         form: The name of its format; None to recognise it.
         force: Whether an existing file may be replaced; a folder never is.
-        choose: Called with what was read where the convention of the poses is in doubt; returns the
-            reading to apply.
+        choose: Called with what was read, unless the only reading that agrees with the images or
+            the target's poses contradicts nothing stated; returns the reading to apply.
         mirrors_poses: Whether that reading may mirror the robot's poses.
         exchange: Two views whose images, corners and readings are exchanged.
         shift: Views whose poses of the robot stand so many rows later (earlier where negative).
@@ -108,10 +108,15 @@ def convert(
     is_session = is_result or is_recording or (source / "session.toml").is_file()
     if form is not None or not is_session:
         foreign = read_foreign(source, requested, form)
-        if choose is not None:
-            doubtful = DoubtfulSession.of(foreign)
+        tested = foreign
+        with nullcontext() if choose is None else suppress(DataError):
+            tested = settled(foreign, requested.progress)
+        # Of what nothing states, the only reading that agrees contradicts nobody.
+        is_found = tested is not foreign and not tested.unstated
+        if choose is None or is_found:
+            choose, session = None, assemble(_checked(foreign, tested, requested))
         else:
-            session = assemble(_checked(foreign, requested))
+            doubtful = DoubtfulSession.of(foreign)
     elif requested != _DEFAULTS:
         raise DataError(
             f"{source} is a session already; what describes poses and cameras is for somebody "
@@ -139,9 +144,10 @@ def convert(
     return session
 
 
-def _checked(foreign: ForeignRecording, requested: ImportOptions) -> ForeignRecording:
-    """The recording with what its source does not say; raises DataError."""
-    tested = settled(foreign, requested.progress)
+def _checked(
+    foreign: ForeignRecording, tested: ForeignRecording, requested: ImportOptions
+) -> ForeignRecording:
+    """The recording with what its source does not say, as tested; raises DataError."""
     robot = foreign.robot if foreign.stream is None else foreign.stream.poses
     # What was tested is in no doubt.
     if tested.unstated or not foreign.unstated:

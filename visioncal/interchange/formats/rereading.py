@@ -439,7 +439,7 @@ def reread(
         corrected = pose_cells(reading.camera.corrected(camera), MEASURED_CAM_POSE)
         _replace_cells(cells, corrected, MEASURED_CAM_POSE)
     if candidate.hypothesis.changes:
-        changes += (f"The poses are read otherwise than declared: {candidate.words}.",)
+        changes += (f"The poses are read otherwise than at first: {candidate.words}.",)
     document, target = {**session.document, "mount": reading.mount}, session.target_document
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
         target = _scaled(target, candidate.board_scale)
