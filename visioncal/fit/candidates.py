@@ -16,6 +16,7 @@ from visioncal.model.effects import (
     Breathing,
     Effect,
     FocusJitter,
+    Heat,
     LensGrows,
     Play,
     Rolling,
@@ -73,17 +74,22 @@ def opened(
 
 def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """All that are not open yet, with their scores."""
-    yield from scored(fit, (*effects_of_lenses(fit), *effects_of_arms(fit)))
-    known = {effect.name for effect in fit.unknowns.effects}
-    for effect in tried_effects(fit):
-        if effect.name not in known:
-            gain = gain_of(fit, pairs, effect)
-            yield Candidate(gain, random_effect(effect), effect)
+    yield from scored(fit, effects_of_lenses(fit))
+    yield from of_arms(fit, pairs)
     for camera in fit.unknowns.lenses:
         is_free = ("lens", camera) in fit.unknowns and camera not in fit.unknowns.fields
         if is_free and images_of(pairs, camera):
             field, size, gain = best_field(fit, pairs, camera)
             yield Candidate(gain, lens_field(camera, field, size), field=field)
+
+
+def of_arms(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
+    """Those that are of arms and their motion."""
+    yield from scored(fit, effects_of_arms(fit))
+    known = {effect.name for effect in fit.unknowns.effects}
+    for effect in tried_effects(fit):
+        if effect.name not in known:
+            yield Candidate(gain_of(fit, pairs, effect), random_effect(effect), effect)
 
 
 def scored(fit: Fit, effects: Iterable[Effect]) -> Iterator[Candidate]:
@@ -133,3 +139,9 @@ def tried_effects(fit: Fit) -> Iterator[Effect]:
     """Effects of known sizes, which no score has."""
     for camera in dict.fromkeys(sweep.camera for sweep in fit.cell.sweeps):
         yield Rolling(camera, fit.unknowns.lenses[camera].resolution[1])
+    for name in fit.unknowns.erring:
+        arm = fit.cell.arms[name]
+        if arm.has_joints and arm.model is not None and arm.heat is not None:
+            heat = Heat(name, arm.model, arm.heat)
+            if heat.is_shown(fit.cell.moments):
+                yield heat

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
-from visioncal.fit.candidates import candidates, effects_of_arms, opened, scored
+from visioncal.fit.candidates import candidates, of_arms, opened
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.held import with_held_lenses
 from visioncal.fit.processes import ENOUGH_STOPS, consider, held_boards
@@ -100,7 +100,7 @@ def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit
     wider = None
     if lost > search.sound.sum() / 10:
         whole = search.with_all(fit)
-        wider = opened(whole, search.pairs, scored(whole, effects_of_arms(whole)))
+        wider = opened(whole, search.pairs, of_arms(whole, search.pairs))
     if wider is not None:
         other = search.with_unknowns(wider[0])
         found, left = other.run(wider[1], search.sound, whole)

@@ -8,6 +8,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.robot import Loads, Robot
+from visioncal.robot.thermal import Inputs
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +22,7 @@ class Arm:
     model: Robot | None = None  # Its geometry, if known.
     # What it carries at the stops, and the side from which it approached them; None where unknown.
     loads: Loads | None = None
+    heat: Inputs | None = None  # What heats it; None where that is not recorded.
 
     @property
     def has_joints(self) -> bool:

@@ -10,6 +10,7 @@ from visioncal.estimation.poses import FEWEST_CORNERS
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.model.arm import Arm, Moments, Swept, even_progress
 from visioncal.model.cell import Cell
+from visioncal.model.heating import recorded_inputs
 from visioncal.model.priors import stated_sightings
 from visioncal.model.sightings import Evidence, MeasuredPlace, MeasuredPose, Sighting, is_copy
 from visioncal.robot import Robot
@@ -107,7 +108,8 @@ def _arms(session: Session, rows: list[Observation], stations: Mapping[int, int]
         )
         known: FloatArray | None = np.nan_to_num(joints) if is_known else None
         loads = loads_of(numbers, approaches)
-        yield Arm(frame_name("flange", name), poses, known, model, loads)
+        heat = recorded_inputs(session, model.joint_count, name) if model is not None else None
+        yield Arm(frame_name("flange", name), poses, known, model, loads, heat)
 
 
 def _evidence(session: Session, row: Observation, corners: Corners | None) -> Evidence | None:

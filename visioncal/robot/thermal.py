@@ -133,6 +133,16 @@ class ThermalModel:
         """The number n of joints."""
         return self.robot.joint_count
 
+    def changed(self, steps: FloatArray) -> Self:
+        """The model after a (2 n + h,) step of its parameters, in the order of their covariance."""
+        count = self.joint_count
+        return replace(
+            self,
+            growth_per_k=self.growth_per_k + steps[:count],
+            drift_rad_per_k=self.drift_rad_per_k + steps[count : 2 * count],
+            heating=self.heating.changed(steps[2 * count :]),
+        )
+
     def columns(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Right perturbations (m, 6, n) of the flange for growth of links and rotation of joints.
 

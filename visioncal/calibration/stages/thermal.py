@@ -6,7 +6,7 @@ coefficients that the views do not determine stay there. Temperatures or current
 streams, or else from columns of views.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -26,33 +26,22 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import fit_problem, starting_noise
+from visioncal.model.heating import (
+    FEWEST_SAMPLES,
+    LEAST_RISE_K,
+    is_recorded,
+    recorded_inputs,
+    sigmas_of,
+    usual_arm,
+    usual_heating,
+)
 from visioncal.results.arm import DriftPoint, DriftResidual, JointDrift, ThermalResult, ViewDrift
 from visioncal.robot import Robot
-from visioncal.robot.thermal import Heating, Inputs, Kind, ThermalModel
+from visioncal.robot.thermal import Inputs, ThermalModel
 from visioncal.session import Session
-from visioncal.session.kinds import name_of
 from visioncal.session.observations import APART_RAD
-from visioncal.session.selecting import streams_of
-from visioncal.session.streams import STAMP, Stream
 
 LEVEL = "thermal"
-_AMBIENT = "ambient_c"
-_FORMS: Mapping[Kind, str] = {"temperatures": "temp{}_c", "currents": "current{}_a"}
-# Largest time of views before the first and after the last sample [s].
-_BEYOND_S = 300.0
-# More samples determine warm-up no better: they are averaged in groups.
-_MOST_SAMPLES, _FEWEST_SAMPLES = 8192, 3
-# Prior: relative growth per kelvin (12e-6 of steel, 23e-6 of aluminium); a zero drifts by about a
-# hundredth of a millimetre at one metre per kelvin, either way.
-_GROWTH_PER_K, _GROWTH_SIGMA_PER_K = 17.5e-6, 5.5e-6
-_DRIFT_SIGMA_RAD_PER_K = 1e-5
-# Gearboxes warm up in half an hour to an hour and a half; links follow a sensor in minutes.
-_TAU_S: Mapping[Kind, float] = {"currents": 2400.0, "temperatures": 120.0}
-_TAU_SIGMA: Mapping[Kind, float] = {"currents": 0.6, "temperatures": 1.0}
-# Rise of joints at work above the air, within a factor [K].
-_RISE_K, _GAIN_SIGMA = 20.0, 0.8
-# Smaller rises of all joints determine nothing [K].
-_LEAST_RISE_K = 3.0
 # Step at convergence [prior sigmas].
 _SETTLED = 1e-3
 # Points of the reported course.
@@ -86,18 +75,18 @@ class HeatedStops:
             raise missing_error(f"view {self.views[np.isnan(self.stamps_s)][0]} has no stamp_s")
         first_s, last_s = inputs.stamps_s[[0, -1]].tolist()
         least_s, most_s = self.stamps_s.min(), self.stamps_s.max()
-        if least_s < first_s - _BEYOND_S or most_s > last_s + _BEYOND_S:
+        if not is_recorded(inputs, self.stamps_s):
             raise missing_error(
                 f"{inputs.kind} were read from {first_s:.10g} to {last_s:.10g} s, and views were "
                 f"taken from {least_s:.10g} to {most_s:.10g} s"
             )
-        links = _expected(inputs).links_c(inputs, self.stamps_s)
+        links = usual_heating(inputs).links_c(inputs, self.stamps_s)
         rise_k = float(np.ptp(links, axis=0).max())
-        if rise_k < _LEAST_RISE_K:
+        if rise_k < LEAST_RISE_K:
             raise DegenerateError(
                 f"thermal: the joints warm up by at most {figure(rise_k)} K in the "
                 f"{figure((most_s - least_s) / 3600.0)} h of the {len(self.q)} used stops, and "
-                f"{_LEAST_RISE_K:g} K are needed: the views do not show how the arm drifts.",
+                f"{LEAST_RISE_K:g} K are needed: the views do not show how the arm drifts.",
                 culprits=["temperatures"],
                 next_step="Begin with a cold robot, let it work for an hour or more, and look at "
                 "the same few reference views every five to ten minutes.",
@@ -118,55 +107,18 @@ def missing_error(
 
 
 def inputs_of(session: Session, joints: int, robot: str = "") -> Inputs:
-    """Reads what heats an arm with some joints; temperatures come before currents.
+    """Reads what heats an arm with some joints; see `recorded_inputs`.
 
     Raises:
-        DataError: Neither is known of all joints together.
+        DataError: Neither temperatures nor currents are known of all joints together.
     """
-    numbers = {
-        view.stamp_s: view.numbers
-        for view in session.views
-        if view.stamp_s is not None and name_of(session.declaration, "robot", view) == robot
-    }
-    names = sorted({name for row in numbers.values() for name in row} - {STAMP})
-    rows = [
-        [stamp_s, *(row.get(name, np.nan) for name in names)]
-        for stamp_s, row in sorted(numbers.items())
-    ]
-    of_views = Stream((STAMP, *names), np.array(rows).reshape(len(rows), len(names) + 1))
-    tables = [*streams_of(session, robot).values(), of_views]
-    for kind, form in _FORMS.items():
-        for table in tables:
-            stamps_s, heat = table.group([form.format(at + 1) for at in range(joints)])
-            if len(stamps_s) >= _FEWEST_SAMPLES:
-                return _averaged(kind, stamps_s, heat, tables)
-    raise missing_error(
-        f"{_FEWEST_SAMPLES} rows of a stream, or of views.csv with a time, with all of temp1_c ... "
-        f"temp{joints}_c or current1_a ... current{joints}_a"
-    )
-
-
-def _averaged(
-    kind: Kind, stamps_s: FloatArray, heat: FloatArray, tables: Sequence[Stream]
-) -> Inputs:
-    """The inputs with the first recorded air temperature, averaged in groups of samples."""
-    of_air = (table.group((_AMBIENT,)) for table in tables)
-    at_s, air = next((group for group in of_air if len(group[0])), (stamps_s, np.zeros((1, 1))))
-    ambient = np.interp(stamps_s, at_s, np.broadcast_to(air[:, 0], len(at_s)))
-    columns = np.column_stack([stamps_s, ambient, heat if kind == "temperatures" else heat**2])
-    starts = np.arange(0, len(columns), -(-len(columns) // _MOST_SAMPLES))
-    lengths = np.diff(np.append(starts, len(columns)))
-    means = np.add.reduceat(columns, starts) / lengths[:, None]
-    return Inputs(kind, means[:, 0], means[:, 2:], means[:, 1])
-
-
-def _expected(inputs: Inputs) -> Heating:
-    """The prior of how links follow what heats them."""
-    count = inputs.signal.shape[1]
-    gain = np.ones(count)
-    if inputs.kind == "currents":
-        gain = _RISE_K / np.maximum(inputs.signal.mean(axis=0), 1e-9)
-    return Heating(inputs.kind, np.full(count, _TAU_S[inputs.kind]), gain)
+    inputs = recorded_inputs(session, joints, robot)
+    if inputs is None:
+        raise missing_error(
+            f"{FEWEST_SAMPLES} rows of a stream, or of views.csv with a time, with all of temp1_c "
+            f"... temp{joints}_c or current1_a ... current{joints}_a"
+        )
+    return inputs
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,17 +139,8 @@ class ThermalFit:
     @classmethod
     def expected(cls, robot: Robot, nominal: Robot, inputs: Inputs) -> Self:
         """The prior; `robot` is up to the frame of its poses, the lengths of `nominal` grow."""
-        count, heating = robot.joint_count, _expected(inputs)
-        model = ThermalModel(
-            robot,
-            heating,
-            heating.links_c(inputs, inputs.stamps_s[:1])[0],
-            np.full(count, _GROWTH_PER_K),
-            np.zeros(count),
-            np.zeros((0, 0)),
-            nominal.chain.placements[:, :3, 3],
-        )
-        return cls(model, inputs, np.zeros(2 * count + heating.size))
+        model = usual_arm(robot, nominal, inputs)
+        return cls(model, inputs, np.zeros_like(sigmas_of(inputs)))
 
     @property
     def is_found(self) -> bool:
@@ -207,10 +150,7 @@ class ThermalFit:
     @property
     def sigmas(self) -> FloatArray:
         """(p,) the prior's sigmas."""
-        kind = self.inputs.kind
-        sizes = [_GROWTH_SIGMA_PER_K, _DRIFT_SIGMA_RAD_PER_K, _TAU_SIGMA[kind]]
-        sizes += [_GAIN_SIGMA] * (kind == "currents")
-        return np.repeat(sizes, self.model.joint_count)
+        return sigmas_of(self.inputs)
 
     @property
     def not_determined(self) -> tuple[str, ...]:
@@ -222,13 +162,7 @@ class ThermalFit:
 
     def moved(self, step: FloatArray) -> Self:
         """The drift after a (p,) step of its values."""
-        model, steps, count = self.model, self.sigmas * step, self.model.joint_count
-        model = replace(
-            model,
-            growth_per_k=model.growth_per_k + steps[:count],
-            drift_rad_per_k=model.drift_rad_per_k + steps[count : 2 * count],
-            heating=model.heating.changed(steps[2 * count :]),
-        )
+        model = self.model.changed(self.sigmas * step)
         return replace(self, model=model, values=self.values + step)
 
     def links_c(self, stops: HeatedStops) -> FloatArray:

@@ -5,6 +5,7 @@ from visioncal.model.effects.clock import Clock as Clock
 from visioncal.model.effects.effect import Effect as Effect
 from visioncal.model.effects.effect import Size as Size
 from visioncal.model.effects.focus_jitter import FocusJitter as FocusJitter
+from visioncal.model.effects.heat import Heat as Heat
 from visioncal.model.effects.lens_grows import LensGrows as LensGrows
 from visioncal.model.effects.links import Links as Links
 from visioncal.model.effects.play import Play as Play
