@@ -8,8 +8,18 @@ from support.small_cells import ROBOT_M, ROBOT_RAD, made, pose
 from support.whole_cells import OPTIONS, recorded
 
 from visioncal.core.transforms import invert, log
-from visioncal.fit.processes import _alone, consider, processes
+from visioncal.fit.assemble import mixed_model
+from visioncal.fit.processes import (
+    _alone,
+    _boards,
+    _independent,
+    _likelihoods,
+    consider,
+    processes,
+)
+from visioncal.fit.search import Search
 from visioncal.fit.solve import solve
+from visioncal.fit.unknowns import State
 from visioncal.model import read_cell
 from visioncal.simulation import simulate
 
@@ -87,3 +97,47 @@ def test_boards_that_are_larger_are_found_beside_errors_of_the_arm():
     scale = fit.state.values["shape", "target"][0]
     assert scale == pytest.approx(0.04 / 0.0402 - 1, abs=5e-4)
     assert abs(consider(solve(small.cell).fit, "flange").board_odds) < 7.0
+
+
+def with_board(cell, square_m, share):
+    board = replace(cell.boards["target"], square_m=square_m, square_sigma_m=share * square_m)
+    return replace(cell, boards={"target": board})
+
+
+def test_odds_of_boards_are_those_of_the_whole_likelihood():
+    cell = with_board(made(stops=12).cell, 0.04, 3e-4)
+    fit = solve(cell).fit
+    # Linearised elsewhere than at the prior's mean, which has a pull there.
+    shape = fit.state.values["shape", "target"] + 1e-4 * np.eye(10)[0]
+    state = State({**fit.state.values, ("shape", "target"): shape}, fit.state.errors)
+    fit = Search.of(cell, fit.unknowns)._sized(state, fit.used, fit)
+    alone = _alone(fit, "flange")
+    every = np.arange(len(alone.stops))
+    (board,) = _boards(fit)
+    found = _likelihoods(alone, every, _independent(alone, every, 1.0), [board])
+    values = []
+    for sigma in (3e-4, 1e-2):
+        member = fit.unknowns["shape", "target"]
+        prior = replace(board.held, sigma=sigma)
+        unknowns = fit.unknowns.with_members(
+            replace(member, priors=(prior, *member.priors[1:])),
+        )
+        mixed = mixed_model(cell, unknowns, fit.linearised, fit.grams, fit.used)
+        values.append(-0.5 * mixed.at(fit.estimate.logs).value - np.log(sigma))
+    assert abs(board.past) == pytest.approx(1e-4, rel=0.1)
+    assert found[1] - found[0] == pytest.approx(values[1] - values[0], abs=1e-3)
+
+
+def test_what_held_boards_may_be_off_by_is_in_the_covariance_and_not_in_the_estimate():
+    cell, share = made(stops=16).cell, 2e-4
+    edges, sigmas = {}, {}
+    for factor in (1.0, 1.0 + share):
+        fit = solve(with_board(cell, 0.04 * factor, share)).fit
+        assert abs(fit.state.values["shape", "target"][0]) < 1e-2 * share
+        edges[factor] = fit.edge("cam")
+        sigmas[share] = fit.covariance(("edge", "cam"))
+    moved = log(invert(edges[1.0]) @ edges[1.0 + share])
+    exact = solve(with_board(cell, 0.04, 1e-7)).fit.covariance(("edge", "cam"))
+    added = sigmas[share] - exact
+    assert np.linalg.norm(moved[3:]) > 3e-5
+    assert np.sqrt(added[5, 5]) == pytest.approx(abs(moved[5]), rel=0.1)

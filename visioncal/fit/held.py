@@ -1,4 +1,7 @@
-"""Errors of lenses that are held: in the covariance, not in the estimate."""
+"""Errors of what is held: in the covariance, not in the estimate (cf. Schmidt 1966).
+
+The derivative of the estimate by something is their covariance over its own, if both are estimated.
+"""
 
 import numpy as np
 
@@ -8,12 +11,21 @@ from visioncal.fit.linearise import linearised, pairs_of
 from visioncal.fit.unknowns import Vector, given_lens
 
 
-def with_held_lenses(fit: Fit) -> Fit:
-    """The fit with what held lenses may be off by in its covariance (cf. Schmidt 1966).
+def with_held_boards(fit: Fit) -> Fit:
+    """The fit with what boards whose size is held may be off by in its covariance."""
+    covariance, added = fit.estimate.covariance, np.zeros((fit.unknowns.count,) * 2)
+    for member in fit.unknowns.members:
+        for prior in member.priors:
+            if prior.considered > 0.0:
+                at = fit.unknowns.columns(*member.key)[prior.columns]
+                own = covariance[at[:, None], at]
+                slope = np.linalg.solve(own, covariance[at]).T * prior.considered
+                added += slope @ slope.T
+    return fit.considering(added)
 
-    The derivative of the estimate by a lens is their covariance over the lens's, if both are
-    estimated.
-    """
+
+def with_held_lenses(fit: Fit) -> Fit:
+    """The fit with what held lenses may be off by in its covariance."""
     lenses = list[Vector]()
     for name in fit.unknowns.lenses:
         table = fit.cell.cameras[name]

@@ -9,7 +9,7 @@ further off than that of independent errors: they take a camera's transform for 
 What each stop alone says of its flange follows from the factorisation.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from visioncal.core.types import FloatArray, IntArray, evenly
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.fit.fit import Fit
 from visioncal.fit.mixed import body_with, inverse
-from visioncal.fit.unknowns import Key
+from visioncal.fit.unknowns import Key, Prior
 
 # Lengths of processes by posture [rad], with the lever per radian, and by time [stops].
 _RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
@@ -125,7 +125,7 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     stops, levels, p = len(alone.stops), alone.levels, fit.unknowns.count
     poses = fit.cell.arms[flange].poses[alone.stops]
     some = evenly(stops, _MOST)
-    boards = [(fit.unknowns.slices[key].start, held) for key, held in held_boards(fit).items()]
+    boards = _boards(fit)
     independent_at = {white: _independent(alone, some, white) for white in _WHITE}
     none = (np.log(1 / 4), *_likelihoods(alone, some, independent_at[1.0], boards))
     found, kinds = [none], list[tuple[Process, float, float]]()
@@ -231,18 +231,32 @@ def _alone(fit: Fit, flange: str) -> _Alone | None:
     return _Alone(body.stops[seen], levels, known, rows, rest)
 
 
-def held_boards(fit: Fit) -> dict[Key, float]:
-    """Boards whose size is held, and the information of its prior."""
-    found = {}
-    for member in fit.unknowns.members:
-        size = member.priors[0].size if member.key[0] == "shape" else None
-        if size is not None and size.high <= size.low:
-            found[member.key] = size.low**-2.0
-    return found
+def held_boards(fit: Fit) -> dict[Key, Prior]:
+    """Boards whose size is held, and its prior."""
+    boards = (member for member in fit.unknowns.members if member.key[0] == "shape")
+    return {at.key: at.priors[0] for at in boards if at.priors[0].considered > 0.0}
+
+
+@dataclass(frozen=True)
+class _Board:
+    """A board whose size is held."""
+
+    column: int  # Of its size, among the unknowns.
+    held: Prior
+    past: float  # Its size where it was linearised.
+
+
+def _boards(fit: Fit) -> list[_Board]:
+    past, starts = fit.unknowns.offsets(fit.linearised), fit.unknowns.slices
+    each = [(starts[key].start, prior) for key, prior in held_boards(fit).items()]
+    return [_Board(column, prior, float(past[column])) for column, prior in each]
 
 
 def _likelihoods(
-    alone: _Alone, some: IntArray, covariance: FloatArray, boards: list[tuple[int, float]]
+    alone: _Alone,
+    some: IntArray,
+    covariance: FloatArray,
+    boards: Sequence[_Board],
 ) -> tuple[float, float]:
     """Restricted log-likelihoods with boards as stated, and of any size.
 
@@ -250,22 +264,24 @@ def _likelihoods(
         alone: What each stop alone says.
         some: (k,) stops that are looked at.
         covariance: (6 k, 6 k) of what they say, under a process.
-        boards: Columns of the sizes of held boards, and the information of their priors.
+        boards: Those whose size is held.
     """
     p = alone.rows.shape[2] - 1
     root = np.linalg.cholesky(covariance)
     solved, _ = lapack.dtrtrs(root, alone.rows[some].reshape(-1, p + 1), lower=1)
     total = solved.T @ solved + alone.rest
-    total[np.arange(p), np.arange(p)] *= 1.0 + 1e-9
-    values = []
-    loosened = np.zeros(p + 1)
-    for places in ([], boards) if boards else ([],):
-        for column, held in places:
-            loosened[column] = held - _LOOSE**-2.0
-        inner = (total - np.diag(loosened))[:p, :p]
-        factor = np.linalg.cholesky(inner)
-        pull, _ = lapack.dtrtrs(factor, total[:p, p], lower=1)
-        value = -np.log(np.diag(root)).sum() - np.log(np.diag(factor)).sum()
-        prior = sum(-0.5 * np.log(held * _LOOSE**2) for _, held in places)
-        values.append(float(value - 0.5 * (total[p, p] - pull @ pull) + prior))
+    values, diagonal = [], np.arange(p)
+    for is_free in (False, True) if boards else (False,):
+        own, prior = total.copy(), 0.0
+        for board in boards:
+            sigma = max(_LOOSE, board.held.considered) if is_free else board.held.considered
+            row = np.zeros(p + 1)
+            row[[board.column, p]] = 1.0, -board.past
+            own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
+            prior -= np.log(sigma)
+        own[diagonal, diagonal] *= 1.0 + 1e-9
+        factor = np.linalg.cholesky(own[:p, :p])
+        pull, _ = lapack.dtrtrs(factor, own[:p, p], lower=1)
+        value = prior - np.log(np.diag(root)).sum() - np.log(np.diag(factor)).sum()
+        values.append(float(value - 0.5 * (own[p, p] - pull @ pull)))
     return values[0], values[-1]

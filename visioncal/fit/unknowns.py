@@ -32,6 +32,8 @@ class Prior:
     columns: IntArray  # (n,) among the unknown's own.
     size: Size | None = None  # Its standard deviation, which is estimated.
     sigma: float = 1.0  # Its standard deviation where it is known, in the columns' units.
+    # What columns that are held, by a small sigma, may be off by: in the covariance alone.
+    considered: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,13 +266,14 @@ def estimated_lens(frame: str, lens: Camera) -> Vector:
 def printed_board(frame: str, board: Target | None, *, has_shape: bool, is_sized: bool) -> Vector:
     """A printed board, or None of which nothing is stated: its size, its shape if `has_shape`.
 
-    `is_sized` where errors of the arms are not confounded with its size: then that is estimated.
+    `is_sized` where errors of the arms are not confounded with its size: then that is estimated,
+    else held.
     """
     share = board.square_sigma_m / board.square_m if board else DEFAULT_RELATIVE_SIGMA
-    low = max(share, 1e-7)
-    high = 0.2 if is_sized else low
-    size = Size(f"scale {frame}", min(0.01, high), low, high)
-    priors = [Prior(np.arange(SHAPES)[SIZE], size)]
+    share, own = max(share, 1e-7), np.arange(SHAPES)[SIZE]
+    # No corners and no arm show a millionth.
+    held = Prior(own, sigma=min(share, 1e-6), considered=share)
+    priors = [Prior(own, Size(f"scale {frame}", 0.01, share, 0.2)) if is_sized else held]
     if has_shape:
         priors.append(Prior(np.arange(SHAPES)[PLANE], Size(f"plane {frame}", 3e-4, 1e-7, 0.02)))
         priors.append(Prior(np.arange(SHAPES)[BEND], Size(f"bend {frame}", 1e-4, 1e-7, 0.05)))
