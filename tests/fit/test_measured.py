@@ -15,7 +15,7 @@ from visioncal.fit.linearise import linearised, pairs_of
 from visioncal.fit.search import Search, nearest
 from visioncal.fit.solve import solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
-from visioncal.fit.unknowns import State
+from visioncal.fit.unknowns import State, printed_board
 from visioncal.model import Arm, Cell, MeasuredPlace, MeasuredPose, Moments, Sighting, read_cell
 from visioncal.model.arm import even_progress
 from visioncal.session import Session
@@ -140,9 +140,8 @@ def test_a_board_of_another_size_is_found_by_an_arm_whose_errors_are_separated()
     cell = poses_by_opencv(small, 0.99)
     start = start_of(cell)
     unknowns = unknowns_of(start, ())
-    scale = next(m for m in unknowns.members if m.key == ("shape", "target"))
-    wide = replace(scale.priors[0], size=replace(scale.priors[0].size, start=0.01, high=0.2))
-    search = Search.of(cell, unknowns.with_members(replace(scale, priors=(wide,))))
+    board = printed_board("target", cell.boards.get("target"), has_shape=False, is_sized=True)
+    search = Search.of(cell, unknowns.with_members(board))
     fit, _ = search.run(state_of(start, ()), nearest(start))
     sigma = float(np.sqrt(fit.covariance(("shape", "target"))[0, 0]))
     found = fit.state.values["shape", "target"][0]
