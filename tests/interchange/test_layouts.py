@@ -690,6 +690,36 @@ def below_tabs(folder):
     write(folder / "log.txt", "\n".join(lines))
 
 
+def below_units(folder):
+    """A long preamble of other widths, units below the header, and a last row without a picture."""
+    shoot(folder, "a{}.png")
+    turns = Rotation.from_matrix(world()[0][:, :3, :3]).as_euler("xyz", degrees=True)
+    lines = [*["Robot: TX2-90"] * 14, "", "Bild;X;Y;Z;Rx;Ry;Rz", ";[mm];[mm];[mm];deg;deg;deg"]
+    for at, row in enumerate(np.hstack([1e3 * world()[0][:, :3, 3], turns])):
+        lines.append(";".join([f"a{at}.png", *(f"{n:.10f}".replace(".", ",") for n in row)]))
+    lines.append(lines[-1].replace("a8.png", "n/a"))
+    write(folder / "p.csv", "\n".join(lines))
+
+
+def below_headings(folder):
+    """Matrices below headings of as many words as they have columns, numbered as pictures."""
+    shoot(folder, "capture_{}.png")
+    text = ""
+    for at in (4 * k % 9 for k in range(9)):
+        text += f"=== capture {at} ===\n"
+        text += "".join(f"  {'  '.join(map(repr, row))}\n" for row in world()[0][at].tolist())
+    write(folder / "run.log", text)
+
+
+def points_of_a_table(folder):
+    """A column of points' names, of which two have no picture."""
+    shoot(folder, "P{}.png")
+    names = ["HOME", *(f"P{at}" for at in range(9)), "END"]
+    rows = zip(names, with_others(1, 1), strict=True)
+    lines = [",".join([name, *map(repr, map(float, seven(pose)))]) for name, pose in rows]
+    write(folder / "p.csv", "\n".join(["point,x,y,z,qx,qy,qz,qw", *lines]))
+
+
 def halcon(folder):
     """A file a picture as HALCON's write_pose has it, in each of its representations."""
     shoot(folder, "calib_image_{:02d}.png")
@@ -761,7 +791,8 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         sorted_as_text, called_by_words, a_folder_a_view, columns_as_lists,
         blocks_of_text, mappings_of_any_names, rounds, pictures_to_numbers, lines_with_brackets,
         krl_with_a_retract, krl_from_one, krl_with_a_home_of_another_name, rapid_with_a_home,
-        below_a_preamble, below_tabs, halcon, console, console_of_a_maker, pictures_above_poses,
+        below_units, below_headings, points_of_a_table, below_a_preamble, below_tabs, halcon,
+        console, console_of_a_maker, pictures_above_poses,
         lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
     )
 }  # fmt: skip

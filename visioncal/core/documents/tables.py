@@ -25,6 +25,8 @@ _EMPTY = "; ,\t\r\n"
 _COMMENTS = ("#", "%", "//")
 # A row printed as a list, possibly with a name: `pose: [1.0, 2.0]`, `array([1, 2]),`.
 _LISTED = re.compile(r"[^\[\](){}]*+[\[({]++([^\[\](){}]*+)[\])}]++\s*+[,;]?\s*+")
+# The unit of a column in a row below the header.
+_UNIT = re.compile(r"(?:um|mm|cm|m|inch|deg|rad|°|º|s|ms)?", re.I)
 # A text that begins so is a formula to spreadsheets.
 _FORMULAS = ("=", "+", "-", "@", "\t", "\r")
 
@@ -140,8 +142,8 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
         inside = (match[1] for match in listed if match)
         lines = list(zip((at for at, _ in lines), inside, strict=True))
     # Titles may stand above.
-    middle = lines[len(lines) // 2][1] if lines else ""
-    separator = declared[1] if declared else next((mark for mark in ";\t," if mark in middle), " ")
+    usual = lines[3 * len(lines) // 4][1] if lines else ""
+    separator = declared[1] if declared else next((mark for mark in ";\t," if mark in usual), " ")
     split = [(at, tuple(line.split())) for at, line in lines]
     if separator != " ":
         split = list(_split(lines, where, separator, stripped=True))
@@ -175,15 +177,26 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
 def _below_titles(
     rows: list[tuple[int, tuple[str, ...]]],
 ) -> list[tuple[int, tuple[str, ...]]]:
-    """Rows without what stands above: titles of other widths, or rows filled in few cells."""
+    """Rows without what stands above: titles of other widths, or rows filled in few cells.
+
+    Units in a row of their own join the names.
+    """
     widths = [len(cells) for _, cells in rows]
-    filled = [sum(map(bool, cells)) for _, cells in rows]
-    usual, half = Counter(widths).most_common(1)[0][0], sorted(filled)[len(rows) // 2] / 2
-    above = next(at for at, width in enumerate(widths) if width == usual and filled[at] > half)
+    filled = [sum(map(bool, cells)) * (len(cells) == widths[-1]) for _, cells in rows]
+    above = next(at for at, count in enumerate(filled) if 2 * count > max(filled))
     # Without a header, rows of few cells may be rows all the same.
-    is_header = not any(map(is_number, rows[above][1])) or usual not in widths[:above]
-    is_title = above and len(rows) > above + 2 and {*widths[above:]} == {usual}
-    return rows[above:] if is_title and is_header else rows
+    is_header = not any(map(is_number, rows[above][1])) or widths[-1] not in widths[:above]
+    is_title = is_header and len(rows) > above + 2 and len({*widths[above:]}) == 1
+    rows = rows[above:] if is_title else rows
+    if len(rows) > 2 and len(rows[0][1]) == len(units := rows[1][1]):
+        plain = [unit.strip("[]()-") for unit in units]
+        if any(plain) and all(map(_UNIT.fullmatch, plain)):
+            both = zip(rows[0][1], plain, strict=True)
+            return [
+                (rows[0][0], tuple(f"{name} [{unit}]" * bool(unit) or name for name, unit in both)),
+                *rows[2:],
+            ]
+    return rows
 
 
 def _named(columns: Sequence[str] | None, width: int, where: str) -> tuple[str, ...]:

@@ -191,8 +191,8 @@ def _further(
 ) -> dict[str, tuple[str, ...]]:
     """All columns of views.csv beside poses, joints and images."""
     found = {**columns, **{name: cells for name, cells in fields.texts.items() if name not in used}}
-    if len({*found.get("point", ())}) == len(fields) and "meas_x_m" in columns:
-        # Names of the readings, and not of the points that are read again and again.
+    if len({*found.get("point", ())}) == len(fields) and (pairing.images or "meas_x_m" in columns):
+        # Names of the stops or readings, and not of points that are read again and again.
         found["reading"] = found.pop("point")
     if pairing.depths:
         found["source_depth"] = tuple(str(file or "") for file in pairing.depths)

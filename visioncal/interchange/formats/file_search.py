@@ -1,7 +1,7 @@
 """Finds files: those of a source in groups of one kind, and the image of each row."""
 
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -33,6 +33,8 @@ from visioncal.session.images import IMAGE_ENDINGS
 _NO_DATA = (".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg")
 # Folders below a source that are looked through, and the most files in all.
 _DEPTH, _MOST_FILES = 3, 100_000
+# Cells of rows without an image.
+_NO_IMAGE = ("", "n/a", "none", "null", "nan")
 # Words of pictures that a program drew: they are no camera's where there are others.
 _DRAWN = re.compile(
     r"result|overlay|detect|corner|annot|drawn|debug|visual|vis(?![a-z])|axes|axis|mask|plot|"
@@ -281,7 +283,7 @@ def images_named(
     paths: list[Path | None] = []
     for name in names:
         path: Path | None = None
-        if name:
+        if name and name.strip("-").lower() not in _NO_IMAGE:
             *_, folder, plain = ("", *name.replace("\\", "/").split("/"))
             known = by_name.get((folder if folder in folders else "", plain))
             known = known or by_number.get(number_in(plain))
@@ -421,7 +423,7 @@ def _unpaired(fields: Fields, group: FileGroup) -> DataError:
 def _in_step(fields: Fields, group: FileGroup) -> Iterator[Match]:
     """Pairings by numbers that differ by a constant, the least first; all of the fewer find one.
 
-    Rows without numbers count from one. Else points of the usual name are paired by their order.
+    Rows without numbers count from one.
     """
     place = {number: at for at, number in enumerate(group.numbers)}
     for own in (*fields.keys.found[HOW[1]].values(), range(1, len(fields) + 1)):
@@ -438,10 +440,6 @@ def _in_step(fields: Fields, group: FileGroup) -> Iterator[Match]:
                 at = (place.get(k + sign * by, -1) if isinstance(k, int) else -1 for k in own)
                 yield Match(HOW[1], np.array([*at]))
             return
-    kinds = [re.sub("[0-9]+", "", name) for name in fields.stems]
-    usual = np.isin(kinds, [kind for kind, _ in Counter(kinds).most_common(1)])
-    if 2 < usual.sum() == len(group.files):
-        yield Match(HOW[-1], np.where(usual, np.cumsum(usual) - 1, -1))
 
 
 def path_inside(base: Path, name: str) -> Path:

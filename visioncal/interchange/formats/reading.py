@@ -226,7 +226,11 @@ def read_rows(path: Path, form: str | None = None, document: object = None) -> l
         return [matrices]
     records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     places = [table.place(index) for index in range(len(table.rows))]
-    return [fields_of_records(records, places, path.stem, path.parent)]
+    fields = fields_of_records(records, places, path.stem, path.parent)
+    # Headings may have as many words as matrices have columns.
+    is_odd = not table.has_header and 2 * len(fields.numbers) < len(table.columns)
+    blocks = _blocks(_placed(text, path), path) if is_odd else None
+    return [blocks if blocks and holds_pose(blocks) else fields]
 
 
 def read_record(path: Path, document: object = None) -> dict[str, object]:
@@ -258,12 +262,9 @@ def _halcon(text: str, path: Path) -> dict[str, object]:
     code, turns, place = (np.array(words[name], dtype=float) for name in "frt")
     kind, sizes = int(code[0]) & 6, (len(code), len(turns), len(place))
     if sizes != (1, 3, 3) or code[0] not in range(14) or kind == 6:
-        raise DataError(
-            f"{path}: f is {' '.join(words['f'])}, and r and t have {sizes[1]} and {sizes[2]} "
-            "numbers; a pose of HALCON has a type f among 0 to 5 and 8 to 13, and 3 of each.",
-            culprits=[str(path)],
-            next_step="Write it anew with write_pose.",
-        )
+        fault = f"f is {' '.join(words['f'])}, and r and t have {sizes[1]} and {sizes[2]} numbers"
+        needed = "0 to 5 or 8 to 13, and 3 each, are needed"
+        raise DataError(f"{path}: {fault}; {needed}.", culprits=[str(path)])
     turns = -turns if code[0] % 2 else turns
     rotation = (
         Rotation.from_quat([*turns, 1.0])
