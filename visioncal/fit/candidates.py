@@ -19,7 +19,6 @@ from visioncal.model.effects import (
     Heat,
     LensGrows,
     Play,
-    Rolling,
     Springs,
     Weight,
 )
@@ -136,9 +135,7 @@ def effects_of_arms(fit: Fit) -> Iterator[Effect]:
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:
-    """Effects of known sizes, which no score has."""
-    for camera in dict.fromkeys(sweep.camera for sweep in fit.cell.sweeps):
-        yield Rolling(camera, fit.unknowns.lenses[camera].resolution[1])
+    """Effects that are not linear in their values: no score has these."""
     for name in fit.unknowns.erring:
         arm = fit.cell.arms[name]
         if arm.has_joints and arm.model is not None and arm.heat is not None:

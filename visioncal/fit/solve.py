@@ -29,7 +29,7 @@ from visioncal.fit.unknowns import (
 )
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
 from visioncal.model.boards import SHAPES
-from visioncal.model.effects import Clock, Effect, Links, Size
+from visioncal.model.effects import Clock, Effect, Links, Rolling, Size
 from visioncal.vision.camera import intrinsics
 
 # Numbers of corners for each unknown of lenses and boards, below which these are held.
@@ -64,7 +64,7 @@ def solve(cell: Cell) -> CellFit:
     """
     start = start_of(cell)
     refuse_unjoined(cell, start.cell)
-    effects = effects_of(start.cell)
+    effects = effects_of(start)
     search = Search.of(start.cell, unknowns_of(start, effects), start.sound)
     fit, left_out = search.run(state_of(start, effects), nearest(start))
     refuse_open(fit)
@@ -118,17 +118,21 @@ def with_free_boards(fit: Fit) -> Unknowns:
     return fit.unknowns.with_members(*freed)
 
 
-def effects_of(cell: Cell) -> tuple[Effect, ...]:
-    """Effects that are always among the unknowns: clocks; links of arms with joint angles."""
-    clocks = (Clock(sweep.flange, sweep.camera, sweep.sigma_s) for sweep in cell.sweeps)
-    if len({sighting.stop for sighting in cell.sightings}) < ENOUGH_STOPS:
-        return tuple(clocks)
-    links = (
-        Links(name, arm.model)
-        for name, arm in cell.arms.items()
-        if arm.has_joints and arm.model is not None
-    )
-    return (*clocks, *links)
+def effects_of(start: Start) -> tuple[Effect, ...]:
+    """Effects that are always among the unknowns: of motion, and links of arms with joint angles.
+
+    Corners of a rolling shutter are off by pixels, which much else would explain without it.
+    """
+    cell, found = start.cell, list[Effect]()
+    found += (Clock(sweep.flange, sweep.camera, sweep.sigma_s) for sweep in cell.sweeps)
+    for camera in dict.fromkeys(sweep.camera for sweep in cell.sweeps):
+        if camera in start.lenses:
+            found.append(Rolling(camera, start.lenses[camera].resolution[1]))
+    if len({sighting.stop for sighting in cell.sightings}) >= ENOUGH_STOPS:
+        for name, arm in cell.arms.items():
+            if arm.has_joints and arm.model is not None:
+                found.append(Links(name, arm.model))
+    return tuple(found)
 
 
 def state_of(start: Start, effects: Sequence[Effect]) -> State:

@@ -1,7 +1,7 @@
 """What an effect of a known size explains, by a fit's linearisation with it.
 
-A score from the factorisation does for effects that are linear in their values and alike in all
-corners of an image. Others are linearised, once, at the point where the fit was.
+A score from the factorisation does for effects that are linear in their values. Others are
+linearised, once, at the point where the fit was.
 """
 
 from collections.abc import Sequence

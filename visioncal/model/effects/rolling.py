@@ -5,22 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.effects.rolling_shutter import READOUT_SIGMA_S
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import Effect, Size
+from visioncal.model.effects.effect import Effect
 
 
 @dataclass(frozen=True)
 class Rolling(Effect):
     """Time from an image's first row to its last, whose middle row has the stamp [s]."""
 
-    place, kind, count = "corners", "rolling", 1
+    place, kind, count, bounds = "corners", "rolling", 1, (1e-2, 1e-6, 0.1)
     height: int  # Of the images [px].
-
-    @property
-    def size(self) -> Size:
-        """See `Effect`: readout times are alike."""
-        return Size(self.name, READOUT_SIGMA_S, READOUT_SIGMA_S, READOUT_SIGMA_S)
 
     def shares(self, px: FloatArray) -> FloatArray:
         """(n,) delays of (n, 2) corners from the stamp, as shares of the readout time."""
