@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.refusals import raised
-from support.small_cells import made
+from support.small_cells import TABLE, made
 from support.whole_cells import OPTIONS, recorded
 
-from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
 from visioncal.core.transforms import exp, invert
+from visioncal.core.types import Camera
 from visioncal.fit.solve import solve
+from visioncal.fit.start import start_of
 from visioncal.model import Arm, MeasuredPose, Moments, read_cell
 from visioncal.model.arm import even_progress
 from visioncal.simulation import simulate
@@ -74,3 +76,44 @@ def test_cells_of_which_a_part_is_tied_to_nothing_are_refused():
     # No number of sightings may end in a traceback.
     for count in (1, 3, 6, 9):
         raised(DegenerateError, "not determined", solve, cell.only(range(count)))
+
+
+def test_a_lens_that_starts_far_off_ends_in_no_traceback(monkeypatch):
+    """As found where views of few corners mislead the closed form of focal lengths."""
+    refused = list[str]()
+    for focal in (60.0, 350.0, 3e4):
+        for seed in range(4):
+            small = made(seed, stops=12, given=False)
+            wild = Camera("brown", TABLE.size, np.array([focal, focal, 900.0, 200.0]), np.zeros(5))
+            monkeypatch.setattr(
+                "visioncal.fit.start.start_lenses", lambda _, lens=wild: {"cam": lens}
+            )
+            try:
+                solve(small.cell)
+            except (ConvergenceError, DegenerateError) as error:
+                refused.append(error.next_step)
+    assert refused
+    assert all(refused)
+
+
+def test_every_view_is_in_the_cell_or_said_to_be_absent():
+    small = made(stops=10)
+    own = list(small.cell.sightings)
+    line = own[3].corners.take(np.arange(len(own[3].corners.ids)) < 5)
+    own[3] = replace(own[3], evidence=line)
+    cell = solve(small.cell.with_sightings(own)).start.cell
+    assert [one.view for one in cell.sightings] == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    assert "in one row of the target" in cell.absent[3]
+
+
+def test_a_lens_is_found_beside_views_of_one_row():
+    for seed in range(6):
+        small = made(seed, stops=24, given=False)
+        own = list(small.cell.sightings)
+        for at in range(0, 24, 2):
+            # All but one in a row: they have many homographies.
+            corners = own[at].corners
+            kept = np.isin(corners.ids, [0, 1, 2, 5])
+            own[at] = replace(own[at], evidence=corners.take(kept))
+        lens = start_of(small.cell.with_sightings(own)).lenses["cam"]
+        assert lens.matrix[:2] == pytest.approx(TABLE.matrix[:2], rel=0.05)

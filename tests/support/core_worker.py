@@ -56,7 +56,8 @@ def fitted(path, out):
         "views": [
             {"view": sighting.view, "used": bool(used)}
             for sighting, used in zip(fit.cell.sightings, fit.used, strict=True)
-        ],
+        ]
+        + [{"view": view, "used": False, "reason": why} for view, why in fit.cell.absent.items()],
         "effort": {
             "linearisations": solved.effort.linearisations,
             "likelihoods": solved.effort.likelihoods,

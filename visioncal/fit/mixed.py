@@ -249,13 +249,20 @@ def inverse(information: FloatArray) -> tuple[FloatArray, float]:
     """Inverse (p, p) of an information matrix, and its log-determinant.
 
     What nothing determines, or elimination leaves slightly indefinite, gets a large variance.
+
+    Raises:
+        LinAlgError: It is not finite: a search diverges.
     """
+    if not len(information):
+        return information, 0.0
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information * np.outer(scale, scale)
     for ridge in _RIDGES:
         root, failed = lapack.dpotrf(scaled + ridge * np.eye(len(scaled)), lower=1)
         if not failed:
             break
+    if failed:
+        raise np.linalg.LinAlgError("information that is not finite")
     half, _ = lapack.dpotri(root, lower=1)
     covariance = (np.tril(half) + np.tril(half, -1).T) * np.outer(scale, scale)
     log_det = 2.0 * float(np.log(np.diag(root)).sum() - np.log(scale).sum())

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.errors import ConvergenceError
 from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.candidates import candidates, of_arms, opened
 from visioncal.fit.fit import Fit, LeftOut
@@ -61,7 +62,21 @@ def solve(cell: Cell) -> CellFit:
     Raises:
         DataError: Too few views show a lens of which nothing is stated.
         DegenerateError: The sightings leave a direction of a frame open.
+        ConvergenceError: The estimate does not come to rest.
     """
+    try:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            return _solved(cell)
+    except np.linalg.LinAlgError as error:
+        raise ConvergenceError(
+            "cell: the estimate does not come to rest: poses and images do not belong together, or "
+            "a lens of which nothing is stated is far from where it started.",
+            next_step="Give matrix and distortion in [camera], or add tilted views; compare the "
+            "robot's poses with their images.",
+        ) from error
+
+
+def _solved(cell: Cell) -> CellFit:
     start = start_of(cell)
     refuse_unjoined(cell, start.cell)
     effects = effects_of(start)

@@ -11,6 +11,7 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from visioncal.core.errors import DataError
@@ -26,9 +27,18 @@ from visioncal.core.transforms import (
     nearest_rotation,
     rotation_angle,
 )
-from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, Target, evenly
+from visioncal.core.types import (
+    Camera,
+    CameraKind,
+    Corners,
+    FloatArray,
+    IntArray,
+    Mask,
+    Target,
+    evenly,
+)
 from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.poses import closed_form_poses
+from visioncal.estimation.poses import closed_form_poses, determines_pose
 from visioncal.fit.places import robust_carried
 from visioncal.fit.weights import by_homography, first_weighed, on_planes
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
@@ -46,6 +56,7 @@ _SHIFTS, _FAR, _NEAR_M = (1, -1, 2, -2, 3, -3), 6.0, 0.002
 _FOCAL, _FOCALS, _SQUARE = (0.25, 10.0), 12, 0.05
 # The second pose of a flat board stays where it fits within this factor and addition [px].
 _ALIKE, _ALIKE_PX = 2.0, 0.3
+_NO_POSE = "corners that determine no pose: all, or all but one, lie in one row of the target"
 # Distortion moves corners off a homography by this and more [px].
 _LEAST_PX = 2.0
 
@@ -81,14 +92,20 @@ def start_of(cell: Cell) -> Start:
     cell, sound = weighed.cell, weighed.sound & ~cell.held
     options = candidates(cell, lenses)
     kept = [at for at, option in enumerate(options) if option is not None]
-    cell, sound = cell.only(kept), sound[kept]
+    lost = dict.fromkeys(np.setdiff1d(np.arange(len(options)), kept).tolist(), _NO_POSE)
+    cell, sound = cell.without(lost), sound[kept]
     known = [option for option in options if option is not None]
     # What is held out helps no fit.
     own = np.flatnonzero(~cell.held).tolist()
     places = _Places(cell.only(own))
     places.join_all([known[at] for at in own])
     joined = [at for at, s in enumerate(cell.sightings) if places.are_joined(*s.pair)]
-    cell, known = cell.only(joined), [known[at] for at in joined]
+    untied = {
+        at: f"nothing ties {' or '.join(sighting.pair)} to the rest of the cell"
+        for at, sighting in enumerate(cell.sightings)
+        if at not in joined
+    }
+    cell, known = cell.without(untied), [known[at] for at in joined]
     is_placed = [s.view not in places.misplaced for s in cell.sightings]
     sound = sound[joined] & np.array(is_placed, bool)
     edges = {name: places.edge(name) for name in cell.unknown}
@@ -128,6 +145,9 @@ def start_lenses(cell: Cell) -> dict[str, Camera]:
             found[frame] = table.stated
             continue
         seen = [s for s in cell.sightings if s.seer == frame and s.corners is not None]
+        # Corners on a line, or a few beside many, mislead the closed form of focal lengths.
+        typical = np.median([len(at.corners.ids) for at in seen if at.corners]) if seen else 0
+        seen = [at for at in seen if at.corners and _shows_lens(cell, at, float(typical))]
         if len(seen) < FEWEST_VIEWS:
             raise DataError(
                 f"intrinsics: {counted(len(seen), 'view', ('shows', 'show'))} the target, and at "
@@ -145,21 +165,43 @@ def start_lenses(cell: Cell) -> dict[str, Camera]:
                 points.append(board[agrees].astype(np.float32)[:, None])
         most = np.max([at.max(axis=(0, 1)) for at in px], axis=0)
         size = table.size or (int(most[0]) + 1, int(most[1]) + 1)
-        if table.model == "fisheye":
-            focal = 0.4 * size[0]
-            guess = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1.0]])
-            flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
-            flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
-            _, matrix, lens, *_ = cv2.fisheye.calibrate(
-                points, px, size, guess, np.zeros(4), flags=flags
-            )
-        else:
-            _, matrix, lens, *_ = cv2.calibrateCamera(points, px, size, np.eye(3), np.zeros(5))
-        four = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], float)
-        found[frame] = Camera(table.model, size, four, np.asarray(lens, float).ravel()[:5])
+        try:
+            found[frame] = _by_corners(table.model, size, points, px)
+        except cv2.error:  # No closed form starts it.
+            none = np.zeros(4 if table.model == "fisheye" else 5)
+            found[frame] = Camera(table.model, size, np.array([1.0, 1.0, *size]), none)
         if not _is_made(found[frame]):
             found[frame] = _lens_by_motion(cell, frame, found[frame])
     return found
+
+
+def _by_corners(
+    model: CameraKind,
+    size: tuple[int, int],
+    points: Sequence[NDArray[np.float32]],
+    px: Sequence[NDArray[np.float32]],
+) -> Camera:
+    """A lens by corners (n, 1, 3) of boards and their pixels (n, 1, 2), view by view."""
+    if model == "fisheye":
+        focal = 0.4 * size[0]
+        guess = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1.0]])
+        flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
+        flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
+        _, matrix, lens, *_ = cv2.fisheye.calibrate(
+            points, px, size, guess, np.zeros(4), flags=flags
+        )
+    else:
+        _, matrix, lens, *_ = cv2.calibrateCamera(points, px, size, np.eye(3), np.zeros(5))
+    four = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], float)
+    return Camera(model, size, four, np.asarray(lens, float).ravel()[:5])
+
+
+def _shows_lens(cell: Cell, sighting: Sighting, typical: float) -> bool:
+    """Whether an image has half of the typical number of corners, and not on a line."""
+    corners = sighting.corners
+    if corners is None or 2 * len(corners.ids) < typical:
+        return False
+    return determines_pose(corner_positions(cell.boards[sighting.seen])[corners.ids])
 
 
 def _is_made(lens: Camera) -> bool:

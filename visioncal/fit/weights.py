@@ -100,7 +100,7 @@ def by_homography(
     for method in (0, cv2.LMEDS, 0):
         some = inside if method == 0 else np.ones(len(px), bool)
         found, _ = cv2.findHomography(flat[some], px[some], method)
-        if not np.size(found):  # None where corners are on a line.
+        if found is None or not found.size:  # Where corners are on a line.
             return _Judged(agreeing, 0.0, 0)
         off = cv2.perspectiveTransform(flat[:, None], found)[:, 0] - px
         lengths = each * np.linalg.norm(off, axis=1)

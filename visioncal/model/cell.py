@@ -1,7 +1,7 @@
 """A cell: a tree of frames, the arms that move in it, and what was seen."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +28,7 @@ class Cell:
     sightings: tuple[Sighting, ...]
     moments: Moments  # At all s stops.
     sweeps: tuple[Swept, ...] = ()  # What was seen while robots moved.
+    absent: Mapping[int, str] = field(default_factory=dict)  # Why views have no sighting.
 
     @cached_property
     def pairs(self) -> dict[tuple[str, str], list[int]]:
@@ -69,3 +70,9 @@ class Cell:
     def only(self, rows: Iterable[int]) -> "Cell":
         """The cell with some of its sightings."""
         return self.with_sightings([self.sightings[row] for row in rows])
+
+    def without(self, reasons: Mapping[int, str]) -> "Cell":
+        """The cell without some rows of sightings, by reasons."""
+        kept = [row for row in range(len(self.sightings)) if row not in reasons]
+        absent = {self.sightings[row].view: reason for row, reason in reasons.items()}
+        return replace(self.only(kept), absent={**self.absent, **absent})

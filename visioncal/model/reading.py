@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.core.types import Corners, FloatArray
 from visioncal.estimation.poses import FEWEST_CORNERS
 from visioncal.estimation.tree import Branch, Tree
@@ -46,21 +47,30 @@ def read_cell(
     stations = {station: at for at, station in enumerate(sorted({row.station for row in rows}))}
     arms = {arm.flange: arm for arm in _arms(session, rows, stations)}
     sightings = list[Sighting]()
-    of_pair: dict[tuple[object, ...], list[Evidence]] = {}
+    of_pair: dict[tuple[object, ...], list[Sighting]] = {}
+    absent = dict[int, str]()
     for row in rows:
         stop = stations[row.station]
         known = (arms[frame_name("flange", name)].poses[stop] for name in row.robots)
-        found = corners.get(row.view.number)
+        view, found = row.view.number, corners.get(row.view.number)
         evidence = _evidence(session, row, found)
-        if evidence is not None and all(np.isfinite(pose).all() for pose in known):
+        if evidence is None:
+            count = "no corners" if found is None else counted(len(found.ids), "corner")
+            absent[view] = f"too few corners: {count}, needs {FEWEST_CORNERS}"
+        elif not all(np.isfinite(pose).all() for pose in known):
+            absent[view] = "the robot's pose there is not known"
+        else:
             earlier = of_pair.setdefault((stop, row.seer, row.seen), [])
             # A copy says nothing new about noise.
             is_anew = row.view.stop is not None or row.view.stamp_s is not None
-            if not any(is_copy(evidence, other, is_anew=is_anew) for other in earlier):
-                earlier.append(evidence)
-                is_held = row.view.holdout
-                one = Sighting(row.view.number, stop, row.seer, row.seen, evidence, is_held)
+            copied = (at for at in earlier if is_copy(evidence, at.evidence, is_anew=is_anew))
+            first = next(copied, None)
+            if first is None:
+                one = Sighting(view, stop, row.seer, row.seen, evidence, row.view.holdout)
+                earlier.append(one)
                 sightings.append(one)
+            else:
+                absent[view] = f"repeats view {first.view}"
     tree = _tree(session, [*arms], sightings)
     sightings += stated_sightings(session.declaration, tree, sightings)
     rates = {(sweep.camera, sweep.flange): np.zeros((len(stations), 6)) for sweep in sweeps}
@@ -79,6 +89,7 @@ def read_cell(
         tuple(sightings),
         Moments.of(arms, even_progress(len(stations)), rates, stamps_s),
         tuple(sweeps),
+        absent,
     )
 
 
