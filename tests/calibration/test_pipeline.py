@@ -8,7 +8,7 @@ import pytest
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from support.cells import board_numbers, calibrated, error_of, known_of, session_of
+from support.cells import board_numbers, calibrated, error_of, known_of, pairs_session, session_of
 from support.following import follow
 from support.misfits import misfit
 from support.refusals import raised
@@ -444,6 +444,13 @@ def test_measured_distances_of_another_scale_are_named_and_mended(scale, tmp_pat
     session = cell_session(simulate(options), "measured", seen="poses")
     verdict = calibrate(session).verdict
     assert verdict.status != "good"
+    session.save("cell")
+    assert follow("calibrate", "cell", "-o", "out").last.status == 0
+    if scale < 0.8:
+        # Farther than a fit follows, it is another reading.
+        assert verdict.causes[0].kind == "misread_poses"
+        assert "the board, 0.484" in verdict.causes[0].words
+        return
     (named,) = (finding for finding in verdict.findings if finding.kind == "board_size")
     assert verdict.causes[0] is named
     # A scale's sigma is a hundredth of a percent there; the factor has five digits.
@@ -453,8 +460,6 @@ def test_measured_distances_of_another_scale_are_named_and_mended(scale, tmp_pat
     share, size = re.search(r"the board is ([\d.]+) % .* (larger|smaller)", named.words).groups()
     said = 1.0 + float(share) / 100.0 * (1 if size == "larger" else -1)
     assert said == pytest.approx(factor, abs=0.05 * abs(1.0 - scale))
-    session.save("cell")
-    assert follow("calibrate", "cell", "-o", "out").last.status == 0
 
 
 def test_an_arm_that_is_off_is_no_other_scale():
@@ -479,3 +484,27 @@ def test_a_head_that_only_turns_says_nothing_of_the_scale():
     seen[:, :3, 3] /= 1.1
     found = distance_scale(arm, seen, X)
     assert "by 1.1" in found.do.words or "by 1.09" in found.do.words
+
+
+def single_tags(rms_mm, rms_deg, views=30, seed=0):
+    """A session of an exact arm and poses of a tag whose errors last over neighbouring views."""
+    rng = np.random.default_rng(seed)
+    tilts = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, (views, 3))).as_matrix()
+    places = rng.uniform([-0.1, -0.1, 0.5], [0.1, 0.1, 0.8], (views, 3))
+    seen = compose(tilts, places)
+    flanges = Z @ invert(seen) @ invert(X)
+    # A tag's errors follow how it is seen: smoothly, by its place in the image.
+    waves = np.sin(places @ rng.normal(0.0, 12.0, (3, 6)) + rng.uniform(0.0, 6.0, 6))
+    waves *= np.sqrt(2.0 / 3.0) * np.repeat([np.deg2rad(rms_deg), 1e-3 * rms_mm], 3)
+    noisy = seen @ exp(waves + rng.normal(size=waves.shape) * np.repeat([1e-4, 5e-5], 3))
+    return pairs_session("eye-in-hand", flanges, noisy)
+
+
+@pytest.mark.parametrize(("mm", "deg", "is_accused"), [(0.8, 0.1, True), (8.0, 1.0, False)])
+def test_an_arm_is_not_accused_of_more_than_arms_err_by(mm, deg, is_accused):
+    verdict = calibrate(single_tags(mm, deg)).verdict
+    assert verdict.status != "good"
+    assert ("arm_errors" in {found.kind for found in verdict.findings}) is is_accused
+    if not is_accused:
+        assert verdict.causes[0].kind == "unexplained"
+        assert "the arm's own errors" not in " ".join(verdict.reasons)

@@ -298,7 +298,7 @@ WORLDS: dict[str, World] = {
         joints=True,
         seed=3,
         status="good",
-        words=(r"% larger than stated.*The stated size allows this \(to within 0.1 %\)",),
+        words=(r"% larger than stated.*does not contradict the stated size \(to within 0.1 %\)",),
     ),
     # As after printing with `fit to page`: the robot's measure is all that is left.
     "size contradicted": World(

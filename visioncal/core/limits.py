@@ -42,6 +42,9 @@ class CalibrationLimits:
     # for which it is no doubt.
     repeatability: float = 2.0
     good_enough: float = 10.0
+    # Errors by posture that an industrial arm has at most [mm], [deg]: beyond, another thing that
+    # follows the posture is likelier, as a lens, marks of few pixels, or poses that are misread.
+    arm_errors: Pair = (3.0, 0.3)
     # Left-out scatter over that by the sensor's noise, as of a small board far away.
     of_noise: float = 1.5
     # Stops of the robot in the fit; fewer do not suffice to check the result.

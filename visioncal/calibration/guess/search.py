@@ -206,8 +206,10 @@ def _of_another_size(candidates: Iterable[Candidate], rows: IntArray) -> list[Ca
         scale, changed = _distance_scale(item), bool(item.hypothesis.changes)
         if scale is None or abs(np.log(scale)) < (_PRINTED if changed else _FOLLOWED):
             continue
-        whose = "the board" if item.recording.is_measured else "the camera's distances"
-        change = Change(f"{whose} {scale:.4g} times as large", "camera", {"scale": scale}, 2)
+        words = f"the board {scale:.4g} times as large"
+        if not item.recording.is_measured:
+            words = f"the camera's distances, and so the board, {scale:.4g} times as large as told"
+        change = Change(words, "camera", {"scale": scale}, 2)
         scaled[change.of(item.hypothesis)] = (*map(change.of, item.labels),)
         recording = item.recording
     if not scaled:

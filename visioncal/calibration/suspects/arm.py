@@ -9,10 +9,12 @@ from visioncal.calibration.stages import thermal
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.kinematics import findings
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
+from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.verdict import NOTE, PLAN, Finding, Remedy, remarks
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT
 
+LIMITS = CalibrationLimits()
 # Remedy for errors of an arm whose joints are not known.
 NO_JOINTS = Remedy(
     "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
@@ -43,9 +45,16 @@ def _of(arm: RobotArm, level: str) -> Iterator[Finding]:
     likely = f"(likelihood ratio {errors.gain:.0f}, noise stays under {SIGNIFICANT:.0f})"
     if errors.fit_sigmas is not None:
         turn_rad, shift_m = (np.sqrt(3.0) * errors.fit_sigmas).tolist()
+        turn_deg, shift_mm = float(np.rad2deg(turn_rad)), 1e3 * shift_m
+        repeats = (0.0, 0.0) if arm.matched is None else arm.matched.robot.repeatability
+        # A servo arm's own repeatability puts its flange so far off.
+        limits = (LIMITS.repeatability * np.sqrt(3.0) * np.array(repeats)).tolist()
+        limit_mm, limit_deg = map(max, LIMITS.arm_errors, limits)
+        if shift_mm > limit_mm or turn_deg > limit_deg:
+            return
         words = (
             f"Residuals follow the arm's posture, or last from stop to stop {likely}: a look near "
-            f"the views errs by {mm_and_deg(1e3 * shift_m, float(np.rad2deg(turn_rad)))} (rms). "
+            f"the views errs by {mm_and_deg(shift_mm, turn_deg)} (rms). "
             "More views will not help: joint angles or a kinematic calibration of the arm will."
         )
         do = NO_JOINTS

@@ -122,6 +122,8 @@ def scale_finding(
     `measured` is the scale by the robot's motion, `written` that of the result, with its total
     sigma; `own` is the session that declares it, and its name there.
     """
+    # Errors that last from stop to stop count in the total alone.
+    measured = replace(measured, sigma=max(measured.sigma, written.sigma))
     share = f"{figure(100 * measured.stated_sigma)} %"
     size = (
         f"By the robot's motion the {called} is {figure(100 * abs(written.scale))} % "
@@ -129,7 +131,7 @@ def scale_finding(
         f"{figure(100 * written.sigma)} %)"
     )
     if not measured.contradicts:
-        allowed = f"{size}. The stated size allows this (to within {share})."
+        allowed = f"{size}, which does not contradict the stated size (to within {share})."
         return Finding(NOTE, f"{allowed} The result goes by both.")
     if target.is_rig:
         words = f"{size}. The result goes by the table of its points."

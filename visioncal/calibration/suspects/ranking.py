@@ -223,7 +223,9 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -
     for name, size in budget.items():
         if size**2 < _LEAST_SHARE * total**2:
             continue
-        kind, words, do = _SOURCES[name]
+        # More than an arm errs by is not blamed on it.
+        is_of_arm = name != "arm" or size <= CalibrationLimits.arm_errors[0 if in_mm else 1]
+        kind, words, do = _SOURCES[name if is_of_arm else "left out"]
         without = ""
         if len(budget) > 1:
             rest = worst.without(name)

@@ -12,7 +12,7 @@ from visioncal.estimation.effects.random_effect import RandomEffect, Stops
 class BaseCreeps(RandomEffect):
     """A base, or a fixed target, that creeps during the session."""
 
-    kind, typical = "base_creeps", 2e-4
+    kind, typical, most = "base_creeps", 2e-4, 3e-3
     do = (
         "Fasten the base, the fixed camera and the fixed target, let the cell warm up, and record "
         "again."

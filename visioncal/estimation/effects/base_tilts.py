@@ -11,7 +11,7 @@ from visioncal.estimation.effects.random_effect import RandomEffect, Stops
 class BaseTilts(RandomEffect):
     """A base that tilts with the arm's reach: its stand, or the floor, gives way."""
 
-    kind, typical = "base_tilts", 1e-3
+    kind, typical, most = "base_tilts", 1e-3, 5e-3
     do = "Tighten the base's screws, and stiffen what it stands on, or keep to one reach."
 
     def columns(self, stops: Stops) -> FloatArray:

@@ -13,7 +13,7 @@ _LENGTH_M = 0.1
 class BracketBends(RandomEffect):
     """A bracket at the flange that bends with gravity."""
 
-    kind, typical = "bracket_bends", 1e-4
+    kind, typical, most = "bracket_bends", 1e-4, 3e-3
     do = "Stiffen the bracket, or record and work in the same attitudes."
 
     def columns(self, stops: Stops) -> FloatArray:

@@ -13,7 +13,7 @@ TIME_CONSTANTS = 3.0
 class LensGrows(RandomEffect):
     """A lens whose focal length grows with time: a camera that warms up."""
 
-    kind, typical = "lens_grows", 1e-3
+    kind, typical, most = "lens_grows", 1e-3, 1e-2
     do = "Let the camera run for half an hour before it is calibrated and used."
     is_of_sensor = True
 

@@ -39,6 +39,7 @@ class RandomEffect(ABC):
 
     kind: ClassVar[str]  # The kind of its finding, and its name in the budget.
     typical: ClassVar[float]  # Its typical size, in the unit of its values.
+    most: ClassVar[float]  # Beyond this, what else looks like it is likelier.
     do: ClassVar[str]  # Advice.
     is_of_sensor: ClassVar[bool] = False  # Whether it moves the measured poses, not the flange.
 
@@ -90,9 +91,9 @@ def find_random_effects(
         return 2.0 * (model.maximised(found.logs, low, high).value - found.value)
 
     chosen = []
-    for index, effect in enumerate(effects[: len(candidates)]):
+    for index, (kind, effect) in enumerate(candidates):
         size = float(np.exp(found.logs[first + index]))
-        if size > 10.0 * LEAST_SIGMA and level_weight(gain(index), _RARE) > 0.5:
+        if 10.0 * LEAST_SIGMA < size <= kind.most and level_weight(gain(index), _RARE) > 0.5:
             information = PriorInformation(np.eye(len(effect)) / size**2, np.zeros(len(effect)))
             chosen.append(replace(effect, prior=information))
     return tuple(chosen)
