@@ -9,10 +9,12 @@ from support.small_cells import TABLE, made, seen_at
 
 from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import invert, log
+from visioncal.core.types import Target
 from visioncal.fit.solve import solve
 from visioncal.fit.start import start_of
 from visioncal.model import Moments
 from visioncal.model.arm import even_progress
+from visioncal.vision.targets import rotation_transforms, rotations
 
 
 def with_poses(cell, poses):
@@ -96,3 +98,24 @@ def test_cameras_keep_the_order_of_their_sightings():
     # By the order in which five names are hashed, one run of 120 would keep it.
     cell = made(cameras=5).cell
     assert list(start_of(cell).lenses) == [sighting.seer for sighting in cell.sightings[:5]]
+
+
+@pytest.mark.parametrize("turned_first", [False, True])
+def test_a_symmetric_board_is_numbered_as_its_first_view(monkeypatch, turned_first):
+    """Views that a detector numbered from the other end are turned, and not the result."""
+    board = Target("board", "checkerboard", 5, 3, 0.04, 4e-6)
+    monkeypatch.setattr("support.small_cells.BOARD", board)
+    half = rotations(board)[1]
+    for seed in range(3):
+        small = made(seed, stops=12)
+        own = list(small.cell.sightings)
+        for at in [*range(0 if turned_first else 1, 12, 2)]:
+            corners = own[at].corners
+            own[at] = replace(own[at], evidence=replace(corners, ids=half[corners.ids]))
+        fit = solve(small.cell.with_sightings(own)).fit
+        assert fit.used.all()
+        first = own[0].corners.ids
+        assert np.array_equal(fit.cell.sightings[0].corners.ids, first)
+        turn = rotation_transforms(board)[1] if turned_first else np.eye(4)
+        away = log(invert(small.edges["target"] @ turn) @ fit.edge("target"))
+        assert np.linalg.norm(away) < 2e-3

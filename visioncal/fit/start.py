@@ -112,6 +112,10 @@ def start_of(cell: Cell) -> Start:
     seers = {sighting.seer for sighting in cell.sightings}
     lenses = {name: lens for name, lens in lenses.items() if name in seers}
     sightings, distances, rivals = list(cell.sightings), np.zeros(len(known)), []
+    # By which symmetry the first view of each board is turned: that one keeps its numbers.
+    firsts, stated = dict[str, int](), {name for s in sightings if s.is_stated for name in s.pair}
+    turnable = set(edges) - stated
+    numbers = {name: rotations(cell.boards[name]) for name in pictured(cell)}
     for at, (sighting, option) in enumerate(zip(cell.sightings, known, strict=True)):
         off = away(places.predicted(sighting), option.poses)
         if isinstance(sighting.evidence, MeasuredPlace):
@@ -122,12 +126,20 @@ def start_of(cell: Cell) -> Start:
         best = int(off.argmin())
         distances[at] = off[best]
         turn = int(option.turns[best])
-        if turn and isinstance(sighting.evidence, Corners):
-            board = cell.boards[sighting.seen]
-            ids = np.argsort(rotations(board)[turn])[sighting.evidence.ids]
-            sightings[at] = replace(sighting, evidence=replace(sighting.evidence, ids=ids))
+        if isinstance(sighting.evidence, Corners):
+            orders = numbers[sighting.seen]
+            first = firsts.setdefault(sighting.seen, turn if sighting.seen in turnable else 0)
+            # Turns are powers of one, and candidates come in blocks of all of them.
+            turn, was = (turn - first) % len(orders), turn
+            best += turn - was
+            if turn:
+                ids = np.argsort(orders[turn])[sighting.evidence.ids]
+                sightings[at] = replace(sighting, evidence=replace(sighting.evidence, ids=ids))
         others = np.flatnonzero((option.turns == turn) & (np.arange(len(off)) != best))
         rivals.append(option.poses[[best, *others]])
+    for name, first in firsts.items():
+        if first:
+            edges[name] = edges[name] @ invert(rotation_transforms(cell.boards[name])[first])
     return Start(cell.with_sightings(sightings), lenses, edges, distances, tuple(rivals), sound)
 
 
@@ -247,6 +259,7 @@ def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:
 def candidates(cell: Cell, lenses: Mapping[str, Camera]) -> list[Candidates | None]:
     """Both poses of each flat board, in all turns of a symmetric one; None where it has none."""
     found, planes = list[Candidates | None](), on_planes(cell, lenses)
+    turns = {name: rotation_transforms(cell.boards[name]) for name in pictured(cell)}
     option: Candidates | None
     once = np.zeros(1, dtype=np.int64)
     for at, sighting in enumerate(cell.sightings):
@@ -256,16 +269,21 @@ def candidates(cell: Cell, lenses: Mapping[str, Camera]) -> list[Candidates | No
         elif isinstance(evidence, MeasuredPlace):
             option = Candidates(compose(np.eye(3), evidence.place_m)[None], once)
         elif at in planes:
-            board = cell.boards[sighting.seen]
-            option = _of_corners(lenses[sighting.seer], board, evidence, planes[at])
+            board, own = cell.boards[sighting.seen], turns[sighting.seen]
+            option = _of_corners(lenses[sighting.seer], board, own, evidence, planes[at])
         else:
             option = None
         found.append(option)
     return found
 
 
+def pictured(cell: Cell) -> set[str]:
+    """Boards that are in images."""
+    return {sighting.seen for sighting in cell.sightings if sighting.corners is not None}
+
+
 def _of_corners(
-    lens: Camera, board: Target, corners: Corners, plane: FloatArray
+    lens: Camera, board: Target, symmetries: FloatArray, corners: Corners, plane: FloatArray
 ) -> Candidates | None:
     px, points = corners.px, corner_positions(board)[corners.ids]
     poses = closed_form_poses(points, plane)
@@ -273,7 +291,6 @@ def _of_corners(
     if not np.isfinite(off).any():
         return None
     alike = poses[off < _ALIKE * np.nanmin(off) + _ALIKE_PX]
-    symmetries = rotation_transforms(board)
     numbers = np.tile(np.arange(len(symmetries)), len(alike))
     return Candidates((alike[:, None] @ symmetries).reshape(-1, 4, 4), numbers)
 
