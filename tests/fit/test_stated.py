@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.small_cells import PX, TABLE, made, pose
+from support.whole_cells import OPTIONS, recorded
 from test_measured import is_fair
 
 from visioncal.core.errors import DataError
@@ -13,7 +14,7 @@ from visioncal.estimation.tree import Branch, Tree
 from visioncal.fit.solve import solve
 from visioncal.model import MeasuredPlace, MeasuredPose, Sighting, read_cell
 from visioncal.model.sightings import is_copy
-from visioncal.simulation import instrument_session
+from visioncal.simulation import instrument_session, simulate
 from visioncal.simulation.instrument_session import InstrumentOptions, session_of
 
 
@@ -80,6 +81,22 @@ def test_a_camera_that_no_robot_passes_is_placed_by_a_prior_alone():
     covariance = fit.covariance(("edge", "target"))
     assert np.sqrt(np.diag(covariance)) == pytest.approx(np.repeat([2e-3, 1e-3], 3), rel=0.05)
     assert np.trace(fit.covariance(("edge", "cam"))[3:, 3:]) > np.trace(covariance[3:, 3:])
+
+
+def test_a_height_that_is_stated_of_a_base_leaves_its_turn_free():
+    made_cell = simulate(OPTIONS)
+    session = recorded(made_cell)
+    cell = read_cell(session, session.corners)
+    away = made_cell.between("base_a", "base_b")
+    gauge = MeasuredPlace(away[2, 3] * np.eye(3)[2], 5e-4, (2,))
+    known = cell.with_sightings([*cell.sightings, Sighting(-1, 0, "base_a", "base_b", gauge)])
+    found, before = (solve(one).fit for one in (known, cell))
+    assert found.used[-1]
+    own, without = (fit.covariance(("edge", "base_b")) for fit in (found, before))
+    # It adds to what is known, and holds nothing.
+    assert np.diag(own)[:3] == pytest.approx(np.diag(without)[:3], rel=0.5)
+    turn = log(invert(away) @ found.edge("base_b"))
+    assert turn @ np.linalg.solve(own, turn) < 27.9  # one in ten thousand, of six
 
 
 def test_tables_become_sightings_of_one_component_each():

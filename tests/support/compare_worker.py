@@ -63,7 +63,7 @@ def main():
     if "--core" in sys.argv:
         from support import core_worker
 
-        jobs |= {"command": core_worker.command, "located": core_worker.located}
+        jobs |= {name: getattr(core_worker, name) for name in jobs}
     for line in asked:
         job, begun = json.loads(line), used_s()
         try:

@@ -4,6 +4,7 @@ It knows no verdict: each result is `good`. Fits stay in this process, by the fo
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,13 +41,15 @@ def fitted(path, out):
     solved = solve(read_cell(session, corners, sweeps))
     fit = solved.fit
     SOLVED[str(out / "calibration.json")] = fit
-    names = {}
-    for frame in fit.cell.unknown:
-        parent = fit.cell.tree.branches[frame].parent
-        if parent == "cell" and len(fit.cell.arms) == 1:
-            parent = next(fit.cell.tree.branches[arm].parent for arm in fit.cell.arms)
-        names[frame] = f"{parent}_from_{frame}"
+    tree = fit.cell.tree
+    reference = next((name for name in tree.branches if tree.branches[name].known is not None), "")
+    parents = {frame: tree.branches[frame].parent for frame in fit.cell.unknown}
+    names = {
+        frame: f"{reference if parent == 'cell' else parent}_from_{frame}"
+        for frame, parent in parents.items()
+    }
     document = {
+        "reference": reference,
         "transforms": {name: {"matrix": fit.edge(at).tolist()} for at, name in names.items()},
         "joint_covariance": {
             "order": [*names.values()],
@@ -138,6 +141,32 @@ def located(calibration, looks):
                 total += sigma**2 * np.outer(slope, slope)
         found.append([centre.tolist(), total.tolist()])
     return {"status": 0, "out": found}
+
+
+def arm(calibration, q, temperatures_c=None):
+    """(m, 4, 4) poses of the only arm, at joint angles and, if given, temperatures."""
+    from visioncal.fit.linearise import predicted
+    from visioncal.model import Moments
+
+    fit, q = SOLVED[calibration], np.array(q)
+    ((flange, one),) = fit.cell.arms.items()
+    heats = [effect for effect in fit.unknowns.effects if effect.kind == "heat"]
+    if temperatures_c is not None and not heats:
+        return {"status": 0, "out": "no drift"}
+    poses, stops = {flange: one.model.base_from_flange(q)}, np.full(len(q), -1)
+    base = fit.cell.tree.branches[flange].parent
+    path, moments = (
+        fit.cell.tree.path(base, flange),
+        Moments(poses, {flange: q}, 0.0 * stops, stops),
+    )
+    cold = replace(
+        fit.unknowns, effects=tuple(at for at in fit.unknowns.effects if at not in heats)
+    )
+    found = predicted(fit.cell, cold, fit.state, path, moments, {}).poses
+    for heat in heats if temperatures_c is not None else ():
+        values = fit.state.values["effect", heat.name]
+        found = found @ heat.arm(values).motion(q, np.array(temperatures_c))
+    return {"status": 0, "out": found.tolist()}
 
 
 def place(fit, camera, values, look):

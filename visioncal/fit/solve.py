@@ -219,7 +219,8 @@ def _is_of_board(sighting: Sighting) -> bool:
 def _points(cell: Cell) -> set[str]:
     """Frames of which places alone are seen, or the touch of another one at their own."""
     points, frames = set[str](), set[str]()
-    for sighting in cell.sightings:
+    # What is stated of frames makes none a point.
+    for sighting in (one for one in cell.sightings if not one.is_stated):
         place = sighting.evidence
         if isinstance(place, MeasuredPlace):
             points.add(sighting.seen)
