@@ -2,7 +2,7 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -127,7 +127,8 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
     alike: dict[tuple[str, str], list[Path]] = defaultdict(list)
     for file in islice(_walked(source, _DEPTH), _MOST_FILES):
         path = file.relative_to(source)
-        alike[re.sub(r"[0-9]+", "#", _stem(path)), path.suffix.lower()].append(file)
+        stem = re.sub(r"[0-9]+", "#", path.with_suffix("").as_posix())
+        alike[stem, path.suffix.lower()].append(file)
     groups, single = list[FileGroup](), list[Path]()
     for (_, ending), files in alike.items():
         for group in _series(source, files, ending):
@@ -144,7 +145,8 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
     for file in single:
         if file in grouped:
             continue
-        is_named = is_image_name(file.name) or _has_any(file.stem, stems)
+        is_named = is_image_name(file.name) or file.stem in stems
+        is_named = is_named or any(each in file.stem for each in stems if len(each) > 1)
         label = f"*{file.suffix.lower()}" if is_named else file.name
         kinds[file.parent.relative_to(source), label].append(file)
     for (folder, label), files in kinds.items():
@@ -165,14 +167,6 @@ def _in_folders(source: Path, single: Sequence[Path]) -> Iterator[FileGroup]:
             yield FileGroup(label, tuple(sorted(files, key=natural)))
 
 
-def _has_any(stem: str, stems: Collection[str]) -> bool:
-    return stem in stems or any(each in stem for each in stems if len(each) > 1)
-
-
-def _stem(path: Path) -> str:
-    return path.with_suffix("").as_posix()
-
-
 def _in_order(path: Path) -> tuple[object, ...]:
     return natural(Path(path.as_posix().replace("/", "|")))
 
@@ -180,7 +174,8 @@ def _in_order(path: Path) -> tuple[object, ...]:
 def _series(source: Path, files: Sequence[Path], ending: str) -> Iterator[FileGroup]:
     """Files that differ in numbers alone, in series of their own where the last ones are alike."""
     files = sorted(files, key=_in_order)
-    runs = [re.split(r"([0-9]+)", _stem(file.relative_to(source))) for file in files]
+    stems = (file.relative_to(source).with_suffix("").as_posix() for file in files)
+    runs = [re.split(r"([0-9]+)", stem) for stem in stems]
     differing = [at for at in range(1, len(runs[0]), 2) if len({run[at] for run in runs}) > 1]
     label = "".join("#" if at in differing else part for at, part in enumerate(runs[0])) + ending
     numbered = (tuple(int(run[at][:18]) for run in runs) for at in reversed(differing))
@@ -366,6 +361,7 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     hint = "; --image-column names a column that names each row's image" * (how == HOW[-1])
     notes = [f"Rows and images are paired by {how}: {ends}{hint}."]
     left = [group.listed() for group in groups if group is not chosen]
+    left += [file.name for file in sorted({*chosen.files}.difference(images), key=natural)]
     if depth is not None:
         left.remove(depth[0].listed())
         notes.append(
@@ -395,11 +391,9 @@ def _orders(
         "in the order of their names as texts": tuple(sorted(files, key=str)),
         "in reverse order": files[::-1],
     }
-    for by in () if others else (1, -1):
-        rows = match.rows + by
-        rows[(match.rows < 0) | (rows >= len(chosen.files))] = -1
-        orders[f"one {'later' if by > 0 else 'earlier'}"] = chosen.taken(rows)
-    for rows in (other.rows for other in others):
+    moved = ((match.rows + by, match.rows) for by in (1, -1))
+    one_off = (np.where((old < 0) | (rows >= len(chosen.files)), -1, rows) for rows, old in moved)
+    for rows in [other.rows for other in others] or one_off:
         at = int(np.argmax(rows >= 0))
         words = f"from {chosen.files[rows[at]].name} with {fields.places[at]} on"
         orders[words] = chosen.taken(rows)
@@ -408,15 +402,14 @@ def _orders(
 
 def _unpaired(fields: Fields, group: FileGroup) -> DataError:
     """The error where nothing says which image is a row's."""
-    folder, first, last = group.files[0].parent, group.files[0].name, group.files[-1].name
-    word = named_by(fields.places[0]).rstrip("s")
+    first, last = group.files[0], group.files[-1]
     return DataError(
-        f"{folder} has {counted(len(group.files), 'image')} ({first} ... {last}), but there are "
-        f"{len(fields)} poses ({fields.places[0]} ... {fields.places[-1]}), and neither names nor "
-        "numbers say which belong together.",
-        culprits=[str(folder)],
-        next_step=f"Write each pose's image beside it, and name that with --image-{word}, or "
-        "remove what is over, wherever it is.",
+        f"{first.parent} has {counted(len(group.files), 'image')} ({first.name} ... {last.name}), "
+        f"but there are {len(fields)} poses ({fields.places[0]} ... {fields.places[-1]}), and "
+        "neither names nor numbers say which belong together.",
+        culprits=[str(first.parent)],
+        next_step="Write each pose's image beside it, and name that with --image-"
+        f"{named_by(fields.places[0]).rstrip('s')}, or remove what is over, wherever it is.",
     )
 
 
@@ -427,8 +420,8 @@ def _in_step(fields: Fields, group: FileGroup) -> Iterator[Match]:
     """
     place = {number: at for at, number in enumerate(group.numbers)}
     for own in (*fields.keys.found[HOW[1]].values(), range(1, len(fields) + 1)):
-        numbers = [number for number in own if isinstance(number, int)]
-        fewer, more = sorted(({*numbers}, {*place}), key=len)
+        numbers = {number for number in own if isinstance(number, int)}
+        fewer, more = sorted((numbers, {*place}), key=len)
         if not 2 < len(fewer) <= len(more) < 2 * len(fewer):
             continue
         first, last, sign = min(fewer), max(fewer), 1 if len(numbers) <= len(place) else -1

@@ -167,7 +167,9 @@ def _without_names(
     for first, second in combinations(places, 2):
         if first.parent == second.parent and len(first.names) == 1 == len(second.names):
             # The position comes first, unless the names say otherwise.
-            names = sorted((*first.names, *second.names), key=_is_rotation_name)
+            names = sorted(
+                (*first.names, *second.names), key=lambda name: bool(_ROTATION_NAME.search(name))
+            )
             yield PoseFields((*names,), (*first.words, *second.words), is_named=False)
     if is_headerless(fields):
         found = _in_sequence(next(iter(column_groups(fields).values()), ()), fields)
@@ -349,10 +351,6 @@ _ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
 
 
-def _is_rotation_name(name: str) -> bool:
-    return _ROTATION_NAME.search(name) is not None
-
-
 def columns_named(fields: Fields, wanted: Sequence[str]) -> tuple[str, ...]:
     """The columns of these names, in any case, with a unit or words before; empty without."""
     groups = {k: group for k, group in _by_prefix(fields, ()).items() if {*wanted} <= group.keys()}
@@ -436,7 +434,7 @@ def _split(
     if len(blocks) == 2:
         rotation_first = sizes[1] == 3
         if sizes[0] == sizes[1]:
-            rotation_first = _is_rotation_name(names[0])
+            rotation_first = _ROTATION_NAME.search(names[0]) is not None
         positions, rotations = blocks[::-1] if rotation_first else blocks
         of_rotation = (names[0] if rotation_first else names[1],)
     if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:

@@ -51,22 +51,20 @@ def _numbers_in(line: str) -> tuple[str, list[float]]:
 
 
 def _stops(lines: _Lines) -> list[_Lines]:
-    """The lines of a log, those of each picture by themselves; all where none are named.
+    """The lines of a log by its pictures, or else by its lines of words.
 
-    Where the first picture has as many numbers above it as usual, each ends the lines that are its
-    own; else each begins them.
+    These end their lines where the first has as many numbers above it as usual; else begin them.
     """
-    named = [_IMAGE.search(line) is not None for _, line in lines]
-    counts = [6 if is_marked_pose(line) else len(_numbers_in(line)[1]) for _, line in lines]
-    above = sum(counts[: named.index(True)]) if any(named) else 0
-    ends = 2 * above * sum(named) > sum(counts)
-    begins, has_image, has_numbers = [0], False, False
-    for at, (is_image, count) in enumerate(zip(named, counts, strict=True)):
-        if (count and has_image) if ends else (is_image and has_numbers):
-            begins.append(at)
-            has_image = has_numbers = False
-        has_image, has_numbers = has_image or is_image, has_numbers or count > 0
-    return [lines[at:end] for at, end in pairwise([*begins, len(lines)])]
+    sizes = (6 if is_marked_pose(line) else len(_numbers_in(line)[1]) for _, line in lines)
+    counts = np.array([*sizes], dtype=int)
+    marks = np.array([_IMAGE.search(line) is not None for _, line in lines], dtype=bool)
+    marks = marks if marks.any() else counts == 0
+    events = np.flatnonzero(marks | (counts > 0))
+    steps = np.diff(marks[events].astype(int), prepend=0)
+    tops, below = events[steps > 0], events[steps < 0]
+    ends = 2 * counts[: min(tops, default=0)].sum() * len(tops) > counts.sum()
+    begins = {0, *(below if ends else tops).tolist(), len(lines)}
+    return [lines[at:end] for at, end in pairwise(sorted(begins))]
 
 
 def _pictured(stop: _Lines) -> str:
@@ -76,13 +74,8 @@ def _pictured(stop: _Lines) -> str:
 
 def _blocks(lines: _Lines, path: Path) -> Fields | None:
     """Rows of several lines each, of a picture or below a line of words; None where none are."""
-    stops = _stops(lines)
-    if not any(map(_pictured, stops)):
-        has = [bool(_numbers_in(line)[1]) for _, line in lines]
-        begins = [at for at, own in enumerate(has) if not own and (at == 0 or has[at - 1])]
-        stops = [lines[at:end] for at, end in pairwise([*begins, len(lines)])]
-    records, places = list[dict[str, object]](), [stop[0][0] for stop in stops]
-    for stop in stops:
+    records, places = list[dict[str, object]](), list[str]()
+    for stop in _stops(lines):
         arrays, title = defaultdict[str, list[float]](list), ""
         for name, numbers, line in ((*_numbers_in(line), line) for _, line in stop):
             arrays[name] += numbers
@@ -90,6 +83,7 @@ def _blocks(lines: _Lines, path: Path) -> Fields | None:
         image = _pictured(stop)
         records.append({"image": image} if image else {"title": title})
         records[-1] |= {name: np.array(row) for name, row in arrays.items() if row}
+        places.append(stop[0][0])
     fields = fields_of_records(records, places, path.stem, path.parent)
     return fields if len(records) > 2 and fields.numbers else None
 
@@ -105,21 +99,17 @@ def _placed(text: str, path: Path, comments: tuple[str, ...] = ()) -> _Lines:
 
 def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
     """Reads 4 x 4 matrices stacked below each other, or side by side in four rows."""
-    height, width = len(table.rows), len(table.columns)
-    count = height * width // 16
-    if table.has_header or count < 2 or 4 not in (height, width) or (height + width) % 4:
+    sides = height, width = len(table.rows), len(table.columns)
+    if table.has_header or 4 not in sides or max(sides) < 8 or max(sides) % 4:
         return None
     if not all(is_number(name) for row in table.rows for name in row):
         return None
-    numbers = np.array(table.rows, dtype=float)
-    matrices = (
-        numbers.reshape(4, count, 4).swapaxes(0, 1) if height == 4 else numbers.reshape(-1, 4, 4)
-    )
+    numbers = np.array(table.rows, dtype=float).reshape(height, width // 4, 4)
+    matrices = numbers.swapaxes(0, 1).reshape(-1, 4, 4)
     if not (matrices[:, 3] == [0, 0, 0, 1]).all():
         return None
-    places = tuple(f"{table.label}, matrix {at}" for at in range(1, count + 1))
-    rows = {"matrix": matrices.reshape(count, 16)}
-    return Fields(path.stem, path.parent, places, rows)
+    places = tuple(f"{table.label}, matrix {at}" for at in range(1, len(matrices) + 1))
+    return Fields(path.stem, path.parent, places, {"matrix": matrices.reshape(-1, 16)})
 
 
 # Names of numbers in a mapping that are one array.
@@ -266,11 +256,10 @@ def _halcon(text: str, path: Path) -> dict[str, object]:
         needed = "0 to 5 or 8 to 13, and 3 each, are needed"
         raise DataError(f"{path}: {fault}; {needed}.", culprits=[str(path)])
     turns = -turns if code[0] % 2 else turns
-    rotation = (
-        Rotation.from_quat([*turns, 1.0])
-        if kind == 4
-        else Rotation.from_euler("xyz" if kind == 2 else "XYZ", turns, degrees=True)
-    )
+    order = {0: "XYZ", 2: "xyz"}.get(kind)
+    # A vector of the tangent is a quaternion but for its length.
+    vector = Rotation.from_quat([*turns, 1.0])
+    rotation = Rotation.from_euler(order, turns, degrees=True) if order else vector
     place = rotation.apply(-place) if code[0] >= 8 else place
     return dict(pose_row(compose(rotation.as_matrix(), place)))
 

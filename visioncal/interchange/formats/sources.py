@@ -254,15 +254,11 @@ def _joined(source: Source) -> list[Fields]:
             fields
             for part in source.parts
             for fields in part.rows
-            if not part.lenses or len(part.group.files) > 1 or _holds(fields)
+            if not part.lenses or len(part.group.files) > 1 or possible_poses(fields)
         ],
         source.path.resolve().name,
         source.path,
         prefixed=True,
     )
     named = [replace(f, name=source.path.resolve().name) if f.stems else f for f in found]
-    return [fields for fields in named if _holds(fields)] or named
-
-
-def _holds(fields: Fields) -> bool:
-    return bool(possible_poses(fields))
+    return [fields for fields in named if possible_poses(fields)] or named
