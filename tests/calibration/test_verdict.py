@@ -11,6 +11,7 @@ from scipy.special import chdtrc
 from support.cells import calibrated, pairs_session, reporting, showing
 from support.sound_findings import SOUND, changed, directions, views
 
+from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.calibration.pipeline.judging import findings_of
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
@@ -254,6 +255,28 @@ def session_of(cell: SimulatedCell, base_from_flange: np.ndarray) -> Session:
         mount=cell.options.mount,
         camera=cell.stated[""],
     )
+
+
+@pytest.mark.parametrize(
+    ("step_mm", "step_deg", "words"),
+    [
+        (1.0, 0.0, "their positions to 1 mm:"),
+        (1.0, 1.0, "their positions to 1 mm and angles to 1 deg:"),
+        (0.1, 0.0, ""),
+    ],
+)
+def test_poses_with_too_few_digits_are_the_cause(step_mm, step_deg, words) -> None:
+    cell = simulate(CellOptions(views=20))
+    flanges = cell.robot.base_from_flange.copy()
+    flanges[:, :3, 3] = np.round(flanges[:, :3, 3] * 1e3 / step_mm) * step_mm * 1e-3
+    if step_deg:
+        angles = Rotation.from_matrix(flanges[:, :3, :3]).as_euler("ZYX", degrees=True)
+        flanges[:, :3, :3] = Rotation.from_euler("ZYX", angles.round(), degrees=True).as_matrix()
+    session = session_of(cell, flanges)
+    verdict = calibrate(session).verdict
+    assert (ids(verdict)[:1] == ["rounded_poses"]) == bool(words)
+    assert words in verdict.top[0]
+    assert ("rounded_poses" in [found.kind for found in doctor(session).findings]) == bool(words)
 
 
 def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():

@@ -18,6 +18,7 @@ from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards, with_undone
+from visioncal.calibration.suspects.rounded_poses import rounded
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
@@ -176,7 +177,10 @@ def _motion(run: RunState) -> Iterator[Finding]:
     repeats_mm, _ = REPEATABILITY if run.robot is None else run.robot.repeatability
     rad, metres = inliers.fit.noise.robots[0].tolist()
     limits = CalibrationLimits()
-    if 1e3 * metres > max(limits.sigma_mm[0], limits.repeatability * repeats_mm):
+    too_few_digits = rounded(run, next(iter(run.session.robots)), 1e3 * metres, np.rad2deg(rad))
+    if too_few_digits is not None:
+        yield too_few_digits
+    elif 1e3 * metres > max(limits.sigma_mm[0], limits.repeatability * repeats_mm):
         yield Finding(
             "scatter",
             f"The views disagree by {mm_and_deg(1e3 * metres, np.rad2deg(rad))} from stop to stop, "

@@ -14,6 +14,7 @@ from visioncal.calibration.suspects import (
     lens,
     mirrored_cell,
     misread_poses,
+    rounded_poses,
     steps,
 )
 from visioncal.calibration.suspects.outliers import moved_finding
@@ -86,6 +87,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     board.PRINT,
     *growing.GROWING,
     mirrored_cell.MIRRORED_CELL,
+    rounded_poses.ROUNDED_POSES,
     Suspect("carried_away", is_doubt=False),
     Suspect("untied", _unconnected, FACT),
     Suspect("unseen_target"),

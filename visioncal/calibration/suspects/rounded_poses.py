@@ -1,0 +1,92 @@
+"""Poses that were written with too few digits, as by hand from a controller's display."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.cell import robot_key
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
+from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS
+from visioncal.core.limits import CLEAR_RATIO
+from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.types import FloatArray
+from visioncal.core.verdict import Finding, Remedy
+from visioncal.robot.model import REPEATABILITY
+from visioncal.session.columns import POSE
+
+# Share of a rounding's standard deviation that residuals show at least: commanded poses may be
+# round numbers, and exact.
+_SHOWN = 0.7
+
+
+def _found(run: RunState) -> Iterator[Finding]:
+    robots, fit = run.session.robots, run.assessment.fit
+    for name in robots:
+        if (key := robot_key(name)) in fit.robots:
+            rad, metres = fit.noise.robots[fit.robots.index(key)].tolist()
+            found = rounded(run, name, 1e3 * metres, float(np.rad2deg(rad)))
+            if found is not None:
+                yield found.of(f"Robot {name}" if len(robots) > 1 else "")
+
+
+def rounded(run: RunState, robot: str, noise_mm: float, noise_deg: float) -> Finding | None:
+    """The finding that a robot's poses are rounded, which explains a noise of its flange."""
+    rows = [seen.robots[robot] for seen in run.timed.observations if robot in seen.robots]
+    poses = np.array([[row.numbers.get(key, np.nan) for key in POSE] for row in rows])
+    poses = poses[np.isfinite(poses).all(axis=1)]
+    if not len(poses):
+        return None
+    step_mm, (step_deg, form) = _step(1e3 * poses[:, :3]), _angle_step(poses[:, 3:])
+    sigmas, noise = np.array([step_mm, step_deg]) / np.sqrt(12.0), np.array([noise_mm, noise_deg])
+    counts = (np.array(REPEATABILITY) < sigmas) & (sigmas < noise / _SHOWN)
+    counts &= noise < CLEAR_RATIO * sigmas
+    if not counts.any():
+        return None
+    words = (f"positions to {figure(step_mm)} mm", f"{form} to {figure(step_deg)} deg")
+    parts = " and ".join(part for part, is_so in zip(words, counts, strict=True) if is_so)
+    return Finding(
+        "rounded_poses",
+        f"The robot's poses are rounded, their {parts}: this alone puts the flange off by "
+        f"{mm_and_deg(*sigmas.tolist())} an axis from stop to stop (the fit finds "
+        f"{mm_and_deg(noise_mm, noise_deg)}).",
+        Remedy(
+            "Read the poses from the controller's interface, not from its display, with 0.01 mm "
+            "and 0.001 deg, and record again."
+        ),
+        until_mm=0.0,
+    )
+
+
+def _step(numbers: FloatArray) -> float:
+    """The largest of 10, 1 and 0.1 and their halves of which all numbers are multiples, or zero."""
+    for step in (10.0, 5.0, 1.0, 0.5, 0.1):
+        shares = numbers / step
+        # Digits of a table in metres and of quaternions.
+        if np.abs(shares - np.round(shares)).max(initial=0.0) * step < 2e-4:
+            return step
+    return 0.0
+
+
+def _angle_step(quaternions: FloatArray) -> tuple[float, str]:
+    """The same of angles [deg] as makers write them, and how these are called."""
+    rotations = ROTATION_FORMS["quaternion-xyzw"].read(quaternions)
+    names = {
+        form.rotation.split("-")[1] for form in POSE_FORMS.values() if "euler" in form.rotation
+    }
+    for name in sorted(names):
+        angles = ROTATION_FORMS[f"euler-{name}-deg"].write(rotations)
+        if step := _step(angles):
+            return step, "angles"
+    step = _step(ROTATION_FORMS["rotation-vector-deg"].write(rotations))
+    return step, "rotation vectors"
+
+
+ROUNDED_POSES = Suspect(
+    "rounded_poses",
+    _found,
+    1e-6,
+    of_chain=True,
+    hides=(UNEXPLAINED,),
+    inflates=("robot_noise", "robot_noise_of_pick", ARM_ERRORS),
+)
