@@ -322,6 +322,23 @@ def test_a_fisheye_camera_goes_the_whole_way():
     assert np.mean(surprises) < 2.13
 
 
+LENS_FREE = CellOptions(state_intrinsics=False, seed=3)
+
+
+def test_a_fisheye_lens_that_is_taken_for_another_is_named():
+    wide = known_of(simulate(replace(LENS_FREE, camera=CAMERAS["fisheye"])))
+    document = wide.session.document
+    camera = {**document["camera"], "model": "brown"}
+    session = replace(wide.session, document={**document, "camera": camera})
+    verdict = calibrate(session, corners=wide.corners).verdict
+    assert verdict.causes[0].kind == "lens_model"
+    assert 'write model = "fisheye"' in verdict.causes[0].do.words
+    assert "lens_field" not in {found.kind for found in verdict.findings if found.probability}
+    narrow = known_of(simulate(LENS_FREE))
+    verdict = calibrate(narrow.session, corners=narrow.corners).verdict
+    assert "lens_model" not in {found.kind for found in verdict.findings}
+
+
 def test_boards_have_names_and_a_common_covariance_that_holds():
     cell = simulate(replace(TWO, seed=3))
     known = calibrated(cell)

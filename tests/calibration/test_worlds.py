@@ -16,7 +16,7 @@ from support.marks import slow
 from support.misfits import misfit
 
 from visioncal.calibration.run import calibrate
-from visioncal.core.transforms import exp, invert
+from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.results import Calibration
 from visioncal.simulation import CAMERAS, CellOptions, SimulatedCell, cell_session, simulate
@@ -48,6 +48,16 @@ def time_of(cell):
 
 TILT_RAD_M, CREEP_M = np.array([1.2e-3, -0.9e-3]), np.array([2e-4, -1e-4, 3e-4])
 BEND_M = np.array([[4e-4, 0.0, 0.0], [0.0, -4e-4, 0.0], [0.0, 2e-4, 4e-4]])
+
+
+def short(cell):
+    """Poses that were commanded: a two-hundredth of each motion is not reached."""
+    sent, there = cell.robot.base_from_flange, [cell.robot.base_from_flange[0]]
+    for pose in sent[1:]:
+        there.append(pose @ exp(5e-3 * log(invert(pose) @ there[-1])))
+    # What the camera sees is where the arm stands; what is logged is where it was sent.
+    left = log(invert(np.array(there)) @ sent)
+    return reporting(cell, base_from_flange=cell.robot.base_from_flange @ exp(left))
 
 
 def tilted(cell):
@@ -392,6 +402,7 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
         (crept, "base_creeps", np.pad(CREEP_M, (3, 0))),
         (bent_bracket, "bracket_bends", None),
         (warmed, "lens_grows", np.array([1.5e-3])),
+        (short, "stops_short", None),
     ],
 )
 def test_what_grows_is_named_recovered_and_in_the_budget(change, kind, true):

@@ -7,7 +7,9 @@ import numpy as np
 
 from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
+from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
@@ -23,6 +25,8 @@ from visioncal.vision.camera import intrinsics, normalise, project
 
 # Changes of intrinsics or corners below this show in no image [px].
 _LEAST_MOVE_PX = 0.1
+# Another model of a lens leaves so much less: more than an even field does.
+_BETTER = 1.1
 _NEW_LENS = Remedy(
     "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
     "the camera anew.",
@@ -132,6 +136,9 @@ def _beyond(run: RunState) -> Iterator[Finding]:
         field, *changes = levels.gains
         of = "The lens" if len(fit.sigmas_px) == 1 else f"The lens of {name}"
         if field > SIGNIFICANT:
+            if (model := _of_fisheye(run, name, of)) is not None:
+                yield replace(model, mahalanobis_sq=field)
+                continue
             optics, field_px = fit.linearised.camera_parameters, levels.field * noise_px
             focal_px = float(np.mean(optics.camera(name).matrix[:2]))
             yield Finding(
@@ -162,8 +169,35 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             )
 
 
+def _of_fisheye(run: RunState, name: str, of: str) -> Finding | None:
+    """The finding that an estimated lens is a fisheye lens; None where that fits no better."""
+    look = run.cameras.get(name)
+    if look is None or look.resolution is None or look.lens is None:
+        return None
+    if not look.lens.estimated or look.table.model == "fisheye":
+        return None
+    corners = {view: px for view, px in look.corners.items() if view in run.used}
+    targets = tuple(run.session.boards.values())
+    try:
+        taken_px, fisheye_px = (
+            estimate_intrinsics(corners, targets, look.resolution, model).sigma_px
+            for model in (look.table.model, "fisheye")
+        )
+    except VisioncalError:
+        return None
+    if fisheye_px * _BETTER > taken_px:
+        return None
+    return Finding(
+        "lens_model",
+        f"{of} is of another model: as a fisheye lens it leaves corners {figure(fisheye_px)} px "
+        f"from any pose of the board, and {figure(taken_px)} px as the model {look.table.model}.",
+        Remedy('In session.toml, write model = "fisheye" in [camera].', CALIBRATE),
+    )
+
+
 # A held lens that the corners contradict looks like a board of another size or shape, and, by the
 # views' postures, like arm errors; the lens is tested beside all three.
 LENS = Suspect("lens", _stated, 1e-4, True, ("board_size", "board_shape", ARM_ERRORS))
 FIELD = Suspect("lens_field", _beyond, 1e-4, True)
 FOCUS = Suspect("focus", None, 1e-4, True)
+MODEL = Suspect("lens_model", None, 1e-4, True, hides=("lens_field", "focus"))

@@ -9,10 +9,12 @@ from visioncal.estimation.effects.base_tilts import BaseTilts
 from visioncal.estimation.effects.bracket_bends import BracketBends
 from visioncal.estimation.effects.lens_grows import LensGrows
 from visioncal.estimation.effects.random_effect import RandomEffect
+from visioncal.estimation.effects.stops_short import StopsShort
 
 RANDOM_EFFECTS: tuple[RandomEffect, ...] = (
     BaseTilts(),
     BaseCreeps(),
     BracketBends(),
     LensGrows(),
+    StopsShort(),
 )
