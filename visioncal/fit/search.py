@@ -20,6 +20,10 @@ from visioncal.model import Cell
 _SUSPECT = 0.4
 # Most linearisations; a step under this share of every sigma is negligible.
 _ROUNDS, _SETTLED = 8, 0.02
+# What a step leaves, over itself and the most that anything turns by it.
+_SECOND = 3.0
+# Change of a size's logarithm from which it is asked again whether chance explains it.
+_MOVED = 0.2
 # Rounds in which sightings come back while the noise is scaled by what most have: the nearest half
 # has less noise than all.
 _SCALED, _WIDENED = 4, 6
@@ -61,14 +65,13 @@ class Search:
             used: (n,) first guess of the sightings that agree.
             known: A fit with other unknowns, whose sizes are the first ones.
         """
-        fit, left_out = self._agreeing(self._sized(state, used & self.sound, known))
+        before = used & self.sound
+        fit, left_out = self._agreeing(self._sized(state, before, known))
         for _ in range(_ROUNDS):
+            if np.array_equal(before, fit.used) and _is_settled(fit):
+                break
             before = fit.used
             fit, left_out = self._agreeing(self._sized(fit.state, before, fit))
-            sigmas = np.sqrt(np.diag(fit.estimate.covariance))
-            is_settled = bool(np.all(np.abs(fit.estimate.values) < _SETTLED * sigmas))
-            if is_settled and np.array_equal(before, fit.used):
-                break
         return fit, left_out
 
     def with_all(self, fit: Fit) -> Fit:
@@ -104,6 +107,11 @@ class Search:
                 begin[at] = np.clip(np.log(value), low[at] + 2.0, high[at])
         found = most_likely(mixed, begin, low, high)
         random = {size for size, *_ in unknowns.priors() if size >= 0}
+        if is_again:
+            # Of a size that stays as it was, the last linearisation told.
+            moved = np.abs(found.estimate.logs - begin) > _MOVED
+            is_open = (high > low) & (found.estimate.logs > low)
+            random -= set(np.flatnonzero(is_open & ~moved).tolist())
         found, more = significant(mixed, found, starts, low, high, sorted(random))
         names = {unknowns.sizes[size].name for size in more}
         return self._fit(
@@ -157,6 +165,22 @@ class Search:
         low, high = fit.unknowns.bounds()
         found = most_likely(mixed, np.clip(fit.estimate.logs, low, high), low, high)
         return self._fit(fit.linearised, fit.grams, used, fit.unknowns, mixed, found)
+
+
+def _is_settled(fit: Fit) -> bool:
+    """Whether one more step would be a small share of every sigma.
+
+    What a step leaves is of second order: as much of it as frames turn, and lenses zoom, by it.
+    """
+    steps, kept = fit.estimate.values, fit.unknowns
+    turns = [np.abs(steps[kept.columns("edge", name)]) for name in fit.cell.unknown]
+    turns += [np.abs(errors).ravel() for errors in fit.errors.values()]
+    for name, lens in kept.lenses.items():
+        at = kept.columns("lens", name)[:2]
+        turns.append(np.abs(steps[at] * kept.units[at]) / float(lens.matrix[0]))
+    most = float(np.concatenate([np.zeros(1), *turns]).max())
+    sigmas = np.sqrt(np.diag(fit.estimate.covariance))
+    return bool(np.all(min(_SECOND * most, 1.0) * np.abs(steps) < _SETTLED * sigmas))
 
 
 def nearest(start: Start) -> Mask:
