@@ -169,7 +169,10 @@ _PROGRAMS = (".dat", ".src", ".ls", ".mod", ".script")
 ENDINGS = (".csv", ".tsv", ".txt", ".log", ".jsonl", *_PROGRAMS, *DOCUMENTS)
 # Field names of a pose by its number of values.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
-_IMAGE = re.compile(r"[^\s,;\"'<>=]+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
+# A word that is no image's name is looked through once.
+_IMAGE = re.compile(
+    r"(?<![^\s,;\"'<>=])[^\s,;\"'<>=]+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE
+)
 # Words of JSON, and the same of Python.
 _NAMES_OF = {"true": "True", "false": "False", "null": "None", "NaN": "None"}
 _PYTHON = re.compile(rf"\b(?:{'|'.join(_NAMES_OF)})\b")
@@ -177,7 +180,7 @@ _PYTHON = re.compile(rf"\b(?:{'|'.join(_NAMES_OF)})\b")
 _FRAMES = re.compile("tool|wobj|load|base", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//", "!")
 # The name of a taught point: `DECL E6POS XP1={`, `CONST robtarget p10:=`, `P[1]{`, `P1: X ..`.
-_POINT = re.compile(r"[\w\s]*?(\w+(?:\[[^\]]*\])?)\s*(?::?=|[:{])")
+_POINT = re.compile(r"([\w\s]++(?:\[\w++)?+)\]?+\s*+[:={]")
 
 
 def read_fields(path: Path, form: str | None = None) -> Fields:
@@ -497,7 +500,8 @@ def _pendant(text: str, path: Path, form: str | None) -> Fields | None:
     if first is None:
         return None
     lines = lines[first:]
-    points = [match[1] if (match := _POINT.match(line)) else "" for _, line in lines]
+    matches = (_POINT.match(line.strip()) for _, line in lines)
+    points = [match[1].split()[-1] + "]" * ("[" in match[1]) if match else "" for match in matches]
     is_named = len({*points}) == len(points)
     records, places, forms = [], list[str](), dict[str, str]()
     for (place, line), point in zip(lines, points, strict=True):
