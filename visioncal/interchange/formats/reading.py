@@ -486,10 +486,9 @@ def _pendant(text: str, path: Path, form: str | None) -> Fields | None:
     lines = _placed(text, path, _COMMENTS)
     if is_program:
         lines = [each for each in lines if is_marked_pose(each[1]) and not _FRAMES.search(each[1])]
-    elif (pictures := [line for _, line in lines if _IMAGE.search(line)]) and not any(
-        map(is_marked_pose, pictures)
-    ):
-        # Named above or below their poses.
+    pictures = [] if is_program else [line for _, line in lines if _IMAGE.search(line)]
+    # A log names pictures above or below their poses, and a table beside them.
+    if 0 < 2 * len(pictures) <= len(lines) and not any(map(is_marked_pose, pictures)):
         lines = [
             (place, f"{line} {_pictured(stop)}")
             for stop in _stops(lines)
