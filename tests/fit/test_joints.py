@@ -14,7 +14,7 @@ from visioncal.fit.candidates import effects_of_arms
 from visioncal.fit.linearise import predicted
 from visioncal.fit.solve import solve
 from visioncal.model import Moments, read_cell
-from visioncal.model.effects import Play, Springs, Weight
+from visioncal.model.effects import Play, Springs, Weight, Zeros
 from visioncal.robot import Loads, Robot, load_robot
 from visioncal.simulation import CellOptions, Payload, cell_session, simulate
 from visioncal.simulation.arms import forward
@@ -63,7 +63,7 @@ def test_springs_bend_as_the_simulated_arm_does():
         assert found == pytest.approx(true, abs=1e-6)
 
 
-@pytest.mark.parametrize("effect", [Springs, Weight, Play])
+@pytest.mark.parametrize("effect", [Springs, Weight, Play, Zeros])
 def test_slopes_are_those_of_differences(effect):
     robot = bare() if effect is Weight else load_robot("ur10e")
     q, rng = postures(robot)[:5], np.random.default_rng(2)
@@ -148,12 +148,29 @@ def test_play_is_found_by_the_order_of_the_stops_alone():
     assert_honest(squares, 6)
 
 
+def test_zeros_are_found_within_their_covariance_and_are_no_errors_of_links():
+    squares = []
+    for seed in range(8):
+        mount = MOUNTS[seed % 2]
+        options = replace(GOOD, offset_sigma_rad=1e-3, branches=True, seed=seed, mount=mount)
+        made = simulate(options)
+        fit = solve(cell_of(made)).fit
+        assert "links flange" in fit.unknowns.closed
+        true = made.robot.true_arm.offset - made.robot.arm.offset
+        squares.append(squares_of(made, fit, "zeros flange", true))
+    # The first joint's and the last one's are turns of base and flange: no stop shows them, and
+    # edges have them. What is stated of both is as wide as the others are.
+    assert_honest(squares, 6)
+
+
 @pytest.mark.parametrize("options", [GOOD, WRONG_LINKS, replace(SAGGING, compliance_rad_per_nm=())])
 def test_arms_that_do_not_yield_have_no_springs_and_no_play(options: CellOptions):
     for seed in range(8):
         made = simulate(replace(options, seed=seed, mount=MOUNTS[seed % 2]))
         fit = solve(cell_of(made)).fit
-        assert {effect.kind for effect in fit.unknowns.effects} == {"links"}
+        assert {effect.kind for effect in fit.unknowns.effects} == {"links", "zeros"}
+        if options is GOOD:
+            assert fit.unknowns.closed >= {"links flange", "zeros flange"}
 
 
 def test_an_arm_of_unknown_weight_is_found_with_its_sag():

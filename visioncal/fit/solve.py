@@ -30,7 +30,7 @@ from visioncal.fit.unknowns import (
 )
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
 from visioncal.model.boards import SHAPES
-from visioncal.model.effects import Clock, Effect, Links, Rolling, Size
+from visioncal.model.effects import Clock, Effect, Links, Rolling, Size, Zeros
 from visioncal.vision.camera import intrinsics
 
 # Numbers of corners for each unknown of lenses and boards, below which these are held.
@@ -134,9 +134,10 @@ def with_free_boards(fit: Fit) -> Unknowns:
 
 
 def effects_of(start: Start) -> tuple[Effect, ...]:
-    """Effects that are always among the unknowns: of motion, and links of arms with joint angles.
+    """Effects that are always among the unknowns: of motion, and of arms with joint angles.
 
-    Corners of a rolling shutter are off by pixels, which much else would explain without it.
+    Corners of a rolling shutter are off by pixels, which much else would explain without it. Zeros
+    have a size of their own: in that of all errors of links, they are outliers.
     """
     cell, found = start.cell, list[Effect]()
     found += (Clock(sweep.flange, sweep.camera, sweep.sigma_s) for sweep in cell.sweeps)
@@ -146,7 +147,7 @@ def effects_of(start: Start) -> tuple[Effect, ...]:
     if len({sighting.stop for sighting in cell.sightings}) >= ENOUGH_STOPS:
         for name, arm in cell.arms.items():
             if arm.has_joints and arm.model is not None:
-                found.append(Links(name, arm.model))
+                found += (Links(name, arm.model), Zeros(name, arm.model))
     return tuple(found)
 
 

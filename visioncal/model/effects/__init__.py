@@ -12,3 +12,4 @@ from visioncal.model.effects.play import Play as Play
 from visioncal.model.effects.rolling import Rolling as Rolling
 from visioncal.model.effects.springs import Springs as Springs
 from visioncal.model.effects.springs import Weight as Weight
+from visioncal.model.effects.zeros import Zeros as Zeros
