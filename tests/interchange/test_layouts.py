@@ -720,6 +720,16 @@ def points_of_a_table(folder):
     write(folder / "p.csv", "\n".join(["point,x,y,z,qx,qy,qz,qw", *lines]))
 
 
+def as_many_of_other_names(folder):
+    """As many points as pictures, of which one has no picture, and one picture no point."""
+    shoot(folder, "P{}.png")
+    cv2.imwrite(str(folder / "P9.png"), world()[1][4][::-1])
+    names = ["HOME", *(f"P{at}" for at in range(9))]
+    rows = zip(names, with_others(1), strict=True)
+    lines = [",".join([name, *map(repr, map(float, seven(pose)))]) for name, pose in rows]
+    write(folder / "p.csv", "\n".join(["stop_name,x_m,y_m,z_m,qx,qy,qz,qw", *lines]))
+
+
 def halcon(folder):
     """A file a picture as HALCON's write_pose has it, in each of its representations."""
     shoot(folder, "calib_image_{:02d}.png")
@@ -791,7 +801,8 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         sorted_as_text, called_by_words, a_folder_a_view, columns_as_lists,
         blocks_of_text, mappings_of_any_names, rounds, pictures_to_numbers, lines_with_brackets,
         krl_with_a_retract, krl_from_one, krl_with_a_home_of_another_name, rapid_with_a_home,
-        below_units, below_headings, points_of_a_table, below_a_preamble, below_tabs, halcon,
+        as_many_of_other_names, below_units, below_headings, points_of_a_table,
+        below_a_preamble, below_tabs, halcon,
         console, console_of_a_maker, pictures_above_poses,
         lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
     )

@@ -370,7 +370,7 @@ def matched(first: Keys, second: Keys) -> Match | None:
             rows, is_equal = (_nearest(keys, their), True) if is_time else _equal(keys, their)
             common, is_same = int((rows >= 0).sum()), a == b
             # Columns of different names have some numbers in common by chance.
-            is_sure = is_same or is_time or any(len(str(key)) > 4 for key in their)
+            is_sure = is_same or how != HOW[1] or any(len(str(key)) > 4 for key in their)
             fits = common == fewest or (2 * common > fewest and is_sure)
             if fits and (common, is_equal, is_same) > best[0]:
                 best = (common, is_equal, is_same), rows

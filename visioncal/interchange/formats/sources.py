@@ -110,7 +110,9 @@ def _field_lines(fields: Fields) -> Iterator[str]:
         if name in columns and name not in poses:
             continue
         shape = " x ".join(map(str, numbers.shape[1:])) or "1"
-        look = "a pose" if name in poses else appearance(numbers) or _sized(numbers)
+        sized = {3: "a position or three angles", 6: "a pose, or six joints"}
+        look = "a pose" if name in poses else appearance(numbers)
+        look = look or sized.get(int(np.prod(numbers.shape[1:])), "")
         finite = numbers[np.isfinite(numbers)]
         span = f", {finite.min():.4g} to {finite.max():.4g}" if finite.size else ", empty"
         yield f"{name}: {shape}{span}{f': looks like {look}' if look else ''}"
@@ -120,11 +122,6 @@ def _field_lines(fields: Fields) -> Iterator[str]:
         yield f"texts {some_of(texts, 20)}"
     if fields.shape_errors:
         yield f"irregular {some_of([*fields.shape_errors])}"
-
-
-def _sized(numbers: FloatArray) -> str:
-    size = int(np.prod(numbers.shape[1:]))
-    return {3: "a position or three angles", 6: "a pose, or six joints"}.get(size, "")
 
 
 def describe(path: Path, form: str | None = None) -> Source:
