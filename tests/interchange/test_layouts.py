@@ -61,6 +61,11 @@ def shoot(folder: Path, name: str) -> None:
         cv2.imwrite(str(folder / name.format(at)), picture)
 
 
+def shoot_one(file: Path, at: int) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(file), world()[1][at])
+
+
 def write(path: Path, document: object) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(document if isinstance(document, str) else json.dumps(document))
@@ -789,6 +794,22 @@ def pictures_above_poses(folder):
     write(folder / "run.txt", text + "wrote thumbs\n")
 
 
+def among_measurements(folder):
+    """Six numbers of a common stem between forces, accelerations and joints; a description."""
+    write(folder / "about.yaml", "poses: state.json, base frame\nboard: charuco\n")
+    turns = Rotation.from_matrix(world()[0][:, :3, :3]).as_euler("xyz", degrees=True)
+    for at, (pose, turn) in enumerate(zip(world()[0], turns, strict=True)):
+        shoot_one(folder / f"s{at}/color.png", at)
+        cv2.imwrite(str(folder / f"s{at}/depth.png"), np.full((4, 6), 900 + at, np.uint16))
+        state: dict[str, object] = {"mode": "READY", "arm_voltage": 24.1 + at}
+        for stem in ("imu_acceleration_", "tool_twist_linear_", "tool_pose_", "force_"):
+            numbers = pose[:3, 3] if stem == "tool_pose_" else 0.1 * pose[0, :3]
+            state |= {f"{stem}{axis}": float(n) for axis, n in zip("xyz", numbers, strict=True)}
+        state |= {f"tool_pose_theta_{a}": float(n) for a, n in zip("xyz", turn, strict=True)}
+        joints = [{"position": 7.0 * at + n, "velocity": 0.0} for n in range(6)]
+        write(folder / f"s{at}/state.json", {"base": state, "actuators": joints})
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -803,7 +824,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         krl_with_a_retract, krl_from_one, krl_with_a_home_of_another_name, rapid_with_a_home,
         as_many_of_other_names, below_units, below_headings, points_of_a_table,
         below_a_preamble, below_tabs, halcon,
-        console, console_of_a_maker, pictures_above_poses,
+        console, console_of_a_maker, pictures_above_poses, among_measurements,
         lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
     )
 }  # fmt: skip
@@ -836,6 +857,8 @@ def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
         assert "Left aside, as rows differ in their shape: joints" in done.err
     if make is two_folders:
         assert "Left out of the images: rgb/frame_#_corners.png (9 files)" in done.err
+    if make is among_measurements:
+        assert "views.csv has their paths in source_depth" in done.err
     if make in (sixes, blanks, inverted):
         assert "Found by the images: With the robot's" in done.err
     if make is rapid_with_a_home:

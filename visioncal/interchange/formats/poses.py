@@ -42,7 +42,7 @@ def _set(words: str) -> set[str]:
 
 _POSITION_WORDS = _set("translation position pos ort posición tvec tvecs trans xyz t")
 _ROTATION_WORDS = _set("rotation orientation quaternion quat rotvec rot r ori winkel drehung angle")
-_ROTATION_WORDS |= _set("ángulo giro rotación rvec rvecs rpy euler vector matrix xyzw wxyz")
+_ROTATION_WORDS |= _set("ángulo giro rotación rvec rvecs rpy euler vector matrix xyzw wxyz theta")
 _POSE_WORDS = _set("pose poses transform transforms t h matrix")
 # Words of the parent frame and of the child frame, for the robot and for the camera.
 _FRAMES = {
@@ -64,7 +64,7 @@ _SIDE_WORDS = {
 _CHILD_FIRST = {"2", "to", "in", "wrt"}
 # Numbers of poses' sizes that are none, and poses that were not reached but asked for.
 _NO_POSE = re.compile(
-    r"joint|axis|axes|angles|wrench|speed|force|torque|twist|vel|effort|corner|intrins"
+    r"joint|axis|axes|angles|wrench|speed|force|torque|twist|vel|accel|effort|corner|intrins"
 )
 _ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "init", "ref", "guess"}
 # Columns among which poses are looked for by their numbers alone.
@@ -139,14 +139,16 @@ def possible_poses(
             found.append(PoseFields(piece.names, piece.words))
         elif piece.size == 6 and not _NO_POSE.search(name):
             found.append(PoseFields(piece.names, piece.words, is_named=False))
-        elif piece.size == 3:
+        elif piece.size == 3 and not _NO_POSE.search(name):
             places.append(piece)
     # A position and a rotation share all other words; of several rotations the least ambiguous is
     # taken: a matrix, then a quaternion. Of other names they share what they stand in.
+    rests = {place.rest for place in places if _POSITION_WORDS & {*place.words}}
     for place in places:
         is_named = bool(_POSITION_WORDS & {*place.words})
         alike = [turn for turn in turns if is_named and turn.rest == place.rest]
-        alike = alike or [turn for turn in turns if turn.parent == place.parent]
+        rest = (turn for turn in turns if turn.parent == place.parent and turn.rest not in rests)
+        alike = alike or [*rest]
         if alike:
             turn = max(alike, key=lambda turn: turn.size)
             others = place.rest if is_named else (*place.words, *turn.words)

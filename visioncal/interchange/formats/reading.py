@@ -346,7 +346,8 @@ def rows_of_document(document: object, path: Path) -> list[Fields]:
     lists = [*_row_lists(document)]
     if not lists:
         raise DataError(
-            f"{path} holds no rows; a list with one entry a pose is needed.", culprits=[str(path)]
+            f"{path} has no list with one entry a pose, but names and values alone.",
+            culprits=[str(path)],
         )
     opened = {name: [*_opened(rows, name)] for name, rows, _ in lists}
     # Lists of rounds are no rows where their own entries are.
