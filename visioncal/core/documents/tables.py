@@ -162,11 +162,12 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
     width = len(columns or rows[0])
     for at, row in zip(numbers, rows, strict=True):
         if len(row) != width:
+            line = all_lines[at - 1]
             raise DataError(
                 f"{where}, line {at}: {len(row)} cells; {width} are needed, as in the first row.",
                 culprits=[f"{where}, line {at}"],
                 next_step="Where commas are decimal, separate the columns by semicolons or tabs."
-                if separator == "," or "," in all_lines[at - 1]
+                if re.search("[0-9],[0-9]", line) and not re.search(r"\.|,(?![0-9])", line)
                 else "Give every row as many cells, and begin lines of other content with #.",
             )
     return TextTable(

@@ -3,7 +3,7 @@
 import ast
 import re
 import tomllib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -38,6 +38,9 @@ from visioncal.interchange.formats.fields import (
 from visioncal.session.columns import pose_row
 
 _HEADED = re.compile(r"\s*([^\d\W][^:=]*?)\s*[:=]\s*(.*?)\s*")
+# A list within a line of text.
+_INNER = re.compile(r"[\[(]([^\[\]()]*)[\])]")
+_POSE_SIZES = (6, 7, 12, 16)
 
 
 # Lines with their places.
@@ -45,20 +48,41 @@ _Lines: TypeAlias = Sequence[tuple[str, str]]
 
 
 def _numbers_in(line: str) -> tuple[str, list[float]]:
-    """The numbers of a line of nothing else but a name before them, and this name."""
-    entry, numbers = _HEADED.fullmatch(line), [*separate(line)]
-    return ("matrix", numbers) if numbers or not entry else (entry[1], [*separate(entry[2])])
+    """The numbers of a line of nothing else but a name before them, or its lists; with the name."""
+    entry = _HEADED.fullmatch(line)
+    for name, text in (("matrix", line), *([(entry[1], entry[2])] if entry else [])):
+        if numbers := [*separate(text)]:
+            return name, numbers
+    text = _IMAGE.sub(" ", line)
+    lists = {match.start(): [*separate(match[1])] for match in _INNER.finditer(text)}
+    lists = {at: numbers for at, numbers in lists.items() if len(numbers) > 2}
+    # Times and counts before them differ from row to row.
+    words = re.findall(r"[^\W\d]+", text[: min(lists, default=0)])
+    return " ".join(words[-3:]) or "matrix", [n for numbers in lists.values() for n in numbers]
 
 
 def _stops(lines: _Lines) -> list[_Lines]:
-    """The lines of a log by its pictures, or else by its lines of words.
+    """The lines of a log by its pictures, or else by its named poses or its lines of words.
 
-    These end their lines where the first has as many numbers above it as usual; else begin them.
+    Pictures and words end their lines where the first has as many numbers above it as usual; else
+    begin them, as those do that stand beside numbers.
     """
-    sizes = (6 if is_marked_pose(line) else len(_numbers_in(line)[1]) for _, line in lines)
-    counts = np.array([*sizes], dtype=int)
+    inner = [_numbers_in(line) for _, line in lines]
+    marked = (is_marked_pose(line) for _, line in lines)
+    counts = np.array(
+        [6 if is_pose else len(n) for is_pose, (_, n) in zip(marked, inner, strict=True)]
+    )
     marks = np.array([_IMAGE.search(line) is not None for _, line in lines], dtype=bool)
-    marks = marks if marks.any() else counts == 0
+    if not marks.any():
+        named = [name * (len(n) in _POSE_SIZES and name != "matrix") for name, n in inner]
+        most, count = Counter(filter(None, named)).most_common(1)[0] if any(named) else ("", 0)
+        words = Counter(line for (_, line), count in zip(lines, counts, strict=True) if not count)
+        # Of headings those that differ are the stops'.
+        once = np.array([words[line] == 1 for _, line in lines], dtype=bool)
+        marks = once if 2 * once.sum() >= words.total() else counts == 0
+        marks = np.array(named) == most if count > 2 else marks
+    if 2 * len(own := np.flatnonzero(marks & (counts > 0))) > marks.sum():
+        return [lines[at:end] for at, end in pairwise([*own.tolist(), len(lines)])]
     events = np.flatnonzero(marks | (counts > 0))
     steps = np.diff(marks[events].astype(int), prepend=0)
     tops, below = events[steps > 0], events[steps < 0]
@@ -74,17 +98,25 @@ def _pictured(stop: _Lines) -> str:
 
 def _blocks(lines: _Lines, path: Path) -> Fields | None:
     """Rows of several lines each, of a picture or below a line of words; None where none are."""
-    records, places = list[dict[str, object]](), list[str]()
+    rows = list[tuple[str, dict[str, object], dict[str, list[float]]]]()
     for stop in _stops(lines):
         arrays, title = defaultdict[str, list[float]](list), ""
         for name, numbers, line in ((*_numbers_in(line), line) for _, line in stop):
-            arrays[name] += numbers
+            # A pose that is written again replaces the first.
+            is_again = len(numbers) == len(arrays[name]) and len(numbers) in _POSE_SIZES
+            arrays[name] = numbers if is_again else arrays[name] + numbers
             title = title if numbers else line.strip(" #:")
         image = _pictured(stop)
-        records.append({"image": image} if image else {"title": title})
-        records[-1] |= {name: np.array(row) for name, row in arrays.items() if row}
-        places.append(stop[0][0])
-    fields = fields_of_records(records, places, path.stem, path.parent)
+        if image or any(arrays.values()):
+            rows.append((stop[0][0], {"image": image} if image else {"title": title}, arrays))
+    # Settings are written once.
+    counts = Counter(name for *_, arrays in rows for name, row in arrays.items() if row)
+    usual = {name for name, count in counts.items() if 2 * count >= len(rows)}
+    records = [
+        words | {name: np.array(row) for name, row in arrays.items() if row and name in usual}
+        for _, words, arrays in rows
+    ]
+    fields = fields_of_records(records, [place for place, *_ in rows], path.stem, path.parent)
     return fields if len(records) > 2 and fields.numbers else None
 
 
@@ -220,10 +252,12 @@ def read_rows(path: Path, form: str | None = None, document: object = None) -> l
     records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     places = [table.place(index) for index in range(len(table.rows))]
     fields = fields_of_records(records, places, path.stem, path.parent)
-    # Headings may have as many words as matrices have columns.
-    is_odd = not table.has_header and 2 * len(fields.numbers) < len(table.columns)
-    blocks = _blocks(_placed(text, path), path) if is_odd else None
-    return [blocks if blocks and holds_pose(blocks) else fields]
+    # Headings may have as many words as matrices have columns; a picture may stand in a sentence.
+    is_odd = 2 * len(fields.numbers) < len(table.columns)
+    is_odd |= _IMAGE.search(text) is not None and not any(map(is_image_name, table.rows[0]))
+    blocks = _blocks(_placed(text, path), path) if is_odd and not table.has_header else None
+    found = blocks.numbers.values() if blocks else ()
+    return [blocks if blocks and any(n[0].size in _POSE_SIZES for n in found) else fields]
 
 
 def read_record(path: Path, document: object = None) -> dict[str, object]:
