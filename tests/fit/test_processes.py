@@ -12,8 +12,8 @@ from visioncal.fit.assemble import mixed_model
 from visioncal.fit.processes import (
     _alone,
     _boards,
-    _independent,
-    _likelihoods,
+    _judged,
+    _tried,
     consider,
     processes,
 )
@@ -112,9 +112,11 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     state = State({**fit.state.values, ("shape", "target"): shape}, fit.state.errors)
     fit = Search.of(cell, fit.unknowns)._sized(state, fit.used, fit)
     alone = _alone(fit, "flange")
-    every = np.arange(len(alone.stops))
     (board,) = _boards(fit)
-    found = _likelihoods(alone, every, _independent(alone, every, 1.0), [board])
+    white = next(_tried(fit, "flange", alone))
+    found = [
+        _judged(white, [board], fit.unknowns.count, is_free=is_free)[0] for is_free in (False, True)
+    ]
     values = []
     for sigma in (3e-4, 1e-2):
         member = fit.unknowns["shape", "target"]

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.fit import processes
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
 from visioncal.fit.linearise import Pair, images_of
@@ -13,11 +14,15 @@ from visioncal.fit.sizes import SIGNIFICANT
 from visioncal.fit.trials import gain_of
 from visioncal.fit.unknowns import State, Unknowns, Vector, lens_field, random_effect
 from visioncal.model.effects import (
+    BaseCreeps,
+    BaseTilts,
+    BracketBends,
     Breathing,
     Effect,
     FocusJitter,
     Heat,
     LensGrows,
+    MountCreeps,
     Play,
     Springs,
     Weight,
@@ -75,6 +80,8 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """All that are not open yet, with their scores."""
     yield from scored(fit, effects_of_lenses(fit))
     yield from of_arms(fit, pairs)
+    for flange in fit.unknowns.erring:
+        yield from scored(fit, effects_of_frames(fit, flange), flange)
     for camera in fit.unknowns.lenses:
         is_free = ("lens", camera) in fit.unknowns and camera not in fit.unknowns.fields
         if is_free and images_of(pairs, camera):
@@ -91,14 +98,19 @@ def of_arms(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
             yield Candidate(gain_of(fit, pairs, effect), random_effect(effect), effect)
 
 
-def scored(fit: Fit, effects: Iterable[Effect]) -> Iterator[Candidate]:
-    """Those of some effects that are not open yet."""
+def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Candidate]:
+    """Those of some effects that are not open yet; of a flange, beside what its arm errs by."""
     known = {effect.name for effect in fit.unknowns.effects}
-    for effect in effects:
-        if effect.name not in known:
-            bounds = effect.size
+    new = [effect for effect in effects if effect.name not in known]
+    is_bare = flange != "" and not fit.cell.arms[flange].has_joints
+    beside = processes.scored(fit, flange, new) if is_bare and new else []
+    for at, effect in enumerate(new):
+        bounds = effect.size
+        if beside:
+            size, gain = beside[at]
+        else:
             size, gain = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
-            yield Candidate(gain, starting_at(random_effect(effect), size), effect)
+        yield Candidate(gain, starting_at(random_effect(effect), size), effect)
 
 
 def starting_at(member: Vector, size: float) -> Vector:
@@ -132,6 +144,18 @@ def effects_of_arms(fit: Fit) -> Iterator[Effect]:
                 yield Weight(name, arm.model)
             if arm.model.masses is not None or (arm.loads is not None and arm.loads.any):
                 yield Springs(name, arm.model)
+
+
+def effects_of_frames(fit: Fit, flange: str) -> Iterator[Effect]:
+    """Effects on what an arm stands on, and on what it carries."""
+    stops = np.unique([fit.cell.sightings[at].stop for at in np.flatnonzero(fit.used)])
+    poses = fit.cell.arms[flange].poses
+    stood = stops[np.isfinite(poses[stops, 0, 0])]
+    if len(stood) >= processes.ENOUGH_STOPS:
+        yield BaseTilts(flange, poses[stood])
+        yield BracketBends(flange, poses[stood])
+        yield BaseCreeps(flange)
+        yield MountCreeps(flange)
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:

@@ -11,6 +11,7 @@ What each stop alone says of its flange follows from the factorisation.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import lapack
@@ -20,7 +21,10 @@ from visioncal.core.types import FloatArray, IntArray, evenly
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.fit.fit import Fit
 from visioncal.fit.mixed import body_with, inverse
+from visioncal.fit.score import Products, Score, added_by, products
 from visioncal.fit.unknowns import Key, Prior
+from visioncal.model.effects import Effect
+from visioncal.model.effects.posture import PostureEffect, twists_of_frames
 
 # Lengths of processes by posture [rad], with the lever per radian, and by time [stops].
 _RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
@@ -29,8 +33,8 @@ _SIZES, _WHITE = (0.3, 0.6, 1.2, 2.5, 5.0), (1.0, 0.7, 0.4, 0.15)
 # Stops that determine errors of an arm's posture; of more than the most, some stand for all in the
 # likelihood.
 ENOUGH_STOPS, _MOST = 8, 40
-# Size of a board that is not as stated, as a share.
-_LOOSE = 0.01
+# Size of a board that is not as stated, as a share, and the chance of one.
+_LOOSE, _OTHER = 0.01, 0.05
 # Shares of evidence that do not count: of a size, of a process where estimates are averaged.
 _LITTLE, _SHARE = 1e-4, 0.01
 # Most stops at which estimates are averaged; of more, the mean over the stops is nearly as good.
@@ -113,8 +117,9 @@ class _Alone:
     stops: IntArray  # (s,)
     levels: FloatArray  # (6,) of its noise.
     known: FloatArray  # (s, 6, 6) covariance.
-    rows: FloatArray  # (s, 6, p + 1) by the unknowns, and the error itself.
-    rest: FloatArray  # (p + 1, p + 1) information of all else.
+    # (s, 6, p + c + 1) by the unknowns, by c more columns, and the error itself.
+    rows: FloatArray
+    rest: FloatArray  # (p + c + 1, p + c + 1) information of all else.
 
 
 def consider(fit: Fit, flange: str) -> Considered | None:
@@ -123,32 +128,26 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     if alone is None:
         return None
     stops, levels, p = len(alone.stops), alone.levels, fit.unknowns.count
-    poses = fit.cell.arms[flange].poses[alone.stops]
-    some = evenly(stops, _MOST)
-    boards = _boards(fit)
-    independent_at = {white: _independent(alone, some, white) for white in _WHITE}
-    none = (np.log(1 / 4), *_likelihoods(alone, some, independent_at[1.0], boards))
-    found, kinds = [none], list[tuple[Process, float, float]]()
-    for process in processes(poses, levels):
-        covariance = process.covariance(some)
-        weight = np.log(process.prior / len(_SIZES) / len(_WHITE))
-        for size in _SIZES:
-            for white in _WHITE:
-                total = independent_at[white] + size**2 * covariance
-                found.append((weight, *_likelihoods(alone, some, total, boards)))
-                kinds.append((process, size, white))
-    prior, as_stated, of_any_size = np.array(found).T
-    logs, free = prior + as_stated, prior + of_any_size
+    boards, logs, free, kinds = _boards(fit), list[float](), list[float](), []
+    for tried in _tried(fit, flange, alone):
+        as_stated, of_any_size = (
+            _judged(tried, boards, p, is_free=is_free)[0] if boards or not is_free else 0.0
+            for is_free in (False, True)
+        )
+        logs.append(tried.prior + as_stated)
+        free.append(tried.prior + of_any_size)
+        if tried.process is not None:
+            kinds.append((tried.process, tried.size, tried.white))
     odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs)) if len(boards) else 0.0
-    shares = np.exp(logs - np.logaddexp.reduce(logs))[1:]
+    shares = np.exp(logs - np.logaddexp.reduce(logs))[len(_WHITE) :]
     # The estimate's response to an error at each stop, which it takes for independent.
     gains = np.linalg.inv(alone.known + np.diag(levels**2)) @ alone.rows[:, :, :p]
     independent = np.einsum("uia,i,uib->ab", gains, levels**2, gains, optimize=True)
     known, excess, shift = fit.estimate.covariance, np.zeros((p, p)), np.zeros(p)
     moved = list[tuple[float, FloatArray]]()
-    tried = len(_SIZES) * len(_WHITE)
-    for at in range(0, len(shares), tried):
-        own, process = shares[at : at + tried], kinds[at][0]
+    count = len(_SIZES) * len(_WHITE)
+    for at in range(0, len(shares), count):
+        own, process = shares[at : at + count], kinds[at][0]
         share = float(own.sum())
         if process.is_of_time and share > _SHARE and stops <= _AVERAGED:
             # The likeliest size of a process stands for all of its sizes where it is estimated.
@@ -156,14 +155,95 @@ def consider(fit: Fit, flange: str) -> Considered | None:
             moved.append((share, values - fit.estimate.values))
             excess += share * (covariance - known)
             continue
-        for share, (_, size, white) in zip(own.tolist(), kinds[at : at + tried], strict=True):
+        for share, (_, size, white) in zip(own.tolist(), kinds[at : at + count], strict=True):
             if share > _LITTLE:
                 added = size**2 * process.through(gains) - (1.0 - white**2) * independent
                 excess += share * (known @ added @ known)
     for share, away in moved:
         shift += share * away
         excess += share * np.outer(away, away)
+    excess += _of_frames(fit, flange, alone, gains)
     return Considered(shift, excess - np.outer(shift, shift), odds)
+
+
+def _of_frames(fit: Fit, flange: str, alone: _Alone, gains: FloatArray) -> FloatArray:
+    """(p, p) covariance by the postures of the stops, to whose mean effects of posture refer."""
+    p, frames = fit.unknowns.count, np.zeros((12, 12))
+    for effect in fit.unknowns.effects:
+        if isinstance(effect, PostureEffect) and effect.frame == flange:
+            own, values = fit.unknowns.columns("effect", effect.name), fit.state.values
+            found = values["effect", effect.name]
+            square = fit.estimate.covariance[own[:, None], own] + np.outer(found, found)
+            frames += effect.covariance_of_frames(square)
+    if not frames.any():
+        return np.zeros((p, p))
+    twists = twists_of_frames(fit.cell.arms[flange].poses[alone.stops])
+    moved = fit.estimate.covariance @ np.einsum("uia,uib->ab", gains, twists)
+    return np.asarray(moved @ frames @ moved.T)
+
+
+def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float, float]]:
+    """Sizes of effects beside an arm's lasting errors, and what each gains alone.
+
+    Empty where too few stops show the arm's errors.
+    """
+    counts = np.cumsum([0, *(effect.count for effect in effects)]).tolist()
+    each = [products(fit, added_by(fit, effect), effect.count) for effect in effects]
+    alone, p, boards = _alone(fit, flange, each), fit.unknowns.count, _boards(fit)
+    if alone is None:
+        return []
+    sizes, logs = np.geomspace(1e-6, 0.1, 31), list[float]()
+    gains = list[list[FloatArray]]()
+    for tried in _tried(fit, flange, alone):
+        for is_free in (False, True) if boards else (False,):
+            value, left = _judged(tried, boards, p, is_free=is_free)
+            logs.append(tried.prior + value + np.log(_OTHER if is_free else 1.0 - _OTHER))
+            of_each = (Score(left[a:b, -1], left[a:b, a:b], np.inf) for a, b in pairwise(counts))
+            gains.append([score.gains(sizes) for score in of_each])
+    found, known = [], np.array(logs)
+    averaged = np.logaddexp.reduce(known[:, None, None] + np.array(gains), axis=0)
+    for effect, gain in zip(effects, averaged - np.logaddexp.reduce(known), strict=True):
+        best = int(
+            np.where(
+                (sizes >= effect.size.low) & (sizes <= effect.size.high), gain, -np.inf
+            ).argmax()
+        )
+        found.append((float(sizes[best]), float(gain[best])))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """A process of some size beside independent errors of some level; None beside the first."""
+
+    prior: float  # Its logarithm.
+    total: FloatArray  # (p + c + 1, p + c + 1) information under it.
+    log_det: float  # Of what stops say.
+    process: Process | None = None
+    size: float = 0.0
+    white: float = 1.0
+
+
+def _tried(fit: Fit, flange: str, alone: _Alone) -> Iterator[_Tried]:
+    poses, some = fit.cell.arms[flange].poses[alone.stops], evenly(len(alone.stops), _MOST)
+    independent_at = {white: _independent(alone, some, white) for white in _WHITE}
+    rows = alone.rows[some].reshape(-1, alone.rows.shape[2])
+
+    def under(covariance: FloatArray) -> tuple[FloatArray, float]:
+        root = np.linalg.cholesky(covariance)
+        solved, _ = lapack.dtrtrs(root, rows, lower=1)
+        return solved.T @ solved + alone.rest, 2.0 * float(np.log(np.diag(root)).sum())
+
+    for white in _WHITE:
+        weight = 1 / 4 if white == 1.0 else 1 / 4 / len(_WHITE)
+        yield _Tried(float(np.log(weight)), *under(independent_at[white]), white=white)
+    for process in processes(poses, alone.levels):
+        covariance = process.covariance(some)
+        weight = float(np.log(process.prior / len(_SIZES) / len(_WHITE)))
+        for size in _SIZES:
+            for white in _WHITE:
+                total = independent_at[white] + size**2 * covariance
+                yield _Tried(weight, *under(total), process, size, white)
 
 
 def _estimated(
@@ -189,8 +269,14 @@ def _independent(alone: _Alone, some: IntArray, white: float) -> FloatArray:
     return covariance
 
 
-def _alone(fit: Fit, flange: str) -> _Alone | None:
-    """What each stop alone says; None where too few say anything."""
+def _alone(fit: Fit, flange: str, added: Sequence[Products] = ()) -> _Alone | None:
+    """What each stop alone says; None where too few say anything.
+
+    Args:
+        fit: The fit.
+        flange: The arm.
+        added: More columns.
+    """
     at = body_with(fit.mixed.bodies, (flange,))
     if at < 0:
         return None
@@ -198,17 +284,18 @@ def _alone(fit: Fit, flange: str) -> _Alone | None:
     own = body.errors_of((flange,))
     others = np.setdiff1d(np.arange(body.width), own)
     levels = fit.flange_sigmas(flange)
-    units, rest = fit.mixed.assembled(fit.estimate.logs)
+    units, rest = _beside(*fit.mixed.assembled(fit.estimate.logs), added)
+    p, more = len(rest) - 1, np.arange(p, len(rest))
     past = fit.linearised.errors[flange][body.stops]
     for other, (errors, cross) in enumerate(units):
         if other != at:
-            columns = np.append(fit.mixed.bodies[other].columns, p)
+            columns = np.append(fit.mixed.bodies[other].columns, more)
             solved = np.linalg.solve(errors, cross)
             rest[columns[:, None], columns] -= np.einsum("uma,umb->ab", cross, solved)
     errors, cross = units[at]
     errors[:, own, own] -= levels**-2.0
     cross[:, own, -1] += past * levels**-2.0
-    columns = np.append(body.columns, p)
+    columns = np.append(body.columns, more)
     if len(others):
         inner, between = errors[:, others[:, None], others], errors[:, own[:, None], others]
         solved = np.linalg.solve(inner, cross[:, others])
@@ -229,6 +316,28 @@ def _alone(fit: Fit, flange: str) -> _Alone | None:
     # From what is reported, not from where it was linearised.
     rows[:, :, p] += past[seen]
     return _Alone(body.stops[seen], levels, known, rows, rest)
+
+
+def _beside(
+    units: list[tuple[FloatArray, FloatArray]], rest: FloatArray, added: Sequence[Products]
+) -> tuple[list[tuple[FloatArray, FloatArray]], FloatArray]:
+    """Information of units and common unknowns with more columns, before the residual."""
+    for one in added:
+        c, pull = len(one.pull), one.pull[:, None]
+        common = np.zeros((len(rest) - 1, c))
+        common[: len(one.common)] = one.common
+        rest = np.block(
+            [
+                [rest[:-1, :-1], common, rest[:-1, -1:]],
+                [common.T, one.own, pull],
+                [rest[-1:, :-1], pull.T, rest[-1:, -1:]],
+            ]
+        )
+        units = [
+            (errors, np.concatenate([cross[:, :, :-1], by, cross[:, :, -1:]], axis=2))
+            for (errors, cross), by in zip(units, one.errors, strict=True)
+        ]
+    return units, rest
 
 
 def held_boards(fit: Fit) -> dict[Key, Prior]:
@@ -252,36 +361,31 @@ def _boards(fit: Fit) -> list[_Board]:
     return [_Board(column, prior, float(past[column])) for column, prior in each]
 
 
-def _likelihoods(
-    alone: _Alone,
-    some: IntArray,
-    covariance: FloatArray,
-    boards: Sequence[_Board],
-) -> tuple[float, float]:
-    """Restricted log-likelihoods with boards as stated, and of any size.
+def _judged(
+    tried: _Tried, boards: Sequence[_Board], p: int, *, is_free: bool
+) -> tuple[float, FloatArray]:
+    """The restricted log-likelihood of a process, with boards as stated or of any size.
 
     Args:
-        alone: What each stop alone says.
-        some: (k,) stops that are looked at.
-        covariance: (6 k, 6 k) of what they say, under a process.
+        tried: The process.
         boards: Those whose size is held.
+        p: The number of unknowns; c columns beside them are no part of the likelihood.
+        is_free: Whether the boards are of any size.
+
+    Returns:
+        It, and what unknowns and errors leave of the information (c + 1, c + 1) of the columns and
+        the residual.
     """
-    p = alone.rows.shape[2] - 1
-    root = np.linalg.cholesky(covariance)
-    solved, _ = lapack.dtrtrs(root, alone.rows[some].reshape(-1, p + 1), lower=1)
-    total = solved.T @ solved + alone.rest
-    values, diagonal = [], np.arange(p)
-    for is_free in (False, True) if boards else (False,):
-        own, prior = total.copy(), 0.0
-        for board in boards:
-            sigma = max(_LOOSE, board.held.considered) if is_free else board.held.considered
-            row = np.zeros(p + 1)
-            row[[board.column, p]] = 1.0, -board.past
-            own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
-            prior -= np.log(sigma)
-        own[diagonal, diagonal] *= 1.0 + 1e-9
-        factor = np.linalg.cholesky(own[:p, :p])
-        pull, _ = lapack.dtrtrs(factor, own[:p, p], lower=1)
-        value = prior - np.log(np.diag(root)).sum() - np.log(np.diag(factor)).sum()
-        values.append(float(value - 0.5 * (own[p, p] - pull @ pull)))
-    return values[0], values[-1]
+    own, prior, diagonal = tried.total.copy(), -tried.log_det / 2.0, np.arange(p)
+    for board in boards:
+        sigma = max(_LOOSE, board.held.considered) if is_free else board.held.considered
+        row = np.zeros(len(own))
+        row[[board.column, -1]] = 1.0, -board.past
+        own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
+        prior -= np.log(sigma)
+    own[diagonal, diagonal] *= 1.0 + 1e-9
+    factor = np.linalg.cholesky(own[:p, :p])
+    pull, _ = lapack.dtrtrs(factor, own[:p, p:], lower=1)
+    left = own[p:, p:] - pull.T @ pull
+    value = prior - np.log(np.diag(factor)).sum()
+    return float(value - 0.5 * left[-1, -1]), left

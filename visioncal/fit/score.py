@@ -39,7 +39,7 @@ class Score:
 
     pull: FloatArray  # (c,) A'P y.
     information: FloatArray  # (c, c) A'P A.
-    freedom: float  # Of the residuals by which noise is known.
+    freedom: float  # Of the residuals by which noise is known; infinite where it is.
 
     def gain(self, sigmas: FloatArray) -> float:
         """Log Bayes factor of values with (c,) standard deviations, against none.
@@ -59,20 +59,39 @@ class Score:
         at = np.flatnonzero(sigmas > 1e-3 * sigmas.max(initial=0.0))
         scaled = self.information[at[:, None], at] * np.outer(sigmas[at], sigmas[at])
         values, vectors = np.linalg.eigh(scaled)
-        values, pull = np.maximum(values, 0.0), vectors.T @ (sigmas * self.pull)[at]
         # A size of which one direction is as large as its uncertainty.
         unit = 1.0 / np.sqrt(max(float(values.max(initial=0.0)), 1e-300))
         sizes = np.unique(np.clip(unit * _TRIED, low, high))
-        within = 1.0 + sizes[:, None] ** 2 * values
-        squares = np.sum(sizes[:, None] ** 2 * pull**2 / within, axis=1)
-        student = -0.5 * self.freedom * np.log1p(-np.minimum(squares / self.freedom, 0.999))
-        gains = student - 0.5 * np.log(within).sum(axis=1)
+        gains = self._gains(values, vectors.T @ (sigmas * self.pull)[at], sizes)
         return float(sizes[gains.argmax()]), float(gains.max())
 
+    def gains(self, sizes: FloatArray) -> FloatArray:
+        """(k,) gains of columns with equal sigmas, of k sizes."""
+        values, vectors = np.linalg.eigh(self.information)
+        return self._gains(values, vectors.T @ self.pull, sizes)
 
-def score(fit: Fit, added: Sequence[Added], count: int, freedom: float) -> Score:
-    """The score of `count` more columns, on rows whose noise is known by so many residuals."""
-    p, estimate = fit.unknowns.count, fit.estimate
+    def _gains(self, values: FloatArray, pull: FloatArray, sizes: FloatArray) -> FloatArray:
+        within = 1.0 + sizes[:, None] ** 2 * np.maximum(values, 0.0)
+        squares = np.sum(sizes[:, None] ** 2 * pull**2 / within, axis=1)
+        gains = 0.5 * squares
+        if np.isfinite(self.freedom):
+            gains = -0.5 * self.freedom * np.log1p(-np.minimum(squares / self.freedom, 0.999))
+        return np.asarray(gains - 0.5 * np.log(within).sum(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Of c more columns with all rows, weighted."""
+
+    pull: FloatArray  # (c,) with the residuals.
+    own: FloatArray  # (c, c) with each other.
+    common: FloatArray  # (p, c) with the unknowns.
+    errors: list[FloatArray]  # (u, m, c) with the errors of each body's units.
+
+
+def products(fit: Fit, added: Sequence[Added], count: int) -> Products:
+    """Those of `count` more columns."""
+    p = fit.unknowns.count
     pull, own, with_common = np.zeros(count), np.zeros((count, count)), np.zeros((p, count))
     with_errors = [np.zeros((len(body.stops), body.width, count)) for body in fit.mixed.bodies]
     for part in added:
@@ -86,9 +105,17 @@ def score(fit: Fit, added: Sequence[Added], count: int, freedom: float) -> Score
             body = fit.mixed.bodies[at]
             units = np.searchsorted(body.stops, gram.stops)
             np.add.at(with_errors[at], (units[:, None], body.errors_of(gram.flanges)), full[:, :f])
-    pull -= with_common.T @ estimate.values
-    reduced = with_common.copy()
-    for body, solved, cross in zip(fit.mixed.bodies, estimate.bodies, with_errors, strict=True):
+    return Products(pull, own, with_common, with_errors)
+
+
+def score(fit: Fit, added: Sequence[Added], count: int, freedom: float) -> Score:
+    """The score of `count` more columns, on rows whose noise is known by so many residuals."""
+    with_rows, estimate = products(fit, added, count), fit.estimate
+    pull, own = with_rows.pull - with_rows.common.T @ estimate.values, with_rows.own
+    reduced = with_rows.common
+    for body, solved, cross in zip(
+        fit.mixed.bodies, estimate.bodies, with_rows.errors, strict=True
+    ):
         pull -= np.einsum("umc,um->c", cross, solved.errors)
         flat = cross.reshape(-1, count)
         own -= flat.T @ (solved.own @ cross).reshape(-1, count)
@@ -99,6 +126,12 @@ def score(fit: Fit, added: Sequence[Added], count: int, freedom: float) -> Score
 
 def of_effect(fit: Fit, effect: Effect) -> Score:
     """The score of an effect that is not among the unknowns."""
+    freedom = fit.freedom if effect.place == "edge" else fit.of_corners
+    return score(fit, added_by(fit, effect), effect.count, freedom)
+
+
+def added_by(fit: Fit, effect: Effect) -> list[Added]:
+    """The columns of an effect."""
     added = []
     for gram in _used(fit):
         if effect.place == "edge" and effect.frame in gram.by_effects:
@@ -112,8 +145,7 @@ def of_effect(fit: Fit, effect: Effect) -> Score:
         local = np.swapaxes(moves, 1, 2) @ gram.heads(fit.estimate.logs)[:, rows]
         own = (local[:, :, rows] @ moves).sum(axis=0)
         added.append(Added(gram, local, own))
-    freedom = fit.freedom if effect.place == "edge" else fit.of_corners
-    return score(fit, added, effect.count, freedom)
+    return added
 
 
 def of_unknown(fit: Fit, key: Key, maps: FloatArray) -> Score:

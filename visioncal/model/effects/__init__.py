@@ -2,6 +2,8 @@
 
 from visioncal.model.effects.breathing import Breathing as Breathing
 from visioncal.model.effects.clock import Clock as Clock
+from visioncal.model.effects.creep import BaseCreeps as BaseCreeps
+from visioncal.model.effects.creep import MountCreeps as MountCreeps
 from visioncal.model.effects.effect import Effect as Effect
 from visioncal.model.effects.effect import Size as Size
 from visioncal.model.effects.focus_jitter import FocusJitter as FocusJitter
@@ -9,6 +11,8 @@ from visioncal.model.effects.heat import Heat as Heat
 from visioncal.model.effects.lens_grows import LensGrows as LensGrows
 from visioncal.model.effects.links import Links as Links
 from visioncal.model.effects.play import Play as Play
+from visioncal.model.effects.posture import BaseTilts as BaseTilts
+from visioncal.model.effects.posture import BracketBends as BracketBends
 from visioncal.model.effects.rolling import Rolling as Rolling
 from visioncal.model.effects.springs import Springs as Springs
 from visioncal.model.effects.springs import Weight as Weight

@@ -1,0 +1,103 @@
+"""What an arm stands on, and what it carries: moved by posture, gravity and time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.small_cells import made, pose
+
+from visioncal.core.transforms import exp, invert, log
+from visioncal.fit.candidates import effects_of_frames, scored
+from visioncal.fit.processes import _alone, _boards, _judged, _tried
+from visioncal.fit.score import added_by, of_effect, products
+from visioncal.fit.solve import solve
+from visioncal.model.effects import BaseCreeps, BaseTilts, BracketBends, MountCreeps
+from visioncal.model.effects.posture import twists_of_frames
+
+KINDS = {"tilts": BaseTilts, "bends": BracketBends, "creeps": BaseCreeps, "slips": MountCreeps}
+
+
+def moving(kind, seed, size, stops=24):
+    """A cell whose flange stands elsewhere than reported, by an effect of a size; and the effect.
+
+    Its report is of the end of the session, or of the mean posture.
+    """
+    small = made(seed, stops, in_hand=seed % 2 == 0)
+    arm, moments = small.cell.arms["flange"], small.cell.moments
+    effect = (
+        KINDS[kind]("flange", arm.poses) if kind in ("tilts", "bends") else KINDS[kind]("flange")
+    )
+    values = size * np.random.default_rng([seed, 11]).normal(size=effect.count)
+    twists = effect.columns(moments, np.ones(stops)) @ values
+    moved = arm.poses @ invert(np.array([exp(twist) for twist in twists]))
+    arms = {"flange": replace(arm, poses=moved)}
+    cell = replace(small.cell, arms=arms, moments=replace(moments, poses={"flange": moved}))
+    return replace(small, cell=cell)
+
+
+@pytest.mark.parametrize("kind", ["tilts", "bends"])
+def test_effects_of_posture_move_neither_base_nor_flange_at_the_mean_of_the_stops(kind):
+    cell = made(3, 20).cell
+    poses = cell.arms["flange"].poses
+    effect = KINDS[kind]("flange", poses)
+    columns = effect.columns(cell.moments, np.ones(20))
+    weights = np.repeat([0.5, 1.0], 3)[:, None]
+    every = (weights * twists_of_frames(poses)).reshape(-1, 12)
+    left = every.T @ (weights * columns).reshape(-1, effect.count)
+    assert np.abs(left).max() < 1e-9
+    assert np.linalg.norm(columns) > 0.1
+
+
+def test_effects_of_time_are_zero_at_the_end():
+    cell = made(3, 20).cell
+    for effect in (BaseCreeps("flange"), MountCreeps("flange")):
+        columns = effect.columns(cell.moments, np.ones(20))
+        assert not columns[-1].any()
+        assert np.abs(columns[0]).max() > 0.9
+
+
+def test_scores_beside_no_process_are_those_of_independent_noise():
+    fit = solve(made(1, 16).cell).fit
+    for effect in effects_of_frames(fit, "flange"):
+        each = products(fit, added_by(fit, effect), effect.count)
+        alone = _alone(fit, "flange", [each])
+        white = next(_tried(fit, "flange", alone))
+        # With boards held as the fit has them.
+        _, left = _judged(white, [], fit.unknowns.count, is_free=False)
+        score = of_effect(fit, effect)
+        scale = np.sqrt(np.diag(score.information)) + 1e-9 * np.abs(score.information).max() ** 0.5
+        assert np.abs((left[:-1, :-1] - score.information) / np.outer(scale, scale)).max() < 1e-4
+        assert np.abs((left[:-1, -1] - score.pull) / scale).max() < 1e-3
+    assert len(_boards(fit)) == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [("tilts", 3e-3), ("bends", 3e-4), ("creeps", 1.5e-3), ("slips", 1.5e-3)]
+)
+def test_what_moves_is_opened_and_its_result_is_fair(kind, size):
+    squares, found = [], 0
+    for seed in range(4):
+        small = moving(kind, seed, size)
+        fit = solve(small.cell).fit
+        names = {effect.name for effect in fit.unknowns.effects} - fit.unknowns.closed
+        found += KINDS[kind].kind + " flange" in names
+        away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
+        squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away) / 6)
+    assert found >= 3
+    assert np.mean(squares) < 2.5
+
+
+def test_sound_arms_and_arms_of_other_errors_open_none():
+    rng = np.random.default_rng(5)
+    for seed in range(4):
+        small = made(seed, 20)
+        fit = solve(small.cell).fit
+        assert not [one for one in scored(fit, effects_of_frames(fit, "flange"), "flange")
+                    if 2.0 * one.gain > 13.8]  # fmt: skip
+        arm = small.cell.arms["flange"]
+        steps = 3.0 * rng.normal(size=(20, 2, 3)) * np.array([2e-4, 1e-4])[:, None]
+        moved = np.array([at @ pose(*step) for at, step in zip(arm.poses, steps, strict=True)])
+        arms = {"flange": replace(arm, poses=moved)}
+        cell = replace(small.cell, arms=arms)
+        other = solve(replace(cell, moments=replace(cell.moments, poses={"flange": moved}))).fit
+        assert not any(effect.frame == "flange" for effect in other.unknowns.effects)

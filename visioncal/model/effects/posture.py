@@ -1,0 +1,98 @@
+"""Errors of an arm's posture: a base that tilts, and what the flange carries that bends."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from visioncal.core.transforms import adjoint, invert
+from visioncal.core.types import FloatArray
+from visioncal.estimation.arm import LEVER_M
+from visioncal.model.arm import Moments
+from visioncal.model.effects.effect import Effect
+
+# A turn counts as what it moves at the lever [m].
+_WEIGHTS: FloatArray = np.repeat([LEVER_M, 1.0], 3)[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class PostureEffect(Effect):
+    """Errors of a flange, less one twist of its base and one of itself at all postures.
+
+    These belong to the frames of which the robot reports: the result is that of the stops' mean
+    posture.
+    """
+
+    stops: FloatArray  # (s, 4, 4) the flange at them.
+
+    @abstractmethod
+    def raw(self, poses: FloatArray) -> FloatArray:
+        """Columns (k, 6, c) at (k, 4, 4) flanges."""
+
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """See `Effect`."""
+        del distances
+        poses = moments.poses[self.frame]
+        return np.asarray(self.raw(poses) - twists_of_frames(poses) @ self.frames)
+
+    @cached_property
+    def frames(self) -> FloatArray:
+        """(12, c) twists of base and flange that are nearest to the columns at the stops."""
+        return self._by_stops @ (_WEIGHTS * self.raw(self.stops)).reshape(-1, self.count)
+
+    @cached_property
+    def _by_stops(self) -> FloatArray:
+        """(12, 6 s) derivative of the nearest twists of base and flange by errors at the stops."""
+        every = (_WEIGHTS * twists_of_frames(self.stops)).reshape(-1, 12)
+        return np.asarray(np.linalg.pinv(every, rcond=1e-9))
+
+    def covariance_of_frames(self, square: FloatArray) -> FloatArray:
+        """(12, 12) of these twists, as other stops have them.
+
+        The stops are some of all postures: each is an independent draw (White 1980).
+
+        Args:
+            square: (c, c) expectation of the values' products.
+        """
+        count = len(self.stops)
+        raw = self.raw(self.stops) - twists_of_frames(self.stops) @ self.frames
+        by_stop = self._by_stops.reshape(12, count, 6).swapaxes(0, 1)
+        each = by_stop @ (_WEIGHTS * raw)
+        found = np.einsum("uac,cd,ubd->ab", each, square, each, optimize=True)
+        return np.asarray(found * count / max(count - 2, 1))
+
+
+def twists_of_frames(poses: FloatArray) -> FloatArray:
+    """(k, 6, 12) twists of (k, 4, 4) flanges by those of their base, and by their own."""
+    own = np.broadcast_to(np.eye(6), (len(poses), 6, 6))
+    return np.concatenate([adjoint(invert(poses)), own], axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class BaseTilts(PostureEffect):
+    """Tilts of the base about its x and y [rad/m], in proportion to the horizontal reach."""
+
+    kind, bounds, count = "base tilts", (1e-2, 1e-7, 0.1), 2
+
+    def raw(self, poses: FloatArray) -> FloatArray:
+        """See `PostureEffect`."""
+        reach = np.hypot(poses[:, 0, 3], poses[:, 1, 3])
+        return np.asarray(adjoint(invert(poses))[:, :, :2] * reach[:, None, None])
+
+
+@dataclass(frozen=True, eq=False)
+class BracketBends(PostureEffect):
+    """Bends of what the flange carries [m], linear in gravity's direction along its axes.
+
+    Turns are times a length of 0.1 m.
+    """
+
+    kind, bounds, count = "bracket bends", (1e-2, 1e-7, 0.1), 18
+
+    def raw(self, poses: FloatArray) -> FloatArray:
+        """See `PostureEffect`."""
+        scales = np.repeat([10.0, 1.0], 3)
+        return np.asarray(
+            np.kron(np.diag(scales), np.ones((1, 3))) * np.tile(-poses[:, None, 2, :3], 6)
+        )
