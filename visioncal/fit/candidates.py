@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.estimation.effects.lens_grows import TIME_CONSTANTS
 from visioncal.fit import processes
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
@@ -101,15 +102,19 @@ def of_arms(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
 def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Candidate]:
     """Those of some effects that are not open yet; of a flange, beside what its arm errs by."""
     known = {effect.name for effect in fit.unknowns.effects}
-    new = [effect for effect in effects if effect.name not in known]
-    is_bare = flange != "" and not fit.cell.arms[flange].has_joints
-    beside = processes.scored(fit, flange, new) if is_bare and new else []
-    for at, effect in enumerate(new):
-        bounds = effect.size
-        if beside:
-            size, gain = beside[at]
-        else:
-            size, gain = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
+    found = list[tuple[Effect, float, float]]()
+    for effect in effects:
+        if effect.name not in known:
+            bounds = effect.size
+            best = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
+            found.append((effect, *best))
+    if flange and not fit.cell.arms[flange].has_joints:
+        # What gains little beside independent noise gains less beside errors that last.
+        found = [one for one in found if 4.0 * one[2] >= SIGNIFICANT]
+        clear = [effect for effect, *_ in found]
+        beside = processes.scored(fit, flange, clear) if clear else []
+        found = [(effect, *best) for effect, best in zip(clear, beside, strict=False)] or found
+    for effect, size, gain in found:
         yield Candidate(gain, starting_at(random_effect(effect), size), effect)
 
 
@@ -130,7 +135,9 @@ def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
         yield LensGrows(camera, lens)
         if fit.cell.cameras[camera].focus == "auto":
             distances = [gram.distances for gram in fit.grams if gram.pair[0] == camera]
-            yield Breathing(camera, lens, float(np.median(np.concatenate(distances))))
+            reference_m = float(np.median(np.concatenate(distances)))
+            is_stated = fit.cell.cameras[camera].stated is not None
+            yield Breathing(camera, lens, reference_m, is_stated)
             yield FocusJitter(camera, lens, len(fit.cell.moments))
 
 
@@ -154,8 +161,10 @@ def effects_of_frames(fit: Fit, flange: str) -> Iterator[Effect]:
     if len(stood) >= processes.ENOUGH_STOPS:
         yield BaseTilts(flange, poses[stood])
         yield BracketBends(flange, poses[stood])
-        yield BaseCreeps(flange)
-        yield MountCreeps(flange)
+        # Evenly; as what warms up; as what settles in the first stops.
+        for rate in (0.0, TIME_CONSTANTS, 20.0):
+            yield BaseCreeps(flange, rate)
+            yield MountCreeps(flange, rate)
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:
