@@ -257,6 +257,18 @@ def session_of(cell: SimulatedCell, base_from_flange: np.ndarray) -> Session:
     )
 
 
+def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> None:
+    cell = simulate(CellOptions(views=20, robot_sigma_m=5e-5, robot_sigma_rad=5e-5))
+    late = exp(np.random.default_rng(2).normal(size=(20, 6)) * np.repeat([1e-3, 6e-4], 3))
+    flanges = cell.robot.base_from_flange @ late
+    verdict = calibrated(reporting(cell, base_from_flange=flanges)).verdict
+    assert ids(verdict)[:1] == ["late_poses"]
+    assert "empty the columns x_m" in verdict.causes[0].do.words
+    # Where both are right, or the joints are the late ones, nothing is said of that.
+    sound = calibrated(cell).verdict
+    assert "late_poses" not in {found.kind for found in sound.findings}
+
+
 @pytest.mark.parametrize(
     ("step_mm", "step_deg", "words"),
     [

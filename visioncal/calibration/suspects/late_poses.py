@@ -1,0 +1,51 @@
+"""Poses that were read at another instant than the joint angles, with which the images agree."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from visioncal.calibration.guess.fit import robust_fits
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
+from visioncal.core.types import MOUNTS
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy
+from visioncal.estimation.chain import robot_part
+
+
+def _found(run: RunState) -> Iterator[Finding]:
+    matched = run.reported.matched
+    if run.mount not in MOUNTS or matched is None or matched.misread:
+        return
+    seen, reported = run.poses_of_one_board, run.base_from_flange
+    views = [view for view in run.used if view in seen and view in matched.joints_rad]
+    if len(views) <= FEWEST_COMPARED:
+        return
+    camera = np.array([seen[view].cam_from_target[0] for view in views])
+    by_joints = [matched.pose(matched.joints_rad[view]) for view in views]
+    poses = robot_part(np.array([[reported[view] for view in views], by_joints]), run.mount)
+    by_report, by_angles = robust_fits(poses, np.broadcast_to(camera, poses.shape))
+    if CLEAR_RATIO * by_angles.score < by_report.score:
+        yield Finding(
+            "late_poses",
+            f"The images agree with the joint angles to {by_angles.figures}, and with the "
+            f"reported poses to {by_report.figures}: these were read at another instant, or are "
+            "commanded ones.",
+            Remedy(
+                "Log poses and joint angles at one instant, while the arm stands. Or empty the "
+                "columns x_m, y_m, z_m, qx, qy, qz and qw of views.csv, and calibrate again: the "
+                "poses are then those of the joints.",
+                CALIBRATE,
+            ),
+            until_mm=0.0,
+        )
+
+
+LATE_POSES = Suspect(
+    "late_poses",
+    _found,
+    1e-6,
+    of_chain=True,
+    hides=(UNEXPLAINED, ARM_ERRORS, "stops_short"),
+    inflates=("robot_noise", "robot_noise_of_pick", "calibration", ARM_ERRORS),
+)
