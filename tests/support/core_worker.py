@@ -105,6 +105,7 @@ def located(calibration, looks):
     fit = SOLVED[calibration]
     (camera,) = fit.unknowns.lenses
     keys = [key for key in fit.unknowns.slices if key[1] == camera]
+    keys += [("effect", effect.name) for effect in at_looks(fit, camera)]
     values, covariance = fit.state.values, fit.covariance(*keys)
     px_sigma = fit.sizes.get(f"px {camera}", 0.0)
     own = fit.unknowns.fields.get(camera)
@@ -130,6 +131,13 @@ def located(calibration, looks):
             # Where no corner was seen, a field may be anything of its size.
             unseen = 0.0 if own is None else left * float(own.variance(moved["px"][None])[0])
             total += (px_sigma**2 + unseen) * np.outer(slope, slope)
+        # A lens that focuses anew does so for this image, too.
+        refocused = fit.sizes.get(f"focus jitter {camera}", 0.0)
+        if refocused:
+            grown = values["lens", camera].copy()
+            grown[:2] *= 1.0 + 1e-6
+            slope = (place(fit, camera, {**values, ("lens", camera): grown}, look) - centre) / 1e-6
+            total += refocused**2 * np.outer(slope, slope)
         if look["pose"] is not None:
             from visioncal.core.transforms import exp
 
@@ -169,18 +177,43 @@ def arm(calibration, q, temperatures_c=None):
     return {"status": 0, "out": found.tolist()}
 
 
+def at_looks(fit, camera):
+    """Effects that act after the session: on a lens by distance, on a flange by its posture."""
+    from visioncal.model.effects.posture import PostureEffect
+
+    return [
+        effect
+        for effect in fit.unknowns.effects
+        if isinstance(effect, PostureEffect)
+        or (effect.frame == camera and effect.kind == "breathing")
+    ]
+
+
 def place(fit, camera, values, look):
     """(3,) where a pixel's ray meets its plane, in the base."""
+    from visioncal.core.transforms import exp
     from visioncal.fit.unknowns import State
-    from visioncal.vision.camera import normalise
+    from visioncal.model import Moments
+    from visioncal.vision.camera import intrinsics, normalise, with_intrinsics
 
     lens, px = fit.unknowns.camera(State(values, {}), camera), np.array(look["px"])
     if camera in fit.unknowns.fields:
         px = px - fit.unknowns.fields[camera].moved(px[None], values["field", camera])[0]
-    ray = np.append(normalise(lens, px[None])[0], 1.0)
-    base_from_cam = values["edge", camera]
-    if look["pose"] is not None:
-        base_from_cam = np.array(look["pose"]) @ base_from_cam
+    base_from_cam, pose = values["edge", camera], look["pose"]
+    flanges = {name: np.array(pose)[None] for name in fit.cell.arms} if pose is not None else {}
+    after = Moments(flanges, {}, np.zeros(1), np.full(1, -1))
+    if pose is not None:
+        twist = np.zeros(6)
+        for effect in at_looks(fit, camera):
+            if effect.place == "edge":
+                twist += effect.twists(after, values["effect", effect.name])[0]
+        base_from_cam = np.array(pose) @ exp(twist) @ base_from_cam
+    point, normal = np.array(look["point"]), np.array(look["normal"])
+    far = np.array([(np.linalg.inv(base_from_cam) @ np.append(point, 1.0))[2]])
+    grown = intrinsics(lens)
+    for effect in at_looks(fit, camera):
+        if effect.place == "lens":
+            grown = grown + effect.columns(after, far)[0] @ values["effect", effect.name]
+    ray = np.append(normalise(with_intrinsics(lens, grown), px[None])[0], 1.0)
     origin, along = base_from_cam[:3, 3], base_from_cam[:3, :3] @ ray
-    normal = np.array(look["normal"])
-    return origin + along * (normal @ (np.array(look["point"]) - origin)) / (normal @ along)
+    return origin + along * (normal @ (point - origin)) / (normal @ along)
