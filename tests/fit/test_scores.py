@@ -13,6 +13,7 @@ from visioncal.fit.linearise import linearised, pairs_of
 from visioncal.fit.score import of_effect, of_waves
 from visioncal.fit.solve import solve
 from visioncal.fit.unknowns import State, lens_field, random_effect
+from visioncal.model.effects import SIGNIFICANT
 
 
 def gain_with(fit, member, size, **changes):
@@ -107,3 +108,31 @@ def test_waves_have_the_covariance_of_a_smooth_field():
     assert np.abs(found - kernel).max() < 0.12
     middle = np.abs(px / TABLE.resolution - 0.5).max(axis=1) < 0.3
     assert np.abs(found - kernel)[np.ix_(middle, middle)].max() < 0.03
+
+
+def test_a_lens_that_breathes_is_likely_to_scatter():
+    fit = solve(made(stops=10).cell).fit
+    (alone,) = [one for one in effects_of_lenses(fit) if one.kind == "focus jitter"]
+    breathing = next(one for one in effects_of_lenses(fit) if one.kind == "breathing")
+    unknowns = fit.unknowns.with_members(random_effect(breathing))
+    unknowns = replace(unknowns, effects=(*unknowns.effects, breathing))
+    logs = np.append(fit.estimate.logs, np.log(1e-3))
+    wider = replace(fit, unknowns=unknowns, estimate=replace(fit.estimate, logs=logs))
+    beside = [one for one in effects_of_lenses(wider) if one.kind == "focus jitter"]
+    assert [one.size.limit < alone.size.limit for one in beside] == [True]
+    # A size that is held at its bound is none.
+    closed = replace(wider, unknowns=unknowns.closing({breathing.name}))
+    assert not any(one.size.limit < SIGNIFICANT for one in effects_of_lenses(closed))
+
+
+def test_a_stated_lens_that_breathes_was_focused_somewhere():
+    cell = made(stops=10).cell
+    fit = solve(cell).fit
+    effect = next(one for one in effects_of_lenses(fit) if one.kind == "breathing")
+    columns = effect.columns(cell.moments, np.full(10, 2.0 * effect.reference_m))
+    # At twice the distance, it has grown by twice what it may be off by where it was stated.
+    assert np.allclose(columns[:, :2, 0], 2.0 * columns[:, :2, 1])
+    assert np.allclose(columns[:, :2, 0], TABLE.matrix[:2])
+    free = solve(made(stops=20, given=False).cell).fit
+    counts = {one.kind: one.count for one in effects_of_lenses(free)}
+    assert counts["breathing"] == 1

@@ -11,10 +11,10 @@ from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
 from visioncal.fit.linearise import Pair, images_of
 from visioncal.fit.score import best_field, of_effect
-from visioncal.fit.sizes import SIGNIFICANT
 from visioncal.fit.trials import gain_of
 from visioncal.fit.unknowns import State, Unknowns, Vector, lens_field, random_effect
 from visioncal.model.effects import (
+    SIGNIFICANT,
     BaseCreeps,
     BaseTilts,
     BracketBends,
@@ -40,6 +40,11 @@ class Candidate:
     field: Field | None = None  # Beside a lens that is as stated.
 
     @property
+    def limit(self) -> float:
+        """The least likelihood ratio by which it is opened."""
+        return SIGNIFICANT if self.effect is None else self.effect.size.limit
+
+    @property
     def lens(self) -> str:
         """The camera about whose lens alone it is; empty of others."""
         if self.effect is None:
@@ -54,7 +59,7 @@ def opened(
 
     With one of a lens come those of other lenses, one each: they explain other images.
     """
-    clear = [one for one in among if 2.0 * one.gain >= SIGNIFICANT]
+    clear = [one for one in among if 2.0 * one.gain >= one.limit]
     if not clear:
         return None
     clear.sort(key=lambda one: -one.gain)
@@ -138,7 +143,8 @@ def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
             reference_m = float(np.median(np.concatenate(distances)))
             is_stated = fit.cell.cameras[camera].stated is not None
             yield Breathing(camera, lens, reference_m, is_stated)
-            yield FocusJitter(camera, lens, len(fit.cell.moments))
+            is_breathing = f"breathing {camera}" in fit.sizes.keys() - fit.unknowns.closed
+            yield FocusJitter(camera, lens, len(fit.cell.moments), is_breathing)
 
 
 def effects_of_arms(fit: Fit) -> Iterator[Effect]:

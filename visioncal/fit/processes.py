@@ -33,8 +33,8 @@ _SIZES, _WHITE = (0.3, 0.6, 1.2, 2.5, 5.0), (1.0, 0.7, 0.4, 0.15)
 # Stops that determine errors of an arm's posture; of more than the most, some stand for all in the
 # likelihood.
 ENOUGH_STOPS, _MOST = 8, 40
-# Size of a board that is not as stated, as a share, and the chance of one.
-_LOOSE, _OTHER = 0.01, 0.05
+# Size of a board that is not as stated, as a share.
+_LOOSE = 0.01
 # Shares of evidence that do not count: of a size, of a process where estimates are averaged.
 _LITTLE, _SHARE = 1e-4, 0.01
 # Most stops at which estimates are averaged; of more, the mean over the stops is nearly as good.
@@ -197,7 +197,8 @@ def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float
     for tried in _tried(fit, flange, alone):
         for is_free in (False, True) if boards else (False,):
             value, left = _judged(tried, boards, p, is_free=is_free)
-            logs.append(tried.prior + value + np.log(_OTHER if is_free else 1.0 - _OTHER))
+            # One board of twenty is of another size.
+            logs.append(tried.prior + value + np.log(0.05 if is_free else 0.95))
             of_each = (Score(left[a:b, -1], left[a:b, a:b], np.inf) for a, b in pairwise(counts))
             gains.append([score.gains(sizes) for score in of_each])
     found, known = [], np.array(logs)

@@ -1,15 +1,14 @@
 """The most likely sizes of a mixed model."""
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.mixed import Estimate, Mixed
+from visioncal.model.effects.effect import SIGNIFICANT
 
-# Likelihood ratio that chance exceeds in one session of ten thousand.
-SIGNIFICANT = 13.8
 # Most change of a size's logarithm in one search: in the elimination, far sizes cancel to nothing.
 _FAR = 3.0
 # Most change in one step; gain of -2 log L that is negligible.
@@ -80,9 +79,11 @@ def significant(
     start: FloatArray,
     low: FloatArray,
     high: FloatArray,
-    random: Iterable[int],
+    random: Mapping[int, float],
 ) -> tuple[Found, tuple[int, ...]]:
     """Closes, at their lower bounds, the sizes of random unknowns that chance explains.
+
+    Those are such whose likelihood ratio is below their limit.
 
     They are closed together; where that is not explained by chance, they stand for each other, and
     the one that gains most is opened again.
@@ -92,12 +93,12 @@ def significant(
     """  # fmt: skip
     count, logs, best = found.evaluations, found.estimate.logs, found.estimate.value
     little = []
-    for size in random:
+    for size, limit in random.items():
         if high[size] > low[size] and logs[size] > low[size]:
             without = logs.copy()
             without[size] = low[size]
             count += 1
-            if mixed.at(without, is_sloped=False).value - best < SIGNIFICANT:
+            if mixed.at(without, is_sloped=False).value - best < limit:
                 little.append(size)
         elif high[size] > low[size]:
             little.append(size)

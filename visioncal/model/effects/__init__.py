@@ -4,6 +4,7 @@ from visioncal.model.effects.breathing import Breathing as Breathing
 from visioncal.model.effects.clock import Clock as Clock
 from visioncal.model.effects.creep import BaseCreeps as BaseCreeps
 from visioncal.model.effects.creep import MountCreeps as MountCreeps
+from visioncal.model.effects.effect import SIGNIFICANT as SIGNIFICANT
 from visioncal.model.effects.effect import Effect as Effect
 from visioncal.model.effects.effect import Size as Size
 from visioncal.model.effects.focus_jitter import FocusJitter as FocusJitter

@@ -10,8 +10,6 @@ from visioncal.estimation.arm import LEVER_M
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect
 
-_UNITS: FloatArray = np.repeat([1.0 / LEVER_M, 1.0], 3)
-
 
 @dataclass(frozen=True, eq=False)
 class Creep(Effect):
@@ -41,7 +39,7 @@ class BaseCreeps(Creep):
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
-        twists = adjoint(invert(moments.poses[self.frame])) * _UNITS
+        twists = adjoint(invert(moments.poses[self.frame])) / np.repeat([LEVER_M, 1.0], 3)
         return np.asarray(twists * self.left(moments))
 
 
@@ -54,4 +52,4 @@ class MountCreeps(Creep):
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
-        return np.asarray(self.left(moments) * np.diag(_UNITS))
+        return np.asarray(self.left(moments) * np.diag(np.repeat([1.0 / LEVER_M, 1.0], 3)))

@@ -13,6 +13,10 @@ from visioncal.vision.camera import intrinsics
 Place: TypeAlias = Literal["edge", "lens", "corners"]
 
 
+# Likelihood ratio that chance exceeds in one session of ten thousand.
+SIGNIFICANT = 13.8
+
+
 @dataclass(frozen=True)
 class Size:
     """Standard deviation of noise or of random unknowns, which is to be estimated."""
@@ -21,6 +25,9 @@ class Size:
     start: float  # Where a search begins: above what is likely.
     low: float  # At this it stands for none.
     high: float
+    # Likelihood ratio below which one of random unknowns is none: less of what something else makes
+    # likely.
+    limit: float = SIGNIFICANT
 
 
 @dataclass(frozen=True)

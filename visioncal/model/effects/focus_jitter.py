@@ -1,12 +1,12 @@
 """A lens that focuses anew for each image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import LensEffect
+from visioncal.model.effects.effect import LensEffect, Size
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,6 +15,13 @@ class FocusJitter(LensEffect):
 
     kind, bounds = "focus jitter", (1e-2, 1e-6, 0.1)
     stops: int
+    is_breathing: bool = False  # Whether the lens is known to focus: then this is likely.
+
+    @property
+    def size(self) -> Size:
+        """See `Effect`: chance exceeds the limit of an expected one in one of twenty sessions."""
+        size = Size(self.name, *self.bounds)
+        return replace(size, limit=3.84) if self.is_breathing else size
 
     @property
     def count(self) -> int:

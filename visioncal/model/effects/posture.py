@@ -12,9 +12,6 @@ from visioncal.estimation.arm import LEVER_M
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect
 
-# A turn counts as what it moves at the lever [m].
-_WEIGHTS: FloatArray = np.repeat([LEVER_M, 1.0], 3)[:, None]
-
 
 @dataclass(frozen=True, eq=False)
 class PostureEffect(Effect):
@@ -36,15 +33,20 @@ class PostureEffect(Effect):
         poses = moments.poses[self.frame]
         return np.asarray(self.raw(poses) - twists_of_frames(poses) @ self.frames)
 
+    @property
+    def _weights(self) -> FloatArray:
+        """(6, 1) of a twist: a turn counts as what it moves at the lever [m]."""
+        return np.repeat([LEVER_M, 1.0], 3)[:, None]
+
     @cached_property
     def frames(self) -> FloatArray:
         """(12, c) twists of base and flange that are nearest to the columns at the stops."""
-        return self._by_stops @ (_WEIGHTS * self.raw(self.stops)).reshape(-1, self.count)
+        return self._by_stops @ (self._weights * self.raw(self.stops)).reshape(-1, self.count)
 
     @cached_property
     def _by_stops(self) -> FloatArray:
         """(12, 6 s) derivative of the nearest twists of base and flange by errors at the stops."""
-        every = (_WEIGHTS * twists_of_frames(self.stops)).reshape(-1, 12)
+        every = (self._weights * twists_of_frames(self.stops)).reshape(-1, 12)
         return np.asarray(np.linalg.pinv(every, rcond=1e-9))
 
     def covariance_of_frames(self, square: FloatArray) -> FloatArray:
@@ -58,7 +60,7 @@ class PostureEffect(Effect):
         count = len(self.stops)
         raw = self.raw(self.stops) - twists_of_frames(self.stops) @ self.frames
         by_stop = self._by_stops.reshape(12, count, 6).swapaxes(0, 1)
-        each = by_stop @ (_WEIGHTS * raw)
+        each = by_stop @ (self._weights * raw)
         found = np.einsum("uac,cd,ubd->ab", each, square, each, optimize=True)
         return np.asarray(found * count / max(count - 2, 1))
 
