@@ -33,7 +33,7 @@ FRAME_READERS = TOOL_READERS | FIXTURE_READERS
 # Those of easy_handeye hold the camera alone.
 ANY_EDGE = sorted(set(READERS) - {"easy-handeye", "easy-handeye2"})
 ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan", "kuka-tool", "kuka-base"}
-ANGLES |= {"xarm", "mecademic", "kawasaki", "comau", "realman", "techman"}
+ANGLES |= {"xarm", "mecademic", "kawasaki", "comau", "realman", "techman", "epson"}
 # With the axes of its first and last angles nearly along each other.
 TINY = {("tiny", name) for name in ("doosan", "kawasaki", "comau")}
 RNG = np.random.default_rng(3)

@@ -410,6 +410,7 @@ NAMES = [
     ("mecademic", "x,y,z,alpha,beta,gamma"),
     ("kawasaki", "X,Y,Z,O,A,T"),
     ("comau", "X,Y,Z,A,E,R"),
+    ("epson", "X,Y,Z,U,V,W"),
     ("realman", "x,y,z,rx,ry,rz"),
     ("rpy-deg", "x,y,z,roll,pitch,yaw"),
 ]

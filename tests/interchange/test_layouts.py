@@ -872,6 +872,69 @@ def tf2_echo(folder):
     write(folder / "tf.txt", "".join(echoed(at, matrix=True) for at in range(9)))
 
 
+def angles_of(order, pose):
+    """Millimetres and degrees about axes in an order."""
+    turn = Rotation.from_matrix(pose[:3, :3]).as_euler(order, degrees=True)
+    return [f"{number:.10f}" for number in (*(1e3 * pose[:3, 3]), *turn)]
+
+
+def job(folder):
+    """A Yaskawa's job: positions in pulses, those in the base, and its instructions."""
+    shoot(folder, "P{:05d}.png")
+    lines = ["/JOB", "//NAME EYE", "//POS", "///NPOS 1,0,0,9,0,0", "///POSTYPE PULSE", "///PULSE"]
+    lines += ["C00000=-1234,5,77,88,1000,9", "///POSTYPE BASE", "///RECTAN", "///RCONF 1,0,0,0,0"]
+    for at, pose in enumerate(world()[0]):
+        lines.append(f"P{at:05d}={','.join(angles_of('xyz', pose))}")
+    lines += ["//INST", "///DATE 2025/11/04 16:20", "NOP"]
+    for at in range(9):
+        lines += [f"MOVJ P{at:05d} VJ=5.00", "TIMER T=1.00", "PULSE OT#(5) T=0.20"]
+    write(folder / "EYE.JBI", "\r\n".join([*lines, "END"]))
+
+
+def within_braces(folder):
+    """An Epson's points, with others between, of keys that begin with their types."""
+    shoot(folder / "images", "cal{:02d}.png")
+    names = ["Home", *(f"cal{at:02d}" for at in range(9)), "Park"]
+    text = 'VERSION=1.0\nsSignature="RC+"\nnNumberOfPoints=11\n'
+    for at, (name, pose) in enumerate(zip(names, with_others(1, 1), strict=True)):
+        text += f'Point{at + 1} {{\n\tnNumber={3 * at}\n\tsLabel="{name}"\n\tsDescription=""\n'
+        cells = zip("XYZUVW", angles_of("ZYX", pose), strict=True)
+        text += "".join(f"\tr{key}={cell}\n" for key, cell in cells)
+        text += "\trR=0\n\tnHand=1\n\tbSimVisible=False\n}\n"
+    write(folder / "Robot1.pts", text.replace("\n", "\r\n"))
+
+
+def elements(folder):
+    """A Staubli's points, as attributes beside joints and others."""
+    shoot(folder / "photos", "pCalib_{}.png")
+    name = "http://www.staubli.com/robotics/VAL3/Data/2"
+    text = f'<?xml version="1.0" encoding="utf-8" ?>\n<Database xmlns="{name}">\n<Datas>\n'
+    text += '<Data name="n" type="num" size="1"><Value key="0" value="9" /></Data>\n'
+    joints = "".join(f'<Value key="{k}" j1="{k}" j2="-20" j3="9"/>' for k in range(4))
+    others = "".join(
+        f'<Value key="{k}" x="{400 + k}" y="{9 * k}" z="3{k}0.5" rx="180" ry="{k}" rz="9{k}"/>'
+        for k in range(5)
+    )
+    text += f'<Data name="jPark" type="jointRx">{joints}</Data>\n<Data name="pPick">{others}</Data>'
+    text += '\n<Data name="pCalib" size="9">\n'
+    for at, pose in enumerate(world()[0]):
+        cells = zip(("x", "y", "z", "rx", "ry", "rz"), angles_of("XYZ", pose), strict=True)
+        inner = " ".join(f'{key}="{cell}"' for key, cell in cells)
+        text += f'  <Value key="{at}" {inner} shoulder="rfree" fatherId="world[0]" />\n'
+    write(folder / "eye/eye.dtx", text + "</Data></Datas>\n</Database>\n")
+
+
+def nested_elements(folder):
+    """Elements of any names, whose positions and rotations are elements of their own."""
+    shoot(folder, "{}.png")
+    text = "<session>\n  <operator>M</operator>\n  <views>\n"
+    for at, pose in enumerate(world()[0]):
+        x, y, z, *turn = map(float, seven(pose))
+        text += f'<view image="{at}.png"><robot><position x="{x}" y="{y}" z="{z}"/>'
+        text += f"<quaternion>{' '.join(map(str, turn))}</quaternion></robot></view>\n"
+    write(folder / "record.xml", text + "</views></session>\n")
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -888,6 +951,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         below_a_preamble, below_tabs, halcon,
         console, console_of_a_maker, pictures_above_poses, among_measurements,
         lists_in_a_log, lists_beside_pictures, lists_alone, tf_echo, tf2_echo,
+        job, within_braces, elements, nested_elements,
         lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
     )
 }  # fmt: skip
@@ -995,6 +1059,20 @@ def test_a_table_of_uneven_rows_hears_of_commas_only_where_all_are_decimal(tmp_p
     write(tmp_path / "in.txt", f"1 2 3 4 5 6 7\n1 2 3 4 5 6 7\n{last}\n")
     done = visioncal("convert", tmp_path / "in.txt", tmp_path / "out", "--mount", "eye-in-hand")
     assert ("ommas" in done.refused("cells", words).err) == ("ommas" in words)
+
+
+def test_a_job_in_pulses_alone_is_refused(tmp_path):
+    lines = "\n".join(f"C{at:05d}=-1234,5,77,88,1000,{at}" for at in range(9))
+    write(tmp_path / "in/EYE.JBI", f"/JOB\n//POS\n///POSTYPE PULSE\n///PULSE\n{lines}\nEND\n")
+    done = visioncal("convert", tmp_path / "in/EYE.JBI", tmp_path / "out", "--mount", "eye-in-hand")
+    done.refused("9 positions are in pulses of the motors", "///POSTYPE BASE")
+
+
+def test_xml_with_entities_is_refused(tmp_path):
+    text = '<?xml version="1.0"?>\n<!DOCTYPE a [<!ENTITY b "c">]>\n<a><v x="1">&b;</v></a>'
+    write(tmp_path / "in/eye.dtx", text)
+    done = visioncal("convert", tmp_path / "in/eye.dtx", tmp_path / "out", "--mount", "eye-in-hand")
+    done.refused("a document type is declared")
 
 
 def test_a_guess_needs_no_second_step_where_it_contradicts_nothing_stated(tmp_path):

@@ -119,6 +119,7 @@ MAKERS_MATRICES = {
     "mecademic": lambda a, b, c: about("x", a) @ about("y", b) @ about("z", c),
     "kawasaki": oat,
     "comau": moving_zyz,
+    "epson": lambda u, v, w: fixed_xyz(w, v, u),
 }
 
 

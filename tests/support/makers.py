@@ -46,6 +46,8 @@ MAKERS = {
     "realman": ("x,y,z,rx,ry,rz", *_euler("xyz", degrees=False)),
     # setRPY of Rx, Ry, Rz (tmr_ros1).
     "techman": ("X,Y,Z,Rx,Ry,Rz", *_euler("xyz")),
+    # U about z, V about y, W about x (SPEL+ language reference, point data).
+    "epson": ("X,Y,Z,U,V,W", *_euler("ZYX")),
 }
 # Of these, those in metres and radians.
 METRES = ("ur", "realman")

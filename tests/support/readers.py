@@ -307,4 +307,5 @@ READERS = {
     "comau": numbers_of(lambda a, e, r: rz(a) @ ry(e) @ rz(r)),
     "realman": numbers_of(lambda x, y, z: rz(z) @ ry(y) @ rx(x), 1, degrees=False),
     "techman": numbers_of(lambda x, y, z: rz(z) @ ry(y) @ rx(x)),
+    "epson": numbers_of(lambda u, v, w: rz(u) @ ry(v) @ rx(w)),
 }

@@ -65,8 +65,9 @@ class PoseForm:
 # intrinsic XYZ. Kawasaki: O, A, T about moving Z, Y, Z (Roboception, "rc_visard manual", pose
 # formats). Comau, eDO_core, vZYZm: A, E, R about moving Z, Y, Z. RealMan, "SDK FAQ", 4: ZYX
 # intrinsic, given as rx, ry, rz [m, rad]. Techman, tmr_ros1, tm_ros_topic.cpp: Rx, Ry, Rz as fixed
-# roll, pitch, yaw. Franka, libfranka, RobotState::O_T_EE: 4x4, column-major. URDF specification:
-# roll, pitch, yaw about fixed x, y, z.
+# roll, pitch, yaw. Epson, "SPEL+ language reference", point data: U about Z, V about Y,
+# W about X. Franka, libfranka, RobotState::O_T_EE: 4x4, column-major. URDF specification: roll,
+# pitch, yaw about fixed x, y, z.
 _FORMS = r"""
 ur         Universal Robots p[...]                m   rotation-vector    rx ry rz  ur\d
 kuka       KUKA X, Y, Z, A, B, C                  mm  euler-ZYX-deg      a b c  kuka|kr\d|lbr|iiwa
@@ -81,6 +82,7 @@ kawasaki   Kawasaki X, Y, Z, O, A, T              mm  euler-ZYZ-deg      o a t  
 comau      Comau X, Y, Z, A, E, R                 mm  euler-ZYZ-deg      a e r  comau|racer
 realman    RealMan X, Y, Z, rx, ry, rz            m   euler-xyz-rad      rx ry rz  realman|rml?\d{2}
 techman    Techman X, Y, Z, Rx, Ry, Rz            mm  euler-xyz-deg      rx ry rz  techman|tm\d
+epson      Epson X, Y, Z, U, V, W                 mm  euler-ZYX-deg      u v w  epson
 franka  Franka O_T_EE, by columns  m  matrix-transposed  r11 r21 r31 r12 r22 r32 r13 r23 r33
 rpy        URDF xyz and rpy                       m   euler-xyz-rad      rx ry rz
 rpy-deg    xyz and rpy in degrees                 m   euler-xyz-deg      rx ry rz

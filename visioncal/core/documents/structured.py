@@ -185,6 +185,40 @@ def read_opencv(path: Path) -> Mapping[str, Any]:
     return value
 
 
+def rows_of_xml(root: Element) -> dict[str, list[object]]:
+    """Elements of any XML, three and more alike beside each other, as rows of their texts by name.
+
+    Rows are called as their parent's `name`, else its tag; those within rows are parts of these.
+    """
+    found: dict[str, list[object]] = {}
+    alike: dict[str, list[Element]] = {}
+    for child in root.iterfind("*"):
+        alike.setdefault(child.tag, []).append(child)
+    for each in alike.values():
+        rows = [_texts(child) for child in each]
+        # Elements that hold nothing but such ones are lists.
+        tags = [[part.tag for part in child.iterfind("*")] for child in each]
+        is_flat = not any(len(inner) > 2 and len({*inner}) == 1 for inner in tags)
+        if len(rows) > 2 and is_flat and not any(isinstance(row, str) for row in rows):
+            found.setdefault(root.get("name") or _tag(root), rows)
+        else:
+            for child in each:
+                found = rows_of_xml(child) | found
+    return found
+
+
+def _tag(element: Element) -> str:
+    """A tag without its name space."""
+    return element.tag.rpartition("}")[2]
+
+
+def _texts(element: Element) -> object:
+    """The text of an element, or those in it and its attributes by name."""
+    values = {**element.attrib, **{_tag(child): _texts(child) for child in element.iterfind("*")}}
+    text = (element.text or "").strip()
+    return values | ({_tag(element): text} if text else {}) if values else text
+
+
 def _with_matrices(value: object, where: str) -> object:
     if isinstance(value, Mapping):
         if value.get("type_id") == _MATRIX:

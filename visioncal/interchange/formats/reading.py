@@ -17,7 +17,13 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.documents.jsons import Array, read_arrays, read_json
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
-from visioncal.core.documents.structured import parse_yaml, read_opencv, read_yaml
+from visioncal.core.documents.structured import (
+    parse_yaml,
+    read_opencv,
+    read_xml,
+    read_yaml,
+    rows_of_xml,
+)
 from visioncal.core.documents.tables import TextTable, is_number, read_table
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
@@ -198,7 +204,9 @@ _KEYED = (".ini", ".cfg", ".conf", ".properties", ".meta")
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml", ".npz", ".npy", ".mat", ".toml", *_KEYED)
 # Robots' programs, of which the poses alone are read.
 _PROGRAMS = (".dat", ".src", ".ls", ".mod", ".script")
-ENDINGS = (".csv", ".tsv", ".txt", ".log", ".jsonl", *_PROGRAMS, *DOCUMENTS)
+# Files of makers' controllers, and the forms of their poses.
+_MAKERS = {".jbi": "yaskawa", ".pts": "epson", ".dtx": "staubli"}
+ENDINGS = (".csv", ".tsv", ".txt", ".log", ".jsonl", *_PROGRAMS, *_MAKERS, *DOCUMENTS)
 # Field names of a pose by its number of values.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
 # A word that is no image's name is looked through once.
@@ -225,14 +233,23 @@ def read_fields(path: Path, form: str | None = None) -> Fields:
 
 def read_rows(path: Path, form: str | None = None, document: object = None) -> list[Fields]:
     """All rows of a file, of which a document may have several kinds; see `read_fields`."""
+    maker = _MAKERS.get(path.suffix.lower(), "")
+    return [replace(each, form=each.form or maker) for each in _rows(path, form, document)]
+
+
+def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
     if path.suffix.lower() in DOCUMENTS:
         return rows_of_document(document or read_document(path), path)
     text = read_plain_text(path)
+    if text.lstrip().startswith("<?xml"):
+        return rows_of_document(rows_of_xml(read_xml(path)), path)
     # Points that a program declares look like keys and values.
     is_program = path.suffix.lower() in _PROGRAMS
-    for literals in () if is_program else (_literals(text, path), _keyed(text)):
+    for literals in () if is_program else (_literals(text, path), _braced(text), _keyed(text)):
         with suppress(DataError):
             return rows_of_document(literals, path)
+    if declared := () if is_program else _declared(text, path):
+        return declared
     if lines := _pendant(text, path, form if form in POSE_FORMS else None):
         return [lines]
     try:
@@ -323,6 +340,54 @@ def _keyed(text: str) -> dict[str, object]:
     return found
 
 
+_BRACED = re.compile(r"^([^\n{}=:]*+)[=:]?[ \t]*+\{[ \t\r]*+\n([^{}]*+)\}", re.MULTILINE)
+
+
+def _braced(text: str) -> list[dict[str, object]]:
+    """Records of keys and values, one a line, within braces; empty for any other text."""
+    found = [{"name": m[1].strip(), **_keyed(m[2])} for m in _BRACED.finditer(text)]
+    keys = {key for record in found for key in record if key != "name"}
+    # A letter before each key says of what type it is.
+    at = all(re.match("[a-z][A-Z]", key) for key in keys)
+    records = [{key[at * (key != "name") :]: v for key, v in each.items()} for each in found]
+    return records if len(records) > 2 and keys else []
+
+
+_DECLARED = re.compile(r"\s*+(?:\w++\s++)?(\w++)\s*+:?=([-+0-9.eE,\s]++);?\s*+")
+
+
+def _declared(text: str, path: Path) -> list[Fields]:
+    """Poses behind their names, `P00001=1.5,2,3,4,5,6`, by the kinds of names; raises DataError.
+
+    Yaskawa's `///POSTYPE` says of what those below it are.
+    """
+    kinds = defaultdict[tuple[str, int], list[tuple[str, str, list[float]]]](list)
+    system, in_pulses = "", 0
+    for place, line in _placed(text, path):
+        system = line.split()[-1] if line.startswith("///POSTYPE") else system
+        match = _DECLARED.fullmatch(line)
+        name, text = match.groups() if match else ("", "")
+        words, kind = re.split(r"[,\s]+", text.strip()), re.sub("[0-9]+", "", name)
+        if kind != name and len(words) in _POSE_SIZES and all(map(is_number, words)):
+            row = (f"{place} ({name})", name, [*map(float, words)])
+            in_pulses += system == "PULSE"
+            kinds[kind, len(words)] += [row] * (system != "PULSE")
+    if in_pulses and not any(kinds.values()):
+        raise DataError(
+            f"{path}: its {in_pulses} positions are in pulses of the motors; poses are needed.",
+            culprits=[str(path)],
+            next_step="Save the job with positions in the base (///POSTYPE BASE, ///RECTAN).",
+        )
+    found = list[Fields]()
+    for (kind, _), rows in kinds.items():
+        if len(rows) > 2:
+            places, names, numbers = zip(*rows, strict=True)
+            records = [{f"{kind.strip('_')}_pose": np.array(row)} for row in numbers]
+            fields = fields_of_records(records, places, path.stem, path.parent)
+            found.append(replace(fields, stems=names))
+    return found
+
+
 def read_document(path: Path) -> object:
     """Reads a document's mappings and lists, arrays without large ones; raises DataError."""
     suffix = path.suffix.lower()
@@ -335,7 +400,8 @@ def read_document(path: Path) -> object:
     if suffix == ".json":
         return read_json(path)
     if suffix == ".xml":
-        return read_opencv(path)
+        root = read_xml(path)
+        return (root.tag != "opencv_storage" and rows_of_xml(root)) or read_opencv(path)
     text = read_plain_text(path)
     if suffix == ".toml":
         with suppress(tomllib.TOMLDecodeError):
