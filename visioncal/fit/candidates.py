@@ -84,7 +84,7 @@ def opened(
 
 def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """All that are not open yet, with their scores."""
-    yield from scored(fit, effects_of_lenses(fit))
+    yield from scored(fit, effects_of_lenses(fit), sole_flange(fit))
     yield from of_arms(fit, pairs)
     for flange in fit.unknowns.erring:
         yield from scored(fit, effects_of_frames(fit, flange), flange)
@@ -114,11 +114,13 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
             best = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
             found.append((effect, *best))
     if flange and not fit.cell.arms[flange].has_joints:
-        # What gains little beside independent noise gains less beside errors that last.
-        found = [one for one in found if 4.0 * one[2] >= SIGNIFICANT]
-        clear = [effect for effect, *_ in found]
+        # What gains little beside independent noise gains less beside errors that last; what
+        # differs from stop to stop does not last.
+        lasting = [one[0] for one in found if one[0].count < len(fit.cell.moments)]
+        clear = [one[0] for one in found if one[0] in lasting and 4.0 * one[2] >= SIGNIFICANT]
         beside = processes.scored(fit, flange, clear) if clear else []
-        found = [(effect, *best) for effect, best in zip(clear, beside, strict=False)] or found
+        others = [one for one in found if one[0] not in (clear if beside else ())]
+        found = [*others, *((one, *best) for one, best in zip(clear, beside, strict=False))]
     for effect, size, gain in found:
         yield Candidate(gain, starting_at(random_effect(effect), size), effect)
 
@@ -130,6 +132,11 @@ def starting_at(member: Vector, size: float) -> Vector:
         for prior in member.priors
     )
     return replace(member, priors=priors)
+
+
+def sole_flange(fit: Fit) -> str:
+    """The only arm, beside whose errors what lenses do is judged; empty where there are more."""
+    return fit.unknowns.erring[0] if len(fit.unknowns.erring) == 1 else ""
 
 
 def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
