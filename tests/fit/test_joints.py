@@ -163,6 +163,23 @@ def test_zeros_are_found_within_their_covariance_and_are_no_errors_of_links():
     assert_honest(squares, 6)
 
 
+def test_a_board_beside_links_that_err_is_held_unless_its_size_is_clear():
+    """Random errors of links lengthen an arm by as much as a printed board may be off."""
+    squares = []
+    for seed in range(8):
+        options = replace(WRONG_LINKS, views=40, branches=True, seed=seed, mount=MOUNTS[seed % 2])
+        made = simulate(replace(options, dh_sigma_m=3e-4, dh_sigma_rad=3e-4))
+        fit = solve(cell_of(made)).fit
+        assert abs(fit.state.values["shape", "target"][0]) < 1e-5
+        assert np.trace(fit.budget(("edge", "cam"))["considered"]) > 0.0
+        squares.append(squares_of(made, fit, "zeros flange", np.zeros(6)))
+    low, high = chi2.ppf([0.001, 0.999], 12 * 8) / 8
+    assert low < np.mean(squares, axis=0)[0] < high
+    large = simulate(replace(WRONG_LINKS, board_scale=1.02, seed=1))
+    fit = solve(cell_of(large)).fit
+    assert fit.state.values["shape", "target"][0] == pytest.approx(0.02, abs=2e-3)
+
+
 @pytest.mark.parametrize("options", [GOOD, WRONG_LINKS, replace(SAGGING, compliance_rad_per_nm=())])
 def test_arms_that_do_not_yield_have_no_springs_and_no_play(options: CellOptions):
     for seed in range(8):

@@ -94,6 +94,11 @@ def _solved(cell: Cell) -> CellFit:
     if again is not None:
         search = again
         fit, left_out = search.run(fit.state, fit.used, fit)
+    held = with_held_sizes(fit)
+    if held is not None:
+        # No stop tells a board of another size from an arm of other lengths.
+        search = search.with_unknowns(held)
+        fit, left_out = search.run(fit.state, fit.used, fit)
     bare = [name for name in fit.unknowns.erring if not start.cell.arms[name].has_joints]
     found = {name: consider(fit, name) for name in bare}
     if any(one is not None and one.board_odds > _CLEAR for one in found.values()):
@@ -122,6 +127,21 @@ def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit
         if (search.sound & ~found.used).sum() < lost / 2:
             return other, found, left
     return search, fit, left_out
+
+
+def with_held_sizes(fit: Fit) -> Unknowns | None:
+    """The unknowns of a fit with boards held whose sizes chance explains; None for no others.
+
+    Errors of links are confounded with a board's size.
+    """
+    if fit.unknowns.closed.issuperset(f"links {name}" for name in fit.cell.arms):
+        return None
+    held = []
+    for name, board in fit.cell.boards.items():
+        if ("shape", name) in fit.unknowns and f"scale {name}" in fit.unknowns.closed:
+            has_shape = fit.unknowns["shape", name].count > 1
+            held.append(printed_board(name, board, has_shape=has_shape, is_sized=False))
+    return fit.unknowns.with_members(*held) if held else None
 
 
 def with_free_boards(fit: Fit) -> Unknowns:
