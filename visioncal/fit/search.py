@@ -171,7 +171,8 @@ class Search:
 def _is_settled(fit: Fit) -> bool:
     """Whether one more step would be a small share of every sigma.
 
-    What a step leaves is of second order: as much of it as frames turn, and lenses zoom, by it.
+    What a step leaves is of second order: as much of it as frames turn, lenses zoom, and slopes of
+    effects change, by it.
     """
     steps, kept = fit.estimate.values, fit.unknowns
     turns = [np.abs(steps[kept.columns("edge", name)]) for name in fit.cell.unknown]
@@ -179,6 +180,8 @@ def _is_settled(fit: Fit) -> bool:
     for name, lens in kept.lenses.items():
         at = kept.columns("lens", name)[:2]
         turns.append(np.abs(steps[at] * kept.units[at]) / float(lens.matrix[0]))
+    for effect in kept.effects:
+        turns.append(effect.curvature * np.abs(steps[kept.columns("effect", effect.name)]))
     most = float(np.concatenate([np.zeros(1), *turns]).max())
     sigmas = np.sqrt(np.diag(fit.estimate.covariance))
     return bool(np.all(min(_SECOND * most, 1.0) * np.abs(steps) < _SETTLED * sigmas))

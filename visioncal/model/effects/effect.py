@@ -42,6 +42,9 @@ class Effect(ABC):
     place: ClassVar[Place] = "edge"
     kind: ClassVar[str]
     bounds: ClassVar[tuple[float, float, float]]  # `start`, `low` and `high` of its size.
+    curvature: ClassVar[float] = (
+        0.0  # Share by which slopes change, at most, for one of its values.
+    )
     frame: str  # The edge's child frame, or the camera.
 
     @property

@@ -21,7 +21,7 @@ class Heat(Effect):
     warm as at the last one.
     """
 
-    kind = "heat"
+    kind, curvature = "heat", 1.0
     robot: Robot
     inputs: Inputs  # What heats it.
 

@@ -16,6 +16,7 @@ from visioncal.robot import Robot
 class JointEffect(Effect):
     """An effect on the joints of an arm; its frame is the flange."""
 
+    curvature = 1.0
     robot: Robot
 
     @abstractmethod

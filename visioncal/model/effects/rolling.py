@@ -14,6 +14,7 @@ class Rolling(Effect):
     """Time from an image's first row to its last, whose middle row has the stamp [s]."""
 
     place, kind, count, bounds = "corners", "rolling", 1, (1e-2, 1e-6, 0.1)
+    curvature = 1.0  # At a radian per second.
     height: int  # Of the images [px].
 
     def shares(self, px: FloatArray) -> FloatArray:

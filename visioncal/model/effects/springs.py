@@ -16,6 +16,7 @@ class Springs(JointEffect):
     """Compliance of each joint [rad/(N m)], under torques that are known."""
 
     kind, bounds = "springs", (1e-3, 1e-9, 0.1)
+    curvature = 200.0  # Under so many newton metres.
 
     @property
     def count(self) -> int:
