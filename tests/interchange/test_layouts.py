@@ -827,7 +827,22 @@ def lists_in_a_log(folder):
         for again in range(1 + at % 2):
             moved = [*six_of(pose)[:3], *six_of(world()[0][at - 1 + again + (at + 1) % 2])[3:]]
             text += f"{when} [INFO] read_position(radian=False) -> (0, {moved})\n"
+        joints = [11.5 * at + n for n in range(6)]
+        text += f"{when} [INFO] get_servo_angle(radian=False) -> (0, {joints})\n"
         text += f"{when} [WARNING] retry 1\n" * (at % 3) + f"{when} [INFO] saved shot_{at}.png\n"
+    write(folder / "run.log", text)
+
+
+def lists_over_lines(folder):
+    """Matrices as numpy prints them, which begin in a sentence, above their pictures' names."""
+    shoot(folder, "shot_{}.png")
+    text = "started\n"
+    for at, pose in enumerate(world()[0]):
+        rows = "\n".join(
+            f" {row}" for row in str(pose.tolist())[1:-1].replace("], ", "]\n").split("\n")
+        )
+        text += f"10:0{at}:17 base to tool [{rows.replace(',', ' ').strip()}]\n"
+        text += f"10:0{at}:18 saved shot_{at}.png\n"
     write(folder / "run.log", text)
 
 
@@ -935,6 +950,13 @@ def nested_elements(folder):
     write(folder / "record.xml", text + "</views></session>\n")
 
 
+def tf_echo_each(folder):
+    """What tf_echo prints of each picture, again and again, in a file of its own."""
+    shoot(folder, "left{:04d}.jpg")
+    for at in range(9):
+        write(folder / f"left{at:04d}.txt", echoed((at + 1) % 9) + 2 * echoed(at))
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -950,7 +972,8 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         as_many_of_other_names, below_units, below_headings, points_of_a_table,
         below_a_preamble, below_tabs, halcon,
         console, console_of_a_maker, pictures_above_poses, among_measurements,
-        lists_in_a_log, lists_beside_pictures, lists_alone, tf_echo, tf2_echo,
+        lists_in_a_log, lists_beside_pictures, lists_alone, lists_over_lines,
+        tf_echo, tf2_echo, tf_echo_each,
         job, within_braces, elements, nested_elements,
         lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
     )

@@ -102,28 +102,50 @@ def _pictured(stop: _Lines) -> str:
     return next((match[0] for _, line in stop if (match := _IMAGE.search(line))), "")
 
 
+def _arrays_in(lines: _Lines) -> dict[str, list[float]]:
+    """The numbers of lines by name."""
+    arrays = defaultdict[str, list[float]](list)
+    for name, numbers, line in ((*_numbers_in(line), line) for _, line in lines):
+        # A pose or a list that is written again replaces the first.
+        is_whole = len(numbers) in _POSE_SIZES or (name != "matrix" and "[" in line)
+        is_again = is_whole and len(numbers) == len(arrays[name])
+        arrays[name] = numbers if is_again else arrays[name] + numbers
+    return {name: row for name, row in arrays.items() if row}
+
+
 def _blocks(lines: _Lines, path: Path) -> Fields | None:
     """Rows of several lines each, of a picture or below a line of words; None where none are."""
     rows = list[tuple[str, dict[str, object], dict[str, list[float]]]]()
-    for stop in _stops(lines):
-        arrays, title = defaultdict[str, list[float]](list), ""
-        for name, numbers, line in ((*_numbers_in(line), line) for _, line in stop):
-            # A pose that is written again replaces the first.
-            is_again = len(numbers) == len(arrays[name]) and len(numbers) in _POSE_SIZES
-            arrays[name] = numbers if is_again else arrays[name] + numbers
-            title = title if numbers else line.strip(" #:")
+    for stop in _stops(_closed(lines)):
+        arrays = _arrays_in(stop)
+        title = next((line for _, line in reversed(stop) if not _numbers_in(line)[1]), "")
         image = _pictured(stop)
-        if image or any(arrays.values()):
-            rows.append((stop[0][0], {"image": image} if image else {"title": title}, arrays))
+        if image or arrays:
+            rows.append(
+                (stop[0][0], {"image": image} if image else {"title": title.strip(" #:")}, arrays)
+            )
     # Settings are written once.
-    counts = Counter(name for *_, arrays in rows for name, row in arrays.items() if row)
+    counts = Counter(name for *_, arrays in rows for name in arrays)
     usual = {name for name, count in counts.items() if 2 * count >= len(rows)}
     records = [
-        words | {name: np.array(row) for name, row in arrays.items() if row and name in usual}
+        words | {name: np.array(row) for name, row in arrays.items() if name in usual}
         for _, words, arrays in rows
     ]
     fields = fields_of_records(records, [place for place, *_ in rows], path.stem, path.parent)
     return fields if len(records) > 2 and fields.numbers else None
+
+
+def _closed(lines: _Lines) -> _Lines:
+    """Lines, those joined that one list of a few rows is written in."""
+    found, is_open = list[tuple[str, str]](), 0
+    for place, line in lines:
+        if 0 < is_open < 16 and not re.search(r"[^\W\d]{2}", line):
+            found[-1] = (found[-1][0], f"{found[-1][1]} {line}")
+            is_open = (is_open + 1) * (found[-1][1].count("[") > found[-1][1].count("]"))
+        else:
+            found.append((place, line))
+            is_open = int(line.count("[") > line.count("]"))
+    return found
 
 
 def _placed(text: str, path: Path, comments: tuple[str, ...] = ()) -> _Lines:
@@ -248,7 +270,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
     for literals in () if is_program else (_literals(text, path), _braced(text), _keyed(text)):
         with suppress(DataError):
             return rows_of_document(literals, path)
-    if declared := () if is_program else _declared(text, path):
+    if declared := () if is_program or "=" not in text else _declared(text, path):
         return declared
     if lines := _pendant(text, path, form if form in POSE_FORMS else None):
         return [lines]
@@ -271,7 +293,8 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
     fields = fields_of_records(records, places, path.stem, path.parent)
     # Headings may have as many words as matrices have columns; a picture may stand in a sentence.
     is_odd = 2 * len(fields.numbers) < len(table.columns)
-    is_odd |= _IMAGE.search(text) is not None and not any(map(is_image_name, table.rows[0]))
+    pictured = _IMAGE.search(text.splitlines()[table.lines[0] - 1])
+    is_odd |= pictured is not None and not any(map(is_image_name, table.rows[0]))
     blocks = _blocks(_placed(text, path), path) if is_odd and not table.has_header else None
     found = blocks.numbers.values() if blocks else ()
     return [blocks if blocks and any(n[0].size in _POSE_SIZES for n in found) else fields]
@@ -282,7 +305,12 @@ def read_record(path: Path, document: object = None) -> dict[str, object]:
     if path.suffix.lower() in DOCUMENTS:
         document = document or read_document(path)
     elif not (document := _keyed(text := read_plain_text(path)) or _halcon(text, path)):
-        table = read_table(path, text)
+        try:
+            table = read_table(path, text)
+        except DataError:
+            if arrays := _arrays_in(_closed(_placed(text, path))):
+                return {name: np.array(row) for name, row in arrays.items()}
+            raise
         rows = [[float(cell) if is_number(cell) else cell for cell in row] for row in table.rows]
         document = rows[0] if len(rows) == 1 else rows
         if table.has_header and len(rows) == 1:
