@@ -26,6 +26,7 @@ from visioncal.model.effects import (
     MountCreeps,
     Play,
     Springs,
+    StopsShort,
     Weight,
 )
 
@@ -174,6 +175,8 @@ def effects_of_frames(fit: Fit, flange: str) -> Iterator[Effect]:
     if len(stood) >= processes.ENOUGH_STOPS:
         yield BaseTilts(flange, poses[stood])
         yield BracketBends(flange, poses[stood])
+        if not any(sweep.flange == flange for sweep in fit.cell.sweeps):
+            yield StopsShort(flange, poses)
         # Evenly; as what warms up; as what settles in the first stops.
         for rate in (0.0, TIME_CONSTANTS, 20.0):
             yield BaseCreeps(flange, rate)
