@@ -13,7 +13,7 @@ from visioncal.fit.linearise import linearised, pairs_of
 from visioncal.fit.score import of_effect, of_waves
 from visioncal.fit.solve import solve
 from visioncal.fit.unknowns import State, lens_field, random_effect
-from visioncal.model.effects import SIGNIFICANT
+from visioncal.model.effects import SIGNIFICANT, FocusJitter
 
 
 def gain_with(fit, member, size, **changes):
@@ -136,3 +136,30 @@ def test_a_stated_lens_that_breathes_was_focused_somewhere():
     free = solve(made(stops=20, given=False).cell).fit
     counts = {one.kind: one.count for one in effects_of_lenses(free)}
     assert counts["breathing"] == 1
+
+
+def test_many_sightings_are_looked_at_some_at_a_time(fit):
+    """Results are those of all at once; no array has rows of more corners than those of some."""
+    few, all_at_once = pairs_of(fit.cell, 3), pairs_of(fit.cell, 10**6)
+    assert len(few) == 8
+    assert len(all_at_once) == 2
+    grams = [
+        linearised(fit.cell, fit.unknowns, fit.linearised, pairs) for pairs in (few, all_at_once)
+    ]
+    values = [
+        mixed_model(fit.cell, fit.unknowns, fit.linearised, own, fit.used).at(fit.estimate.logs)
+        for own in grams
+    ]
+    assert values[0].value == pytest.approx(values[1].value, rel=1e-9)
+    assert values[0].values == pytest.approx(values[1].values, rel=1e-5, abs=1e-9)
+
+
+def test_jitter_of_many_images_is_judged_by_some(fit):
+    stops = np.arange(1000)
+    jitter = FocusJitter("cam", fit.unknowns.lenses["cam"], stops)
+    assert jitter.typical.count == 150
+    few = replace(jitter, stops=np.arange(10))
+    columns = few.columns(fit.cell.moments, np.ones(10))
+    assert np.array_equal(columns[:, 0], fit.unknowns.lenses["cam"].matrix[0] * np.eye(10))
+    one = replace(jitter, stops=np.array([4]))
+    assert np.flatnonzero(one.columns(fit.cell.moments, np.ones(10))[:, 0, 0]).tolist() == [4]

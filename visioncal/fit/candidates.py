@@ -112,12 +112,14 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
     for effect in effects:
         if effect.name not in known:
             bounds = effect.size
-            best = of_effect(fit, effect).best(np.ones(effect.count), bounds.low, bounds.high)
+            # One of very many unknowns is judged by some of them.
+            own = of_effect(fit, effect.typical)
+            best = own.best(np.ones(len(own.pull)), bounds.low, bounds.high)
             found.append((effect, *best))
     if flange and not fit.cell.arms[flange].has_joints:
         # What gains little beside independent noise gains less beside errors that last; what
         # differs from stop to stop does not last.
-        lasting = [one[0] for one in found if one[0].count < len(fit.cell.moments)]
+        lasting = [one[0] for one in found if one[0].typical is one[0]]
         clear = [one[0] for one in found if one[0] in lasting and 4.0 * one[2] >= SIGNIFICANT]
         beside = processes.scored(fit, flange, clear) if clear else []
         others = [one for one in found if one[0] not in (clear if beside else ())]
@@ -152,7 +154,8 @@ def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
             is_stated = fit.cell.cameras[camera].stated is not None
             yield Breathing(camera, lens, reference_m, is_stated)
             is_breathing = f"breathing {camera}" in fit.sizes.keys() - fit.unknowns.closed
-            yield FocusJitter(camera, lens, len(fit.cell.moments), is_breathing)
+            stops = [gram.stops for gram in fit.grams if gram.pair[0] == camera]
+            yield FocusJitter(camera, lens, np.unique(np.concatenate(stops)), is_breathing)
 
 
 def effects_of_arms(fit: Fit) -> Iterator[Effect]:

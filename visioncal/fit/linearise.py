@@ -230,15 +230,19 @@ class Pair:
         return shape_basis(self.points)
 
 
-def pairs_of(cell: Cell) -> tuple[Pair, ...]:
-    """All sightings of a cell, by what they are of; those measured and those in images apart."""
+def pairs_of(cell: Cell, most: int = 50) -> tuple[Pair, ...]:
+    """All sightings of a cell, by what they are of; those measured and those in images apart.
+
+    Of more than `most`, several pairs are made: rows of all corners at once would fill the memory.
+    """
     found = []
     for names, indices in cell.pairs.items():
         kinds: dict[tuple[type, bool], list[int]] = {}
         for index in indices:
             sighting = cell.sightings[index]
             kinds.setdefault((type(sighting.evidence), sighting.is_stated), []).append(index)
-        for rows in kinds.values():
+        parts = [own[at : at + most] for own in kinds.values() for at in range(0, len(own), most)]
+        for rows in parts:
             stops = np.array([cell.sightings[row].stop for row in rows])
             board = cell.boards.get(names[1])
             points = np.zeros((0, 3)) if board is None else corner_positions(board)

@@ -15,6 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import lapack
+from scipy.spatial.distance import cdist
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, evenly
@@ -87,7 +88,7 @@ def processes(poses: FloatArray, levels: FloatArray) -> Iterator[Process]:
     yield Process(1 / 4, _beyond_mean(factors @ factors.T), of_base)
     turns = poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
     places = np.concatenate([poses[:, :3, 3] / LEVER_M, turns], axis=1)
-    squared = np.sum((places[:, None] - places) ** 2, axis=2)
+    squared = cdist(places, places, "sqeuclidean")
     for length in _RANGES:
         kernel = _beyond_mean(np.exp(-squared / (2.0 * length**2)))
         yield Process(1 / 4 / len(_RANGES), kernel, both)

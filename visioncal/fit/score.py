@@ -5,7 +5,7 @@ values and A'P A their information; the likelihood of values ~ N(0, s^2) at the 
 follows for any s (Rao 1948; for variances Verbeke and Molenberghs 2003).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,7 +89,7 @@ class Products:
     errors: list[FloatArray]  # (u, m, c) with the errors of each body's units.
 
 
-def products(fit: Fit, added: Sequence[Added], count: int) -> Products:
+def products(fit: Fit, added: Iterable[Added], count: int) -> Products:
     """Those of `count` more columns."""
     p = fit.unknowns.count
     pull, own, with_common = np.zeros(count), np.zeros((count, count)), np.zeros((p, count))
@@ -108,7 +108,7 @@ def products(fit: Fit, added: Sequence[Added], count: int) -> Products:
     return Products(pull, own, with_common, with_errors)
 
 
-def score(fit: Fit, added: Sequence[Added], count: int, freedom: float) -> Score:
+def score(fit: Fit, added: Iterable[Added], count: int, freedom: float) -> Score:
     """The score of `count` more columns, on rows whose noise is known by so many residuals."""
     with_rows, estimate = products(fit, added, count), fit.estimate
     pull, own = with_rows.pull - with_rows.common.T @ estimate.values, with_rows.own
@@ -143,7 +143,7 @@ def added_by(fit: Fit, effect: Effect) -> list[Added]:
             continue
         rows = slice(first, first + moves.shape[1])
         local = np.swapaxes(moves, 1, 2) @ gram.heads(fit.estimate.logs)[:, rows]
-        own = (local[:, :, rows] @ moves).sum(axis=0)
+        own = np.tensordot(local[:, :, rows], moves, ((0, 2), (0, 1)))
         added.append(Added(gram, local, own))
     return added
 
@@ -165,9 +165,14 @@ def of_unknown(fit: Fit, key: Key, maps: FloatArray) -> Score:
 
 def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
     """The score of all waves of a lens's field, along both axes."""
-    orders, added = orders_of_waves(), []
-    width, count = float(fit.unknowns.lenses[camera].resolution[0]), len(orders)
-    own = images_of(pairs, camera)
+    added = _by_waves(fit, images_of(pairs, camera), camera)
+    return score(fit, added, 2 * len(orders_of_waves()), fit.of_corners)
+
+
+def _by_waves(fit: Fit, own: Sequence[Pair], camera: str) -> Iterator[Added]:
+    """The waves' columns, of some images at a time: those of all would fill the memory."""
+    orders, width = orders_of_waves(), float(fit.unknowns.lenses[camera].resolution[0])
+    count = len(orders)
     for gram in fit.grams:
         pair = next((one for one in own if np.array_equal(one.rows, gram.rows)), None)
         kept = fit.used[gram.rows]
@@ -191,8 +196,7 @@ def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
             solved = of_pose_alone(raw) @ by_pose
             product += more * by_pose.reshape(-1, 2 * count).T @ solved.reshape(-1, 2 * count)
             local = local + more / weight * np.swapaxes(solved, 1, 2) @ raw[:, :6]
-        added.append(Added(taken, weight * local, product))
-    return score(fit, added, 2 * count, fit.of_corners)
+        yield Added(taken, weight * local, product)
 
 
 def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, float, float]:

@@ -72,6 +72,11 @@ class Effect(ABC):
                 where a frame moves.
         """
 
+    @property
+    def typical(self) -> "Effect":
+        """One by whose score this one is judged, where it has very many unknowns."""
+        return self
+
     def twists(self, moments: Moments, values: FloatArray) -> FloatArray:
         """(k, 6) right perturbations of an edge by (c,) values."""
         return np.asarray(self.columns(moments, np.ones(len(moments))) @ values)

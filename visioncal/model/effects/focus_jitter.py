@@ -4,17 +4,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray, evenly
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import LensEffect, Size
 
 
 @dataclass(frozen=True, eq=False)
 class FocusJitter(LensEffect):
-    """Growth of the focal lengths at each of the cell's stops, independent of the others."""
+    """Growth of the focal lengths at each of some stops, independent of the others."""
 
     kind, bounds = "focus jitter", (1e-2, 1e-6, 0.1)
-    stops: int
+    stops: IntArray  # (c,) in order.
     is_breathing: bool = False  # Whether the lens is known to focus: then this is likely.
 
     @property
@@ -26,12 +26,18 @@ class FocusJitter(LensEffect):
     @property
     def count(self) -> int:
         """See `Effect`."""
-        return self.stops
+        return len(self.stops)
+
+    @property
+    def typical(self) -> "FocusJitter":
+        """See `Effect`."""
+        return replace(self, stops=self.stops[evenly(self.count, 150)])
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
         found = self.none(moments)
-        known = np.flatnonzero(moments.stops >= 0)
-        found[known, :2, moments.stops[known]] = self.lens.matrix[:2]
+        known = np.flatnonzero(np.isin(moments.stops, self.stops))
+        own = np.searchsorted(self.stops, moments.stops[known])
+        found[known, :2, own] = self.lens.matrix[:2]
         return found
