@@ -1084,6 +1084,31 @@ def test_a_table_of_uneven_rows_hears_of_commas_only_where_all_are_decimal(tmp_p
     assert ("ommas" in done.refused("cells", words).err) == ("ommas" in words)
 
 
+def test_rounded_quaternions_give_way_to_angles_of_more_digits_that_agree(tmp_path):
+    """As tf_echo prints both, by three decimals."""
+    poses, away = world()[0], []
+    for name, wrong in (("agree", 0.0), ("differ", 1.0)):
+        text = ""
+        for at, pose in enumerate(poses):
+            turn = Rotation.from_matrix(pose[:3, :3])
+            quaternion, angles = turn.as_quat(), turn.as_euler("xyz", degrees=True)
+            angles[2] += wrong
+            text += f"At time {at}.5\n- Translation: {pose[:3, 3].tolist()}\n"
+            text += f"- Rotation: in Quaternion {quaternion.round(3).tolist()}\n"
+            text += f"            in RPY (degree) {angles.round(3).tolist()}\n"
+        write(tmp_path / name / "tf.txt", text)
+        shoot(tmp_path / name, "{}.png")
+        said = ("--target", world()[2].document["target"], "--mount", "eye-in-hand")
+        visioncal("convert", tmp_path / name, tmp_path / f"{name}_out", *said).good()
+        views = Session.load(tmp_path / f"{name}_out").views
+        found = np.array([view.base_from_flange().as_matrix()[:3, :3] for view in views])
+        turned = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1) @ found)
+        away.append(np.rad2deg(turned.magnitude()).max())
+    # Half a unit of the last decimal in three angles, and in four numbers of a quaternion.
+    assert away[0] < 1e-3
+    assert 1e-2 < away[1] < 0.12
+
+
 def test_a_job_in_pulses_alone_is_refused(tmp_path):
     lines = "\n".join(f"C{at:05d}=-1234,5,77,88,1000,{at}" for at in range(9))
     write(tmp_path / "in/EYE.JBI", f"/JOB\n//POS\n///POSTYPE PULSE\n///PULSE\n{lines}\nEND\n")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.core.choices import UNITS_M
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, Reading
@@ -150,7 +151,7 @@ def possible_poses(
         rest = (turn for turn in turns if turn.parent == place.parent and turn.rest not in rests)
         alike = alike or [*rest]
         if alike:
-            turn = max(alike, key=lambda turn: turn.size)
+            turn = _clearest(fields, alike)
             others = place.rest if is_named else (*place.words, *turn.words)
             found.append(PoseFields((*place.names, *turn.names), others, is_named))
     known = {name for item in found if item.is_named for name in item.names}
@@ -160,6 +161,30 @@ def possible_poses(
         if item.is_named or by_shape:
             complete.setdefault(item.names, item)
     return sorted(complete.values(), key=lambda item: not item.is_named)
+
+
+def _clearest(fields: Fields, turns: Sequence["_Piece"]) -> "_Piece":
+    """The least ambiguous of one rotation's forms.
+
+    Angles [deg] beside a quaternion of three or four decimals have more digits; they are taken
+    where both agree.
+    """
+    best = max(turns, key=lambda turn: turn.size)
+    if best.appearance != "quaternion" or len(best.names) > 1:
+        return best
+    numbers = fields.column(best.names[0])
+    is_coarse = (np.abs(np.linalg.norm(numbers, axis=1) - 1.0) < 0.01).all() and (
+        numbers == numbers.round(4)
+    ).all()
+    for turn in turns if is_coarse else ():
+        angles = fields.column(turn.names[0])
+        if turn.size == 3 and re.search("(rpy|euler).*deg", turn.names[0].lower()):
+            turned = Rotation.from_euler("xyz", angles, degrees=True)
+            away = (turned.inv() * Rotation.from_quat(numbers)).magnitude()
+            # Half a unit of the third decimal in four numbers turns by up to 2 mrad.
+            if np.isfinite(angles).all() and away.max() <= 2e-3:
+                return turn
+    return best
 
 
 def _without_names(
