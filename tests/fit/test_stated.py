@@ -11,6 +11,8 @@ from test_measured import is_fair
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.estimation.tree import Branch, Tree
+from visioncal.fit.held import with_small_sizes
+from visioncal.fit.score import Score
 from visioncal.fit.solve import solve
 from visioncal.model import MeasuredPlace, MeasuredPose, Sighting, read_cell
 from visioncal.model.sightings import is_copy
@@ -174,3 +176,41 @@ def test_a_refined_lens_without_a_sigma_is_found_from_the_corners():
     sigmas = np.sqrt(np.diag(fit.covariance(("lens", "cam"))))[:4]
     assert (np.abs(off) < 5 * sigmas).all()
     assert (sigmas < 10).all()
+
+
+def test_small_sizes_that_chance_explains_count_as_their_posterior_says():
+    fit = solve(made(4, 16).cell).fit
+    bare = replace(fit, considered=None, shift=None)
+    own = fit.unknowns.columns("edge", "cam")
+    names = [name for name in bare.unknowns.closed if name.endswith(" cam")]
+    assert names
+    expected = np.zeros((6, 6))
+    for name in names:
+        at = bare.unknowns.size_of(name)
+        prior = next(
+            prior
+            for prior in bare.unknowns["lens", "cam"].priors
+            if prior.size is not None and prior.size.name == name
+        )
+        columns = bare.unknowns.columns("lens", "cam")[prior.columns]
+        inner = np.linalg.inv(bare.estimate.covariance[columns[:, None], columns])
+        shown = inner - np.eye(len(columns)) * prior.size.low**-2.0
+        sizes, _ = Score(np.zeros(len(columns)), shown, np.inf).posterior(
+            prior.size.low, prior.size.high
+        )
+        found = []
+        for size in sizes:
+            logs = bare.estimate.logs.copy()
+            logs[at] = np.log(size)
+            found.append(bare.mixed.at(logs, is_sloped=False))
+        logs = np.array([(bare.estimate.value - one.value) / 2 for one in found])
+        weights = np.exp(logs) / (np.exp(logs).sum() + len(logs))
+        for one, weight in zip(found, weights, strict=True):
+            away = (one.values - bare.estimate.values)[own]
+            covariance = (one.covariance - bare.estimate.covariance)[own[:, None], own]
+            expected += weight * (covariance + np.outer(away, away))
+    others = {name for name in bare.unknowns.closed if name not in names}
+    only = replace(bare, unknowns=bare.unknowns.closing(set(bare.unknowns.closed) - others))
+    added = with_small_sizes(only).considered[own[:, None], own]
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((added - expected) / scale).max() < 0.02

@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
 from visioncal.fit.linearise import linearised, pairs_of
+from visioncal.fit.score import Score
 from visioncal.fit.unknowns import Vector, given_lens
 
 
@@ -41,3 +42,32 @@ def with_held_lenses(fit: Fit) -> Fit:
     slope = np.linalg.solve(both[first:, first:], both[first:, :first]).T
     sigmas = np.concatenate([np.full(lens.count, lens.priors[0].sigma) for lens in lenses])
     return fit.considering((slope * sigmas**2) @ slope.T)
+
+
+def with_small_sizes(fit: Fit) -> Fit:
+    """The fit with what random unknowns may be whose size chance explains, in its covariance.
+
+    They are in no estimate. A priori, a size is none as likely as it is some, with a uniform
+    logarithm; its posterior is by the score of the unknowns.
+    """
+    covariance, unknowns = fit.estimate.covariance, fit.unknowns
+    added = np.zeros((unknowns.count,) * 2)
+    values = unknowns.offsets(fit.linearised) + fit.estimate.values
+    for member in unknowns.members:
+        for prior in member.priors:
+            if prior.size is None or prior.size.name not in unknowns.closed:
+                continue
+            at = unknowns.columns(*member.key)[prior.columns]
+            inner = np.linalg.inv(covariance[at[:, None], at])
+            shown = inner - np.eye(len(at)) / prior.size.low**2
+            score = Score(inner @ values[at], (shown + shown.T) / 2, np.inf)
+            sizes, gains = score.posterior(prior.size.low, prior.size.high)
+            # As likely as all of these is none.
+            weights = np.exp(gains - np.logaddexp.reduce([*gains, np.log(len(gains))]))
+            slope = covariance[:, at] @ inner
+            for size, weight in zip(sizes.tolist(), weights.tolist(), strict=True):
+                own = np.linalg.inv(score.information + np.eye(len(at)) / size**2)
+                away = own @ score.pull - values[at]
+                more = own - covariance[at[:, None], at] + np.outer(away, away)
+                added += slope @ (weight * more) @ slope.T
+    return fit.considering(added)

@@ -65,6 +65,12 @@ class Score:
         gains = self._gains(values, vectors.T @ (sigmas * self.pull)[at], sizes)
         return float(sizes[gains.argmax()]), float(gains.max())
 
+    def posterior(self, low: float, high: float) -> tuple[FloatArray, FloatArray]:
+        """Sizes (k,) that the data would hardly show to clearly show, and their gains (k,)."""
+        unit = 1.0 / np.sqrt(max(float(np.linalg.eigvalsh(self.information)[-1]), 1e-300))
+        sizes = np.unique(np.clip(unit * _TRIED, low, high))
+        return sizes, self.gains(sizes)
+
     def gains(self, sizes: FloatArray) -> FloatArray:
         """(k,) gains of columns with equal sigmas, of k sizes."""
         values, vectors = np.linalg.eigh(self.information)

@@ -10,7 +10,7 @@ from visioncal.core.errors import ConvergenceError
 from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.candidates import candidates, of_arms, opened
 from visioncal.fit.fit import Fit, LeftOut
-from visioncal.fit.held import with_held_boards, with_held_lenses
+from visioncal.fit.held import with_held_boards, with_held_lenses, with_small_sizes
 from visioncal.fit.processes import ENOUGH_STOPS, consider, held_boards
 from visioncal.fit.refuse import refuse_open, refuse_unjoined
 from visioncal.fit.search import Effort, Search, nearest
@@ -108,7 +108,8 @@ def _solved(cell: Cell) -> CellFit:
         found = {name: consider(fit, name) for name in bare}
     for one in found.values():
         fit = fit if one is None else fit.considering(one.covariance, one.shift)
-    return CellFit(with_held_lenses(with_held_boards(fit)), left_out, start, search.effort)
+    fit = with_held_lenses(with_held_boards(with_small_sizes(fit)))
+    return CellFit(fit, left_out, start, search.effort)
 
 
 def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit, LeftOut]:
