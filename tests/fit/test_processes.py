@@ -13,6 +13,7 @@ from visioncal.fit.processes import (
     _alone,
     _boards,
     _judged,
+    _squares,
     _tried,
     consider,
     processes,
@@ -125,9 +126,15 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
             replace(member, priors=(prior, *member.priors[1:])),
         )
         mixed = mixed_model(cell, unknowns, fit.linearised, fit.grams, fit.used)
-        values.append(-0.5 * mixed.at(fit.estimate.logs).value - np.log(sigma))
+        best = mixed.at(fit.estimate.logs)
+        values.append(-0.5 * best.value - np.log(sigma))
     assert abs(board.past) == pytest.approx(1e-4, rel=0.1)
     assert found[1] - found[0] == pytest.approx(values[1] - values[0], abs=1e-3)
+    # Of any size, it is off by what the whole likelihood says.
+    (square,) = _squares(white, [board], fit.unknowns.count)
+    off = best.values[board.column] + board.past
+    own = best.covariance[board.column, board.column]
+    assert square == pytest.approx(off**2 + own, rel=1e-3)
 
 
 def test_what_held_boards_may_be_off_by_is_in_the_covariance_and_not_in_the_estimate():
@@ -143,3 +150,17 @@ def test_what_held_boards_may_be_off_by_is_in_the_covariance_and_not_in_the_esti
     added = sigmas[share] - exact
     assert np.linalg.norm(moved[3:]) > 3e-5
     assert np.sqrt(added[5, 5]) == pytest.approx(abs(moved[5]), rel=0.1)
+
+
+def test_a_board_that_is_doubted_and_not_freed_counts_in_the_covariance():
+    squares, odds = [], []
+    for seed in range(6):
+        world = made(stops=16, seed=seed)
+        # Larger by 0.12 % than stated, to 0.02 %.
+        fit = solve(with_board(world.cell, 0.04 / 1.0012, 2e-4)).fit
+        odds.append(consider(fit, "flange").board_odds)
+        away = log(invert(world.edges["cam"]) @ fit.edge("cam"))
+        squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away) / 6.0)
+    assert max(odds) < 7.0
+    # Chi-square of 36 over 36 exceeds this in one case of a thousand.
+    assert np.mean(squares) < 1.9

@@ -3,25 +3,40 @@
 The derivative of the estimate by something is their covariance over its own, if both are estimated.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
+from scipy.special import expit, logit
 
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
 from visioncal.fit.linearise import linearised, pairs_of
+from visioncal.fit.processes import Considered
 from visioncal.fit.score import Score
-from visioncal.fit.unknowns import Vector, given_lens
+from visioncal.fit.unknowns import Key, Vector, given_lens
+
+# Share of boards whose size is not within what is stated.
+_OTHERS = 0.05
 
 
-def with_held_boards(fit: Fit) -> Fit:
-    """The fit with what boards whose size is held may be off by in its covariance."""
+def with_held_boards(fit: Fit, considered: Iterable[Considered]) -> Fit:
+    """The fit with what boards whose size is held may be off by in its covariance.
+
+    They are as stated, or of any size, as `considered` beside lasting errors of an arm.
+    """
+    squares = dict[Key, float]()
+    for one in considered:
+        share = float(expit(one.board_odds + logit(_OTHERS)))
+        squares |= {key: share * square for key, square in one.board_squares.items()}
     covariance, added = fit.estimate.covariance, np.zeros((fit.unknowns.count,) * 2)
     for member in fit.unknowns.members:
         for prior in member.priors:
             if prior.considered > 0.0:
                 at = fit.unknowns.columns(*member.key)[prior.columns]
                 own = covariance[at[:, None], at]
-                slope = np.linalg.solve(own, covariance[at]).T * prior.considered
-                added += slope @ slope.T
+                slope = np.linalg.solve(own, covariance[at]).T
+                square = prior.considered**2 + squares.get(member.key, 0.0)
+                added += slope * square @ slope.T
     return fit.considering(added)
 
 

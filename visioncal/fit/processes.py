@@ -9,7 +9,7 @@ further off than that of independent errors: they take a camera's transform for 
 What each stop alone says of its flange follows from the factorisation.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -50,6 +50,8 @@ class Considered:
     covariance: FloatArray  # (p, p) beyond that of independent errors, in units of the columns.
     # Log-odds of boards of any size against boards as stated; zero where their size is free.
     board_odds: float
+    # Mean square of what each held board is off by, if boards are of any size.
+    board_squares: Mapping[Key, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +132,7 @@ def consider(fit: Fit, flange: str) -> Considered | None:
         return None
     stops, levels, p = len(alone.stops), alone.levels, fit.unknowns.count
     boards, logs, free, kinds = _boards(fit), list[float](), list[float](), []
+    squares = list[FloatArray]()
     for tried in _tried(fit, flange, alone):
         as_stated, of_any_size = (
             _judged(tried, boards, p, is_free=is_free)[0] if boards or not is_free else 0.0
@@ -137,6 +140,7 @@ def consider(fit: Fit, flange: str) -> Considered | None:
         )
         logs.append(tried.prior + as_stated)
         free.append(tried.prior + of_any_size)
+        squares.append(_squares(tried, boards, p))
         if tried.process is not None:
             kinds.append((tried.process, tried.size, tried.white))
     odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs)) if len(boards) else 0.0
@@ -164,7 +168,10 @@ def consider(fit: Fit, flange: str) -> Considered | None:
         shift += share * away
         excess += share * np.outer(away, away)
     excess += _of_frames(fit, flange, alone, gains)
-    return Considered(shift, excess - np.outer(shift, shift), odds)
+    by_evidence = np.exp(free - np.logaddexp.reduce(free)) @ np.array(squares)
+    keys = (key for key in held_boards(fit))
+    off = dict(zip(keys, by_evidence.tolist(), strict=True))
+    return Considered(shift, excess - np.outer(shift, shift), odds, off)
 
 
 def _of_frames(fit: Fit, flange: str, alone: _Alone, gains: FloatArray) -> FloatArray:
@@ -378,16 +385,36 @@ def _judged(
         It, and what unknowns and errors leave of the information (c + 1, c + 1) of the columns and
         the residual.
     """
-    own, prior, diagonal = tried.total.copy(), -tried.log_det / 2.0, np.arange(p)
-    for board in boards:
-        sigma = max(_LOOSE, board.held.considered) if is_free else board.held.considered
-        row = np.zeros(len(own))
-        row[[board.column, -1]] = 1.0, -board.past
-        own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
-        prior -= np.log(sigma)
-    own[diagonal, diagonal] *= 1.0 + 1e-9
+    own, sigmas = _with_boards(tried, boards, p, is_free=is_free)
+    prior = -tried.log_det / 2.0 - np.log(sigmas).sum()
     factor = np.linalg.cholesky(own[:p, :p])
     pull, _ = lapack.dtrtrs(factor, own[:p, p:], lower=1)
     left = own[p:, p:] - pull.T @ pull
     value = prior - np.log(np.diag(factor)).sum()
     return float(value - 0.5 * left[-1, -1]), left
+
+
+def _with_boards(
+    tried: _Tried, boards: Sequence[_Board], p: int, *, is_free: bool
+) -> tuple[FloatArray, FloatArray]:
+    """The information under a process with boards as stated or of any size, and their sigmas."""
+    own, diagonal = tried.total.copy(), np.arange(p)
+    sigmas = np.array([board.held.considered for board in boards])
+    sigmas = np.maximum(sigmas, _LOOSE) if is_free else sigmas
+    for board, sigma in zip(boards, sigmas.tolist(), strict=True):
+        row = np.zeros(len(own))
+        row[[board.column, -1]] = 1.0, -board.past
+        own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
+    own[diagonal, diagonal] *= 1.0 + 1e-9
+    return own, sigmas
+
+
+def _squares(tried: _Tried, boards: Sequence[_Board], p: int) -> FloatArray:
+    """(b,) mean squares of what boards are off by under a process, if they are of any size."""
+    if not boards:
+        return np.zeros(0)
+    own, columns = _with_boards(tried, boards, p, is_free=True)[0], [b.column for b in boards]
+    asked = np.column_stack([own[:p, -1], np.eye(p)[:, columns]])
+    solved = np.linalg.solve(own[:p, :p], asked)[columns]
+    values = solved[:, 0] + [board.past for board in boards]
+    return np.asarray(values**2 + np.diag(solved[:, 1:]))

@@ -108,7 +108,8 @@ def _solved(cell: Cell) -> CellFit:
         found = {name: consider(fit, name) for name in bare}
     for one in found.values():
         fit = fit if one is None else fit.considering(one.covariance, one.shift)
-    fit = with_held_lenses(with_held_boards(with_small_sizes(fit)))
+    doubts = [one for one in found.values() if one is not None]
+    fit = with_held_lenses(with_held_boards(with_small_sizes(fit), doubts))
     return CellFit(fit, left_out, start, search.effort)
 
 
