@@ -242,6 +242,12 @@ LENSES = {
     "kalibr.yaml": "cam0:\n  camera_model: pinhole\n  intrinsics: [500.5, 501.0, 320.0, 240.0]\n"
     "  distortion_model: radtan\n  distortion_coeffs: [-0.25, 0.125, 0.0, 0.0]\n"
     "  resolution: [640, 480]\n",
+    "realsense.json": '{"width": 640, "height": 480, "ppx": 320.0, "ppy": 240.0, "fx": 500.5, '
+    '"fy": 501.0, "model": "distortion.brown_conrady", "coeffs": [-0.25, 0.125, 0, 0, 0.5]}',
+    "zivid.yml": "CameraIntrinsics:\n  CameraMatrix: {CX: 320, CY: 240, FX: 500.5, FY: 501}\n"
+    "  Distortion: {K1: -0.25, K2: 0.125, K3: 0.5, P1: 0, P2: 0}\n  Resolution: [640, 480]\n",
+    "named.json": '{"Width": 640, "Height": 480, "cameraMatrix": {"fx": 500.5, "fy": 501, '
+    '"cx": 320, "cy": 240}, "distCoeffs": {"k1": -0.25, "k2": 0.125, "p1": 0, "p2": 0, "k3": 0.5}}',
 }
 
 

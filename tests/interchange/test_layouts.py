@@ -957,6 +957,17 @@ def tf_echo_each(folder):
         write(folder / f"left{at:04d}.txt", echoed((at + 1) % 9) + 2 * echoed(at))
 
 
+def sections(folder):
+    """An INI with a section a pose, beside one of settings."""
+    shoot(folder / "Images", "Cam1_{:04d}.png")
+    text = "; HandEyeTool\n[Setup]\nRobot=KUKA KR6 R900\nPoseCount=9\n\n"
+    for at, pose in enumerate(world()[0]):
+        cells = zip("XYZABC", angles_of("ZYX", pose), strict=True)
+        text += f"[Pose{at + 1}]\nImage=Images\\Cam1_{at:04d}.png\n"
+        text += "".join(f"{key}={cell}\n" for key, cell in cells) + "Used=1\n\n"
+    write(folder / "HandEye.ini", text.replace("\n", "\r\n"))
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -974,7 +985,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         console, console_of_a_maker, pictures_above_poses, among_measurements,
         lists_in_a_log, lists_beside_pictures, lists_alone, lists_over_lines,
         tf_echo, tf2_echo, tf_echo_each,
-        job, within_braces, elements, nested_elements,
+        job, within_braces, elements, nested_elements, sections,
         lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
     )
 }  # fmt: skip

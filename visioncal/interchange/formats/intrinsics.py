@@ -1,7 +1,7 @@
 """Targets by name, file or description; intrinsics in foreign formats as fields of `[camera]`."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -70,13 +70,39 @@ _MATRIX_KEYS = (
 )
 _DISTORTION_KEYS = (
     *("distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distCoeffs", "distortion"),
-    *("dist", "D", "d", "D1"),
+    *("dist", "D", "d", "D1", "coeffs"),
 )
 LENS_KEYS = (*_MATRIX_KEYS, *_DISTORTION_KEYS)
-_FOUR = ("fx", "fy", "cx", "cy")
-_SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
+# By name as RealSense and others call the centre, too; coefficients by name in OpenCV's order.
+_FOURS = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"))
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_SIZE_KEYS = (("imagewidth", "imageheight"), ("width", "height"), ("w", "h"))
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
-_BROWN = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "brown", "none")
+_BROWN = (
+    *("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "brown", "none"),
+    "brown_conrady",
+)
+
+
+def _plain(names: Iterable[str]) -> dict[str, str]:
+    """Names as they are written, by their letters and digits alone, in lower case."""
+    return {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in map(str, names)}
+
+
+def _named(content: Mapping[str, Any], names: Iterable[str]) -> str | None:
+    """The key that is one of some names, however it is written; None where there is none."""
+    written = _plain(content)
+    return next((written[name] for name in _plain(names) if name in written), None)
+
+
+def _four(content: Mapping[str, Any], where: str) -> list[float] | None:
+    """Focal lengths and centre by their names; None where these are not all there."""
+    written = _plain(content)
+    four = next((names for names in _FOURS if written.keys() >= {*names}), None)
+    if four is None:
+        return None
+    keys = [written[name] for name in four]
+    return [number(content[key], f"{where}: {key}") for key in keys]
 
 
 def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -102,7 +128,9 @@ def lenses_in(document: object, where: str) -> Iterator[tuple[str, dict[str, Any
     """All intrinsics in a document, at any depth, with where they stand."""
     if not isinstance(document, Mapping):
         return
-    if {*_FOUR} <= document.keys() or {*_MATRIX_KEYS, "cam0"} & document.keys():
+    written = _plain(document)
+    is_lens = any(written.keys() >= {*names} for names in _FOURS)
+    if is_lens or "cam0" in document or _named(document, _MATRIX_KEYS) is not None:
         with suppress(DataError):
             yield where, intrinsics_from(document, where)[0]
             return
@@ -117,16 +145,18 @@ def intrinsics_from(
     if "cam0" in content:
         where = f"{where}: cam0"
         content = mapping(content["cam0"], where)
-    inner = content.get("intrinsics")
-    if isinstance(inner, Mapping):
+    inner = content.get(_named(content, ("intrinsics", "CameraIntrinsics")) or "")
+    key = _named(content, _MATRIX_KEYS)
+    if isinstance(inner, Mapping) and _four(inner, where) is None:
         return intrinsics_from(inner, f"{where}: intrinsics")
-    key = next((key for key in _MATRIX_KEYS if key in content), None)
-    if {*_FOUR} <= content.keys():
-        matrix = [number(content[name], f"{where}: {name}") for name in _FOUR]
-    elif key is not None:
+    named = inner if isinstance(inner, Mapping) else content
+    if key is not None and isinstance(content[key], Mapping):
+        named = content[key]
+    matrix = _four(named, where)
+    if matrix is None and key is not None:
         k = _camera_matrix(_array(content[key], f"{where}: {key}"), f"{where}: {key}")
         matrix = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
-    else:
+    elif matrix is None:
         # Kalibr's camchain (Kalibr wiki, "Yaml formats").
         matrix = as_numbers(inner or [], f"{where}: intrinsics").reshape(-1).tolist()
     if len(matrix) != 4 or content.get("camera_model", "pinhole") != "pinhole":
@@ -136,8 +166,7 @@ def intrinsics_from(
             culprits=[where],
             next_step=f"The usual names are {', '.join(_MATRIX_KEYS[:5])}, or fx, fy, cx, cy.",
         )
-    coefficients: object = next((content[key] for key in _DISTORTION_KEYS if key in content), [])
-    flat = _array(coefficients, f"{where}: distortion").reshape(-1).tolist()
+    flat = _coefficients(content, where)
     notes: tuple[str, ...] = ()
     if len(flat) == 4 and "distortion_model" not in content:
         notes = (
@@ -145,6 +174,18 @@ def intrinsics_from(
             "OpenCV's fisheye model has four as well.",
         )
     return _lens(matrix, flat, content, where), notes
+
+
+def _coefficients(content: Mapping[str, Any], where: str) -> list[float]:
+    """Coefficients of the distortion, in a list or by their names; none where none are there."""
+    key = _named(content, _DISTORTION_KEYS)
+    found = content if key is None else content[key]
+    written = _plain(found) if isinstance(found, Mapping) else {}
+    if known := [name for name in _COEFFICIENTS if name in written]:
+        last = _COEFFICIENTS.index(known[-1]) + 1
+        names = [written.get(name, "") for name in _COEFFICIENTS[:last]]
+        return [number(found[name], f"{where}: {name}") if name else 0.0 for name in names]
+    return [] if key is None else _array(found, f"{where}: {key}").reshape(-1).tolist()
 
 
 def _camera_matrix(numbers: FloatArray, where: str) -> FloatArray:
@@ -202,6 +243,10 @@ def _lens(
     matrix: list[float], coefficients: list[float], content: Mapping[str, Any], where: str
 ) -> dict[str, Any]:
     name = str(content.get("distortion_model", "none")).lower()
+    # As RealSense says it; another `model` is that of the camera.
+    stated = str(content.get("model", "")).lower().rpartition(".")[2]
+    if name == "none" and stated.endswith("brown_conrady") and any(coefficients):
+        name = stated
     model = "fisheye" if name in _FISHEYE else "brown"
     count = 4 if model == "fisheye" else 5 if len(coefficients) <= 5 else 8
     fault = ""
@@ -224,14 +269,16 @@ def _lens(
 
 
 def _size(content: Mapping[str, Any], where: str) -> tuple[int, int] | None:
+    written = _plain(content)
     for names in _SIZE_KEYS:
-        if set(names) <= content.keys():
-            sides = [number(content[name], f"{where}: {name}") for name in names]
+        if set(names) <= written.keys():
+            sides = [number(content[written[name]], f"{where}: {name}") for name in names]
             break
     else:
-        if "resolution" not in content:
+        if "resolution" not in written:
             return None
-        sides = list(as_numbers(content["resolution"], f"{where}: resolution").reshape(-1))
+        stated = content[written["resolution"]]
+        sides = list(as_numbers(stated, f"{where}: resolution").reshape(-1))
     if len(sides) != 2 or not all(side % 1 == 0 and 0 < side < 1e6 for side in sides):
         raise DataError(f"{where}: the size of the image is {sides}.", culprits=[where])
     return int(sides[0]), int(sides[1])

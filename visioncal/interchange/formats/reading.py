@@ -532,6 +532,7 @@ def _row_lists(document: object, name: str = "") -> Iterator[_Rows]:
             yield name, values, tuple(map(str, document))
             if len(values) > 3:
                 return
+        yield from ((name, records, keys) for records, keys in _numbered_records(document))
         for key, value in document.items():
             yield from _row_lists(value, f"{name}.{key}" if name else str(key))
 
@@ -567,6 +568,20 @@ def _arrays_of(values: Sequence[object]) -> FloatArray | None:
         array = np.array(cells, dtype=float)
         return array if array.ndim > 1 else None
     return None
+
+
+def _numbered_records(
+    document: Mapping[str, object],
+) -> Iterator[tuple[list[object], tuple[str, ...]]]:
+    """Records of one name and numbers of their own that stand beside others, and their keys."""
+    found = defaultdict[str, dict[str, Mapping[str, object]]](dict)
+    for key, value in document.items():
+        match = re.fullmatch(r"(.*?)[0-9]+", str(key))
+        if match and isinstance(value, Mapping):
+            found[match[1]][str(key)] = value
+    for records in found.values():
+        if 2 < len(records) < len(document) and set.intersection(*map(set, records.values())):
+            yield [*records.values()], tuple(records)
 
 
 def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
