@@ -276,7 +276,9 @@ DONE_WRONG = {
     "Excel's semicolons": (logged(separator=";"), CONVERT, 0, "wrote new"),
     "no header": (logged(header=False), CONVERT, 0, "wrote new"),
     "a row of units": (logged(units=True), CONVERT, 0, "wrote new"),
-    "one pose too few": (logged(image=False, rows=14), CONVERT, 2, "one image a pose is needed"),
+    "one pose too few": (
+        logged(image=False, rows=14), CONVERT, 0, "The images are taken from 000.png with log.csv",
+    ),
     "a session for a result": (
         nothing, ("verify", "cell", "--against", "cell"), 2, "Run visioncal",
     ),

@@ -931,7 +931,7 @@ def elements(folder):
         for k in range(5)
     )
     text += f'<Data name="jPark" type="jointRx">{joints}</Data>\n<Data name="pPick">{others}</Data>'
-    text += '\n<Data name="pCalib" size="9">\n'
+    text += '\n<Data name="pCalib" size="9">\n<!-- taught by hand -->\n'
     for at, pose in enumerate(world()[0]):
         cells = zip(("x", "y", "z", "rx", "ry", "rz"), angles_of("XYZ", pose), strict=True)
         inner = " ".join(f'{key}="{cell}"' for key, cell in cells)

@@ -28,8 +28,9 @@ from visioncal.vision.targets import (
 _RIVAL_RATIO = 2.0
 # ... or while the difference in squared error is within 6 sigma.
 _RIVAL_CHI2 = 36.0
-# Smaller differences of rotation [rad] are one pose that was reached from both starts.
-_SAME_RAD = 1e-5
+# Smaller differences of rotation [rad] are one pose that was reached from both starts, not quite as
+# near where corners are all but exact; poses that are mirrored differ by twice the board's tilt.
+_SAME_RAD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -192,12 +192,12 @@ def rows_of_xml(root: Element) -> dict[str, list[object]]:
     """
     found: dict[str, list[object]] = {}
     alike: dict[str, list[Element]] = {}
-    for child in root.iterfind("*"):
+    for child in _parts(root):
         alike.setdefault(child.tag, []).append(child)
     for each in alike.values():
         rows = [_texts(child) for child in each]
         # Elements that hold nothing but such ones are lists.
-        tags = [[part.tag for part in child.iterfind("*")] for child in each]
+        tags = [[part.tag for part in _parts(child)] for child in each]
         is_flat = not any(len(inner) > 2 and len({*inner}) == 1 for inner in tags)
         if len(rows) > 2 and is_flat and not any(isinstance(row, str) for row in rows):
             found.setdefault(root.get("name") or _tag(root), rows)
@@ -207,6 +207,11 @@ def rows_of_xml(root: Element) -> dict[str, list[object]]:
     return found
 
 
+def _parts(element: Element) -> list[Element]:
+    """The elements in one, without comments."""
+    return [child for child in element if isinstance(child.tag, str)]
+
+
 def _tag(element: Element) -> str:
     """A tag without its name space."""
     return element.tag.rpartition("}")[2]
@@ -214,7 +219,7 @@ def _tag(element: Element) -> str:
 
 def _texts(element: Element) -> object:
     """The text of an element, or those in it and its attributes by name."""
-    values = {**element.attrib, **{_tag(child): _texts(child) for child in element.iterfind("*")}}
+    values = {**element.attrib, **{_tag(child): _texts(child) for child in _parts(element)}}
     text = (element.text or "").strip()
     return values | ({_tag(element): text} if text else {}) if values else text
 
