@@ -13,7 +13,6 @@ from visioncal.fit.processes import (
     _alone,
     _boards,
     _judged,
-    _squares,
     _tried,
     consider,
     processes,
@@ -131,7 +130,7 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     assert abs(board.past) == pytest.approx(1e-4, rel=0.1)
     assert found[1] - found[0] == pytest.approx(values[1] - values[0], abs=1e-3)
     # Of any size, it is off by what the whole likelihood says.
-    (square,) = _squares(white, [board], fit.unknowns.count)
+    (square,) = _judged(white, [board], fit.unknowns.count, is_free=True)[2]
     off = best.values[board.column] + board.past
     own = best.covariance[board.column, board.column]
     assert square == pytest.approx(off**2 + own, rel=1e-3)

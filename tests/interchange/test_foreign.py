@@ -246,6 +246,10 @@ LENSES = {
     '"fy": 501.0, "model": "distortion.brown_conrady", "coeffs": [-0.25, 0.125, 0, 0, 0.5]}',
     "zivid.yml": "CameraIntrinsics:\n  CameraMatrix: {CX: 320, CY: 240, FX: 500.5, FY: 501}\n"
     "  Distortion: {K1: -0.25, K2: 0.125, K3: 0.5, P1: 0, P2: 0}\n  Resolution: [640, 480]\n",
+    "within.json": '{"intrinsics": {"width": 640, "height": 480, "fx": 500.5, "fy": 501, '
+    '"cx": 320, "cy": 240, "distortion": [-0.25, 0.125, 0, 0, 0.5]}}',
+    "beside.json": '{"intrinsics": {"width": 640, "height": 480, "fx": 500.5, "fy": 501, '
+    '"cx": 320, "cy": 240}, "distortion": [-0.25, 0.125, 0, 0, 0.5]}',
     "named.json": '{"Width": 640, "Height": 480, "cameraMatrix": {"fx": 500.5, "fy": 501, '
     '"cx": 320, "cy": 240}, "distCoeffs": {"k1": -0.25, "k2": 0.125, "p1": 0, "p2": 0, "k3": 0.5}}',
 }

@@ -134,16 +134,15 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     boards, logs, free, kinds = _boards(fit), list[float](), list[float](), []
     squares = list[FloatArray]()
     for tried in _tried(fit, flange, alone):
-        as_stated, of_any_size = (
-            _judged(tried, boards, p, is_free=is_free)[0] if boards or not is_free else 0.0
-            for is_free in (False, True)
-        )
-        logs.append(tried.prior + as_stated)
-        free.append(tried.prior + of_any_size)
-        squares.append(_squares(tried, boards, p))
+        ways = (False, True) if boards else (False,)
+        found = [_judged(tried, boards, p, is_free=is_free) for is_free in ways]
+        logs.append(tried.prior + found[0][0])
+        free.append(tried.prior + found[-1][0])
+        squares.append(found[-1][2])
         if tried.process is not None:
             kinds.append((tried.process, tried.size, tried.white))
-    odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs)) if len(boards) else 0.0
+    odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs))
+    mean_squares = np.exp(free - np.logaddexp.reduce(free)) @ np.array(squares)
     shares = np.exp(logs - np.logaddexp.reduce(logs))[len(_WHITE) :]
     # The estimate's response to an error at each stop, which it takes for independent.
     gains = np.linalg.inv(alone.known + np.diag(levels**2)) @ alone.rows[:, :, :p]
@@ -168,10 +167,8 @@ def consider(fit: Fit, flange: str) -> Considered | None:
         shift += share * away
         excess += share * np.outer(away, away)
     excess += _of_frames(fit, flange, alone, gains)
-    by_evidence = np.exp(free - np.logaddexp.reduce(free)) @ np.array(squares)
-    keys = (key for key in held_boards(fit))
-    off = dict(zip(keys, by_evidence.tolist(), strict=True))
-    return Considered(shift, excess - np.outer(shift, shift), odds, off)
+    by_board = dict(zip(held_boards(fit), mean_squares.tolist(), strict=True))
+    return Considered(shift, excess - np.outer(shift, shift), odds, by_board)
 
 
 def _of_frames(fit: Fit, flange: str, alone: _Alone, gains: FloatArray) -> FloatArray:
@@ -204,7 +201,7 @@ def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float
     gains = list[list[FloatArray]]()
     for tried in _tried(fit, flange, alone):
         for is_free in (False, True) if boards else (False,):
-            value, left = _judged(tried, boards, p, is_free=is_free)
+            value, left, _ = _judged(tried, boards, p, is_free=is_free)
             # One board of twenty is of another size.
             logs.append(tried.prior + value + np.log(0.05 if is_free else 0.95))
             of_each = (Score(left[a:b, -1], left[a:b, a:b], np.inf) for a, b in pairwise(counts))
@@ -372,7 +369,7 @@ def _boards(fit: Fit) -> list[_Board]:
 
 def _judged(
     tried: _Tried, boards: Sequence[_Board], p: int, *, is_free: bool
-) -> tuple[float, FloatArray]:
+) -> tuple[float, FloatArray, FloatArray]:
     """The restricted log-likelihood of a process, with boards as stated or of any size.
 
     Args:
@@ -382,39 +379,22 @@ def _judged(
         is_free: Whether the boards are of any size.
 
     Returns:
-        It, and what unknowns and errors leave of the information (c + 1, c + 1) of the columns and
-        the residual.
+        It; what unknowns and errors leave of the information (c + 1, c + 1) of the columns and the
+        residual; and (b,) mean squares of what the boards are off by.
     """
-    own, sigmas = _with_boards(tried, boards, p, is_free=is_free)
-    prior = -tried.log_det / 2.0 - np.log(sigmas).sum()
+    own, prior, diagonal = tried.total.copy(), -tried.log_det / 2.0, np.arange(p)
+    for board in boards:
+        sigma = max(_LOOSE, board.held.considered) if is_free else board.held.considered
+        row = np.zeros(len(own))
+        row[[board.column, -1]] = 1.0, -board.past
+        own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
+        prior -= np.log(sigma)
+    own[diagonal, diagonal] *= 1.0 + 1e-9
     factor = np.linalg.cholesky(own[:p, :p])
     pull, _ = lapack.dtrtrs(factor, own[:p, p:], lower=1)
     left = own[p:, p:] - pull.T @ pull
     value = prior - np.log(np.diag(factor)).sum()
-    return float(value - 0.5 * left[-1, -1]), left
-
-
-def _with_boards(
-    tried: _Tried, boards: Sequence[_Board], p: int, *, is_free: bool
-) -> tuple[FloatArray, FloatArray]:
-    """The information under a process with boards as stated or of any size, and their sigmas."""
-    own, diagonal = tried.total.copy(), np.arange(p)
-    sigmas = np.array([board.held.considered for board in boards])
-    sigmas = np.maximum(sigmas, _LOOSE) if is_free else sigmas
-    for board, sigma in zip(boards, sigmas.tolist(), strict=True):
-        row = np.zeros(len(own))
-        row[[board.column, -1]] = 1.0, -board.past
-        own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
-    own[diagonal, diagonal] *= 1.0 + 1e-9
-    return own, sigmas
-
-
-def _squares(tried: _Tried, boards: Sequence[_Board], p: int) -> FloatArray:
-    """(b,) mean squares of what boards are off by under a process, if they are of any size."""
-    if not boards:
-        return np.zeros(0)
-    own, columns = _with_boards(tried, boards, p, is_free=True)[0], [b.column for b in boards]
-    asked = np.column_stack([own[:p, -1], np.eye(p)[:, columns]])
-    solved = np.linalg.solve(own[:p, :p], asked)[columns]
-    values = solved[:, 0] + [board.past for board in boards]
-    return np.asarray(values**2 + np.diag(solved[:, 1:]))
+    of_boards, _ = lapack.dtrtrs(factor, np.eye(p)[:, [board.column for board in boards]], lower=1)
+    off = of_boards.T @ pull[:, -1] + [board.past for board in boards]
+    squares = off**2 + np.sum(of_boards**2, axis=0)
+    return float(value - 0.5 * left[-1, -1]), left, squares

@@ -217,3 +217,26 @@ def distances(
 def _kept_count(rows: int, share: float = _KEPT_SHARE) -> int:
     """Number of rows that a fit of this many keeps."""
     return max(int(np.ceil(share * rows)), min(rows, FEWEST_COMPARED))
+
+
+def distance_rows(
+    robot: FloatArray, camera: FloatArray, x: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Rows by which the factor of measured distances is linear, whatever the places of X and Z are.
+
+    The target's places over the factor are linear in its inverse. A regression on the factor itself
+    would give zero for a robot that only turns, as a pan-tilt head: this makes all places the same.
+
+    Args:
+        robot: (m, 4, 4) the robot's part of the chain.
+        camera: (m, 4, 4) `cam_from_target`.
+        x: (4, 4) X, of which the rotation is used.
+
+    Returns:
+        (m, 3, 7) rows by both translations and the inverse of the factor, the translations over it,
+        and (m, 3) what these make up for with the other sign.
+    """
+    turned = robot[:, :3, :3]
+    same = np.broadcast_to(-np.eye(3), (len(robot), 3, 3))
+    rows = np.concatenate([turned, same, robot[:, :3, 3:]], axis=2)
+    return rows, (turned @ x[:3, :3] @ camera[:, :3, 3:])[:, :, 0]

@@ -14,7 +14,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import STARTS, Fit, robust_fits
+from visioncal.calibration.guess.fit import STARTS, Fit, distance_rows, robust_fits
 from visioncal.calibration.guess.readings import (
     ROW_ORDERS,
     Change,
@@ -192,12 +192,14 @@ def search(recording: Recording) -> list[Candidate]:
     refined = [declared, *(reading for reading in near if reading != declared)]
     found = fitted(recording, refined, rows, STARTS)
     first, *others = (replace(item, labels=labels[item.hypothesis]) for item in found)
-    others += _of_another_size([first, *others], rows)
+    others += _of_another_size(recording, [first, *others], rows)
     others.sort(key=lambda item: -item.log_posterior)
     return [first, *others]
 
 
-def _of_another_size(candidates: Iterable[Candidate], rows: IntArray) -> list[Candidate]:
+def _of_another_size(
+    recording: Recording, candidates: Iterable[Candidate], rows: IntArray
+) -> list[Candidate]:
     """The readings whose turns agree and whose distances do, once the camera's are multiplied."""
     scaled: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
     for item in candidates:
@@ -206,39 +208,29 @@ def _of_another_size(candidates: Iterable[Candidate], rows: IntArray) -> list[Ca
         scale, changed = _distance_scale(item), bool(item.hypothesis.changes)
         if scale is None or abs(np.log(scale)) < (_PRINTED if changed else _FOLLOWED):
             continue
-        words = f"the board {scale:.4g} times as large"
-        if not item.recording.is_measured:
-            words = f"the camera's distances, and so the board, {scale:.4g} times as large as told"
-        change = Change(words, "camera", {"scale": scale}, 2)
+        whose = (
+            "the board" if recording.is_measured else "the camera's distances, and so the board,"
+        )
+        change = Change(f"{whose} {scale:.4g} times as large", "camera", {"scale": scale}, 2)
         scaled[change.of(item.hypothesis)] = (*map(change.of, item.labels),)
-        recording = item.recording
-    if not scaled:
-        return []
-    found = fitted(recording, scaled, rows, STARTS)
+    found = fitted(recording, scaled, rows, STARTS) if scaled else []
     return [replace(item, labels=scaled[item.hypothesis]) for item in found]
 
 
 def _distance_scale(candidate: Candidate) -> float | None:
-    """Factor of the camera's distances by which those of most rows agree; None without motion.
-
-    The target's places over the factor are linear in its inverse. A regression on the factor itself
-    would give zero where it only turns: this makes all places the same.
-    """
+    """Factor of the camera's distances by which those of most rows agree; None without motion."""
     (robot,), (camera,) = chains(candidate.recording, [candidate.hypothesis], candidate.of_rows)
-    turned, count = robot[:, :3, :3], len(robot)
-    seen = (turned @ candidate.fit.x[:3, :3] @ camera[:, :3, 3:])[:, :, 0]
-    same = np.broadcast_to(-np.eye(3), (count, 3, 3))
-    by_edges = np.concatenate([turned, same, robot[:, :3, 3:]], axis=2)
+    by_edges, seen = distance_rows(robot, camera, candidate.fit.x)
     kept = np.argsort(candidate.fit.angle, kind="stable")[: len(candidate.fit.kept)]
-    solution = np.zeros(7)
+    inverse = 0.0
     for _ in range(_CONCENTRATED):
         rows, some = by_edges[kept].reshape(-1, 7), seen[kept].reshape(-1)
         solution, _, rank, _ = np.linalg.lstsq(rows, -some, rcond=_DETERMINED)
         if rank < 7:
             return None
         away = np.linalg.norm(seen + by_edges @ solution, axis=1)
-        kept = np.argsort(away, kind="stable")[: len(kept)]
-    return 1.0 / float(solution[6]) if solution[6] > 0.0 else None
+        kept, inverse = np.argsort(away, kind="stable")[: len(kept)], float(solution[6])
+    return 1.0 / inverse if inverse > 0.0 else None
 
 
 def in_one_turn(robot: FloatArray, camera: FloatArray) -> IntArray:

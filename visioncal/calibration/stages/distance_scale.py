@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from visioncal.calibration.guess.fit import distance_rows
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
@@ -12,10 +13,6 @@ def distance_scale(
     parent_from_flange: FloatArray, cam_from_target: FloatArray, flange_from_seer: FloatArray
 ) -> Finding | None:
     """Estimates the scale error of measured distances.
-
-    parent_from_flange * flange_from_seer * cam_from_target is the same for all views; its position
-    over the scale is linear in the inverse of the scale. A regression on the scale itself would
-    give zero for a robot that only turns, as a pan-tilt head: this makes all positions the same.
 
     Args:
         parent_from_flange: (m, 4, 4) the robot's poses; their inverses for a static camera.
@@ -29,10 +26,8 @@ def distance_scale(
     count = len(cam_from_target)
     if 3 * count < 14:
         return None
-    turned = parent_from_flange[:, :3, :3]
-    seen = (turned @ flange_from_seer[:3, :3] @ cam_from_target[:, :3, 3:]).reshape(-1)
-    same = np.broadcast_to(-np.eye(3), (count, 3, 3))
-    a = np.concatenate([turned, same, parent_from_flange[:, :3, 3:]], axis=2).reshape(-1, 7)
+    rows, places = distance_rows(parent_from_flange, cam_from_target, flange_from_seer)
+    a, seen = rows.reshape(-1, 7), places.reshape(-1)
     solution, _, rank, _ = np.linalg.lstsq(a, -seen)
     misfit = float(np.sum((seen + a @ solution) ** 2))
     unscaled, *_ = np.linalg.lstsq(a[:, :6], -seen - a[:, 6])

@@ -14,7 +14,7 @@ from visioncal.core.number_format import mm_and_deg
 from visioncal.core.verdict import NOTE, PLAN, Finding, Remedy, remarks
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT
 
-LIMITS = CalibrationLimits()
+_LIMITS = CalibrationLimits()
 # Remedy for errors of an arm whose joints are not known.
 NO_JOINTS = Remedy(
     "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
@@ -48,8 +48,8 @@ def _of(arm: RobotArm, level: str) -> Iterator[Finding]:
         turn_deg, shift_mm = float(np.rad2deg(turn_rad)), 1e3 * shift_m
         repeats = (0.0, 0.0) if arm.matched is None else arm.matched.robot.repeatability
         # A servo arm's own repeatability puts its flange so far off.
-        limits = (LIMITS.repeatability * np.sqrt(3.0) * np.array(repeats)).tolist()
-        limit_mm, limit_deg = map(max, LIMITS.arm_errors, limits)
+        limits = (_LIMITS.repeatability * np.sqrt(3.0) * np.array(repeats)).tolist()
+        limit_mm, limit_deg = map(max, _LIMITS.arm_errors, limits)
         if shift_mm > limit_mm or turn_deg > limit_deg:
             return
         words = (

@@ -145,20 +145,21 @@ def intrinsics_from(
     if "cam0" in content:
         where = f"{where}: cam0"
         content = mapping(content["cam0"], where)
-    inner = content.get(_named(content, ("intrinsics", "CameraIntrinsics")) or "")
     key = _named(content, _MATRIX_KEYS)
-    if isinstance(inner, Mapping) and _four(inner, where) is None:
-        return intrinsics_from(inner, f"{where}: intrinsics")
-    named = inner if isinstance(inner, Mapping) else content
-    if key is not None and isinstance(content[key], Mapping):
-        named = content[key]
-    matrix = _four(named, where)
+    for outer in (_named(content, ("intrinsics", "CameraIntrinsics")), key):
+        inner = content.get(outer or "")
+        if isinstance(inner, Mapping) and "data" not in inner:
+            rest = {name: value for name, value in content.items() if name != outer}
+            return intrinsics_from({**rest, **inner}, f"{where}: {outer}")
+    matrix = _four(content, where)
     if matrix is None and key is not None:
         k = _camera_matrix(_array(content[key], f"{where}: {key}"), f"{where}: {key}")
         matrix = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
     elif matrix is None:
         # Kalibr's camchain (Kalibr wiki, "Yaml formats").
-        matrix = as_numbers(inner or [], f"{where}: intrinsics").reshape(-1).tolist()
+        matrix = (
+            as_numbers(content.get("intrinsics") or [], f"{where}: intrinsics").reshape(-1).tolist()
+        )
     if len(matrix) != 4 or content.get("camera_model", "pinhole") != "pinhole":
         raise DataError(
             f"{where}: the camera matrix of a pinhole is needed; there are "

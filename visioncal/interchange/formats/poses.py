@@ -72,7 +72,7 @@ _ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "ini
 _MOST_COLUMNS = 40
 # Columns that count or time rows.
 _COUNTED = {"view", "index", "id", "nr", "no", "t", "time", "timestamp", "stamp", "stamp_s"}
-# Names of the numbers of a position and of a rotation, the the least ambiguous rotations first.
+# Names of the numbers of a position and of a rotation, the least ambiguous rotations first.
 _POSITION_NAMES = tuple(tuple(names.split()) for names in ("x y z", "tx ty tz", "px py pz"))
 _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
     ("qx", "qy", "qz", "qw"),
