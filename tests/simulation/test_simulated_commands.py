@@ -17,6 +17,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.results import Calibration
 from visioncal.session import Session
+from visioncal.session.depth import read_depth
 from visioncal.simulation import cell_session, read_cell, simulate
 
 # Chi-square of six exceeds this in one case of a thousand.
@@ -219,3 +220,25 @@ def test_a_sweep_of_a_cell_with_a_rolling_shutter_has_corners(place):
     session = Session.load(place / "rolling")
     assert all(view.has_corners or view.reading_m is not None for view in session.views)
     assert sum(view.stamp_s is not None for view in session.views) > 10
+
+
+def test_depth_is_off_by_what_was_asked_for(place):
+    folder = place / "depth"
+    asked = ("--depth-scale", 1.02, "--depth-offset-mm", 3, "--depth-bowl-mm", 0)
+    done("simulate", folder, "--views", 1, "--mount", "eye-to-hand", *asked)
+    content, _ = truth_of(folder)
+    session = Session.load(folder)
+    camera = session.declaration.camera
+    size, unit_m = session.resolution, camera.depth_unit_m
+    path = session.views[0].depth
+    depth = read_depth(session.images.read(path), path, size, unit_m)
+    # Where the board's middle is imaged; beside it the wall is at 2.6 m.
+    pose = np.array(content["cam_from_target"][0])
+    middle = pose @ [0.135, 0.09, 0.0, 1.0]
+    px = simulation.project(simulation.CAMERAS["wide"], middle[None, :3])[0]
+    u, v = np.rint(px).astype(int)
+    seen = np.nanmedian(depth[v - 2 : v + 3, u - 2 : u + 3])
+    # Noise under 2 mm, ink 2 mm, and the slope between pixels.
+    assert abs(seen - (1.02 * middle[2] + 0.003)) < 0.004
+    assert abs(np.nanmedian(depth) - (1.02 * 2.6 + 0.003)) < 0.004
+    assert 0.01 < np.isnan(depth).mean() < 0.06

@@ -16,6 +16,7 @@ from visioncal.simulation import (
     CAMERAS,
     ArmOptions,
     CellOptions,
+    DepthOptions,
     InstrumentAt,
     Moved,
     NetworkOptions,
@@ -54,14 +55,15 @@ _SINGLE = frozenset(
         *("images", "stiffness_knm", "payload_kg", "recording", "camera_moved_mm", "seed"),
     )
 )
+_DEPTH = ("depth", "depth_scale", "depth_offset_mm", "depth_bowl_mm", "depth_box")
 _TAKES: Mapping[str, frozenset[str]] = {
-    "": _SINGLE | {"touches", "second_board"},
+    "": _SINGLE | {"touches", "second_board", *_DEPTH},
     "sweep": _SINGLE | {"clock_offset_ms", "readout_ms"},
     "warm_up": _SINGLE | {"currents"},
     "cell": frozenset(
         (
             *("views", "images", "seed", "recording", "camera_moved_mm", "touches", "currents"),
-            *("instrument", "torques"),
+            *("instrument", "torques", *_DEPTH),
         )
     ),
     "instrument": frozenset(
@@ -161,7 +163,14 @@ def _check(asked: SimulateOptions) -> None:
 
 def _write(cell: SimulatedCell, asked: SimulateOptions) -> None:
     """Writes a cell, and its robots' touches."""
-    count = len(cell.sights)
+    count, depth = len(cell.sights), None
+    if asked.depth or asked.given.intersection(_DEPTH):
+        depth = DepthOptions(
+            scale=asked.depth_scale,
+            offset_m=1e-3 * asked.depth_offset_mm,
+            bowl_m=1e-3 * asked.depth_bowl_mm,
+            boxed=0.5 * asked.depth_box,
+        )
     with shown_progress(quiet=False) as progress:
         write_session(
             cell,
@@ -169,6 +178,7 @@ def _write(cell: SimulatedCell, asked: SimulateOptions) -> None:
             lambda share: progress("render", round(share * count), count),
             images=asked.images and not (asked.sweep or asked.warm_up),
             touched=touch(cell) if asked.touches else None,
+            depth=depth,
         )
 
 

@@ -41,7 +41,7 @@ _PLAIN_NUMBERS = frozenset({"stamp_s", "ambient_c", *LOAD}.union(*WHOLE_GROUPS))
 _NUMBERED = re.compile(r"(q[1-9]\d*_rad|tau[1-9]\d*_nm|current[1-9]\d*_a|temp[1-9]\d*_c)", re.ASCII)
 _JOINT = re.compile(r"q([1-9][0-9]*)_rad")
 _TEXTS = frozenset(
-    {"view", "stop", "role", "image", "point", "group", "approach"}
+    {"view", "stop", "role", "image", "depth", "point", "group", "approach"}
     | {"camera", "robot", "target", "instrument"}
 )
 # Largest plausible numbers by unit, with the message for a larger one. The limits of metres and

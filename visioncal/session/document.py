@@ -83,6 +83,9 @@ class CameraTable(TableModel):
     intrinsics: Literal["auto", "hold", "refine"] = "auto"
     matrix_sigma_px: PixelSigma | None = None
     focus: Literal["auto", "fixed"] = "auto"
+    # Of depth pictures: their unit [m], and whether they have distances along z or along the ray.
+    depth_unit_m: Positive | None = None
+    depth_of: Literal["z", "ray"] = "z"
 
     @property
     def size(self) -> tuple[int, int] | None:

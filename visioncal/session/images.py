@@ -13,6 +13,7 @@ from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_byte
 from visioncal.core.types import Searched
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+CLOUD_ENDINGS = (".ply", ".pcd", ".npy")
 _Place = TypeVar("_Place")
 
 
@@ -136,6 +137,20 @@ def image_path(path: str) -> str:
             "is needed.",
             culprits=[path],
             next_step="Convert the images without loss, to png.",
+        )
+    return inside
+
+
+def depth_path(path: str) -> str:
+    """Checks the path of a depth picture or cloud as `image_path` does; raises DataError."""
+    inside, endings = inside_path(path), (".png", ".tif", ".tiff", *CLOUD_ENDINGS)
+    if not inside.lower().endswith(endings):
+        raise DataError(
+            f"the depth {path!r} is of a kind that is not read; one of {', '.join(endings)} is "
+            "needed.",
+            culprits=[path],
+            next_step="Save depth as a 16-bit .png, or an organised cloud as .ply (of Zivid's .zdf "
+            "by its own program).",
         )
     return inside
 

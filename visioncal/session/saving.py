@@ -54,7 +54,7 @@ def save_session(session: "Session", folder: Path) -> None:
         with temporary(folder.parent, is_folder=True) as (aside, _):
             new = aside / "new"
             new.mkdir()
-            for path in dict.fromkeys(view.image for view in session.views if view.image):
+            for path in dict.fromkeys(path for view in session.views for path in view.files):
                 # Reading fails for an image of which only the digest is available.
                 if images.exists(path) or images.sha256(path):
                     _write_below(new, path, images.read(path))
@@ -115,7 +115,7 @@ def digest_of(session: "Session") -> str:
     The robot's link dimensions, masses and drives, the form of its poses in which results are said,
     and the task's need are not part of it.
     """
-    paths = sorted({view.image for view in session.views} - {""})
+    paths = sorted({path for view in session.views for path in view.files})
     digests = {path: session.images.sha256(path) for path in paths}
     document = {name: value for name, value in session.document.items() if name != "need"}
     if is_file(document.get("target")):

@@ -14,7 +14,7 @@ from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.robot import Loads
 from visioncal.session import columns as cols
-from visioncal.session.images import image_path
+from visioncal.session.images import depth_path, image_path, inside_path
 
 # Largest number of rows: two days of a stop every ten seconds.
 MOST_VIEWS = 20_000
@@ -52,6 +52,17 @@ class View:
     def point(self) -> str:
         """Name of the point that an instrument measured; empty where it has none."""
         return self.text.get("point", "").strip()
+
+    @property
+    def depth(self) -> str:
+        """Path of its depth picture or cloud, with forward slashes; empty where it has none."""
+        path = self.text.get("depth", "").strip()
+        return inside_path(path) if path else ""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Paths of its image and its depth, where it has them."""
+        return tuple(filter(None, (self.image, self.depth)))
 
     @property
     def joints_rad(self) -> FloatArray | None:
@@ -164,6 +175,7 @@ def read_views(table: TextTable, *, with_corners: bool = False) -> tuple[View, .
     numbers = reader.read("view", as_whole, "a whole number")
     stops = reader.read("stop", as_whole)
     images, roles = reader.read("image", image_path), reader.read("role", _role)
+    reader.read("depth", depth_path)
     known = [name for name in columns if cols.is_number(name)]
     for name in known:
         # Recordings of earlier versions may have any time; see `check_times`.

@@ -8,6 +8,7 @@ from visioncal.simulation.arms import ArmOptions, Heat, Payload, arm_named, forw
 from visioncal.simulation.boards import BOARDS
 from visioncal.simulation.cell import SimulatedCell
 from visioncal.simulation.cell_files import read_cell
+from visioncal.simulation.depth import DepthOptions
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,
@@ -43,6 +44,7 @@ __all__ = [
     "CameraAt",
     "CameraOptions",
     "CellOptions",
+    "DepthOptions",
     "Heat",
     "InstrumentAt",
     "Moved",

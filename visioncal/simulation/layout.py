@@ -40,6 +40,7 @@ class RandomStream(IntEnum):
     SWEEP = 10
     BUMP = 11
     TOUCHES = 12
+    DEPTH = 13
     MOUNTINGS = 100
     POSTURES = 101
     ARMS = 102

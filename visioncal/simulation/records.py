@@ -5,8 +5,8 @@ A single robot with one camera has no names; its session has singular tables.
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
@@ -23,6 +23,7 @@ from visioncal.session.columns import POSE, pose_row
 from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import BOARDS, corners_m
 from visioncal.simulation.cell import SimulatedCell, SimulatedSight
+from visioncal.simulation.depth import DepthOptions, depth_picture
 from visioncal.simulation.layout import CellOptions, RandomStream
 from visioncal.simulation.optics import project
 from visioncal.simulation.render import RenderScene, encode, prepare_scene, render
@@ -128,6 +129,7 @@ def write_session(
     *,
     images: bool = True,
     touched: Mapping[str, Touching] | None = None,
+    depth: DepthOptions | None = None,
 ) -> Path:
     """Writes a cell as a session's folder, with its truth in `<folder>.truth.json` beside it.
 
@@ -139,6 +141,7 @@ def write_session(
             `pixel_sigma_px` of noise would measure it, or corners if a camera has a rolling
             shutter.
         touched: Touches of its robots, by robot name.
+        depth: A sensor of depth, whose pictures go beside the images.
 
     Returns:
         The session's folder.
@@ -148,9 +151,10 @@ def write_session(
     """
     folder = Path(folder)
     without: Seen = "poses" if all(sight.at_once for sight in cell.sights) else "corners"
-    session = cell_session(cell, folder.name, progress, seen="images" if images else without)
+    seen: Seen = "images" if images else without
+    session = cell_session(cell, folder.name, progress, seen=seen, depth=depth)
     session.save(folder)
-    truth = truth_of(cell)
+    truth = truth_of(cell) | ({} if depth is None else {"depth": asdict(depth)})
     if touched:
         write_touches(touched, folder)
         for robot, touching in touched.items():
@@ -160,7 +164,12 @@ def write_session(
 
 
 def cell_session(
-    cell: SimulatedCell, name: str, progress: Progress | None = None, *, seen: Seen = "images"
+    cell: SimulatedCell,
+    name: str,
+    progress: Progress | None = None,
+    *,
+    seen: Seen = "images",
+    depth: DepthOptions | None = None,
 ) -> Session:
     """The session of a cell; see `write_session`.
 
@@ -172,6 +181,8 @@ def cell_session(
             "simulation: images and poses are those of a moment, and a sweep has readout_s.",
             next_step="Leave readout_s out, or write corners: visioncal simulate --no-images.",
         )
+    if depth is not None and seen != "images":
+        raise DataError("simulation: depth is beside images.", next_step="Leave --no-images out.")
     sights = [sight for sight in cell.sights if not sight.is_of_lens or seen != "poses"]
     poses = measured_poses(cell) if seen == "poses" else [None] * len(sights)
     views = {
@@ -187,6 +198,11 @@ def cell_session(
         views[reading.view] = _view(cell, reading.view, reading.stop, robot, numbers, text)
     for number, stop, robot in cell.pose_rows:
         views[number] = _view(cell, number, stop, robot, {}, {})
+    if depth is not None:
+        for sight in (sight for sight in sights if not sight.is_of_lens):
+            row = views[sight.view]
+            text = {**row.text, "depth": _depth_name(row.image)}
+            views[sight.view] = replace(row, text=text)
     rows = [views[number] for number in sorted(views)]
     texts = dict.fromkeys(key for row in rows for key in row.text)
     robots, boards = cell.layout.robots, cell.layout.boards
@@ -209,11 +225,15 @@ def cell_session(
         if board.name or seen != "poses"
     }
     single = next(iter(documents.values()), None)
+    document = _document(cell, name, seen)
+    if depth is not None:
+        for camera in [document.get("camera", {}), *document.get("cameras", {}).values()]:
+            camera["depth_unit_m"] = depth.unit_m
     return Session.assemble(
-        _document(cell, name, seen),
+        document,
         columns,
         [[row.cell(column) for column in columns] for row in rows],
-        MemoryImages(_rendered(cell, progress) if seen == "images" else {}),
+        MemoryImages(_rendered(cell, progress, depth) if seen == "images" else {}),
         target_document=documents if len(documents) > 1 else single,
         corners=corners,
     ).with_streams(cell.streams)
@@ -366,8 +386,15 @@ def _image_name(cell: SimulatedCell, sight: SimulatedSight) -> str:
     return f"{folder}/{sight.view:04d}.{suffix}"
 
 
-def _rendered(cell: SimulatedCell, progress: Progress | None) -> dict[str, bytes]:
-    """Renders all images, each with one board."""
+def _depth_name(image: str) -> str:
+    """Path of the depth picture beside an image."""
+    return str(PurePosixPath("depth", image.removeprefix("images/")).with_suffix(".png"))
+
+
+def _rendered(
+    cell: SimulatedCell, progress: Progress | None, depth: DepthOptions | None
+) -> dict[str, bytes]:
+    """Renders all images, each with one board, and their depth."""
     scenes: dict[tuple[str, str], RenderScene] = {}
     files: dict[str, bytes] = {}
     for camera in cell.layout.cameras:
@@ -376,7 +403,12 @@ def _rendered(cell: SimulatedCell, progress: Progress | None) -> dict[str, bytes
         ):
             key = sight.camera, sight.board
             scene = scenes.get(key) or scenes.setdefault(key, prepare_scene(cell, *key))
-            files[_image_name(cell, sight)] = encode(render(scene, index), camera.jpeg_quality)
+            path, image = _image_name(cell, sight), render(scene, index)
+            if depth is not None and not sight.is_of_lens:
+                rng = cell.options.stream(RandomStream.DEPTH, sight.view)
+                distances, image = depth_picture(scene, index, image, depth, rng)
+                files[_depth_name(path)] = encode(distances, None)
+            files[path] = encode(image, camera.jpeg_quality)
             if progress is not None:
-                progress(len(files) / len(cell.sights))
+                progress((index + 1) / len(scene.sights))
     return files

@@ -17,7 +17,7 @@ from scipy.interpolate import make_interp_spline
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply, compose, invert, rotation_angle
-from visioncal.core.types import Camera, FloatArray, Image
+from visioncal.core.types import Camera, FloatArray, Image, Image16
 from visioncal.session import frame_name
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import Sheet, bow_depth_m, centre_m, corners_m, outline_m, unit_m
@@ -209,7 +209,7 @@ def developed(light: Float32Array, camera: CameraOptions, noise: np.random.Gener
     return np.asarray(np.clip(np.rint(light), 0.0, 255.0), np.uint8)
 
 
-def encode(image: Image, jpeg_quality: int | None) -> bytes:
+def encode(image: Image | Image16, jpeg_quality: int | None) -> bytes:
     """Encodes an image as JPEG, or as PNG without a quality; raises DataError."""
     if jpeg_quality is None:
         done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 2])

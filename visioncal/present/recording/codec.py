@@ -115,6 +115,11 @@ def session_record(
         "cells": [[view.cell(column) for column in session.columns] for view in session.views],
         "images": kept,
         "digests": digests,
+        "depths": {
+            path: np.frombuffer(session.images.read(path), np.uint8)
+            for path in {view.depth: None for view in session.views if view.depth}
+            if session.images.exists(path)
+        },
         "streams": {
             name: (samples.columns, samples.values) for name, samples in session.streams.items()
         },

@@ -1,7 +1,7 @@
 """Reads the session, the result and its evidence of a recording."""
 
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
@@ -62,7 +62,9 @@ def read_session(path: Path) -> Session:
         what = f"the image {', '.join(lost)} cannot be read or does not match its SHA-256"
         raise _damaged(path, what, lost)
     searches = codec.searches_of(record)
-    return codec.session_of(record, RecordedImages(path, kept, digests, places, searches))
+    depths = {name: content.tobytes() for name, content in record.get("depths", {}).items()}
+    images = RecordedImages(path, kept, digests, places, searches, depths)
+    return codec.session_of(record, images)
 
 
 def read_calibration(path: Path) -> Calibration | None:
@@ -147,9 +149,12 @@ class RecordedImages(ImageStore):
     places: Mapping[str, _Place]  # Places of the stored images or faint copies, by name.
     # What was found in each image, by its name and that of the board in the session's `boards`.
     searches: Mapping[tuple[str, str], Searched]
+    depths: Mapping[str, bytes] = field(default_factory=dict)  # Depth files, by name.
 
     def read(self, path: str) -> bytes:
-        """Reads the bytes of one image file; raises DataError."""
+        """Reads the bytes of one image or depth file; raises DataError."""
+        if path in self.depths:
+            return self.depths[path]
         if path not in self.digests:
             raise DataError(f"The session has no image {path}.", culprits=[path])
         if self.kept != "full":
@@ -182,7 +187,7 @@ class RecordedImages(ImageStore):
 
     def sha256(self, path: str) -> str:
         """Digest of an image's bytes; empty without an image."""
-        return self.digests.get(path, "")
+        return sha256(self.depths[path]) if path in self.depths else self.digests.get(path, "")
 
     def shown(self, path: str) -> bytes | None:
         """A faint copy of an image; None if there is none."""
@@ -194,6 +199,8 @@ class RecordedImages(ImageStore):
 
     def absence(self, path: str) -> str:
         """Why the image cannot be read, in words; empty where it can."""
+        if path in self.depths:
+            return ""
         if path not in self.digests:
             return "is missing"
         if self.kept == "full":
