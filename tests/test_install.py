@@ -1,5 +1,10 @@
-"""What a wheel carries: boards, robots and the report's template, found from any folder."""
+"""What a wheel carries: boards, robots and the report's template, found from any folder.
 
+And the checks' options: a test that hangs is ended, and named.
+"""
+
+import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -40,3 +45,21 @@ def test_a_wheel_carries_its_data_and_finds_it(tmp_path):
         *(f"live/clients/visioncal.{end}" for end in ("src", "dat", "xml", "mod", "kl", "script")),
     ):
         assert f"visioncal/{data}" in names
+
+
+def test_a_test_that_hangs_is_ended_and_named(tmp_path):
+    """With the options of `.ci/run`, but for their time; the hang keeps Python's lock."""
+    (options,) = re.findall(r"PYTEST_ADDOPTS='(.*)'", (ROOT / ".ci" / "run").read_text("utf-8"))
+    hanging = tmp_path / "test_hanging.py"
+    hanging.write_text("def test_it():\n    import ctypes; ctypes.PyDLL(None).sleep(10**6)\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-n", "1", "--rootdir", tmp_path, hanging],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTEST_ADDOPTS": re.sub("=6[0-9]+", "=2", options)},
+    )
+    assert done.returncode == 1
+    assert "crashed while running 'test_hanging.py::test_it'" in done.stdout
+    assert f'"{hanging}", line 2 in test_it' in done.stderr

@@ -16,6 +16,7 @@ from support.refusals import raised
 from support.samples import made_up
 
 from visioncal.calibration.run import Run
+from visioncal.core import files
 from visioncal.core.errors import DataError
 from visioncal.core.files import (
     check_free,
@@ -46,6 +47,19 @@ def test_killed_at_any_call_one_generation_is_whole(tmp_path):
     assert done.returncode == 0, done.stderr
     # A writer whose calls are not seen is never killed.
     assert all(int(calls) > 5 for calls in done.stdout.split())
+
+
+def test_on_windows_files_are_renamed_one_by_one(tmp_path, monkeypatch):
+    """Without locks, links and flushed folders."""
+    monkeypatch.setattr(sys, "platform", "win32")
+    for name in ("O_NOFOLLOW", "link", "symlink"):
+        monkeypatch.delattr(os, name, raising=False)
+    monkeypatch.delattr(files, "fcntl", raising=False)
+    for content in (ALL, LESS):
+        written(tmp_path, content)
+        assert visible(tmp_path) == content
+        expect_no_leftovers(tmp_path, content)
+    files.flush_folder(tmp_path / "no folder")
 
 
 @posix

@@ -1,6 +1,8 @@
 """The table of a recording's views: edits under kills, and requests while a trial runs."""
 
 import shutil
+import subprocess
+import sys
 import time
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -23,6 +25,7 @@ from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.folder import FolderCamera
 from visioncal.live.drivers.manual import ManualArm
 from visioncal.live.drivers.protocols import ArmState, Frame
+from visioncal.live.page import outcome
 from visioncal.live.page import station as stations
 from visioncal.live.page.outcome import Outcome
 from visioncal.live.page.station import Setup, Station, Task, Visitor
@@ -325,3 +328,21 @@ def test_poses_and_pictures_that_are_one_apart_are_moved(recording):
     takes(station, visitor, 2, 5)
     done(6)
     assert poses()[-2:] == [("shot2.png", 2), ("shot5.png", 5)]
+
+
+@pytest.mark.parametrize(("folder", "flags"), [(None, 0x4000), (Path("out"), 0)])
+def test_on_windows_a_trial_has_a_lower_priority_too(monkeypatch, folder, flags):
+    started = {}
+
+    def popen(words, creationflags, **options):
+        started[words[-2]] = creationflags
+        return subprocess.Popen([sys.executable, "-c", "print('{\"error\"')"], **options)
+
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.delattr(outcome.os, "setpriority")
+    stand_in = SimpleNamespace(
+        PIPE=subprocess.PIPE, BELOW_NORMAL_PRIORITY_CLASS=0x4000, Popen=popen
+    )
+    monkeypatch.setattr(outcome, "subprocess", stand_in)
+    assert outcome.ask_command(["calibrate", "cell"], folder, ()).title == "failed"
+    assert [*started.values()] == [flags]

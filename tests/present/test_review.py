@@ -18,7 +18,7 @@ from support.samples import made_up
 from visioncal.interchange.result_files import load_result
 from visioncal.present import viewer
 from visioncal.present.recording import write_recording
-from visioncal.present.viewer import blueprint
+from visioncal.present.viewer import blueprint, native
 
 ENVIRONMENT = os.environ | {"COLUMNS": "300", "PYTHONWARNINGS": "error", "PYTHONUTF8": "1"}
 
@@ -127,6 +127,23 @@ def test_the_native_viewer_ends_with_all_that_it_started(out, stub, tmp_path):
     # The viewer itself is a child of rerun's command; an ended one may wait for its reaper.
     state = Path(f"/proc/{viewer['child']}/stat")
     assert not state.exists() or state.read_text().split()[2] == "Z"
+
+
+def test_on_windows_the_viewer_s_tree_is_ended(monkeypatch):
+    """Without groups of processes, and signals to them."""
+    ended = []
+
+    def run(words, **_):
+        ended.append(words)
+        process.kill()
+
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.delattr(os, "killpg")
+    monkeypatch.setattr(native.subprocess, "run", run)
+    with native.viewer_process("--version") as process:
+        pass
+    assert ended == [["taskkill", "/F", "/T", "/PID", str(process.pid)]]
+    assert process.returncode is not None
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
 
 def flush_folder(folder: Path) -> None:
     """Flushes a folder's entries to the disk; not possible on Windows."""
-    if os.name == "nt":
+    if sys.platform == "win32":
         return
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -508,8 +508,10 @@ def locked(path: Path, *, wait: bool) -> Iterator[bool | None]:
         was moved or removed meanwhile. None where there are no locks.
     """
     if sys.platform == "win32":
-        path.touch()
-        yield None
+        # An open file could neither be renamed nor removed.
+        if exists := path.parent.is_dir():
+            path.touch()
+        yield None if exists else False
         return
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)

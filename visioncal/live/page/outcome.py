@@ -69,9 +69,12 @@ def ask_command(words: Sequence[str], folder: Path | None, views: tuple[View, ..
             folder, words = Path(passing) / "trial", (*words, "--no-report", "--no-recording")
         command = [sys.executable, "-P", "-m", "visioncal", *words, "-o", str(folder), "--json"]
         pipe = subprocess.PIPE
-        with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+        # Pictures and requests come first.
+        below = getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0) if is_trial else 0
+        with subprocess.Popen(
+            command, stdout=pipe, stderr=pipe, text=True, creationflags=below
+        ) as process:
             if is_trial and hasattr(os, "setpriority"):
-                # Pictures and requests come first.
                 with suppress(OSError):
                     os.setpriority(os.PRIO_PROCESS, process.pid, 19)
             answer, complaint = process.communicate()

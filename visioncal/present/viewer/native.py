@@ -101,7 +101,7 @@ def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         arguments: Arguments of the `rerun` command. Its output can be read from `stdout`.
 
     Yields:
-        The process, which leads its own process group.
+        The process, which leads its own process group (on Windows: its tree of processes).
     """
     # It sends no statistics under continuous integration, and checks for a newer version through
     # the proxy; neither changes the user's settings of rerun.
@@ -122,11 +122,16 @@ def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         yield process
     finally:
         # Rerun's command starts the viewer as a child, and may have ended before it.
-        for number in (signal.SIGTERM, signal.SIGKILL):
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, number)
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(5.0)
+        if sys.platform == "win32":
+            ending = ["taskkill", "/F", "/T", "/PID", str(process.pid)]
+            subprocess.run(ending, check=False, capture_output=True)
+            process.wait()
+        else:
+            for number in (signal.SIGTERM, signal.SIGKILL):
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, number)
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(5.0)
         if process.stdout is not None:
             process.stdout.close()
 
