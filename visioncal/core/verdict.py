@@ -96,8 +96,8 @@ class Finding:
     views: tuple[int, ...] = ()  # The views concerned.
     # Probability that it is the cause of what is wrong; 0 for no cause.
     probability: Annotated[float, DROPPED] = 0.0
-    # Whether this probability follows from the limit of its test (or comparison) alone, the same in
-    # all sessions: it ranks causes, and is not stated.
+    # Whether this probability ranks its cause alone and is not stated: it follows from the limit of
+    # a comparison, the same in all sessions, or no cure was applied that proves it.
     by_limit: Annotated[bool, DROPPED] = False
     # Whether its probability is its share of the errors of picks: a source of errors, no mistake.
     is_share: Annotated[bool, DROPPED] = False
@@ -110,6 +110,8 @@ class Finding:
     # Squared test statistic, as of a standard normal variable; zero where the limit of its test
     # decides.
     mahalanobis_sq: Annotated[float, UNWRITTEN] = field(default=0.0, compare=False)
+    # Whether its cure, applied and refitted, leaves mere noise, as no other cause does.
+    is_proven: Annotated[bool, UNWRITTEN] = field(default=False, compare=False)
     # Greatest error of a pick that it causes [mm]; infinite where unknown.
     up_to_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
 
@@ -206,7 +208,9 @@ class Verdict:
     def _line(self, finding: Finding) -> str:
         likely = "" if finding.by_limit else f" ({percent(finding.probability)})"
         how = "Also likely" if finding.probability >= _EVEN else "Possibly"
-        how = "Most likely" if finding in self.causes[:1] else how
+        if finding in self.causes[:1]:
+            others = [cause for cause in self.causes[1:] if cause.probability >= LEAST_LIKELY]
+            how = "Likeliest of these" if finding.by_limit and others else "Most likely"
         is_likely = finding.probability >= LEAST_LIKELY and not finding.is_share
         begin = f"{how}{likely}: " if is_likely else ""
         return f"{begin}{finding.words} {finding.without_it}".strip()

@@ -11,6 +11,7 @@ from visioncal.calibration.pipeline.connectivity import robot_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.need import PickInputs, predict_picks
+from visioncal.calibration.suspects.contest import contested
 from visioncal.calibration.suspects.judge import judge
 from visioncal.calibration.suspects.judged import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.calibration.suspects.misread_poses import BY_CHAIN, with_misreading
@@ -64,7 +65,7 @@ def findings_of(run: RunState) -> Findings:
         _sensors(connected, run),
         _arms(answer),
         _worst(run),
-        (*found_in(run), *run.warnings),
+        (*contested(run, found_in(run)), *run.warnings),
         run.notes,
         run.session.need,
         predict_picks(_pick_inputs(run, explained), run.session.need),

@@ -12,9 +12,8 @@ The probability depends on the kind of finding:
 - Facts, such as an unconnected frame: probability one. Remarks without a test, and sigmas beyond
   their limits, are facts that are causes only where there is no other.
 
-A probability is stated if this session's data decide it. Facts, and findings of comparisons of
-which the limit alone is known (`Finding.by_limit`), are only ranked by it: the same figure would
-stand before each.
+A probability is stated where a cure, applied and refitted, proves the cause (`contest`). All others
+are only ranked by theirs (`Finding.by_limit`).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -173,7 +172,7 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
         if UNEXPLAINED not in rivals:
             among.append(0.0)
         probability = float(np.exp(log_odds[name] - np.logaddexp.reduce(among)))
-        return replace(found, probability=probability, by_limit=not finding.mahalanobis_sq)
+        return replace(found, probability=probability, by_limit=not finding.is_proven)
 
     return [weighed(doubt) for doubt in doubts]
 

@@ -1,0 +1,148 @@
+"""The contest of causes: each is applied and refitted, and proven only by what it then leaves.
+
+A test shows a cause beside noise alone; errors of an arm by its posture, say, follow whatever
+follows the posture. A cause is proven where its cure, applied, leaves what such arms and cameras
+have, without a pattern, and where no other cause does about as well. The others are ranked.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration.pipeline.arm_results import joint_offsets
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.likely_steps import likely_steps
+from visioncal.calibration.suspects.suspect import STEPS
+from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits, CheckLimits
+from visioncal.core.number_format import mm_and_deg
+from visioncal.core.types import FloatArray
+from visioncal.core.verdict import Finding
+from visioncal.estimation.appearance import SCALE
+from visioncal.estimation.effects import RANDOM_EFFECTS
+from visioncal.estimation.joint import target_sizes
+from visioncal.estimation.pose_errors import find_pose_errors
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
+from visioncal.estimation.robot_likelihood import robot_likelihood
+from visioncal.estimation.solve import Solution, fit_problem
+from visioncal.estimation.steps import with_step
+from visioncal.estimation.unknowns import BOARD
+from visioncal.robot.model import REPEATABILITY
+
+_LIMITS = CalibrationLimits()
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Fits without a cause and with its cure."""
+
+    without: tuple[Problem, Solution]
+    cured: tuple[Problem, Solution]
+    # Whether the fit of the session has the cure, so that steps were not sought without it.
+    is_in_fit: bool = True
+
+    @property
+    def levels(self) -> FloatArray:
+        """(2, 2) noise of the worst flange, without and with the cure, [mm] and [deg] an axis."""
+        noise = np.array([fit.noise.robots.max(axis=0) for _, fit in (self.without, self.cured)])
+        return np.asarray(noise[:, ::-1] * [1e3, np.rad2deg(1.0)])
+
+    @property
+    def gain(self) -> float:
+        """Twice the logarithm of the likelihood ratio of the cure to none."""
+        before, after = (
+            robot_likelihood(problem, fit.state, self.cured[1].noise).negative_log_likelihood
+            for problem, fit in (self.without, self.cured)
+        )
+        return 2.0 * (before - after)
+
+
+def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
+    """Findings of tests with what their cures leave, and whether that proves them."""
+    for finding in found:
+        trial = None
+        if finding.mahalanobis_sq and finding.kind in _TRIALS and run.assessment.fit.robots:
+            trial = _TRIALS[finding.kind](run, finding.kind)
+        if trial is None:
+            yield finding
+            continue
+        before, after = (mm_and_deg(*levels) for levels in trial.levels.tolist())
+        words = f"Applied and refitted, it leaves noise of {after} an axis; else it is {before}."
+        yield replace(finding, without_it=words, is_proven=_proves(run, trial))
+
+
+def _proves(run: RunState, trial: Trial) -> bool:
+    """Whether a cure leaves mere noise, and no other cause leaves about as little."""
+    before, after = trial.levels
+    limits = np.array([_LIMITS.scatter_mm[0], _LIMITS.scatter_deg[0]])
+    is_noise = bool((after < _LIMITS.repeatability * np.array(REPEATABILITY)).all())
+    is_noise |= bool((after < limits).all() and (CLEAR_RATIO * after < before).any())
+    if not is_noise or any(
+        _has_pattern(trial, name) for name, arm in run.cell_fit.arms.items() if not arm.is_modelled
+    ):
+        return False
+    if not trial.is_in_fit:
+        return True
+    errors = {
+        name: arm.errors
+        for name, arm in run.cell_fit.arms.items()
+        if arm.errors and not arm.is_modelled
+    }
+    rivals = likely_steps(*trial.without, errors, joint_offsets(run.cell_fit.arms))
+    about = 2.0 * float(np.log(CheckLimits.ruled_out))
+    return not any(step.gain > trial.gain - about for step in rivals)
+
+
+def _has_pattern(trial: Trial, robot: str) -> bool:
+    """Whether residuals beside a cure follow the posture or the stop before."""
+    problem, fit = trial.cured
+    errors = find_pose_errors(problem, fit.state, fit.noise, robot)
+    return errors is not None and errors.is_significant
+
+
+def _of_step(run: RunState, _: str) -> Trial | None:
+    fit = run.assessment.fit
+    own = fit.problem, fit.solution
+    return Trial(own, with_step(*own, run.assessment.steps[0]), is_in_fit=False)
+
+
+def _of_growth(run: RunState, kind: str) -> Trial | None:
+    """The fit without a random effect."""
+    fit = run.assessment.fit
+    problem = fit.problem
+    kept = [effect for effect in problem.effects if effect.name.partition(" of ")[0] != kind]
+    values = [problem.values_of(effect.name, fit.state) for effect in kept]
+    state = State(fit.state.edges, np.concatenate([np.zeros(0), *values]))
+    bare = problem.with_effects(kept)
+    return Trial((bare, fit_problem(bare, state, fit.noise)), (problem, fit.solution))
+
+
+def _of_size(run: RunState, _: str) -> Trial | None:
+    """The fit of boards of the stated sizes; of measured poses, that of scaled distances."""
+    fit = run.assessment.fit
+    problem, targets = fit.problem, [name for name in fit.frames if name.startswith("target")]
+    if fit.corners is None:
+        sized = problem.with_effects([*problem.effects, target_sizes(problem, targets)])
+        values = np.append(fit.state.values, np.zeros(sized.size - problem.size))
+        state = State(fit.state.edges, values)
+        return Trial((problem, fit.solution), (sized, fit_problem(sized, state)))
+    first, scales = 6 * len(problem.unknown), list[int]()
+    for board in fit.unknowns.all_of(BOARD):
+        columns = fit.unknowns.columns(board)
+        scales += columns[fit.unknowns.values_of(board) == SCALE].tolist()
+    is_held = np.isin(np.arange(first, problem.size), scales)
+    effects, at = [], 0
+    for effect in problem.effects:
+        effects.append(replace(effect, held=effect.held | is_held[at : at + len(effect)]))
+        at += len(effect)
+    stated = problem.with_effects(effects)
+    state = State(fit.state.edges, np.where(is_held, 0.0, fit.state.values))
+    return Trial((stated, fit_problem(stated, state, fit.noise)), (problem, fit.solution))
+
+
+_TRIALS: Mapping[str, Callable[[RunState, str], Trial | None]] = {
+    **dict.fromkeys(STEPS, _of_step),
+    **dict.fromkeys((effect.kind for effect in RANDOM_EFFECTS), _of_growth),
+    "board_size": _of_size,
+}
