@@ -283,6 +283,12 @@ def command():
     import sys, numpy, pyarrow, scipy.linalg, threadpoolctl
     # Of another type than arrow would find, so that it looks at what it was given.
     assert pyarrow.array([1, 2], pyarrow.uint8()).to_pylist() == [1, 2]
+    assert scipy.linalg.solve([[2.0]], [1.0]).tolist() == [0.5]
+    import cv2
+    assert "cv2.typing" not in sys.modules
+    assert cv2.norm(numpy.ones(4)) == 2.0
+    assert cv2.aruco.DICT_4X4_50 == 0
+    assert not hasattr(cv2, "nothing")
     print("pandas" in sys.modules, {it["num_threads"] for it in threadpoolctl.threadpool_info()})
 
 it.app = command
@@ -293,13 +299,51 @@ assert pyarrow.Table.from_pandas(pandas.DataFrame({"a": [1]})).num_rows == 1
 
 
 def test_libraries_are_kept_small_in_commands():
-    """Arrow does not load pandas while a command runs, but afterwards; BLAS has one thread."""
+    """Arrow loads pandas after a command alone, and OpenCV comes as used; BLAS has one thread."""
     limits = {"OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"}
     environment = {name: value for name, value in os.environ.items() if name not in limits}
     words = [sys.executable, "-c", SMALL]
     done = subprocess.run(words, check=False, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "False {1}"
+
+
+LOADING = """
+import sys
+from visioncal.cli import main
+try:
+    main()
+finally:
+    heavy = "cv2.typing jinja2 matplotlib pandas pinocchio pyarrow rerun scipy.optimize scipy.stats"
+    heavy = {*heavy.split(), "scipy.io", "visioncal.calibration", "visioncal.interchange.formats"}
+    print(len(sys.modules), *heavy & set(sys.modules), file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "most", "used"),
+    [
+        ("--help", 250, set()),
+        ("calibrate --help", 450, set()),
+        # A quarter of today's beyond them: what another Python and other releases may add.
+        ("export out --to ur", 1100, {"cv2.typing"}),
+        ("diff out out", 1100, {"cv2.typing"}),
+        ("locate -c out --pixel 320,200 --plane z=20 --pose 0.5,0.1,0.4,0,1,0,0", 1100,
+         {"cv2.typing"}),
+        ("show out -o report.html", 1250, {"cv2.typing", "jinja2", "matplotlib"}),
+        ("history empty.db", 1050, set()),
+    ],
+)  # fmt: skip
+def test_a_short_command_loads_what_it_uses(words, most, used, tmp_path):
+    (tmp_path / "out").mkdir()
+    made_up().calibration.save(tmp_path / "out" / "calibration.json")
+    History(tmp_path / "empty.db").append()
+    program = [sys.executable, "-c", LOADING, *words.split()]
+    done = subprocess.run(program, check=False, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    count, *loaded = done.stderr.splitlines()[-1].split()
+    assert set(loaded) <= used
+    assert int(count) <= most
 
 
 def test_a_bad_result_has_status_3_and_is_used_by_force_alone(pairs, tmp_path):

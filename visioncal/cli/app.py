@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, TextIO, cast
 import typer
 
 from visioncal.cli.lazy import LazyGroup
+from visioncal.cli.libraries import SmallLibraries
 from visioncal.core.errors import DataError, VerdictError, VisioncalError, check_names
 from visioncal.core.version import __version__
 
@@ -102,7 +103,7 @@ def main() -> None:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     messages, results = _guarded(sys.stderr, lambda _: None), _guarded(sys.stdout, _end)
-    with redirect_stderr(messages), redirect_stdout(results), _WithoutPandas():
+    with redirect_stderr(messages), redirect_stdout(results), SmallLibraries():
         try:
             with suppress(FileNotFoundError):
                 check_names(*sys.argv, str(Path.cwd()))
@@ -113,26 +114,6 @@ def main() -> None:
             if error.errno != ENAMETOOLONG:
                 raise
             _refuse(DataError(f"{error.filename} is longer than the name of any file."))
-
-
-class _WithoutPandas:
-    """Hides pandas, which no command uses.
-
-    Arrow would import it, where installed, to check for pandas arrays: half a second before the
-    first line of a recording.
-    """
-
-    def find_spec(self, fullname: str, path: object, target: object = None) -> None:
-        """Finds nothing, and no pandas."""
-        del path, target
-        if fullname == "pandas":
-            raise ModuleNotFoundError("commands do without pandas", name=fullname)
-
-    def __enter__(self) -> None:
-        sys.meta_path.insert(0, self)
-
-    def __exit__(self, *_: object) -> None:
-        sys.meta_path.remove(self)
 
 
 def _refuse(error: VisioncalError) -> None:

@@ -19,9 +19,6 @@ from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.types import FloatArray, Target
 from visioncal.frames.camera_chain import CalibratedCamera, Plane
 from visioncal.frames.locate import Located, locate, locate_target
-from visioncal.frames.session_observations import calibrated_joints, pose_of
-from visioncal.frames.target_in_image import check_image_size
-from visioncal.interchange.formats.intrinsics import target_named
 from visioncal.interchange.result_files import load_result
 from visioncal.results import Calibration, Edge
 from visioncal.results.picking import check_mount
@@ -67,6 +64,8 @@ def locate_command(options: LocateOptions) -> None:
         if session is not None:
             flange, joints_rad = _flange_of(session, _chosen(session, options.view), calibrated)
         elif source is not None:
+            from visioncal.frames.target_in_image import check_image_size
+
             check_image_size(CalibratedCamera.of(calibrated), read_image(source), source.name)
         boards = targets_fixed_to_base(result, choice, EYE)
         if options.plane is None:
@@ -121,6 +120,8 @@ def _flange_of(
     session: Session, views: Sequence[View], calibration: Calibration
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Flange pose and joint angles of a calibrated arm at the one chosen view."""
+    from visioncal.frames.session_observations import calibrated_joints, pose_of
+
     check_mount(session, calibration)
     if calibration.mount == "eye-to-hand":
         return None, None
@@ -242,6 +243,9 @@ def _by_image(
 def _target(words: str, result: Calibration) -> Target:
     if result.cell is not None and words in result.cell.targets:
         return target_from_document(result.cell.targets[words], words)
+    # A pixel waits for no foreign format.
+    from visioncal.interchange.formats.intrinsics import target_named
+
     return target_named(words, Path(words).stem)
 
 

@@ -16,7 +16,6 @@ from typing import Self
 
 import numpy as np
 from scipy.linalg import block_diag, cholesky, qr, solve_triangular
-from scipy.optimize import least_squares
 from scipy.special import logsumexp, softmax
 
 from visioncal.core.errors import DataError, DegenerateError
@@ -296,6 +295,9 @@ def fit_consistent(
     start = np.zeros(len(lower))
     own = slopes(start)[: base.rank, count:]
     start[count:] = np.linalg.lstsq(own, -residuals(start)[: base.rank], rcond=None)[0]
+    # An export of what was identified waits for no optimiser.
+    from scipy.optimize import least_squares
+
     fit = least_squares(
         residuals, np.maximum(start, lower), slopes, (lower, np.inf), x_scale="jac", ftol=1e-9
     )

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.ndimage import binary_opening, uniform_filter1d
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
@@ -333,6 +332,8 @@ def condition(
         longest = max(parts, key=len)
     notes += gap_notes(recorded, clock, longest_gap_s)
     window = window_of(smoothing, rate_hz, len(longest))
+    from scipy.ndimage import binary_opening, uniform_filter1d
+
     pieces, speeds_agree = [], True
     for part in parts:
         if len(part) < len(lowpass.taps) + 2 * window:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.fft import next_fast_len, rfft
 from scipy.linalg import qr, solve_triangular
 
 from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
@@ -212,6 +211,8 @@ def _scores(rows: FloatArray, correlations: FloatArray) -> FloatArray:
     # By the noise's spectrum, which is kept positive although the correlations are truncated.
     if not len(correlations):
         return np.asarray(rows.T @ rows)
+    from scipy.fft import next_fast_len, rfft
+
     size = next_fast_len(len(rows) + len(correlations), real=True)
     kernel = np.zeros(size)
     kernel[0] = 1.0

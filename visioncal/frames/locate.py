@@ -21,7 +21,6 @@ from visioncal.frames.camera_chain import (
     checked_point,
     point_jacobian,
 )
-from visioncal.frames.target_in_image import target_pose_candidates
 from visioncal.results import Calibration
 from visioncal.session.selecting import EYE, Choice
 from visioncal.vision.camera import normalise
@@ -314,6 +313,9 @@ def locate_target(
         DataError: There is no camera or no pose of the robot, or the image does not show the
             target.
     """
+    # A pixel waits for no search of images.
+    from visioncal.frames.target_in_image import target_pose_candidates
+
     eye = CalibratedCamera.of(calibration.chosen(Choice(camera, robot), EYE))
     cam_pose = eye.at(base_from_flange, joints_rad)
     board = target if isinstance(target, Target) else load_target(target)

@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.io import loadmat
 
 from visioncal.core.documents.values import read_plain_text, shown
 from visioncal.core.errors import DataError
@@ -45,6 +44,8 @@ def read_arrays(path: Path) -> Mapping[str, Array]:
         if unpacked <= MOST_BYTES:
             # Memory is allocated lazily, so that a size beyond the data costs nothing.
             if path.suffix.lower() == ".mat":
+                from scipy.io import loadmat
+
                 found = loadmat(data)
                 arrays = {name: each for name, each in found.items() if name[:2] != "__"}
                 # Structures and cells are of other kinds.

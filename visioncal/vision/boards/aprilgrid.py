@@ -22,7 +22,6 @@ DARKER, _LITTLE, ENLARGED = 25.0, 7.0, 2.0
 # Half-widths of the windows of corner refinement, as a share of the gap between tags, and bounds
 # [px].
 _WINDOW, _WINDOWS_PX = 0.35, (2, 6)
-_ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-2)
 
 
 class AprilGrid(GridBoard, Board):
@@ -166,7 +165,8 @@ def _refined_tags(image: Image, px: FloatArray, spacing: float) -> FloatArray:
     sides = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2)
     window = int(np.clip(_WINDOW * spacing * sides.min(), *_WINDOWS_PX))
     start = px.reshape(-1, 1, 2).astype(np.float32)
-    refined = cv2.cornerSubPix(image, start.copy(), (window, window), (-1, -1), _ENDS)
+    ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-2)
+    refined = cv2.cornerSubPix(image, start.copy(), (window, window), (-1, -1), ends)
     # Without a saddle point the refinement diverges.
     strays = np.linalg.norm(refined - start, axis=2, keepdims=True) > 2 * window
     return np.where(strays, start, refined).reshape(px.shape).astype(float)

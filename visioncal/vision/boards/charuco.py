@@ -195,7 +195,7 @@ def marked_squares(target: Target) -> IntArray:
 
 # Cached, as OpenCV warns of a narrow rim around the markers whenever it builds the board.
 @lru_cache(maxsize=64)
-def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
+def charuco_board(target: Target) -> "cv2.aruco.CharucoBoard":
     """OpenCV's board for a ChArUco target."""
     board = cv2.aruco.CharucoBoard(
         (target.columns, target.rows),

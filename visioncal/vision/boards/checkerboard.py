@@ -23,15 +23,8 @@ from visioncal.vision.boards.template import Print
 
 # OpenCV's search takes 170 bytes and a microsecond per pixel, and fails beyond these sides.
 _MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
-# Its searches: a quick one, and two that are tried one after the other.
-_FLAGS = (
-    0,
-    cv2.CALIB_CB_ACCURACY,
-    cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
-)
-# The search for any count, and counts that it begins at: a smaller one finds more small boards, and
-# more parts of larger ones.
-_ANY = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+# Counts that the search for any count begins at: a smaller one finds more small boards, and more
+# parts of larger ones.
 _FEWEST = ((4, 4), (3, 3))
 # Shares of a square at which its grey levels are compared, and their range in units of contrast
 # from which on it is not plain: light and noise leave a tenth.
@@ -112,7 +105,9 @@ class Checkerboard(Board):
                 f"(up to {_MOST_PIXELS / 1e6:.0f} million pixels; a ChArUco board is found in "
                 "larger ones)"
             )
-        for flags in _FLAGS[:1] if quick else _FLAGS[1:]:
+        fine = cv2.CALIB_CB_ACCURACY
+        thorough = fine | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+        for flags in (0,) if quick else (fine, thorough):
             found, px = cv2.findChessboardCornersSB(
                 image, (target.columns, target.rows), flags=flags
             )
@@ -130,8 +125,9 @@ class Checkerboard(Board):
 
     def seen_in(self, image: Image) -> Target | None:
         """The checkerboard of any count that a (h, w) grey image shows whole, the wider way."""
+        flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
         for size in _FEWEST:
-            found, _, grid = cv2.findChessboardCornersSBWithMeta(image, size, flags=_ANY)
+            found, _, grid = cv2.findChessboardCornersSBWithMeta(image, size, flags=flags)
             columns, rows = sorted(grid.shape, reverse=True) if found else (0, 0)
             board = Target("board", self.name, columns, rows, 1.0, DEFAULT_RELATIVE_SIGMA)
             # A second look, as this search takes parts of some boards for the whole.

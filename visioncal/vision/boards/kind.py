@@ -267,7 +267,7 @@ def first_id(table: DocumentTable, count: int, board: str, dictionary: str) -> i
     return first
 
 
-def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
+def aruco_dictionary(name: str) -> "cv2.aruco.Dictionary":
     """One of OpenCV's dictionaries by name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 

@@ -148,7 +148,7 @@ def read_markers(
     return found, (np.asarray(np.reshape(px, (-1, 4, 2)), dtype=float) + 0.5) / scale - 0.5
 
 
-def _parameters(border: int, darker: float | None) -> cv2.aruco.DetectorParameters:
+def _parameters(border: int, darker: float | None) -> "cv2.aruco.DetectorParameters":
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
     if darker is not None:

@@ -40,6 +40,7 @@ because ink spreads.
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from threading import Lock
 from typing import Self, TypeAlias
 
@@ -52,10 +53,8 @@ from visioncal.vision.boards.maps import OpticalAxis, maps_about
 
 _Float32Array: TypeAlias = npt.NDArray[np.float32]
 
-# Sigma of the smoothing [px], its taps, and the remaining share of white noise's variance.
-_SMOOTH_PX, _TAPS = 0.7, 5
-_KERNEL = np.asarray(cv2.getGaussianKernel(_TAPS, _SMOOTH_PX))
-_NOISE_LEFT = float(np.sum(_KERNEL**2)) ** 2
+# Sigma of the smoothing [px].
+_SMOOTH_PX = 0.7
 # Least half-width of the patch around a corner [px].
 _LEAST_PX = 3.0
 # Minimum number of corners for a homography.
@@ -195,7 +194,7 @@ class _Windows:
         )
         height, width = smooth.shape
         rows, columns = centre[:, 1, None] + steps, centre[:, 0, None] + steps
-        rim = _TAPS // 2
+        rim = len(_smoothing()) // 2
         inside = ((rows >= rim) & (rows < height - rim))[:, :, None] & (
             (columns >= rim) & (columns < width - rim)
         )[:, None, :]
@@ -266,7 +265,8 @@ class _GaussNewtonStep:
         )
         variance = np.maximum(squares, 0.0) / np.maximum(sums[:, 0, 0] - unknowns, 1.0)
         contrast = solution[:, 1, None]
-        variance_scale = (variance / _NOISE_LEFT)[:, None, None] / contrast[:, :, None] ** 2
+        noise_left = float(np.sum(_smoothing() ** 2)) ** 2
+        variance_scale = (variance / noise_left)[:, None, None] / contrast[:, :, None] ** 2
         return cls(
             solution[:, :2],
             -solution[:, 2:4] / contrast,
@@ -364,10 +364,17 @@ def unrefined(px: FloatArray) -> Refined:
     return Refined(px, np.full(len(px), np.nan), np.full(2, np.nan))
 
 
+@cache
+def _smoothing() -> FloatArray:
+    """The (5, 1) taps of the smoothing; white noise keeps the square of their sum of squares."""
+    return np.asarray(cv2.getGaussianKernel(5, _SMOOTH_PX), dtype=np.float64)
+
+
 def _refine_corners(
     image: Image, pattern: Print, board: FloatArray, px: FloatArray, axis: OpticalAxis
 ) -> Refined:
-    smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
+    kernel = _smoothing()
+    smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel), np.float32)
     indices, all_corners = np.arange(len(px)), np.ones(len(px), bool)
     sample = indices[:: -(-len(px) // 30)]
     # Wide, as circles may be larger than stated.

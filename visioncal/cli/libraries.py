@@ -1,0 +1,59 @@
+"""Libraries as commands need them: none loads what no command uses, and none before its use."""
+
+import sys
+from collections import defaultdict
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any
+
+
+class SmallLibraries:
+    """Keeps libraries small within its block, which save half the time of a short command.
+
+    Arrow would import pandas, where installed, to check for arrays of it. SciPy parses and rewrites
+    hundreds of docstrings as it is imported. Many modules import OpenCV for what few commands do.
+    """
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> None:
+        """Finds nothing, and no pandas."""
+        del path, target
+        if fullname == "pandas":
+            raise ModuleNotFoundError("commands do without pandas", name=fullname)
+        if fullname == "scipy._lib._util":
+            # Both of its decorators take the class from there.
+            vars(import_module("scipy._lib._docscrape")).update(FunctionDoc=_Undocumented)
+
+    def __enter__(self) -> None:
+        sys.meta_path.insert(0, self)
+        if "cv2" not in sys.modules:
+            sys.modules["cv2"] = _Postponed("cv2")
+
+    def __exit__(self, *_: object) -> None:
+        sys.meta_path.remove(self)
+
+
+class _Undocumented(defaultdict[str, list[object]]):
+    """A docstring without sections."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        super().__init__(list)
+
+    def __str__(self) -> str:
+        return "\n"
+
+
+class _Postponed(ModuleType):
+    """A module that is loaded when one of its attributes is first used."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.__spec__ = find_spec(name)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the module has
+        if sys.modules.get(self.__name__) is self:
+            sys.modules.pop(self.__name__, None)
+        # Another thread's import is waited for.
+        module = import_module(self.__name__)
+        self.__dict__.update({key: vars(module)[key] for key in vars(module) if key[:2] != "__"})
+        return getattr(module, name)
