@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from support.cells import calibrated, pairs_session, reporting
 from support.marks import slow
+from support.sound_findings import SOUND, changed, directions
 
 import visioncal
+from visioncal.calibration.suspects.judge import judge
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Verdict
@@ -90,6 +92,36 @@ def test_creeping_is_not_sure_where_a_step_does_as_well(seed):
     step = [0.0, 0.0, 0.0, 1e-3, 5e-4, 0.0]
     for cause in visioncal.calibrate(pairs(seed, MOUNTS[0], step=step)).verdict.causes:
         assert cause.by_limit or cause.is_share or cause.kind == "moved_at_once"
+
+
+def test_nothing_is_accused_of_more_than_it_can_do():
+    """A base that creeps by 40 mm, and as is likelier, whatever else follows the order of views."""
+    cell = simulate(FINE)
+    time = np.linspace(-0.5, 0.5, len(cell.corners))[:, None]
+    crept = exp(0.04 * time * np.eye(6)[4]) @ cell.robot.base_from_flange
+    causes = calibrated(reporting(cell, base_from_flange=crept)).verdict.causes
+    assert not {cause.kind for cause in causes} & {"moved_slowly", "base_creeps"}
+
+
+def test_fewer_stops_than_check_a_result_accuse_no_arm():
+    cell = simulate(replace(FINE, views=9, dh_sigma_m=5e-4, dh_sigma_rad=1e-3))
+    known = calibrated(cell, joints=False)
+    # It counts in the covariance as ever.
+    assert any(arm.errors.is_significant for arm in known.cell_fit.arms.values())
+    assert not any("posture" in finding.words for finding in known.verdict.findings)
+
+
+@pytest.mark.parametrize(("explains", "first"), [(0.9, "board_shape"), (0.3, "unexplained")])
+def test_what_the_fit_accounts_for_explains_what_it_removed(explains, first):
+    bent = Finding("board_shape", "The board is not flat.", explains=explains)
+    verdict = judge(changed(SOUND, warnings=(bent,), noise_mm=1.0))
+    assert verdict.causes[0].kind == first
+
+
+def test_a_bent_board_that_is_in_the_fit_is_no_cause_of_a_weak_motion():
+    bent = Finding("board_shape", "The board is not flat.")
+    verdict = judge(replace(changed(SOUND, warnings=(bent,)), worst=directions(9e-3)))
+    assert [cause.kind for cause in verdict.causes][:1] == ["weak_motion"]
 
 
 def test_words_say_whether_rivals_are_left():

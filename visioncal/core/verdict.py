@@ -112,6 +112,8 @@ class Finding:
     mahalanobis_sq: Annotated[float, UNWRITTEN] = field(default=0.0, compare=False)
     # Whether its cure, applied and refitted, leaves mere noise, as no other cause does.
     is_proven: Annotated[bool, UNWRITTEN] = field(default=False, compare=False)
+    # Share of the misfit, as a variance, that its cure removes: all of it where none was applied.
+    explains: Annotated[float, UNWRITTEN] = field(default=1.0, compare=False)
     # Greatest error of a pick that it causes [mm]; infinite where unknown.
     up_to_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
 

@@ -12,7 +12,7 @@ from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.verdict import NOTE, PLAN, Finding, Remedy, remarks
-from visioncal.estimation.arm import LEVER_M, SIGNIFICANT
+from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, stops_of
 
 _LIMITS = CalibrationLimits()
 # Remedy for errors of an arm whose joints are not known.
@@ -28,11 +28,12 @@ def _found(run: RunState) -> Iterator[Finding]:
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         levels = () if arm.kinematics is None else (*findings(arm.kinematics),)
         notes = remarks((*drifts, *levels, *reports[name].notes), NOTE)
-        for finding in (*_of(arm, run.cell_fit.level), *reports[name].doubts, *notes):
+        stops = len(stops_of(run.assessment.fit.problem, name))
+        for finding in (*_of(arm, run.cell_fit.level, stops), *reports[name].doubts, *notes):
             yield finding.of("" if len(arms) == 1 else f"Robot {name}")
 
 
-def _of(arm: RobotArm, level: str) -> Iterator[Finding]:
+def _of(arm: RobotArm, level: str, stops: int) -> Iterator[Finding]:
     is_cold = level == thermal.LEVEL and arm.thermal is None
     if is_cold or (arm.joints_rad is None and level not in ("auto", "hand-eye")):
         words = f"It stays as it reports itself: its rows lack what --level {level} needs."
@@ -50,7 +51,8 @@ def _of(arm: RobotArm, level: str) -> Iterator[Finding]:
         # A servo arm's own repeatability puts its flange so far off.
         limits = (_LIMITS.repeatability * np.sqrt(3.0) * np.array(repeats)).tolist()
         limit_mm, limit_deg = map(max, _LIMITS.arm_errors, limits)
-        if shift_mm > limit_mm or turn_deg > limit_deg:
+        # By fewer stops than check a result, no pattern among them is known for the arm's.
+        if shift_mm > limit_mm or turn_deg > limit_deg or stops < _LIMITS.stops[0]:
             return
         words = (
             f"Residuals follow the arm's posture, or last from stop to stop {likely}: a look near "

@@ -19,6 +19,7 @@ from visioncal.core.number_format import mm_and_deg
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding
 from visioncal.estimation.appearance import SCALE
+from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.estimation.joint import target_sizes
 from visioncal.estimation.pose_errors import find_pose_errors
@@ -59,17 +60,24 @@ class Trial:
 
 
 def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
-    """Findings of tests with what their cures leave, and whether that proves them."""
+    """Findings with what their cures leave: whether that proves them, and how much they explain."""
     for finding in found:
         trial = None
-        if finding.mahalanobis_sq and finding.kind in _TRIALS and run.assessment.fit.robots:
+        if finding.kind in _TRIALS and finding.until_mm and run.assessment.fit.robots:
             trial = _TRIALS[finding.kind](run, finding.kind)
         if trial is None:
             yield finding
             continue
-        before, after = (mm_and_deg(*levels) for levels in trial.levels.tolist())
-        words = f"Applied and refitted, it leaves noise of {after} an axis; else it is {before}."
-        yield replace(finding, without_it=words, is_proven=_proves(run, trial))
+        before, after = (mm_and_deg(*at) for at in trial.levels.tolist())
+        # Turns count by what they move at a typical distance.
+        left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
+        yield replace(
+            finding,
+            without_it=f"Applied and refitted, it leaves noise of {after} an axis; else it is "
+            f"{before}.",
+            is_proven=bool(finding.mahalanobis_sq) and _proves(run, trial),
+            explains=max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0),
+        )
 
 
 def _proves(run: RunState, trial: Trial) -> bool:
@@ -118,8 +126,8 @@ def _of_growth(run: RunState, kind: str) -> Trial | None:
     return Trial((bare, fit_problem(bare, state, fit.noise)), (problem, fit.solution))
 
 
-def _of_size(run: RunState, _: str) -> Trial | None:
-    """The fit of boards of the stated sizes; of measured poses, that of scaled distances."""
+def _of_board(run: RunState, kind: str) -> Trial | None:
+    """The fit of boards as stated in size or shape; of measured poses, that of other distances."""
     fit = run.assessment.fit
     problem, targets = fit.problem, [name for name in fit.frames if name.startswith("target")]
     if fit.corners is None:
@@ -127,22 +135,23 @@ def _of_size(run: RunState, _: str) -> Trial | None:
         values = np.append(fit.state.values, np.zeros(sized.size - problem.size))
         state = State(fit.state.edges, values)
         return Trial((problem, fit.solution), (sized, fit_problem(sized, state)))
-    first, scales = 6 * len(problem.unknown), list[int]()
+    first, stated = 6 * len(problem.unknown), list[int]()
     for board in fit.unknowns.all_of(BOARD):
         columns = fit.unknowns.columns(board)
-        scales += columns[fit.unknowns.values_of(board) == SCALE].tolist()
-    is_held = np.isin(np.arange(first, problem.size), scales)
+        is_size = fit.unknowns.values_of(board) == SCALE
+        stated += columns[is_size == (kind == "board_size")].tolist()
+    is_held = np.isin(np.arange(first, problem.size), stated)
     effects, at = [], 0
     for effect in problem.effects:
         effects.append(replace(effect, held=effect.held | is_held[at : at + len(effect)]))
         at += len(effect)
-    stated = problem.with_effects(effects)
+    held = problem.with_effects(effects)
     state = State(fit.state.edges, np.where(is_held, 0.0, fit.state.values))
-    return Trial((stated, fit_problem(stated, state, fit.noise)), (problem, fit.solution))
+    return Trial((held, fit_problem(held, state, fit.noise)), (problem, fit.solution))
 
 
 _TRIALS: Mapping[str, Callable[[RunState, str], Trial | None]] = {
     **dict.fromkeys(STEPS, _of_step),
     **dict.fromkeys((effect.kind for effect in RANDOM_EFFECTS), _of_growth),
-    "board_size": _of_size,
+    **dict.fromkeys(("board_size", "board_shape"), _of_board),
 }

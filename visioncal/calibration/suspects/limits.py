@@ -14,7 +14,7 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg
 from visioncal.core.verdict import LEAST_NEED_MM, REVIEW, Finding, Remedy, look_at, without
 from visioncal.estimation.arm import LEVER_M
-from visioncal.results import ViewResult
+from visioncal.results import Rms, ViewResult
 
 _LIMITS = CalibrationLimits()
 # Views that are named.
@@ -77,16 +77,28 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
             UNEXPLAINED,
             f"Left out of the fit, views disagree with the others by {', '.join(words)}, rms; the "
             f"worst are {named}.",
-            Remedy(
-                "Look at the worst views for possible causes: a board, tool or instrument that "
-                "moved, rows paired with other poses, units or conventions of the poses, "
-                "intrinsics, a warped board, a marker of few pixels, or an arm with large errors.",
-                REVIEW,
-            ),
+            Remedy(_unexplained_words(judged.held_out), REVIEW),
             tuple(view.view for view in worst),
             is_fatal=is_fatal,
             until_mm=until_mm,
         )
+
+
+def _unexplained_words(away: Rms) -> str:
+    """What to look for where nothing that was tried explains left-out residuals."""
+    sides = [
+        "the robot's poses (commanded or rounded ones, or read before the arm stood still; a "
+        "servo arm; another tool in some rows)",
+        "what was seen (a marker of few pixels, blur, a lens or a board that is not as stated)",
+    ]
+    # Turns are seen worse than places, and arms err by both alike.
+    if np.deg2rad(away.deg or 0.0) * LEVER_M > 1e-3 * away.mm:
+        sides.reverse()
+    return (
+        "Other units or conventions of the poses, rows that are apart, exchanged or repeated, "
+        "steps and drift were tried and do not explain it. Look at the worst views, for "
+        f"{sides[0]}; then for {sides[1]}."
+    )
 
 
 def _residual(view: ViewResult) -> str:

@@ -34,6 +34,8 @@ from visioncal.results import NeedMet
 
 # Probability from which on a mistake precedes sigmas beyond their limits.
 _LIKELIER = 0.5
+# Kinds of errors that are in the fit, and no mistakes.
+_ACCOUNTED = ("board_shape", "lens_field", "focus")
 # Removing a source with a smaller share of the variance would reduce a pick's error by under 5 %.
 _LEAST_SHARE = 0.1
 
@@ -116,8 +118,11 @@ def rank_causes(
     found = _with_probabilities(doubts, left_out_mm)
     sigmas = [finding for finding in found if SUSPECTS[finding.kind].is_sigma]
     sigma = min(sigmas, key=lambda finding: SUSPECTS[finding.kind].size, default=None)
-    # A sigma far beyond its limit alone makes a result bad, with no likely mistake.
-    is_likely = any(finding.probability >= _LIKELIER for finding in found)
+    # A sigma far beyond its limit alone makes a result bad, with no likely mistake. What the fit
+    # accounts for inflates none.
+    is_likely = any(
+        finding.probability >= _LIKELIER and finding.kind not in _ACCOUNTED for finding in found
+    )
     decides = met is None and not is_likely and any(finding.is_fatal for finding in sigmas)
     enough, limit = NeedLimits.probability[0], Need(mm=CalibrationLimits.sigma_mm[0])
     unmet = met is not None and met.probability < enough
@@ -197,9 +202,8 @@ def _log_odds(doubt: Finding, misfit_mm: float = 0.0) -> float:
         log_chance = min(np.log(2.0) + float(log_ndtr(-np.sqrt(doubt.mahalanobis_sq))), log_chance)
     log_chance = max(log_chance, np.finfo(float).min)
     log_odds = float(-1.0 - log_chance - np.log(-log_chance))
-    if doubt.up_to_mm >= misfit_mm:
-        return log_odds
-    return float(logit((doubt.up_to_mm / misfit_mm) ** 2 * expit(log_odds)))
+    share = min(1.0, doubt.explains, (doubt.up_to_mm / misfit_mm) ** 2) if misfit_mm else 1.0
+    return log_odds if share == 1.0 else float(logit(share * expit(log_odds)))
 
 
 def is_negligible(found: Finding, picks: Sequence[Picks]) -> bool:

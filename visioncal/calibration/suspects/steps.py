@@ -6,19 +6,25 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
+from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import exp, pose_difference
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step
 
+_LIMITS = CalibrationLimits()
 _THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
 
 
 def _found(run: RunState) -> Iterator[Finding]:
     """The likeliest step or drift, and another that may be the cause instead."""
     steps, cell = run.assessment.steps, run.cell_fit.cell
-    if not steps:
+    # More than a base or an arm drifts by is of another cause that follows the order of the views.
+    moved = [pose_difference(np.eye(4), exp(step.value)) for step in steps if step.kind == DRIFT]
+    if not steps or any(
+        mm > _LIMITS.arm_errors[0] or deg > _LIMITS.arm_errors[1] for mm, deg in moved
+    ):
         return
     step, instead = steps[0], ""
     if steps[1:]:
