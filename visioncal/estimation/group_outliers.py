@@ -42,6 +42,25 @@ class GroupInliers:
         """(m,) residual distance of each group over the observed directions [m]."""
         return np.asarray(np.linalg.norm(self.fit.groups.residuals, axis=1))
 
+    @property
+    def suspected(self) -> tuple[int, float] | None:
+        """The inlier that is likeliest wrong, and the noise level of the others [m].
+
+        Its deletion residual exceeds what one of twenty such fits has by chance: too little to
+        leave it out. None without one.
+        """
+        fit = self.fit
+        found, total = distances(fit), _misfit(fit.groups.subset(fit.used), fit.sigma)
+        left, freedom = total - found.squares, fit.freedom - found.directions
+        known = fit.used & (freedom > 0) & (left > 0.0) & (found.directions > 0)
+        left, freedom = np.where(known, left, np.inf), np.maximum(freedom, 1)
+        directions = np.maximum(found.directions, 1)
+        ratios = found.squares / directions / (left / freedom)
+        at = int(np.argmax(ratios))
+        if ratios[at] <= f_limit(0.05 / len(ratios), directions[at], freedom[at]):
+            return None
+        return at, float(fit.sigma * np.sqrt(left[at] / freedom[at]))
+
 
 def find_inlier_groups(
     problem: PointProblem,

@@ -10,12 +10,13 @@ The scale of a drawing is estimated separately, never absorbed.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations, product
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.quantiles import FALSE_REJECTION, t_chance
 from visioncal.core.transforms import compose, nearest_rotation
@@ -226,6 +227,41 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
     )
     # Points within five sigmas of a plane lie in it.
     return DrawingFit(agreement, scale, float(extents[2]) < 5.0 * level_m)
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A mistake that makes all points agree with their drawing."""
+
+    # Pairs of points, of which one has its names exchanged; an empty pair: the drawing is mirrored.
+    exchanged: tuple[tuple[str, ...], ...]
+    rms_m: float  # How far off the points then are, root mean square [m].
+    declared_m: float  # The same as they are named and drawn [m].
+
+
+def mistake_of(pairs: PointPairs) -> Mistake | None:
+    """Two exchanged names, or a mirrored drawing; None where none of these makes all agree.
+
+    Any mirror image of a drawing is any other one, turned. Symmetric points leave several open.
+    """
+
+    def rms_m(nominal: FloatArray) -> float:
+        frame = align(pairs.measured, nominal)
+        off = pairs.measured - nominal @ frame[:3, :3].T - frame[:3, 3]
+        return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+    declared_m, labels = rms_m(pairs.nominal), np.array(pairs.labels)
+    tried: dict[tuple[str, ...], float] = {(): rms_m(pairs.nominal * [1.0, 1.0, -1.0])}
+    for names in combinations(dict.fromkeys(pairs.labels), 2):
+        first, second = (labels == name for name in names)
+        nominal = pairs.nominal.copy()
+        nominal[first], nominal[second] = pairs.nominal[second][0], pairs.nominal[first][0]
+        tried[names] = rms_m(nominal)
+    least_m = min(tried.values())
+    if not CLEAR_RATIO * least_m < declared_m:
+        return None
+    rivals = tuple(names for names, off_m in tried.items() if off_m < CLEAR_RATIO * least_m)
+    return Mistake(rivals, least_m, declared_m)
 
 
 def _fit_inliers(pairs: PointPairs, expected_noise_m: float | None) -> tuple[GroupInliers, Scale]:

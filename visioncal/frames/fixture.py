@@ -19,9 +19,11 @@ from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_n
 from visioncal.estimation.pointfit import (
     FEATURE_KINDS,
     FeatureKind,
+    Mistake,
     PointPairs,
     fit_features,
     fit_points,
+    mistake_of,
 )
 from visioncal.estimation.procrustes import spreads
 from visioncal.frames.touches import (
@@ -138,6 +140,23 @@ class PointsFit:
         return words
 
     def findings(self, setting: FitSettings) -> Iterator[Finding]:
+        """Findings on the fit, led by the touch without which the others agree, if it is one."""
+        found = [*self._doubts(setting)]
+        suspected = self.agreement.suspected if found and self.agrees.all() else None
+        if suspected is not None:
+            at, level_m = suspected
+            place = f" ({self.places[at]})" if self.places[at] else ""
+            yield Finding(
+                "suspected",
+                f"{self.names[at]}{place} is the likeliest to be wrong: without it the others "
+                f"agree to {figure(1e3 * level_m)} mm per axis, and with it to "
+                f"{figure(1e3 * self.agreement.fit.sigma)} mm, which is too little to leave it "
+                "out.",
+                Remedy(_TOUCH_AGAIN, AGAIN),
+            )
+        yield from found
+
+    def _doubts(self, setting: FitSettings) -> Iterator[Finding]:
         """Findings on outliers and contradictions, the noise, and what is poorly determined."""
         reasons = self.reasons
         names = [
@@ -174,11 +193,16 @@ class PointsFit:
         yield from sigma_findings(self.worst, limits.sigma_mm, limits.sigma_deg, setting.weak)
 
     def frame(
-        self, method: str, more: Sequence[Finding], details: Mapping[str, Any], setting: FitSettings
+        self,
+        method: str,
+        more: Sequence[Finding],
+        details: Mapping[str, Any],
+        setting: FitSettings,
+        first: Sequence[Finding] = (),
     ) -> Frame:
         """Builds the frame with its verdict.
 
-        `more` and `details` are findings and figures specific to the method.
+        `more` and `details` are findings and figures of the method; `first` are more, in front.
         """
         off_m, offset = self.agreement.off_m, self.worst[0]
         off_mm = (1e3 * off_m).tolist()
@@ -207,7 +231,8 @@ class PointsFit:
                 for label, used, reason, kind, off in rows
             ),
             Verdict.by(
-                [*self.findings(setting), *more, *setting.doubts], Finding(AGREEMENT, praise)
+                [*first, *self.findings(setting), *more, *setting.doubts],
+                Finding(AGREEMENT, praise),
             ),
             {**details, **setting.details},
         )
@@ -358,7 +383,15 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
         DegenerateError: They do not determine the fixture in every direction.
     """
     pairs = drawing.beside(measured.names, measured.points, measured.scattered)
-    fit = fit_points(pairs, setting.touch_noise_m)
+    mistake = mistake_of(pairs)
+    named = () if mistake is None else (_finding_of(mistake, drawing),)
+    try:
+        fit = fit_points(pairs, setting.touch_noise_m)
+    except DataError as error:
+        for finding in named:
+            words, step = f"fixture: {finding.words}", finding.do.words if finding.do else ""
+            raise DataError(words, culprits=error.culprits, next_step=step) from error
+        raise
     # Probable cause if a point is an outlier.
     cause = "it was missed, or named as another, or the part is not there as drawn"
     centre = np.asarray(pairs.nominal[fit.agreement.mask].mean(axis=0))
@@ -383,7 +416,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
             f"{figure(1e3 * extent_m)} mm, which the frame does not take in: {cause}"
         )
         more.append(Finding("scale", words, is_fatal=deviation > _WARM * 10))
-    if fit.is_flat:
+    if fit.is_flat and not named:
         normal = spreads(pairs.nominal[fitted.agrees])[1][2]
         cosines = measured.outward[fitted.agrees] @ fitted.edge.matrix[:3, 2]
         # The side of the touches determines the handedness of points in the drawing's xy plane.
@@ -415,4 +448,27 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
             **_worst_details(fitted),
         },
         setting,
+        named,
+    )
+
+
+def _finding_of(mistake: Mistake, drawing: NominalPoints) -> Finding:
+    """The finding that two names are exchanged, or the drawing mirrored."""
+    pairs = [" and ".join(names) for names in mistake.exchanged if names]
+    agree = f"all points agree to {figure(1e3 * mistake.rms_m)} mm (rms), and to "
+    agree += f"{figure(1e3 * mistake.declared_m)} mm as they are."
+    mirror = "with the other sign of one axis, or two axes exchanged,"
+    if pairs:
+        also = f" Or {drawing.source} is a mirror image: {mirror} they agree, too."
+        return Finding(
+            "exchanged_names",
+            f"Of {', or of '.join(pairs)}, the names are exchanged: with the other name for each, "
+            f"{agree}{also * (() in mistake.exchanged)}",
+            Remedy("Look which points were touched, and write their names in the rows.", AGAIN),
+        )
+    return Finding(
+        "mirrored",
+        f"{drawing.source} is a mirror image of the part: {mirror} {agree}",
+        Remedy("Correct the sign or the order of its columns, as the part has them.", AGAIN),
+        is_fatal=True,
     )
