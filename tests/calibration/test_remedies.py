@@ -1,0 +1,162 @@
+"""A fault is named first, and what the printed command does mends what was named.
+
+Cells of corners on disk, one fault each: the commands are followed word for word, the copy is
+calibrated, and must know the camera as well as its sigma says.
+"""
+
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from support.cells import showing
+from support.edited import Rows, edit_rows
+from support.following import follow
+from support.marks import slow
+
+import visioncal
+from visioncal.core.errors import DegenerateError
+from visioncal.results import Calibration
+from visioncal.session.columns import POSE
+from visioncal.simulation import CellOptions, SimulatedCell, cell_session, simulate
+
+SOUND = CellOptions(views=20, pixel_sigma_px=0.1, seed=4)
+
+
+def rows_of(change: Callable[[Rows], Rows]) -> Callable[[Path], None]:
+    return lambda folder: edit_rows(folder, change)
+
+
+def document_of(change: Callable[[dict], object]) -> Callable[[Path], None]:
+    def edit(folder: Path) -> None:
+        path = folder / "session.toml"
+        document = tomllib.loads(path.read_text("utf-8"))
+        change(document)
+        path.write_text(tomli_w.dumps(document), "utf-8")
+
+    return edit
+
+
+def each(change: Callable[[np.ndarray, Rotation], tuple[np.ndarray, np.ndarray]]):
+    """Changes each row's position and rotation, to a position and numbers of the rotation."""
+
+    def changed(rows: Rows) -> Rows:
+        for row in rows:
+            numbers = np.array([float(row[name]) for name in POSE])
+            place, turn = change(numbers[:3], Rotation.from_quat(numbers[3:]))
+            row |= dict(zip(POSE, map(repr, [*place.tolist(), *turn.tolist()]), strict=True))
+        return rows
+
+    return rows_of(changed)
+
+
+def poses_from(order: Callable[[int], list[int]]) -> Callable[[Path], None]:
+    """Each row has the pose of another, and rows behind the last one go."""
+
+    def changed(rows: Rows) -> Rows:
+        poses = [{name: row[name] for name in POSE} for row in rows]
+        source = order(len(rows))
+        return [row | poses[at] for row, at in zip(rows, source, strict=False) if at >= 0]
+
+    return rows_of(changed)
+
+
+def exchanged(count: int) -> list[int]:
+    rows = [*range(count)]
+    rows[3], rows[11] = rows[11], rows[3]
+    return rows
+
+
+def moved_lens(document: dict) -> None:
+    camera = document["camera"]
+    camera["matrix"] = np.add(camera["matrix"], [6.0, 6.0, -5.0, 4.0]).tolist()
+
+
+def turned_off(document: dict) -> None:
+    document["mount"] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}[
+        document["mount"]
+    ]
+
+
+def pushed(cell: SimulatedCell) -> SimulatedCell:
+    """The last twelve images are those of a camera that is elsewhere by 5 mm."""
+    other = simulate(replace(cell.options, camera_moved_m=5e-3))
+    return showing(other, [*cell.corners[:-12], *other.corners[-12:]])
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of a sound cell, the kind that names it, and the command that is printed for it."""
+
+    kind: str
+    change: Callable[[Path], None] = lambda _: None
+    seen: Callable[[SimulatedCell], SimulatedCell] = lambda cell: cell
+    options: CellOptions = SOUND
+    command: str = "--guess --yes"
+
+
+FAULTS = {
+    "two rows exchanged": Fault(
+        "exchanged_views", poses_from(exchanged), command="--exchange 3,11"
+    ),
+    "rows two apart from one on": Fault(
+        "shifted_rows",
+        poses_from(lambda count: [at - 2 * (at > 9) for at in range(count)]),
+        command="--shift",
+    ),
+    "all rows one apart": Fault("misread_poses", poses_from(lambda count: [*range(1, count), -1])),
+    "millimetres": Fault("misread_poses", each(lambda place, turn: (1e3 * place, turn.as_quat()))),
+    "quaternions that begin with w": Fault(
+        "misread_poses", each(lambda place, turn: (place, np.roll(turn.as_quat(), 1)))
+    ),
+    "inverse poses": Fault(
+        "misread_poses",
+        each(lambda place, turn: (-turn.inv().apply(place), turn.inv().as_quat())),
+    ),
+    "another mount": Fault("misread_poses", document_of(turned_off)),
+    "a board of another size": Fault(
+        "board_size", options=replace(SOUND, board_scale=1.03), command="target make"
+    ),
+    "a lens of another camera": Fault("lens", document_of(moved_lens), command="calibrate"),
+    "a camera that was pushed for the last views": Fault(
+        "something_moved", seen=pushed, options=replace(SOUND, views=32), command="--views 20-31"
+    ),
+}
+QUICK = ("two rows exchanged", "quaternions that begin with w")
+
+
+@pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in FAULTS])
+def test_what_is_named_is_mended_by_what_is_printed(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    fault = FAULTS[name]
+    cell = fault.seen(simulate(fault.options))
+    cell_session(cell, "cell", seen="corners").save(tmp_path / "cell")
+    # A cell whose arm has no model, and no joint angles.
+    document_of(lambda it: it.pop("robot"))(tmp_path / "cell")
+    joints = re.compile(r"q\d_rad").fullmatch
+    rows_of(lambda rows: [{key: row[key] for key in row if not joints(key)} for row in rows])(
+        tmp_path / "cell"
+    )
+    fault.change(tmp_path / "cell")
+    try:
+        kinds = [visioncal.calibrate("cell").verdict.causes[0].kind]
+    except DegenerateError:
+        # Misread poses may leave the motion open, and are named where it fails.
+        kinds = ["misread_poses"]
+    assert kinds == [fault.kind]
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert fault.command in followed.runs[0].said
+    assert followed.last.status == 0, followed.last.said
+    words = [*followed.words]
+    known = Calibration.load(words[words.index("-o") + 1])
+    assert fault.kind not in [cause.kind for cause in known.verdict.causes]
+    true, edge = cell.transforms["flange_from_cam"], known.edges["flange_from_cam"]
+    away = edge.matrix[:3, :3].T @ (edge.matrix[:3, 3] - true[:3, 3])
+    # Exceeded in one case of a thousand.
+    assert away @ np.linalg.solve(edge.covariance[3:, 3:], away) < chi2.isf(1e-3, 3)
