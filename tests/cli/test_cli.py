@@ -1,9 +1,11 @@
 """Commands as a user runs them: exit status, messages, streams, and advice that is typed."""
 
+import gzip
 import io
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -306,6 +308,85 @@ def test_libraries_are_kept_small_in_commands():
     done = subprocess.run(words, check=False, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "False {1}"
+
+
+def test_help_lists_first_what_most_need():
+    """Of commands by group, and of options in order of use."""
+    said = visioncal("--help").out
+    heads = ("Start:", "Calibrate:", "Use the result:", "Keep it valid:", "More:")
+    assert [line for line in said.splitlines() if line in heads] == [*heads]
+    for name, command in every_command():
+        if " " not in name and (shown := len(command.first)):
+            said = visioncal(name, "--help").out
+            assert said.index("\nOptions:") < said.index("\nMore")
+            head = said[said.index("\nOptions:") : said.index("\nMore")]
+            names = {param.name: max(param.opts, key=len) for param in command.params}
+            lines = [rf"^  (-\S+, )*{names[name]}\b" for name in command.first]
+            places = [re.search(line, head, re.M).start() for line in lines]
+            assert places == sorted(places)
+            assert len(places) == shown <= 11
+        elif " " not in name and name not in ("target", "dynamics"):
+            assert len(command.params) <= 8, f"{name} has options, and none that matter"
+
+
+def test_examples_work(pairs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("OUT").mkdir()
+    made_up().calibration.save("OUT/calibration.json")
+    for name in ("tcp", "fixture", "correct"):
+        Path(f"{name}.csv").write_text(visioncal(name, "--example").good().out)
+    visioncal("tcp", "tcp.csv", "-o", "frames.json", "--name", "tip").good()
+    for source, name, *more in (
+        ("tcp", "tcp.csv"),
+        ("fixture", "fixture.csv", "--tool", "none"),
+    ):
+        done = visioncal(source, name, *more, "--json").good()
+        (frame,) = json.loads(done.out).values()
+        assert frame["verdict"]["status"] == "good"
+    elastic = Path(__file__).parents[1] / "data" / "calibration_elastic.json.gz"
+    Path("elastic.json").write_bytes(gzip.decompress(elastic.read_bytes()))
+    done = visioncal("correct", "correct.csv", "--against", "elastic.json", "--json").good()
+    assert len(json.loads(done.out)["targets"]) == 2
+    more = {
+        "plan": ("--candidates", "60", "--stops", "4"),
+        "history": (),
+        # That camera's pictures are smaller.
+        "locate": ("--pixel", "320,200"),
+    }
+    for name, words in more.items():
+        lines = visioncal(name, "--example").good().out.replace("\\\n", "").splitlines()
+        _, typed, *rest = shlex.split(lines[-1])
+        assert typed == name
+        if name == "locate":
+            rest[rest.index("--pixel") : rest.index("--pixel") + 2] = []
+        visioncal(name, *rest, *words).good()
+    looks = visioncal("guard", "--example").good().out
+    monkeypatch.setattr(sys, "stdin", io.StringIO(looks))
+    visioncal("calibrate", pairs, "--level", "hand-eye", "-o", "pairs", "--no-report").good()
+    done = visioncal("guard", "--against", "pairs")
+    assert "error" not in done.out
+    assert len(done.out.splitlines()) == 2
+
+
+def test_files_and_columns_that_are_missing_are_named_at_once(tmp_path):
+    out, drawing = tmp_path / "out", tmp_path / "drawing.csv"
+    out.mkdir()
+    made_up().calibration.save(out / "calibration.json")
+    visioncal("fixture", "points.csv", "--cad", "cad.csv", "-c", out).refused(
+        "points.csv and cad.csv do not exist, and", "has no tool", "visioncal tcp", "--example"
+    )
+    visioncal("fixture", "points.csv", "--cad", "cad.csv", "--tool", "none", "-c", "none").refused(
+        "points.csv, cad.csv and none do not exist."
+    )
+    visioncal("tcp", "points.csv", "-c", out).refused("points.csv does not exist.")
+    visioncal("locate", "-c", out, "--pixel", "1,2").refused("(--plane)", "(--pose)", "--example")
+    drawing.write_text("part,x\n1,2\n")
+    touches = tmp_path / "points.csv"
+    touches.write_text(visioncal("fixture", "--example").out)
+    visioncal("fixture", touches, "--cad", drawing, "--tool", "none").refused(
+        "a column point", "x_mm, y_mm, z_mm"
+    )
+    visioncal("plan", "ur5e").refused("--target, --camera, --cam, --board", "plan --example")
 
 
 LOADING = """

@@ -24,7 +24,7 @@ def _group(name: str, words: str, records: str, *listed: str) -> typer.Typer:
     attributes = {
         "prefix": f"{name}_",
         "records": (f"visioncal.cli.{records}",),
-        "listed": listed,
+        "listed": {"Commands": listed},
         "homes": dict.fromkeys(listed, name),
     }
     cls = type(name, (LazyGroup,), attributes)
@@ -50,11 +50,13 @@ class _Commands(LazyGroup):
             *("plan", "record", "identify", "validate", "payload", "gains"),
         ),
     }
-    listed = (
-        *("demo", "plan", "record", "calibrate", "doctor", "batch", "show", "verify", "guard"),
-        *("recover", "diff", "convert", "export", "tcp", "locate", "fixture", "touch-test"),
-        *("correct", "history", "simulate", "target", "dynamics"),
-    )
+    listed: ClassVar = {
+        "Start": ("demo", "target", "record", "convert", "simulate"),
+        "Calibrate": ("doctor", "calibrate", "show", "plan"),
+        "Use the result": ("export", "touch-test", "locate", "tcp", "fixture", "correct"),
+        "Keep it valid": ("verify", "guard", "recover", "diff", "history"),
+        "More": ("batch", "dynamics"),
+    }
 
 
 app = typer.Typer(

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 from visioncal.cli.options import (
     REQUIRED,
@@ -52,6 +53,7 @@ class DynamicsPlanOptions(ClearanceOptions):
     Nothing is sent to a robot. Exit status 2: the limits allow none.
     """
 
+    first: ClassVar = "out duration payload tool"
     robot: str = argument("A built-in robot, or the path of a .urdf, .toml or .json.")
     duration: float = _motion("Duration of the exciting motion, in s.", default=20.0)
     harmonics: int = _motion("Harmonics of that period.", default=5)
@@ -112,6 +114,7 @@ class DynamicsIdentifyOptions(StreamOptions):
     given.
     """
 
+    first: ClassVar = "output validate_on robot as_json"
     session: Path = motions_argument()
     validate_on: str | None = option("A stream to predict; else the end of the fastest.")
     output: Path | None = out_folder(f"A folder for {DYNAMICS_FILE} and report.", "-o", "--output")

@@ -16,7 +16,7 @@ from visioncal.cli.result_options import FixtureOptions, FrameOptions, TcpOption
 from visioncal.cli.summary import print_verdict
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import figure, listed, mm_and_deg
 from visioncal.core.transforms import pose_difference
 from visioncal.frames.fixture import touched_fixture
 from visioncal.frames.frame_from_images import seen_frame
@@ -164,8 +164,10 @@ def place_frame(
             f"{command}: touches of it, or a session that shows it, are needed.",
             culprits=["TOUCHES"],
             next_step=f"Name them: visioncal {command} TOUCHES -c OUT"
-            f"{' --cad DRAWING --tool NAME' * (kind != 'tool')}.",
+            f"{' --cad DRAWING --tool NAME' * (kind != 'tool')}; visioncal {command} --example "
+            "prints touches that work.",
         )
+    _check_paths(request, cad, kind == "fixture" and tool is None)
     session = _image_session(source, {"--cad": cad, "--tool": tool, **request.for_touches()})
     if session is None:
         origin = "the tool's point" if kind == "tool" else "the fixture's origin"
@@ -194,6 +196,26 @@ def place_frame(
         with shown_progress(quiet=request.as_json) as progress:
             frame = seen_frame(session, place.calibration, kind, point_m, progress=progress)
     _keep_and_report(place, frame, source, request)
+
+
+def _check_paths(request: FrameOptions, cad: Path | None, needs_tool: bool) -> None:
+    """Names all that is not there where a file is not; raises DataError."""
+    paths = (request.touches, cad, request.calibration)
+    absent = [str(path) for path in paths if path is not None and not path.exists()]
+    if not absent:
+        return
+    words, found = f"{listed(absent)} {'does' if len(absent) == 1 else 'do'} not exist", ""
+    if needs_tool and request.calibration is not None and str(request.calibration) not in absent:
+        frames = load_result_or_frames(request.calibration).frames
+        if not any(name.startswith("flange_from_") for name in frames):
+            words, found = f"{words}, and {request.calibration} has no tool", f" {NO_TOOL}"
+    command = "fixture" if needs_tool or cad else "tcp"
+    raise DataError(
+        f"{words}.",
+        culprits=absent,
+        next_step=f"Check the paths and their spelling; visioncal {command} --example prints "
+        f"touches that work.{found}",
+    )
 
 
 def _image_session(source: Path, for_touches: Mapping[str, object]) -> Session | None:
@@ -229,9 +251,9 @@ def tcp_command(options: TcpOptions) -> None:
 
 def fixture_command(options: FixtureOptions) -> None:
     """Runs `visioncal fixture`."""
-    drawing = None if options.cad is None else read_nominal(options.cad, options.cad_unit)
 
     def by_touches(source: Path, calibration: Calibration | None) -> Frame:
+        drawing = None if options.cad is None else read_nominal(options.cad, options.cad_unit)
         robot, asked = options.robot, import_options(options, calibration)
         if options.tool is None and calibration is None:
             named = drawing or any(read_touches(source, asked, robot, positions=True).kinds)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from functools import partial
 from importlib import import_module
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, get_args, get_origin, get_type_hints
 
@@ -26,11 +26,13 @@ _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 
 
 class PlainCommand(TyperCommand):
-    """A command whose help lists its options under the headings of their panels.
+    """A command whose help lists first what most need, and then all else by panel.
 
     Without markup, which reads `[mm]` as a style, and without columns, which do not fit a terminal
     of 80 columns.
     """
+
+    first: ClassVar[Sequence[str]] = ()  # Options that most need, in order of use.
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - typer's own
         """Parses the options; a usage error becomes a DataError."""
@@ -78,13 +80,20 @@ class PlainCommand(TyperCommand):
             raise typer.Exit(128 + 2) from None
 
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - typer's own types
-        """Writes the options by panel."""
-        panels: dict[str, list[tuple[str, str]]] = defaultdict(list)
-        for param in self.get_params(ctx):
+        """Writes what most need in order of use, and all else by panel."""
+        panels = defaultdict[str, list[tuple[str, str]]](list)
+        params, last = self.get_params(ctx), len(self.first)
+        places = {name: place for place, name in enumerate(self.first)}
+        for param in sorted(params, key=lambda param: places.get(param.name, last)):
+            kind, panel = param.param_type_name, getattr(param, "rich_help_panel", None)
+            if kind == "option" and last and param.name not in places:
+                panel = f"More: {panel[0].lower()}{panel[1:]}" if panel else "More options"
+            elif kind == "argument" or param.name in places or not panel:
+                panel = f"{kind.capitalize()}s"
             if record := param.get_help_record(ctx):
-                named = getattr(param, "rich_help_panel", None)
-                panels[named or f"{param.param_type_name.capitalize()}s"].append(record)
-        for name in sorted(panels, key=lambda panel: panel != "Arguments"):
+                panels[panel].append(record)
+        heads = ("Arguments", "Options", "More options")
+        for name in sorted(panels, key=lambda panel: (*heads, panel).index(panel)):
             with formatter.section(name):
                 formatter.write_dl(panels[name])
 
@@ -96,7 +105,8 @@ class LazyGroup(TyperGroup):
     is its help, and is the function `dynamics_plan_command` of the module `dynamics_plan`.
     """
 
-    listed: ClassVar[Sequence[str]]  # Names of its commands, as they are listed.
+    # Names of its commands by heading, as they are listed.
+    listed: ClassVar[Mapping[str, Sequence[str]]]
     records: ClassVar[Sequence[str]]  # Modules of the records, which import nothing heavy.
     homes: ClassVar[Mapping[str, str]] = {}  # Modules with another name than their command's.
     prefix: ClassVar[str] = ""
@@ -104,18 +114,20 @@ class LazyGroup(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:  # noqa: ANN401 - typer's
         super().__init__(**attributes)
-        for name in self.listed:
+        for name in chain(*self.listed.values()):
             group = self.groups.get(name)
             words = group.info.help if group else inspect.getdoc(self.record_of(name))
             self.add_command(TyperCommand(name, help=str(words).partition("\n\n")[0]))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401, ARG002 - typer's
         """Writes the listing without typer's truncation."""
-        with formatter.section("Commands"):
-            shown = [
-                (name, " ".join(str(self.commands[name].help).split())) for name in self.listed
-            ]
-            formatter.write_dl(shown)
+        width = max(map(len, self.commands))
+        for heading, names in self.listed.items():
+            with formatter.section(heading):
+                words = (" ".join(str(self.commands[name].help).split()) for name in names)
+                # All headings' words begin in one column.
+                listed = zip((f"{name:<{width}}" for name in names), words, strict=True)
+                formatter.write_dl([*listed])
 
     def resolve_command(self, *arguments: Any) -> Any:  # noqa: ANN401 - of typer's own types
         """Imports the command that the first argument names."""
@@ -147,7 +159,8 @@ class LazyGroup(TyperGroup):
         command.__signature__ = inspect.Signature([at, *parameters])  # type: ignore[attr-defined]
         command.__annotations__ = {value.name: value.annotation for value in (at, *parameters)}
         app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        app.command(name, cls=PlainCommand, help=record.__doc__)(command)
+        kind = type(name, (PlainCommand,), {"first": getattr(record, "first", "").split()})
+        app.command(name, cls=kind, help=record.__doc__)(command)
         return get_command(app)
 
 

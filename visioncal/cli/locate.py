@@ -69,10 +69,14 @@ def locate_command(options: LocateOptions) -> None:
             check_image_size(CalibratedCamera.of(calibrated), read_image(source), source.name)
         boards = targets_fixed_to_base(result, choice, EYE)
         if options.plane is None:
+            no_pose = flange is None and calibrated.mount == "eye-in-hand"
+            also = ", and so is the flange's pose at the image (--pose)" if no_pose else ""
             raise DataError(
-                "One image shows no depth: the plane (--plane) that the feature lies in is needed.",
-                culprits=["--plane"],
-                next_step=f"It is {FORMS}.",
+                "One image shows no depth: the plane (--plane) that the feature lies in is needed"
+                f"{also}.",
+                culprits=["--plane", *["--pose"] * no_pose],
+                next_step=f"A plane is {FORMS}. visioncal locate --example prints a line that "
+                "works.",
             )
         px = np.array(options.pixel)
         declared, note = _plane_of(options.plane, options.plane_sigma or 0.0, calibrated, boards)

@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from visioncal.cli.parsing import address_in, numbers_in, size_in
 from visioncal.core.choices import SITE_FILE, ImagesKept
 from visioncal.interchange.outputs import RECORDING, REPORT
@@ -35,6 +37,20 @@ def option(words: str, *names: str, default: object = None, **attributes: object
 def flag(words: str, *names: str, **attributes: object) -> Any:  # noqa: ANN401 - as `option`
     """A field that an option without a value switches on; see `option`."""
     return field(default=False, metadata={"flag": (words, names, attributes)})
+
+
+def example_flag(name: str) -> Any:  # noqa: ANN401 - as `option`
+    """The flag that prints a command's example, and ends."""
+
+    def show(wanted: bool) -> None:
+        if wanted:
+            from visioncal.cli.examples import EXAMPLES
+
+            typer.echo(EXAMPLES[name], nl=False)
+            raise typer.Exit
+
+    words = "Print a small table, or a line, that works."
+    return flag(words, "--example", callback=show, is_eager=True)
 
 
 def argument(words: str, default: object = REQUIRED, **attributes: object) -> Any:  # noqa: ANN401

@@ -316,7 +316,8 @@ def cell_of(source: Source, words: PlanOptions, kept: Kept) -> PlanCell:
             f"{source.words}: {some_of(missing)} {'is' if len(missing) == 1 else 'are'} needed to "
             "know the cell.",
             culprits=missing,
-            next_step="Give them, or plan from a session or a calibration of the cell.",
+            next_step="Give them, as visioncal plan --example does, or plan from a session or a "
+            "calibration of the cell.",
         )
     refuse_given(words.options("robot"), f"{source.words} is named already")
     cell = PlanCell(

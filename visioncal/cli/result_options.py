@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import get_args
+from typing import ClassVar, get_args
 
 import typer
 
@@ -17,6 +17,7 @@ from visioncal.cli.options import (
     against_option,
     argument,
     camera_name,
+    example_flag,
     flag,
     force_bad,
     force_both,
@@ -61,6 +62,7 @@ class CalibrateOptions(NeedOptions, WorkOptions, ActOptions):
     --robot, --target).
     """
 
+    first: ClassVar = "out need_mm need_deg views as_json"
     session: Path = argument("A session's folder, or its .rrd recording.")
     out: Path = out_folder(default=Path("out"))
     views: tuple[int, ...] | None = option("These views alone.", metavar="1-12,14", parse=views_in)
@@ -87,6 +89,7 @@ class BatchOptions(NeedOptions, ActOptions):
     continues. Exit status 0: there are results, none of them bad; 3: one is bad; 2: there is none.
     """
 
+    first: ClassVar = "out need_mm need_deg workers"
     out: Path = out_folder(default=REQUIRED)
     sessions: list[str] | None = argument(
         "Sessions, recordings, their folders, or globs.", default=None
@@ -109,6 +112,7 @@ class ShowOptions:
     --viewer --web the page's URL goes to stdout, and only this machine can reach it; Ctrl-C ends.
     """
 
+    first: ClassVar = "out viewer view certificate"
     result: Path = argument("An output folder, its calibration.json, or an .rrd.", metavar="OUT")
     out: Path | None = option("The page; report.html or certificate.html otherwise.", "-o", "--out")
     viewer: bool = flag("Open the recording in the rerun viewer, instead.")
@@ -130,6 +134,7 @@ class VerifyOptions(PartOptions, PageOptions, ActOptions):
     Exit status 0: it holds; 3: it does not; 2: that cannot be decided, for the reason given.
     """
 
+    first: ClassVar = "against page output as_json"
     session: Path = argument("Five stops or more of the same cell: a folder or an .rrd.")
     against: Path = against_option()
     board_moved: bool = flag("The board was put elsewhere on purpose.")
@@ -149,6 +154,7 @@ class GuardOptions(PartOptions):
     does not; 2: a look could not be used, and the others are no reason to doubt.
     """
 
+    first: ClassVar = "against state scene _example"
     against: Path = against_option()
     false_alarm_looks: float = option(
         "Mean number of looks to a false alarm.", default=10_000.0, min=100.0, max=1e9
@@ -178,6 +184,7 @@ class GuardOptions(PartOptions):
         min=0.01,
         max=10.0,
     )
+    _example: bool = example_flag("guard")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,6 +212,7 @@ class RecoverOptions(LoadOptions, PartOptions, ActOptions):
     or the proof fails; 2: stops are next, or it cannot go on.
     """
 
+    first: ClassVar = "against stops count cause targets to"
     folder: Path = argument(
         "A folder for the act; the same one to go on.", metavar="FOLDER", file_okay=False
     )
@@ -246,6 +254,7 @@ class ExportOptions(PartOptions):
     nothing was written, for the reason given; 3: nothing was, as the result's verdict is bad.
     """
 
+    first: ClassVar = "to out edge inverse number force _list"
     source: Path = argument("An output folder, its .json, a recording, or a file of frames.")
     to: str = option("A format, as ros or ur; see --list.", default=REQUIRED, metavar="FORMAT")
     out: Path | None = out_file()
@@ -276,6 +285,7 @@ class CorrectOptions(LoadOptions, PartOptions):
     status 3: nothing was, as the calibration's verdict is bad.
     """
 
+    first: ClassVar = "calibration out tool robot_form _example"
     targets: Path = argument("A table as views.csv, or as X,Y,Z,A,B,C; others are kept.")
     calibration: Path = against_option("-c", "--against", "--calibration")
     out: Path | None = out_file()
@@ -288,6 +298,7 @@ class CorrectOptions(LoadOptions, PartOptions):
     skip: bool = flag("Write the other targets where some are refused.", "--skip-unreachable")
     force: bool = force_both()
     as_json: bool = json_flag()
+    _example: bool = example_flag("correct")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,6 +345,9 @@ class TcpOptions(FrameOptions):
     given; 3: the tool is bad, and joins no calibration.
     """
 
+    first: ClassVar = "calibration name out force _example"
+    _example: bool = example_flag("tcp")
+
 
 @dataclass(frozen=True, kw_only=True)
 class FixtureOptions(FrameOptions):
@@ -346,9 +360,11 @@ class FixtureOptions(FrameOptions):
     fixture is bad, and joins no calibration.
     """
 
+    first: ClassVar = "calibration name cad tool out force _example"
     cad: Path | None = option("Points of the drawing: point, x_mm, y_mm, z_mm, sigma_mm.")
     cad_unit: str | None = option("What x, y, z in it are in.", metavar="|".join(UNITS_M))
     tool: str | None = option("A tool of the calibration or of a file, or none: poses of the tip.")
+    _example: bool = example_flag("fixture")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -361,6 +377,7 @@ class TouchTestOptions(ActOptions):
     nothing was done as the calibration or the tool is bad.
     """
 
+    first: ClassVar = "calibration tool gaps_mm height_mm"
     session: Path = session_argument()
     calibration: Path = against_option("-c", "--calibration")
     tool: str | None = option("The tool that touches; none: a gauge of --clearance-mm.")
@@ -382,6 +399,7 @@ class LocateOptions:
     reason given; 3: there is none, as the calibration's verdict is bad.
     """
 
+    first: ClassVar = "calibration pixel plane pose target point view _example"
     source: Path | None = argument(
         "A session, or one image; not needed with --pixel.", default=None
     )
@@ -407,6 +425,7 @@ class LocateOptions:
     sigma_px: float | None = option("Noise of a feature; else that of the corners.")
     force: bool = force_bad()
     as_json: bool = json_flag()
+    _example: bool = example_flag("locate")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -418,6 +437,7 @@ class HistoryOptions:
     Exit status 2: it cannot be read or written, for the reason given.
     """
 
+    first: ClassVar = "out cell kind show add _example"
     file: Path | None = argument(
         f"The history's file; else the nearest {SITE_FILE} here or above.", default=None
     )
@@ -432,3 +452,4 @@ class HistoryOptions:
     out: Path | None = option("The page (.html) or the table (.csv) to write.", "-o", "--out")
     force: bool = force_flag()
     as_json: bool = json_flag()
+    _example: bool = example_flag("history")

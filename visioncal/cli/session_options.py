@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
 from visioncal.cli.options import (
     REQUIRED,
     SIZE,
     PageOptions,
     argument,
+    example_flag,
     flag,
     force_flag,
     json_flag,
@@ -71,6 +72,7 @@ class DemoOptions:
     bad.
     """
 
+    first: ClassVar = "out live"
     out: Path = out_folder(default=Path("demo"))
     views: int = option("Number of views.", default=20, min=5, max=200)
     seed: int = seed_option()
@@ -84,6 +86,7 @@ class DemoOptions:
 class SimulateOptions:
     """Write a simulated session, and its truth in a file beside it."""
 
+    first: ClassVar = "mount views camera robot images touches recording seed"
     folder: Path = argument("Where to write the session.")
     mount: CameraMount = option("Where the camera is.", default="eye-in-hand")
     views: int = option("Number of views.", default=20, min=1)
@@ -161,6 +164,7 @@ class TargetMakeOptions(BoardOptions):
     written; 2: none, because the board does not fit or files are there already.
     """
 
+    first: ClassVar = "out page kind columns rows square_mm marker_mm"
     target: str | None = argument(
         "A board of visioncal's, or a .toml; or see --kind.", default=None
     )
@@ -209,6 +213,7 @@ class PlanOptions(ClearanceOptions):
     a robot. Exit status 2: the cell or the session allows no plan, for the reason given.
     """
 
+    first: ClassVar = "out add to_verify stops need_mm target camera resolution cam board _example"
     source: str = argument("A robot, a session, or an output folder of calibrate.")
     add: int | None = _what("How many stops to add to a recorded session.", min=1, max=500)
     to_verify: bool = flag(
@@ -255,6 +260,7 @@ class PlanOptions(ClearanceOptions):
     focus_m: tuple[float, float] | None = _span("Depths at which images are sharp.", "--focus-mm")
     out: Path = out_folder(default=Path("plan"))
     as_json: bool = json_flag()
+    _example: bool = example_flag("plan")
 
     def options(self, *names: str) -> dict[str, object]:
         """Some options by their names; None for those that were not given."""
@@ -271,6 +277,7 @@ class RecordOptions(PageOptions):
     continues it.
     """
 
+    first: ClassVar = "out page arm camera target mount plan follow views resume"
     out: Path = out_folder("The session's folder; a new one.", default=REQUIRED, metavar="SESSION")
     arm: str | None = option(
         "A UR by its address, typed poses, or the robot's own program: socket listens for it.",
@@ -335,6 +342,7 @@ class ConvertOptions(RobotPoseOptions):
     nothing was written, and the message says what is missing or wrong.
     """
 
+    first: ClassVar = "target mount images robot_form robot_model intrinsics guess yes force"
     source: Path = argument("A session's folder, its .rrd, or somebody else's file or folder.")
     dest: Path = argument("An .rrd, or the folder to write.")
     form: str | None = _recording("Its format, by a name; a wrong one gets the list.", "--from")

@@ -141,9 +141,10 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
         )
     column = next((name for name in _NAMES if name in fields.texts), None)
     if column is None:
+        also = "" if columns_named(fields, _AXES) else ", and so are x_mm, y_mm, z_mm"
         raise DataError(
-            f"{fields.name}: a column {some_of(_NAMES)} is needed, with the name of each point; "
-            f"there are {fields.listing()}.",
+            f"{fields.name}: a column {some_of(_NAMES)} is needed, with the name of each point"
+            f"{also}; there are {fields.listing()}.",
             culprits=[fields.name],
         )
     names = tuple(text.strip() for text in fields.texts[column])
