@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from support.cells import calibrated, pairs_session, reporting
 from support.marks import slow
+from support.refusals import raised
 from support.sound_findings import SOUND, changed, directions
 
 import visioncal
 from visioncal.calibration.suspects.judge import judge
+from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Verdict
@@ -122,6 +124,58 @@ def test_a_bent_board_that_is_in_the_fit_is_no_cause_of_a_weak_motion():
     bent = Finding("board_shape", "The board is not flat.")
     verdict = judge(replace(changed(SOUND, warnings=(bent,)), worst=directions(9e-3)))
     assert [cause.kind for cause in verdict.causes][:1] == ["weak_motion"]
+
+
+def moving(kind, mount, count=16):
+    """Pairs of a machine that cannot tilt, and the camera's true transform."""
+    rng = np.random.default_rng(1)
+    places = rng.uniform([0.3, -0.3, 0.2], [0.6, 0.3, 0.5], (count, 3))
+    turns = np.zeros((count, 3))
+    if kind == "rail":
+        places[:, 1:] = [0.0, 0.4]
+    if kind == "scara":
+        turns[:, 2] = rng.uniform(-1.5, 1.5, count)
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+    robot = compose(exp(np.pad(turns, ((0, 0), (0, 3))))[:, :3, :3], places) @ down
+    x = exp(np.r_[rng.normal(0.0, 0.3, 3), 0.05, -0.03, 0.08])
+    z = exp(np.r_[rng.normal(0.0, 0.5, 3), 0.5, 0.1, 0.0])
+    seen = invert(x) @ (invert(robot) if mount == MOUNTS[0] else robot) @ z
+    noise = rng.normal(0.0, 1.0, (count, 6)) * np.repeat([5e-4, 2e-4], 3)
+    return pairs_session(mount, robot, seen @ exp(noise)), {"cam": x, "target": z}
+
+
+@pytest.mark.parametrize(
+    ("kind", "mount", "name", "keys"),
+    [
+        ("gantry", MOUNTS[0], "base_from_target", "xyz"),
+        ("gantry", MOUNTS[1], "flange_from_target", "xyz"),
+        ("scara", MOUNTS[0], "flange_from_cam", "z"),
+        ("scara", MOUNTS[1], "base_from_cam", "z"),
+    ],
+)
+def test_a_machine_that_cannot_tilt_hears_what_to_measure(kind, mount, name, keys):
+    session, true = moving(kind, mount)
+    error = raised(DegenerateError, "not determined at all", visioncal.calibrate, session)
+    assert f"[prior.{name}]" in error.next_step
+    assert all(f"{key}_m" in error.next_step for key in keys)
+    values = dict(zip("xyz", true[name.rpartition("_")[2]][:3, 3].tolist(), strict=True))
+    prior = {f"{key}_m": values[key] for key in keys} | {"sigma_m": 5e-4}
+    measured = session.with_content(document=session.document | {"prior": {name: prior}})
+    found = visioncal.calibrate(measured)
+    camera = "flange_from_cam" if mount == MOUNTS[0] else "base_from_cam"
+    away = found.edges[camera].matrix[:3, 3] - true["cam"][:3, 3]
+    # Three sigma of what was measured, beside little noise.
+    assert np.linalg.norm(away) < 1.5e-3
+    # Nobody is told to tilt what cannot.
+    assert not any("tilted" in str(step) for step in found.verdict.next_steps)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_rail_leaves_a_turn_open_too(mount):
+    error = raised(
+        DegenerateError, "in position only", visioncal.calibrate, moving("rail", mount)[0]
+    )
+    assert "move along a second direction" in error.next_step
 
 
 def test_words_say_whether_rivals_are_left():

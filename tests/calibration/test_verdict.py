@@ -173,6 +173,21 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     assert ids(judge(met)) == ["moved_slowly"]
 
 
+@pytest.mark.parametrize(("repeats", "advised"), [((0.1, 0.01), False), ((5.0, 1.5), True)])
+def test_no_better_robot_is_advised_where_none_errs_so(repeats, advised) -> None:
+    """Eight millimetres are a servo arm's noise, and no industrial arm's."""
+    spread = np.diag(np.repeat([1e-6, 5e-3], 3) ** 2)[None]
+    picks = (Picks("cam", "robot", {"pick": spread}, np.inf, 0.1),)
+    (arm,) = SOUND.arms
+    found = replace(SOUND, need=NEED, picks=picks, arms=(replace(arm, repeatability=repeats),))
+    verdict = judge(found)
+    assert any("repeats better" in str(cause.do) for cause in verdict.causes) == advised
+    # Ten centimetres from the camera, 14 mm are no task.
+    assert not any(
+        "good for" in finding.words for finding in judge(replace(found, need=None)).findings
+    )
+
+
 def test_a_sigma_far_beyond_its_limit_is_the_cause_of_a_bad_result() -> None:
     spread = np.diag(np.repeat([1e-6, 4e-4], 3) ** 2)[None]
     picks = (Picks("cam", "robot", {"look": spread}, np.inf, 0.5),)

@@ -162,15 +162,35 @@ def chain_words(problem: Problem, mount: Mount) -> CellWords:
         if frame in targets[1:]:
             return f"Add views of {names[frame][0][4:]}, or take it out of the session."
         measured = ""
-        # One measured offset is of no help to a robot that does not turn at all.
-        if turning is not None and not turning.is_still and "offset along" in open_part:
+        carried, placed = edge_names(mount)
+        if turning is not None and turning.is_still and "offset" in open_part:
+            measured = _of_straight(placed.replace("target", targets[0]), flange)
+        elif turning is not None and "offset along" in open_part:
             # A caliper reaches what is on the flange, and no instrument's origin.
-            name = edge_names(mount)[mount == "instrument"]
-            measured = f"Where the arm cannot tilt, measure that offset for [prior.{name}]. "
+            name = (carried, placed)[mount == "instrument"]
+            keys = [f"{axis}_m" for axis in "xyz" if open_part.endswith(f"'s {axis}")]
+            keys *= mount != "instrument"
+            measured = f"Where the arm cannot tilt, measure that offset for [prior.{name}]"
+            measured += f" ({keys[0]}, and its sigma_m). " if keys else ". "
         return f"{measured}{_advice(mount)}"
 
     undetermined = _POINTS_OPEN if mount == "instrument" else _LENS_OPEN
     return CellWords(title(mount), names, motion, advice, undetermined)
+
+
+def _of_straight(placed: str, flange: FloatArray) -> str:
+    """What to measure where (m, 4, 4) flange poses differ in position alone; or empty."""
+    away = flange[:, :3, 3] - flange[:, :3, 3].mean(axis=0)
+    directions = int(np.sum(np.linalg.norm(away @ np.linalg.svd(away)[2].T, axis=0) > 1e-2))
+    if not directions:
+        return ""
+    words = (
+        "Where the machine cannot turn (a gantry, a rail), measure where the target's origin is, "
+        f"as by touching it, and state x_m, y_m, z_m and their sigma_m in [prior.{placed}]"
+    )
+    if directions == 1:
+        words += ", and move along a second direction: one leaves the turn about it open"
+    return f"{words}. "
 
 
 def title(mount: Mount) -> str:

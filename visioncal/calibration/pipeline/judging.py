@@ -27,6 +27,7 @@ from visioncal.estimation.intervals import freedom_of
 from visioncal.estimation.observability import (
     CellWords,
     Direction,
+    Turning,
     chain_words,
     check_determined,
     directions,
@@ -226,13 +227,15 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
         arm, found = cell_fit.arms[robot], answer.arms[robot].sections.arm
         accuracy = None if found is None else found.workspace_sigma_mm
         model = None if arm.matched is None else arm.matched.robot
+        stops = stops_of(problem, robot)
+        poses = problem.poses[robot][stops]
         judged = JudgedArm(
-            len(stops_of(problem, robot)),
+            len(stops),
             has_posture_errors=arm.errors is not None and arm.errors.is_significant,
             workspace_mm=None if accuracy is None else accuracy.median,
             modelled=model is not None,
             repeatability=REPEATABILITY if model is None else model.repeatability,
-            can_tilt=model is None or model.can_tilt,
+            can_tilt=Turning.of(poses).is_enough if model is None else model.can_tilt,
             name=f"Robot {robot}" if len(problem.robots) > 1 else "",
         )
         # Of pose pairs without a stated noise, the detection's may be in the flange's.

@@ -26,6 +26,7 @@ from visioncal.core.verdict import (
 )
 from visioncal.results import NeedMet
 from visioncal.results.conditions import uncorrected_words
+from visioncal.robot.model import REPEATABILITY
 
 # Kinds of doubts that what was seen is not as modelled, however it moves.
 _MISFITS = (UNEXPLAINED, "corner_noise")
@@ -69,6 +70,7 @@ def judge(findings: Findings) -> Verdict:
                 met,
                 more=remedy_for_uncertainty(findings),
                 left_out_mm=findings.held_out.mm,
+                repeats=max((arm.repeatability for arm in findings.arms), default=REPEATABILITY),
             )
         ]
     if is_unknown:
@@ -76,7 +78,8 @@ def judge(findings: Findings) -> Verdict:
         stated.append(Finding(NO_ACCURACY, words))
     elif met is not None:
         stated.insert(len(stated) * is_met, Finding("need", _need_words(findings, met)))
-    elif worst is not None and good_for_mm is not None:
+    elif worst and good_for_mm is not None and good_for_mm < 1e3 * worst.distance_m / 10.0:
+        # A need of a tenth of the distance is none of a calibration.
         stated.append(_good_for(worst, good_for_mm, status))
     if not doubts:
         stated.append(_agreement(findings, is_enough=status == "good"))

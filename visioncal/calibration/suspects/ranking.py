@@ -31,6 +31,7 @@ from visioncal.core.number_format import figure, percent
 from visioncal.core.types import Need
 from visioncal.core.verdict import ADD_VIEWS, CALIBRATE, REVIEW, Finding, Remedy
 from visioncal.results import NeedMet
+from visioncal.robot.model import REPEATABILITY
 
 # Probability from which on a mistake precedes sigmas beyond their limits.
 _LIKELIER = 0.5
@@ -102,6 +103,7 @@ def rank_causes(
     *,
     more: Remedy | None = None,
     left_out_mm: float = 0.0,
+    repeats: tuple[float, float] = REPEATABILITY,
 ) -> tuple[Finding, ...]:
     """Ranks findings by their probability of being the cause, and adds too large error sources.
 
@@ -111,6 +113,7 @@ def rank_causes(
         met: The required accuracy and the probability of meeting it; None where none is stated.
         more: Remedy that makes the calibration less uncertain.
         left_out_mm: Disagreement of left-out views [mm].
+        repeats: What the worst robot repeats to [mm, deg].
 
     Raises:
         KeyError: A kind is not in the registry.
@@ -131,7 +134,7 @@ def rank_causes(
     if picks and not decides and (unmet or (met is None and too_large and is_sized)):
         causes = {finding.kind for finding in found if finding.probability}
         known = causes.union(*(SUSPECTS[kind].inflates for kind in causes))
-        for source in _sources(picks, met, more):
+        for source in _sources(picks, met, more, repeats):
             if source.kind in known:
                 continue
             found.append(source)
@@ -212,7 +215,9 @@ def is_negligible(found: Finding, picks: Sequence[Picks]) -> bool:
     return found.up_to_mm**2 < _LEAST_SHARE * least_mm**2
 
 
-def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -> Iterator[Finding]:
+def _sources(
+    picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None, repeats: tuple[float, float]
+) -> Iterator[Finding]:
     """Dominant error sources of the worst pair of camera and robot."""
     need = None if met is None else met.need
     worst = (
@@ -226,9 +231,10 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -
     for name, size in budget.items():
         if size**2 < _LEAST_SHARE * total**2:
             continue
-        # More than an arm errs by is not blamed on it.
-        is_of_arm = name != "arm" or size <= CalibrationLimits.arm_errors[0 if in_mm else 1]
-        kind, words, do = _SOURCES[name if is_of_arm else "left out"]
+        # More than an arm errs by, or repeats to, is not blamed on it.
+        most = max(CalibrationLimits.arm_errors[1 - in_mm], 6.0 * repeats[1 - in_mm])
+        is_of_arm = name in ("arm", "look", "pick")
+        kind, words, do = _SOURCES["left out" if is_of_arm and size > most else name]
         without = ""
         if len(budget) > 1:
             rest = worst.without(name)
