@@ -12,7 +12,7 @@ from support.sound_findings import SOUND, changed, directions
 
 import visioncal
 from visioncal.calibration.suspects.judge import judge
-from visioncal.core.errors import DegenerateError
+from visioncal.core.errors import ConvergenceError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Verdict
@@ -176,6 +176,15 @@ def test_a_rail_leaves_a_turn_open_too(mount):
         DegenerateError, "in position only", visioncal.calibrate, moving("rail", mount)[0]
     )
     assert "move along a second direction" in error.next_step
+
+
+def test_a_lens_that_far_views_leave_open_hears_what_to_state():
+    far = CellOptions(
+        views=14, seed=1, state_intrinsics=False, distance_m=(2.8, 3.2), pixel_sigma_px=0.3
+    )
+    error = raised(ConvergenceError, "over 5 % of the image's width", calibrated, simulate(far))
+    assert "matrix and distortion" in error.next_step
+    assert "role = intrinsics" in error.next_step
 
 
 def test_words_say_whether_rivals_are_left():

@@ -173,12 +173,12 @@ def test_two_exchanged_names_are_named():
     (step,) = {finding.do.words for finding in frame.verdict.findings if finding.kind == "left_out"}
     assert step.startswith("Correct the names of what is named")
     assert sorted(left_out_of(frame)) == ["P3", "P7"]
-    assert frame.verdict.reasons[0].startswith("Of P7 and P3, the names are exchanged: ")
+    assert frame.verdict.reasons[0].startswith("Of P3 and P7, the names are exchanged: ")
     few = (0, 1, 4, 5)
     with pytest.raises(DataError, match="fixture: Of P5 and P6, the names are exchanged"):
         drawn(CAD_MM[[0, 1, 5, 4]], [NAMES[index] for index in few])
     # Of a rectangle's corners, exchanging either pair of neighbours gives the same shape.
-    with pytest.raises(DataError, match="Of P2 and P1, or of P3 and P4, the names are exchanged"):
+    with pytest.raises(DataError, match="Of P1 and P2, or of P3 and P4, the names are exchanged"):
         drawn(CAD_MM[:4], ("P2", "P1", "P3", "P4"))
 
 

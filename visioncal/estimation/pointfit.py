@@ -245,14 +245,19 @@ def mistake_of(pairs: PointPairs) -> Mistake | None:
     Any mirror image of a drawing is any other one, turned. Symmetric points leave several open.
     """
 
-    def rms_m(nominal: FloatArray) -> float:
+    def off_m(nominal: FloatArray) -> FloatArray:
         frame = align(pairs.measured, nominal)
         off = pairs.measured - nominal @ frame[:3, :3].T - frame[:3, 3]
-        return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+        return np.asarray(np.linalg.norm(off, axis=1))
+
+    def rms_m(nominal: FloatArray) -> float:
+        return float(np.sqrt(np.mean(off_m(nominal) ** 2)))
 
     declared_m, labels = rms_m(pairs.nominal), np.array(pairs.labels)
     tried: dict[tuple[str, ...], float] = {(): rms_m(pairs.nominal * [1.0, 1.0, -1.0])}
-    for names in combinations(dict.fromkeys(pairs.labels), 2):
+    # Of many points, the two are among those that are off most.
+    worst = dict.fromkeys(labels[np.argsort(-off_m(pairs.nominal), kind="stable")].tolist())
+    for names in combinations(sorted([*worst][:12]), 2):
         first, second = (labels == name for name in names)
         nominal = pairs.nominal.copy()
         nominal[first], nominal[second] = pairs.nominal[second][0], pairs.nominal[first][0]

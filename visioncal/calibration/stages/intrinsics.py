@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
 from visioncal.core.limits import FEWEST_VIEWS
-from visioncal.core.number_format import counted
+from visioncal.core.number_format import counted, percent
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
 from visioncal.estimation.bundle import BundleFit, fit_bundle
@@ -76,9 +76,15 @@ def estimate_intrinsics(
                 fit, reasons = restarted
     relative = np.sqrt(np.diag(fit.covariance)[:2]) / fit.camera.matrix[:2]
     if not fit.settled or not np.all(np.isfinite(relative)) or np.any(fit.camera.matrix[:2] <= 0):
+        spans = [np.ptp(seen.px[:, 0]) for seen in corners.values()]
+        share = float(np.median(spans)) / resolution[0]
         raise ConvergenceError(
-            "intrinsics: the estimate does not come to rest.",
-            next_step="Give matrix and distortion in [camera], or add tilted views.",
+            "intrinsics: the estimate does not come to rest: the target is seen over "
+            f"{percent(share)} of the image's width (median), and perspective shows where it is "
+            "near and tilted.",
+            next_step="Give matrix and distortion in [camera], as a calibration of this camera "
+            "alone has them, or add 10 images (role = intrinsics) in which the target is held "
+            "near, over half of the width, tilted by 30 to 45 degrees.",
         )
     if relative.max() > 0.2:
         raise DegenerateError(
