@@ -16,7 +16,7 @@ from visioncal.calibration.stages.likely_steps import likely_steps
 from visioncal.calibration.suspects.suspect import STEPS
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits, CheckLimits
 from visioncal.core.number_format import mm_and_deg
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import Finding
 from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.arm import LEVER_M
@@ -62,95 +62,90 @@ class Trial:
 def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
     """Findings with what their cures leave: whether that proves them, and how much they explain."""
     for finding in found:
-        trial = None
-        if finding.kind in _TRIALS and finding.until_mm and run.assessment.fit.robots:
-            trial = _TRIALS[finding.kind](run, finding.kind)
-        if trial is None:
+        if finding.kind not in _TRIALS or not finding.until_mm:
             yield finding
             continue
+        trial = _TRIALS[finding.kind](run, finding.kind)
         before, after = (mm_and_deg(*at) for at in trial.levels.tolist())
         # Turns count by what they move at a typical distance.
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
+        share = max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0)
         yield replace(
             finding,
             without_it=f"Applied and refitted, it leaves noise of {after} an axis; else it is "
             f"{before}.",
             is_proven=bool(finding.mahalanobis_sq) and _proves(run, trial),
-            explains=max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0),
+            # Without evidence of its own, it stands for what it removes alone.
+            explains=1.0 if finding.mahalanobis_sq else share,
         )
 
 
 def _proves(run: RunState, trial: Trial) -> bool:
     """Whether a cure leaves mere noise, and no other cause leaves about as little."""
-    before, after = trial.levels
-    limits = np.array([_LIMITS.scatter_mm[0], _LIMITS.scatter_deg[0]])
+    (before, after), (problem, fit) = trial.levels, trial.cured
     is_noise = bool((after < _LIMITS.repeatability * np.array(REPEATABILITY)).all())
-    is_noise |= bool((after < limits).all() and (CLEAR_RATIO * after < before).any())
-    if not is_noise or any(
-        _has_pattern(trial, name) for name, arm in run.cell_fit.arms.items() if not arm.is_modelled
-    ):
+    is_less = (after < (_LIMITS.scatter_mm[0], _LIMITS.scatter_deg[0])).all()
+    if not is_noise and not (is_less and (CLEAR_RATIO * after < before).any()):
+        return False
+    arms = {name: arm for name, arm in run.cell_fit.arms.items() if not arm.is_modelled}
+    patterns = (find_pose_errors(problem, fit.state, fit.noise, name) for name in arms)
+    if any(errors is not None and errors.is_significant for errors in patterns):
         return False
     if not trial.is_in_fit:
         return True
-    errors = {
-        name: arm.errors
-        for name, arm in run.cell_fit.arms.items()
-        if arm.errors and not arm.is_modelled
-    }
+    # A step is sought in the fit, which has the cure.
+    errors = {name: arm.errors for name, arm in arms.items() if arm.errors}
     rivals = likely_steps(*trial.without, errors, joint_offsets(run.cell_fit.arms))
     about = 2.0 * float(np.log(CheckLimits.ruled_out))
     return not any(step.gain > trial.gain - about for step in rivals)
 
 
-def _has_pattern(trial: Trial, robot: str) -> bool:
-    """Whether residuals beside a cure follow the posture or the stop before."""
-    problem, fit = trial.cured
-    errors = find_pose_errors(problem, fit.state, fit.noise, robot)
-    return errors is not None and errors.is_significant
-
-
-def _of_step(run: RunState, _: str) -> Trial | None:
+def _of_step(run: RunState, _: str) -> Trial:
     fit = run.assessment.fit
     own = fit.problem, fit.solution
     return Trial(own, with_step(*own, run.assessment.steps[0]), is_in_fit=False)
 
 
-def _of_growth(run: RunState, kind: str) -> Trial | None:
-    """The fit without a random effect."""
-    fit = run.assessment.fit
-    problem = fit.problem
-    kept = [effect for effect in problem.effects if effect.name.partition(" of ")[0] != kind]
-    values = [problem.values_of(effect.name, fit.state) for effect in kept]
-    state = State(fit.state.edges, np.concatenate([np.zeros(0), *values]))
-    bare = problem.with_effects(kept)
-    return Trial((bare, fit_problem(bare, state, fit.noise)), (problem, fit.solution))
-
-
-def _of_board(run: RunState, kind: str) -> Trial | None:
-    """The fit of boards as stated in size or shape; of measured poses, that of other distances."""
-    fit = run.assessment.fit
-    problem, targets = fit.problem, [name for name in fit.frames if name.startswith("target")]
-    if fit.corners is None:
-        sized = problem.with_effects([*problem.effects, target_sizes(problem, targets)])
-        values = np.append(fit.state.values, np.zeros(sized.size - problem.size))
-        state = State(fit.state.edges, values)
-        return Trial((problem, fit.solution), (sized, fit_problem(sized, state)))
-    first, stated = 6 * len(problem.unknown), list[int]()
-    for board in fit.unknowns.all_of(BOARD):
-        columns = fit.unknowns.columns(board)
-        is_size = fit.unknowns.values_of(board) == SCALE
-        stated += columns[is_size == (kind == "board_size")].tolist()
-    is_held = np.isin(np.arange(first, problem.size), stated)
-    effects, at = [], 0
+def _held(run: RunState, columns: IntArray) -> Trial:
+    """A trial of what is in the fit, without which some values are zero."""
+    fit, first = run.assessment.fit, 6 * len(run.assessment.fit.frames)
+    problem, effects = fit.problem, []
     for effect in problem.effects:
-        effects.append(replace(effect, held=effect.held | is_held[at : at + len(effect)]))
-        at += len(effect)
-    held = problem.with_effects(effects)
-    state = State(fit.state.edges, np.where(is_held, 0.0, fit.state.values))
-    return Trial((held, fit_problem(held, state, fit.noise)), (problem, fit.solution))
+        own = problem.effect_columns[effect.name]
+        held = effect.held | np.isin(np.arange(own.start, own.stop), columns)
+        effects.append(replace(effect, held=held))
+    values = fit.state.values.copy()
+    values[columns - first] = 0.0
+    without = problem.with_effects(effects)
+    solved = fit_problem(without, State(fit.state.edges, values), fit.noise)
+    return Trial((without, solved), (problem, fit.solution))
 
 
-_TRIALS: Mapping[str, Callable[[RunState, str], Trial | None]] = {
+def _of_growth(run: RunState, kind: str) -> Trial:
+    return _held(run, run.assessment.fit.unknowns.of_kinds(kind))
+
+
+def _of_board(run: RunState, kind: str) -> Trial:
+    """Of sizes or shapes of boards; of measured poses, of other distances."""
+    fit = run.assessment.fit
+    if fit.corners is None:
+        targets = [name for name in fit.frames if name.startswith("target")]
+        wide = fit.with_columns(target_sizes(fit.problem, targets))
+        return Trial(
+            (fit.problem, fit.solution),
+            (wide.problem, fit_problem(wide.problem, wide.state)),
+            is_in_fit=False,
+        )
+    columns = [
+        fit.unknowns.columns(board)[
+            (fit.unknowns.values_of(board) == SCALE) == (kind == "board_size")
+        ]
+        for board in fit.unknowns.all_of(BOARD)
+    ]
+    return _held(run, np.concatenate(columns))
+
+
+_TRIALS: Mapping[str, Callable[[RunState, str], Trial]] = {
     **dict.fromkeys(STEPS, _of_step),
     **dict.fromkeys((effect.kind for effect in RANDOM_EFFECTS), _of_growth),
     **dict.fromkeys(("board_size", "board_shape"), _of_board),

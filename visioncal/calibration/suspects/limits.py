@@ -307,18 +307,12 @@ def _robot_noise(judged: Findings) -> Iterator[Finding]:
         least_mm, least_deg = arm.lower_bounds or (arm.noise_mm, arm.noise_deg)
         if max(least_mm / limit_mm, least_deg / limit_deg) <= 1.0:
             continue
-        likelier = (
-            "Look for what is likelier than noise of the arm: a board of another size than stated "
-            "(measure it over many squares) or warped, intrinsics that are not this camera's, an "
-            "instrument that was moved or reads worse than stated, a model of the arm that is off "
-            "by as much, or poses that are rounded or were read before the arm stood still."
-        )
         ratio = max(arm.noise_mm / limit_mm, arm.noise_deg / limit_deg)
         yield Finding(
             UNEXPLAINED,
             "The residuals would take a flange that is off by "
             f"{mm_and_deg(arm.noise_mm, arm.noise_deg)} from stop to stop; such "
             f"arms repeat to {mm_and_deg(*arm.repeatability)}.",
-            Remedy(likelier),
+            Remedy(_unexplained_words(judged.held_out)),
             until_mm=_LIMITS.good_enough * ratio * limit_mm,
         ).of(arm.name)
