@@ -87,7 +87,9 @@ def slipping(size_rad: float) -> Callable[[np.ndarray, np.random.Generator], np.
 
 FAULTS: Mapping[str, Fault] = {
     "lens grows by 0.15 %": Fault(World(focus=elsewhere.growing(0.0015), views=30), "lens_grows"),
-    "base creeps by 0.5 mm": Fault(World(lift=lambda share: 5e-4 * share, views=30), "base_creeps"),
+    "base creeps by 0.5 mm": Fault(
+        World(lift=lambda share: 5e-4 * share, views=30), "base_creeps|moved_slowly"
+    ),
     "base tilts by 1.5 mrad/m": Fault(
         World(robot=elsewhere.tilting(1.5e-3), views=30), "base_tilts"
     ),

@@ -60,7 +60,7 @@ EXCHANGED = Finding(
 )
 POSTURE = Finding("arm_errors", "Residuals follow the arm's posture.", mahalanobis_sq=45.0)
 FIELD = Finding("lens_field", "The lens departs.", mahalanobis_sq=300.0, up_to_mm=0.08)
-DRIFT = Finding("base_creeps", "The base crept.")
+DRIFT = Finding("moved_slowly", "Residuals drift with time.")
 MEASURED = MeasuredScale(4.7e-3, 6e-4, 8e-4)
 SIZE = scale_finding(
     "board", load_target("charuco_9x6_30mm"), MEASURED, replace(MEASURED, scale=4e-3, sigma=9e-4)
@@ -170,7 +170,7 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     assert all(cause.do is MEASURE_BOARD for cause in of_board.causes[1:])
     # What can be had without them is no cause of a doubt about something else.
     met = replace(found, need=None, worst=directions(1e-4), warnings=(DRIFT,))
-    assert ids(judge(met)) == ["base_creeps"]
+    assert ids(judge(met)) == ["moved_slowly"]
 
 
 @pytest.mark.parametrize(("repeats", "advised"), [((0.1, 0.01), False), ((5.0, 1.5), True)])
@@ -201,7 +201,7 @@ def test_a_sigma_far_beyond_its_limit_is_the_cause_of_a_bad_result() -> None:
     assert ids(judge(misplaced)) == ["place"]
     # A mistake that is found is likelier, and a need asks for what picks err by.
     drifting = judge(replace(bad, warnings=(DRIFT,)))
-    assert "base_creeps" in ids(drifting)
+    assert "moved_slowly" in ids(drifting)
     assert "weak_motion" not in ids(drifting)
     assert ids(judge(replace(bad, need=Need(0.5)))) == ["robot_noise"]
 
@@ -526,11 +526,11 @@ def test_each_doubt_has_its_sentence(changes, status, words):
         ({"warnings": (MISSPELT,)}, ["remark"]),
         ({"stops": 8, "worst": directions(2e-3)}, ["weak_motion", "few_stops"]),
         # They are none where something else is likely.
-        ({"stops": 8, "warnings": (DRIFT,)}, ["base_creeps"]),
+        ({"stops": 8, "warnings": (DRIFT,)}, ["moved_slowly"]),
         # What happened comes before what nothing explains.
         ({"noise_mm": 1.0, "warnings": (MOVED,)}, ["something_moved", "unexplained"]),
         # What moves with the time passes for a focus, and not the other way round.
-        ({"warnings": (FOCUS, DRIFT)}, ["base_creeps"]),
+        ({"warnings": (FOCUS, DRIFT)}, ["moved_slowly"]),
         # A held lens that is wrong is no arm that errs.
         ({"warnings": (POSTURE, HELD_LENS), "noise_mm": 2.0}, ["lens"]),
         # Joints that are there but misread come before the errors they would explain.
@@ -551,7 +551,7 @@ def test_every_doubt_has_a_cause_and_a_next_step(changes, causes) -> None:
 def test_poses_that_are_misread_explain_the_rest_but_exchanged_rows() -> None:
     misread = Finding("misread_poses", "The quaternions are w, x, y, z.", READ_AGAIN)
     verdict = judge(changed(SOUND, warnings=(DRIFT, misread), noise_mm=3.0))
-    assert ids(verdict) == ["misread_poses", "unexplained", "base_creeps"]
+    assert ids(verdict) == ["misread_poses", "unexplained", "moved_slowly"]
     assert sum(cause.probability for cause in verdict.causes) <= 1.0 + 1e-9
     assert verdict.top[0].startswith("Most likely: The quaternions are w, x, y, z.")
     assert verdict.next_steps == (READ_AGAIN,)

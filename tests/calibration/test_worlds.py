@@ -213,7 +213,7 @@ WORLDS: dict[str, World] = {
         lifted,
         causes=("moved_at_once",),
         words=("moved at once: from view 9 on",),
-        never=frozenset({"base_creeps", "weak_motion", "place", "calibration"}),
+        never=frozenset({"moved_slowly", "weak_motion", "place", "calibration"}),
         of=NONE,
     ),
     "stops err in groups": World(

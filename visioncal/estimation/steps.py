@@ -1,4 +1,4 @@
-"""Changes from some stop on: of a frame, a joint's offset or a board's size.
+"""Changes from some stop on: of a frame, a joint's offset or a board's size; and a base's drift.
 
 Each is a few columns of the residuals, and all stops are tried at once by running sums (Rao's score
 test of a change point, Page 1955). The evidence of a fit with the change decides; `moves` finds
@@ -13,8 +13,9 @@ import numpy as np
 
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
+from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.arm import rows_of
+from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import ROUNDING, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
@@ -30,11 +31,12 @@ from visioncal.estimation.solve import (
     fitted_covariance,
 )
 
-FRAME, JOINT, SIZE = "frame", "joint", "size"
+FRAME, JOINT, SIZE, DRIFT = "frame", "joint", "size", "drift"
 # Sizes of changes with equal prior probability, and the unit of each value.
 _MOTION = SIZES_M, np.repeat([TURN_PER_M, 1.0], 3)
 _PRIOR: Mapping[str, tuple[tuple[float, ...], FloatArray]] = {
     FRAME: _MOTION,
+    DRIFT: _MOTION,
     JOINT: ((1e-4, 1e-3, 1e-2, 1e-1), np.ones(1)),
     SIZE: ((1e-3, 1e-2, 1e-1), np.ones(1)),
 }
@@ -46,8 +48,8 @@ _MOST_EXPLAINED = 0.99
 class Candidate:
     """What may have changed during the session."""
 
-    kind: str  # `FRAME`, `JOINT` or `SIZE`.
-    of: str  # The frame; of a joint the robot, as the problem names it.
+    kind: str  # `FRAME`, `JOINT`, `SIZE` or `DRIFT`.
+    of: str  # The frame; of a joint or a drift the robot, as the problem names it.
     stops: IntArray  # The stops from which on it may have changed.
     effect: Effect | None = None  # The change as an effect on all stops; None for a frame's pose.
     joint: int = -1  # Index of the joint.
@@ -59,8 +61,8 @@ class Step:
 
     candidate: Candidate  # What changed.
     stop: int  # The first stop after it.
-    # (c,) change: twist of a frame in its own old pose [rad, m]; actual minus reported angle [rad];
-    # relative size.
+    # (c,) change: twist of a frame in its own old pose, or of a base over the session [rad, m];
+    # actual minus reported angle [rad]; relative size.
     value: FloatArray
     covariance: FloatArray  # (c, c) of the change.
     gain: float  # Twice the gain in log-likelihood, or the log Bayes factor of `evidence`.
@@ -70,7 +72,7 @@ class Step:
 
     @property
     def kind(self) -> str:
-        """What changed: `FRAME`, `JOINT` or `SIZE`."""
+        """What changed: `FRAME`, `JOINT`, `SIZE` or `DRIFT`."""
         return self.candidate.kind
 
     @property
@@ -120,6 +122,19 @@ def sizes_of(problem: Problem, fit: Solution) -> list[Candidate]:
     return candidates
 
 
+def drift_of(problem: Problem, robot: str) -> Candidate:
+    """Motion of a robot's base in proportion to the number of the stop."""
+    stops, poses = stops_of(problem, robot), problem.poses[robot]
+    jacobian = np.zeros((len(poses), 6, 6))
+    time = np.linspace(-0.5, 0.5, len(stops))[:, None, None]
+    jacobian[stops] = adjoint(invert(poses[stops])) * time
+    effect = Effect.free(
+        f"drift of {robot}", PriorInformation.flat(6), flange_jacobian={robot: jacobian}
+    )
+    first = int(problem.observations.stops.min())
+    return Candidate(DRIFT, robot, np.array([first]), effect)
+
+
 def _between(problem: Problem, rows: Mask) -> IntArray:
     """Stops with enough stops of (n,) some observations before and after."""
     return np.asarray(np.unique(problem.observations.stops[rows])[FEWEST_VIEWS : 1 - FEWEST_VIEWS])
@@ -135,7 +150,8 @@ def find_steps(
         fit: Their converged fit.
         candidates: What may have changed.
         kinds: Number of kinds of residuals, rotations and positions, if a frame's step may be in
-            one alone: it then has to explain a half as much, and noise explains it more often.
+            one alone: it then has to explain a half as much, and noise explains it more often. No
+            `evidence` follows for a drift, whose test is of both.
     """
     size, fitted = problem.size, fitted_covariance(problem, fit.state, fit.noise)
     effects = [candidate.effect for candidate in candidates if candidate.effect is not None]

@@ -19,7 +19,7 @@ from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.steps import FRAME, SIZE, Step, with_step
+from visioncal.estimation.steps import DRIFT, FRAME, SIZE, Step, with_step
 from visioncal.estimation.unknowns import ARM
 
 # Name of a sudden step (a frame that moved, a joint that slipped) as a source of uncertainty.
@@ -85,7 +85,7 @@ def covariance_from_other_sources(
         elif arm.errors is not None:
             at, by_noise = fit.unknowns[ARM, robot], fit.by_noise
             parts[f"size of arm errors{suffix}"] = covariance_of_size(at, by_noise, arm.errors)
-    if steps:
+    if steps and steps[0].kind != DRIFT:
         parts[STEP] = steps[0].spread
     return parts
 

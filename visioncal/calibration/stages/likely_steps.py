@@ -1,4 +1,4 @@
-"""Steps that the residuals of a fit show."""
+"""Steps and drifts that the residuals of a fit show."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,9 +12,11 @@ from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, by_noise_alone
 from visioncal.estimation.steps import (
+    DRIFT,
     FRAME,
     SIZE,
     Step,
+    drift_of,
     evidence,
     find_steps,
     frames_of,
@@ -34,7 +36,7 @@ def likely_steps(
     errors: Mapping[str, ArmErrors],
     offsets: Mapping[str, FloatArray],
 ) -> tuple[Step, ...]:
-    """The likeliest step that the residuals show, followed by others about as likely.
+    """The likeliest step that the residuals show, followed by others about as likely; or a drift.
 
     The gain of a step is the logarithm, doubled, of its Bayes factor beside the errors of arms.
 
@@ -49,11 +51,15 @@ def likely_steps(
         return ()
     candidates = frames_of(problem, tuple(problem.unknown)) + sizes_of(problem, fit)
     candidates += joints_of(problem, {name: offsets[name] for name in robots if name in offsets})
+    candidates += [drift_of(problem, robot) for robot in robots]
     # A push shifts positions alone, and dominates their noise.
     found = find_steps(problem, fit, candidates, kinds=2)
+    drift = next((step for step in found if step.kind == DRIFT), None)
     penalty = 2.0 * float(np.log(len(problem.unknown) * (1 + problem.observations.stops.max())))
     likely = []
     for step in found[:_MOST_FITTED]:
+        if step.kind == DRIFT or (drift is not None and step.gain - penalty < drift.gain):
+            continue
         gain, apart, there = evidence(problem, fit, step)
         if step.kind in (FRAME, SIZE) and not _leaves_noise(apart, there, step):
             continue
@@ -68,7 +74,9 @@ def likely_steps(
     if likely and likely[0].gain > needed:
         least = max(needed, likely[0].gain - _CLEARLY)
         return tuple(step for step in likely if step.gain > least)
-    return ()
+    if drift is None or (drift.of in errors and drift.gain < errors[drift.of].gain):
+        return ()
+    return (drift,)
 
 
 def _leaves_noise(problem: Problem, fit: Solution, step: Step) -> bool:

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.core.limits import CalibrationLimits
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import LEVER_M, stops_of
@@ -23,6 +22,8 @@ from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 
+# With fewer stops, no such error is distinguished from noise.
+_FEWEST_STOPS = 12
 _KINDS = {kind.kind: kind for kind in RANDOM_EFFECTS}
 
 
@@ -44,8 +45,7 @@ def random_effects(
     problem, found = inliers.problem, list[Effect]()
     for robot, arm in arms.items():
         stops = stops_of(inliers.part, robot)
-        # By fewer than check a result, no such error is distinguished from noise.
-        if len(stops) < CalibrationLimits.stops[0] or f"arm of {robot}" in problem.effect_columns:
+        if len(stops) < _FEWEST_STOPS or f"arm of {robot}" in problem.effect_columns:
             continue
         candidates = [*_of_flange(problem, robot, stops)]
         if corners is not None and rows is not None and len(arms) == 1:

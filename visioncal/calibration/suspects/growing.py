@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
+from visioncal.calibration.suspects.suspect import Suspect
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.effects import RANDOM_EFFECTS
@@ -25,8 +25,6 @@ def _found(effect: RandomEffect, run: RunState) -> Iterator[Finding]:
             yield found.of(owner if len(fit.noise.robots) > 1 else "")
 
 
-# A focus that changes at random does not follow time, reach or gravity.
 GROWING = tuple(
-    Suspect(effect.kind, partial(_found, effect), 1e-4, True, ("focus",), (ARM_ERRORS,))
-    for effect in RANDOM_EFFECTS
+    Suspect(effect.kind, partial(_found, effect), 1e-4, True) for effect in RANDOM_EFFECTS
 )

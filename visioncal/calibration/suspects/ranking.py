@@ -35,8 +35,8 @@ from visioncal.robot.model import REPEATABILITY
 
 # Probability from which on a mistake precedes sigmas beyond their limits.
 _LIKELIER = 0.5
-# Kinds of errors that are in the fit, and no mistakes.
-_ACCOUNTED = ("board_shape", "lens_field", "focus")
+# Kinds of errors that are in the fit, where no test of their own says more.
+_ACCOUNTED = ("board_shape", "lens")
 # Removing a source with a smaller share of the variance would reduce a pick's error by under 5 %.
 _LEAST_SHARE = 0.1
 
@@ -124,7 +124,9 @@ def rank_causes(
     # A sigma far beyond its limit alone makes a result bad, with no likely mistake. What the fit
     # accounts for inflates none.
     is_likely = any(
-        finding.probability >= _LIKELIER and finding.kind not in _ACCOUNTED for finding in found
+        finding.probability >= _LIKELIER
+        and (finding.kind not in _ACCOUNTED or finding.mahalanobis_sq > 0.0)
+        for finding in found
     )
     decides = met is None and not is_likely and any(finding.is_fatal for finding in sigmas)
     enough, limit = NeedLimits.probability[0], Need(mm=CalibrationLimits.sigma_mm[0])

@@ -78,6 +78,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     steps.MOVED_AT_ONCE,
     steps.JOINT_SLIPPED,
     steps.BOARD_CHANGED,
+    steps.MOVED_SLOWLY,
     lens.FIELD,
     lens.FOCUS,
     lens.MODEL,
@@ -112,7 +113,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("other_arm", None, REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
     *map(Suspect, ("contradicting_joints", "base_link", "tool_frame", "level", "load", "clock")),
     # The remainder of a clock's jump looks like motion.
-    Suspect("clock_changed", None, 1e-4, True, ("base_creeps", *STEPS, ARM_ERRORS)),
+    Suspect("clock_changed", None, 1e-4, True, ("moved_slowly", *STEPS, ARM_ERRORS)),
     # The size of errors.
     # It stands for noise that no such robot has.
     Suspect(UNEXPLAINED, None, REMARK, True, inflates=SOURCES[2:4], size=3, order=1),

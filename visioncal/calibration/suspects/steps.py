@@ -1,4 +1,4 @@
-"""What moved, slipped or was exchanged at some stop."""
+"""What moved, slipped or was exchanged at some stop, or drifted over the session."""
 
 from collections.abc import Iterator
 
@@ -6,19 +6,25 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
+from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import exp, pose_difference
-from visioncal.core.verdict import Finding
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.identifiability import joint_words
-from visioncal.estimation.steps import FRAME, JOINT, SIZE, Step
+from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step
 
+_LIMITS = CalibrationLimits()
 _THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
 
 
 def _found(run: RunState) -> Iterator[Finding]:
-    """The likeliest step, and another that may be the cause instead."""
+    """The likeliest step or drift, and another that may be the cause instead."""
     steps, cell = run.assessment.steps, run.cell_fit.cell
-    if not steps:
+    # More than a base or an arm drifts by is of another cause that follows the order of the views.
+    moved = [pose_difference(np.eye(4), exp(step.value)) for step in steps if step.kind == DRIFT]
+    if not steps or any(
+        mm > _LIMITS.arm_errors[0] or deg > _LIMITS.arm_errors[1] for mm, deg in moved
+    ):
         return
     step, instead = steps[0], ""
     if steps[1:]:
@@ -28,12 +34,14 @@ def _found(run: RunState) -> Iterator[Finding]:
         FRAME: ("moved_at_once", f"Fasten {thing[0].lower()}{thing[1:]}"),
         JOINT: ("joint_slipped", "Look whether the joint keeps its zero"),
         SIZE: ("board_changed", "Measure both prints, take one of them for all views"),
+        DRIFT: ("moved_slowly", "Fasten base and target, let the arm warm up, and record again."),
     }[step.kind]
+    is_drift = step.kind == DRIFT
     yield Finding(
         kind,
         f"{_words(step, run)}; the result is between before and after.{instead}",
-        cell.or_separately(do, step.stop),
-        mahalanobis_sq=step.gain,
+        Remedy(do) if is_drift else cell.or_separately(do, step.stop),
+        mahalanobis_sq=0.0 if is_drift else step.gain,
     )
 
 
@@ -59,6 +67,11 @@ def _words(step: Step, run: RunState) -> str:
             "before, by the robot's motion"
         )
     moved = mm_and_deg(*pose_difference(np.eye(4), exp(step.value)))
+    if step.kind == DRIFT:
+        return (
+            "Residuals drift with time: from the first stop to the last, base or target moved by "
+            f"{moved}"
+        )
     return f"{thing} moved at once: {when}, it is {moved} from where it was"
 
 
@@ -70,3 +83,4 @@ JOINT_SLIPPED = Suspect("joint_slipped", None, 1e-4, True, _EFFECTS, INFLATED)
 BOARD_CHANGED = Suspect(
     "board_changed", None, 1e-4, True, (*_EFFECTS, "board_size", "board_shape"), INFLATED
 )
+MOVED_SLOWLY = Suspect("moved_slowly", None, 1e-4, True, ("focus",), (ARM_ERRORS,))
