@@ -16,8 +16,8 @@ LAYERS = (
     "core", "robot", "vision", "session", "estimation", "model", "fit", "dynamics", "results",
     "simulation", "calibration", "frames", "present", "live", "interchange", "cli",
 )  # fmt: skip
-# The session's loader hands recordings over.
-LAZY = {("session", "present"), ("results", "present")}
+# The session's loader hands recordings over; a result locates what its camera sees.
+LAZY = {("session", "present"), ("results", "present"), ("results", "frames")}
 # Boards are drawn as they are printed; lens, arm and solvers are its own.
 SIMULATION_MAY_USE = ("core", "session", "simulation", "vision.targets", "vision.printing.pattern")
 HOMES = {

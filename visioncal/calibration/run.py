@@ -106,7 +106,8 @@ def calibrate(
     state = initial_state(session, **asked)
     with_need = state.session.needing(need_mm, need_deg, corrected=corrected)
     state = replace(state, session=with_need, given_corners=corners)
-    return result_of(run_stages(state))
+    state = run_stages(state)
+    return _with_depth(state)[0] if _has_depth(state) else result_of(state)
 
 
 def run(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> Run:
@@ -116,7 +117,21 @@ def run(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> R
     residuals = zip(held_out.residual_m.tolist(), held_out.rms_px.tolist(), strict=True)
     left_out = dict(zip(state.used, residuals, strict=True))
     searches = state.searches if state.dense is None else {}
-    return Run(result_of(state), view_evidence(state), left_out, searches)
+    result = _with_depth(state) if _has_depth(state) else (result_of(state), view_evidence(state))
+    return Run(*result, left_out, searches)
+
+
+def _has_depth(state: RunState) -> bool:
+    return any(view.depth for view in state.session.views)
+
+
+def _with_depth(state: RunState) -> tuple[Calibration, tuple[ViewEvidence, ...]]:
+    """The result and its evidence, with the depth of its cameras."""
+    # Imported here, as few sessions have depth.
+    from visioncal.calibration.stages.depth import with_depth
+
+    with one_blas_thread():
+        return with_depth(result_of(state), view_evidence(state), state.session)
 
 
 @dataclass(frozen=True)

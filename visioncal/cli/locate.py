@@ -15,10 +15,17 @@ from visioncal.cli.result_options import LocateOptions
 from visioncal.core.conventions import PoseForm, controller_form, stated_pose
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.errors import DataError
+from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes, write_atomically
 from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.types import FloatArray, Target
 from visioncal.frames.camera_chain import CalibratedCamera, Plane
-from visioncal.frames.locate import Located, locate, locate_target
+from visioncal.frames.locate import (
+    Located,
+    cloud_in_base,
+    locate,
+    locate_by_depth,
+    locate_target,
+)
 from visioncal.interchange.result_files import load_result
 from visioncal.results import Calibration, Edge
 from visioncal.results.picking import check_mount
@@ -58,36 +65,14 @@ def locate_command(options: LocateOptions) -> None:
         refuse_given({"--view": options.view}, "only a session has views")
     form = controller_form("", options.robot_form) or calibrated.controller()
     flange, joints_rad = None if options.pose is None else _flange(options.pose, form), None
-    if options.pixel:
-        given = {"--point-mm": options.point, "--target": target}
-        refuse_given(given, "a pixel is placed by its plane")
+    if options.pixel or options.cloud is not None:
         if session is not None:
             flange, joints_rad = _flange_of(session, _chosen(session, options.view), calibrated)
-        elif source is not None:
-            from visioncal.frames.target_in_image import check_image_size
-
-            check_image_size(CalibratedCamera.of(calibrated), read_image(source), source.name)
+        if options.cloud is not None:
+            _write_cloud(options, options.cloud, calibrated, flange, joints_rad)
+            return
         boards = targets_fixed_to_base(result, choice, EYE)
-        if options.plane is None:
-            no_pose = flange is None and calibrated.mount == "eye-in-hand"
-            also = ", and so is the flange's pose at the image (--pose)" if no_pose else ""
-            raise DataError(
-                "One image shows no depth: the plane (--plane) that the feature lies in is needed"
-                f"{also}.",
-                culprits=["--plane", *["--pose"] * no_pose],
-                next_step=f"A plane is {FORMS}. visioncal locate --example prints a line that "
-                "works.",
-            )
-        px = np.array(options.pixel)
-        declared, note = _plane_of(options.plane, options.plane_sigma or 0.0, calibrated, boards)
-        sigma_px = options.sigma_px
-        places = locate(calibrated, px, declared, flange, joints_rad=joints_rad, sigma_px=sigma_px)
-        if note:
-            places = tuple(replace(at, warnings=(*at.warnings, note)) for at in places)
-        points: list[_Point] = [
-            (f"pixel ({u:g}, {v:g})", {"pixel": [u, v]}, place)
-            for (u, v), place in zip(px.tolist(), places, strict=True)
-        ]
+        points = _by_pixels(options, session, calibrated, boards, (flange, joints_rad))
     else:
         needless = {"--plane": options.plane, "--plane-sigma-mm": options.plane_sigma}
         refuse_given(needless, "it is for --pixel")
@@ -98,6 +83,106 @@ def locate_command(options: LocateOptions) -> None:
         else:
             points = _by_image(options, calibrated, other_target, origin_m, flange)
     _report(points, as_json=options.as_json)
+
+
+def _by_pixels(
+    options: LocateOptions,
+    session: Session | None,
+    calibrated: Calibration,
+    boards: Mapping[str, Edge],
+    state: tuple[FloatArray | None, FloatArray | None],
+) -> list[_Point]:
+    """Pixels on a plane or at their depth, with the flange's pose and the joints."""
+    given = {"--point-mm": options.point, "--target": options.target}
+    refuse_given(given, "a pixel is placed by its plane or its depth")
+    if session is None and options.source is not None:
+        from visioncal.frames.target_in_image import check_image_size
+
+        image = read_image(options.source)
+        check_image_size(CalibratedCamera.of(calibrated), image, options.source.name)
+    px, sigma_px, (flange, joints_rad) = np.array(options.pixel), options.sigma_px, state
+    measured = _measured(options, session, calibrated, px)
+    if measured is not None:
+        places = locate_by_depth(
+            calibrated, px, measured, flange, joints_rad=joints_rad, sigma_px=sigma_px
+        )
+    elif options.plane is not None:
+        plane, note = _plane_of(options.plane, options.plane_sigma or 0.0, calibrated, boards)
+        places = locate(calibrated, px, plane, flange, joints_rad=joints_rad, sigma_px=sigma_px)
+        if note:
+            places = tuple(replace(at, warnings=(*at.warnings, note)) for at in places)
+    else:
+        no_pose = flange is None and calibrated.mount == "eye-in-hand"
+        also = ", and so is the flange's pose at the image (--pose)" if no_pose else ""
+        raise DataError(
+            "One image shows no depth: the plane (--plane) that the feature lies in is needed, or "
+            f"its depth (--depth){also}.",
+            culprits=["--plane", *["--pose"] * no_pose],
+            next_step=f"A plane is {FORMS}. visioncal locate --example prints a line that works.",
+        )
+    return [
+        (f"pixel ({u:g}, {v:g})", {"pixel": [u, v]}, place)
+        for (u, v), place in zip(px.tolist(), places, strict=True)
+    ]
+
+
+def _measured(
+    options: LocateOptions, session: Session | None, calibration: Calibration, px: FloatArray
+) -> FloatArray | None:
+    """(n,) depth at (n, 2) pixels, of the file or the view; None where a plane is given instead."""
+    camera, file = CalibratedCamera.of(calibration).camera, options.depth
+    if options.plane is not None:
+        refuse_given({"--depth": file}, "the plane says how far the pixels are")
+        return None
+    # Imported late, like all that few picks need.
+    from visioncal.session.depth import read_depth
+
+    if file is not None:
+        data, name = read_bytes(file, MOST_IMAGE_BYTES), file.name
+    else:
+        views = () if session is None else _chosen(session, options.view)
+        if session is None or not views[0].depth:
+            return None
+        data, name = session.images.read(views[0].depth), views[0].depth
+    depth = read_depth(data, name, camera.resolution, _unit_m(calibration))
+    u, v = np.clip(np.rint(px), 0, np.array(camera.resolution) - 1).astype(int).T
+    lost = np.flatnonzero(np.isnan(depth[v, u]))
+    if len(lost):
+        at = f"({px[lost[0], 0]:g}, {px[lost[0], 1]:g})"
+        raise DataError(
+            f"{name}: the sensor measured no depth at pixel {at}.",
+            culprits=[f"pixel {at}"],
+            next_step="Give a pixel beside it, or the plane that it lies in (--plane).",
+        )
+    return np.asarray(depth[v, u])
+
+
+def _unit_m(calibration: Calibration) -> float | None:
+    depth = None if calibration.camera is None else calibration.camera.depth
+    return None if depth is None else depth.unit_m
+
+
+def _write_cloud(
+    options: LocateOptions,
+    cloud: Path,
+    calibration: Calibration,
+    flange: FloatArray | None,
+    joints_rad: FloatArray | None,
+) -> None:
+    """Writes a cloud in the base."""
+    from visioncal.session.depth import npy_of, ply_of, read_cloud
+
+    output = options.output
+    if output is None or output.suffix.lower() not in (".ply", ".npy"):
+        raise DataError(
+            "--cloud: it is not said where the cloud goes: -o is needed, with a .ply or .npy.",
+            culprits=["--output"],
+            next_step="Add -o cloud.ply.",
+        )
+    points = read_cloud(read_bytes(cloud, MOST_IMAGE_BYTES), cloud.name)
+    placed = cloud_in_base(calibration, points, flange, joints_rad=joints_rad)
+    write_atomically(output, (ply_of if output.suffix.lower() == ".ply" else npy_of)(placed))
+    say(f"wrote {output}: {np.isfinite(placed[..., 2]).sum()} points in the base, in metres")
 
 
 def _chosen(session: Session, view: int | None) -> tuple[View, ...]:

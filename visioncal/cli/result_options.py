@@ -395,8 +395,8 @@ class TouchTestOptions(ActOptions):
 class LocateOptions:
     """Locate what an image shows in the robot's base, with its uncertainty.
 
-    It is a target, or a pixel whose plane is known. Exit status 2: there is no place, for the
-    reason given; 3: there is none, as the calibration's verdict is bad.
+    It is a target, a pixel whose plane or depth is known, or a whole cloud. Exit status 2: there is
+    no place, for the reason given; 3: there is none, as the calibration's verdict is bad.
     """
 
     first: ClassVar = "calibration pixel plane pose target point view _example"
@@ -407,6 +407,11 @@ class LocateOptions:
     pixel: list[tuple[float, float]] | None = numbers_option(
         "A feature, in the image as it was taken; several may be given.", form="u,v"
     )
+    depth: Path | None = option(
+        "Depth picture or organised cloud at the image, instead of a plane; else that of the view."
+    )
+    cloud: Path | None = option("A camera's cloud, to be written in the base, with -o.")
+    output: Path | None = option("The cloud in the base: .ply or .npy.", "-o", "--output")
     plane: str | None = option(f"Plane of the features: {FORMS}.")
     plane_sigma: float | None = option("Sigma of the plane's height, in mm.", "--plane-sigma-mm")
     point: tuple[float, float, float] | None = numbers_option(

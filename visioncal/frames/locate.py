@@ -37,7 +37,8 @@ class Located:
 
     p_base: FloatArray  # (3,) [m].
     # (3, 3) covariance by source [m^2]: `pixels`, `calibration` (the camera's transform and its
-    # lens together), `robot` (at this stop), `arm`, `plane`, `target`, `focus` (a pixel's, by the
+    # lens and depth together), `robot` (at this stop), `arm`, `plane`, `depth` (its noise),
+    # `target`, `focus` (a pixel's, by the
     # change of the focal length at this view).
     parts: Mapping[str, FloatArray]
     freedom: float  # Effective degrees of freedom of the covariance.
@@ -115,6 +116,119 @@ def locate(
     """
     eye = CalibratedCamera.of(calibration.chosen(Choice(camera, robot), EYE))
     noise_px, cam_pose = eye.noise_px(sigma_px), eye.at(base_from_flange, joints_rad)
+    px, rays = _rays(eye, px)
+    return tuple(
+        _on_plane(eye, cam_pose, plane, ray, at, noise_px) for ray, at in zip(rays, px, strict=True)
+    )
+
+
+@typed
+def locate_by_depth(
+    calibration: Calibration,
+    px: FloatArray,
+    depth_m: FloatArray | float,
+    base_from_flange: Pose | None = None,
+    *,
+    joints_rad: FloatArray | None = None,
+    sigma_px: float | None = None,
+    camera: str | None = None,
+    robot: str | None = None,
+) -> tuple[Located, ...]:
+    """Positions in the base of image features at measured distances, which are corrected.
+
+    Args:
+        calibration: The camera's, with its depth; without it, distances are taken as exact.
+        px: As in `locate`.
+        depth_m: (n,) distances as the sensor measured them, along z or the ray as the calibration's
+            session has them [m].
+        base_from_flange: As in `locate`.
+        joints_rad: As in `locate`.
+        sigma_px: As in `locate`.
+        camera: As in `locate`.
+        robot: As in `locate`.
+
+    Raises:
+        DataError: As `locate`, or a distance is not above 0.
+    """
+    eye = CalibratedCamera.of(calibration.chosen(Choice(camera, robot), EYE))
+    noise_px, cam_pose = eye.noise_px(sigma_px), eye.at(base_from_flange, joints_rad)
+    px, rays = _rays(eye, px)
+    measured = np.broadcast_to(np.asarray(depth_m, dtype=float), len(px))
+    if not (measured > 0.0).all():
+        raise DataError(
+            f"locate: the distances are {measured.tolist()}; metres above 0 are needed.",
+            next_step="Take a pixel at which the sensor measured one.",
+        )
+    model, found = eye.lens.depth, list[Located]()
+    for at, ray, metres in zip(px, rays, measured, strict=True):
+        depth, noise_m = metres, 0.0
+        by_depth, covariance = np.zeros((0, 1)), np.zeros((0, 0))
+        cross = np.zeros((0, len(eye.covariance)))
+        warnings = ["The calibration's views had no depth: it is taken as it was measured."]
+        along = 1.0
+        if model is not None:
+            warnings = []
+            along = float(np.linalg.norm(ray)) if model.of == "ray" else 1.0
+            (true,) = model.true_m(metres[None], at[None], eye.camera.resolution)
+            depth = true / along
+            noise_m = model.noise_at(true) / along
+            by_depth = -model.by_values(true[None], at[None], eye.camera.resolution).T / along
+            covariance = model.covariance
+            if model.with_calibration is not None:
+                # Between the camera's edge and the lens is the board's.
+                cross = np.delete(model.with_calibration, np.s_[6:12], axis=1)
+        # The first ray is for the mean distance, as in `_on_plane`.
+        unit = np.append(normalise(eye.camera, eye.lens.in_model(at[None], depth))[0], 1.0)
+        point_cam = depth * unit
+        (by_px,), (by_lens,) = eye.lens.rays_by_lens(at[None], point_cam[None], depth)
+        by_cam = cam_pose.base_from_cam[:3, :3]
+        by_noise = (noise_m * by_cam @ unit)[:, None]
+        parts = {
+            "pixels": _mapped(noise_px * by_cam @ by_px, np.eye(2)),
+            "depth": _mapped(by_noise, np.eye(1)),
+            **_camera_parts(
+                *(eye, cam_pose, cam_pose.camera_jacobian(point_cam), by_cam @ by_lens),
+                (np.outer(by_cam @ unit, by_depth), covariance, cross),
+            ),
+        }
+        warnings += _distance_warning(eye, point_cam)
+        found.append(_located(eye, cam_pose.point(point_cam), parts, warnings))
+    return tuple(found)
+
+
+def cloud_in_base(
+    calibration: Calibration,
+    points_cam: FloatArray,
+    base_from_flange: Pose | None = None,
+    *,
+    joints_rad: FloatArray | None = None,
+) -> FloatArray:
+    """Points of a camera's cloud in the base, with corrected distances.
+
+    Args:
+        calibration: The camera's.
+        points_cam: (..., 3) in the camera's frame, NaN where there are none [m].
+        base_from_flange: As in `locate`.
+        joints_rad: As in `locate`.
+
+    Returns:
+        (..., 3) [m].
+    """
+    eye = CalibratedCamera.of(calibration)
+    pose, model = eye.at(base_from_flange, joints_rad).base_from_cam, eye.lens.depth
+    if model is not None:
+        flat = points_cam.reshape(-1, 3)
+        z, focal, centre = flat[:, 2], eye.camera.matrix[:2], eye.camera.matrix[2:]
+        # Tilt and bowl change so slowly that distortion moves no pixel far enough to matter.
+        px = flat[:, :2] / z[:, None] * focal + centre
+        measured = np.linalg.norm(flat, axis=1) if model.of == "ray" else z
+        share = model.true_m(measured, px, eye.camera.resolution) / measured
+        points_cam = (flat * share[:, None]).reshape(points_cam.shape)
+    return np.asarray(points_cam @ pose[:3, :3].T + pose[:3, 3])
+
+
+def _rays(eye: CalibratedCamera, px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) checked pixels, and (n, 3) their rays of unit depth; raises DataError."""
     px = np.atleast_2d(np.asarray(px, dtype=float))
     if px.shape[1:] != (2,):
         raise DataError(f"locate: pixels have the shape {px.shape}; (n, 2) is needed.")
@@ -138,10 +252,7 @@ def locate(
                 culprits=[f"pixel {at}"],
                 next_step="Calibrate with corners up to the image's edge.",
             )
-    return tuple(
-        _on_plane(eye, cam_pose, plane, np.append(ray, 1.0), at, noise_px)
-        for ray, at in zip(unit, px, strict=True)
-    )
+    return px, np.column_stack([unit, np.ones(len(px))])
 
 
 def _depth(cam_pose: CameraPose, plane: Plane, ray: FloatArray, label: str) -> float:
@@ -204,9 +315,16 @@ _LOOK_AT_PLANE = (
 
 
 def _camera_parts(
-    eye: CalibratedCamera, cam_pose: CameraPose, by_camera: FloatArray, by_lens: FloatArray
+    eye: CalibratedCamera,
+    cam_pose: CameraPose,
+    by_camera: FloatArray,
+    by_lens: FloatArray,
+    depth: tuple[FloatArray, FloatArray, FloatArray] | None = None,
 ) -> dict[str, FloatArray]:
-    """Covariance parts of calibration, robot and arm from the Jacobians of a position (3, 3)."""
+    """Covariance parts of calibration, robot and arm from the Jacobians of a position (3, 3).
+
+    `depth` has the Jacobian by the values of its model, their covariance, and that with the camera.
+    """
     flange_jacobian = by_camera @ cam_pose.flange_jacobian
     by_arm = flange_jacobian @ cam_pose.arm_basis
     # The errors of a calibrated arm are correlated with the camera's transform.
@@ -214,8 +332,14 @@ def _camera_parts(
     calibrated = by_arm.copy()
     calibrated[:, independent] = 0.0
     by_calibration = np.concatenate([by_camera, by_lens, calibrated], axis=1)
+    covariance = eye.shared_covariance
+    if depth is not None:
+        by_depth, own, cross = depth
+        by_calibration = np.concatenate([by_calibration, by_depth], axis=1)
+        cross = np.pad(cross, ((0, 0), (0, len(covariance) - cross.shape[1])))
+        covariance = np.block([[covariance, cross.T], [cross, own]])
     return {
-        "calibration": _mapped(by_calibration, eye.shared_covariance),
+        "calibration": _mapped(by_calibration, covariance),
         "robot": _mapped(flange_jacobian, cam_pose.flange_noise),
         "arm": _mapped(by_arm[:, independent], np.eye(eye.posture_error_count)),
     }
@@ -269,6 +393,7 @@ _ESTIMATED = {"calibration", "robot", "arm"}
 _SOURCES = {
     "pixels": "pixel's noise: look from nearer, or less along the plane",
     "focus": "focal length, which changes from view to view: fix the focus",
+    "depth": "sensor's noise of depth: look from nearer",
     "plane": "plane's own uncertainty",
     "calibration": "hand-eye calibration",
     "robot": "robot's noise",

@@ -11,6 +11,7 @@ from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Target
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CellResult, Rms, ViewResult
+from visioncal.results.depth import DepthResult
 from visioncal.results.sections import BoardResult, UncertaintyResult
 from visioncal.results.views import left_out_rms, rms_of
 
@@ -259,3 +260,17 @@ def _size_facts(board: BoardResult, target: Target) -> tuple[Fact, ...]:
         note += ", between what is stated and what the robot's motion measures"
     size = f"{x_mm} \N{MULTIPLICATION SIGN} {y_mm} mm"
     return (stated, Fact("squares, found", size, note))
+
+
+def depth_table(depth: DepthResult) -> Table:
+    """How a camera's depth deviates from the true one."""
+    names = ("scale [%]", "offset [mm]", "tilt in u [mm]", "tilt in v [mm]", "bowl [mm]")
+    units = np.array([100.0, 1e3, 1e3, 1e3, 1e3])
+    values = zip(
+        names, depth.values * units, np.sqrt(np.diag(depth.covariance)) * units, strict=True
+    )
+    rows = [
+        (name, f"{matched(value, sigma)} {PLUS_MINUS} {significant(sigma)}")
+        for name, value, sigma in values
+    ]
+    return Table.of(("", ""), [*rows, ("black against white [mm]", significant(1e3 * depth.ink_m))])

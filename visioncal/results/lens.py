@@ -16,6 +16,7 @@ from visioncal.core.codec import INLINE, Array, Matrix, Section, Vector, Written
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, CameraKind, FloatArray
 from visioncal.estimation.lens_field import LensLevels, displacements
+from visioncal.results.depth import DepthResult
 from visioncal.results.edge import Covariance, Edge, StoredEdge, StoredPose
 from visioncal.session.document import check_coefficients
 from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian, with_intrinsics
@@ -86,6 +87,8 @@ class CameraResult:
     edge_covariance: Matrix | None = None
     # Displacement field beyond the lens model; None where it is not significant.
     field: LensField | None = None
+    # How its depth deviates from the true one; None where views have none.
+    depth: DepthResult | None = None
 
     def __post_init__(self) -> None:
         size = 4 + len(self.camera.distortion)
@@ -100,25 +103,26 @@ class CameraResult:
                     raise ValueError(f"field.{name} has {rows} rows; {count} are needed")
 
     def covariance_with(self, edge: FloatArray) -> FloatArray:
-        """Joint covariance of the camera's edge, lens and field; 6 + k + m rows and columns.
+        """Joint covariance of the first edges, lens and field; e + k + m rows and columns.
 
         Calibrations of older versions have no cross-covariance of edge and lens: it is zero then.
 
         Args:
-            edge: (6, 6) of the edge, the first of the calibration's.
+            edge: (e, e) of the camera's edge, (6, 6), or of the calibration's first ones.
         """
-        size, field = 4 + len(self.camera.distortion), self.field
-        lens, fields = slice(6, 6 + size), slice(6 + size, None)
-        covariance = np.zeros((6 + size + (0 if field is None else len(field.coefficients)),) * 2)
-        covariance[:6, :6] = edge
+        size, field, first = 4 + len(self.camera.distortion), self.field, len(edge)
+        lens, fields = slice(first, first + size), slice(first + size, None)
+        count = first + size + (0 if field is None else len(field.coefficients))
+        covariance = np.zeros((count, count))
+        covariance[:first, :first] = edge
         if self.covariance is not None:
             covariance[lens, lens] = self.covariance
             if self.edge_covariance is not None:
-                covariance[lens, :6] = self.edge_covariance[:, :6]
+                covariance[lens, :first] = self.edge_covariance[:, :first]
         if field is not None and len(field.coefficients):
             covariance[fields, fields] = field.root @ field.root.T
             covariance[fields, lens] = field.intrinsics_covariance
-            covariance[fields, :6] = field.edge_covariance[:, :6]
+            covariance[fields, :first] = field.edge_covariance[:, :first]
         low = np.tril(covariance, -1)
         return np.asarray(low + low.T + np.diag(np.diag(covariance)))
 

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -39,6 +39,9 @@ from visioncal.robot.loads import deflected_joints
 from visioncal.robot.thermal import ThermalModel
 from visioncal.session.frames import CELL, frames_of_kind, object_name
 from visioncal.session.selecting import PARTS, Choice, Part
+
+if TYPE_CHECKING:
+    from visioncal.frames.locate import Located
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,6 +280,28 @@ class Calibration(CalibrationSections):
             DataError: There is no transform of that name.
         """
         return self.placed[name].covariance
+
+    def locate(
+        self,
+        pixel: FloatArray | Sequence[float],
+        depth_m: float,
+        base_from_flange: FloatArray | RigidTransform | None = None,
+    ) -> "Located":
+        """Position in the base of a pixel at a measured depth; see `frames.locate_by_depth`.
+
+        Args:
+            pixel: (2,) in the image [px].
+            depth_m: Its distance as the sensor measured it [m].
+            base_from_flange: The flange's pose at the image; only for a camera on the flange.
+
+        Raises:
+            DataError: See `locate_by_depth`.
+        """
+        # Imported here, since picks depend on results.
+        from visioncal.frames.locate import locate_by_depth
+
+        px = np.asarray(pixel, dtype=float)[None]
+        return locate_by_depth(self, px, np.array([depth_m]), base_from_flange)[0]
 
     @typed
     def base_from_flange(

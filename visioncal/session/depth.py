@@ -37,8 +37,7 @@ def read_depth(
         data: Bytes of the file.
         path: Its name, whose ending says what it is.
         size: (width, height) of the image [px].
-        unit_m: Unit of the file [m]; where None, millimetres of integers, metres of other pictures,
-            and what fits of clouds.
+        unit_m: Unit of a picture [m]; where None, millimetres of integers and metres of others.
 
     Returns:
         (h, w) distances, of clouds along the camera's z [m].
@@ -60,7 +59,7 @@ def read_depth(
         unit = (0.001 if is_whole else 1.0) if unit_m is None else unit_m
         depth = np.asarray(raw, float) * unit
     else:
-        cloud = read_cloud(data, path, unit_m)
+        cloud = read_cloud(data, path)
         if cloud.ndim == 2 and len(cloud) == size[0] * size[1]:
             cloud = cloud.reshape(size[1], size[0], 3)
         if cloud.ndim == 2:
@@ -95,13 +94,14 @@ def _checked(depth: FloatArray, path: str) -> FloatArray:
     return np.where(valid, depth, np.nan)
 
 
-def read_cloud(data: bytes, path: str, unit_m: float | None = None) -> FloatArray:
+def read_cloud(data: bytes, path: str) -> FloatArray:
     """Points of a .ply, .pcd or .npy in the camera's frame, NaN where there are none.
+
+    They are in metres, or in millimetres where metres would be too far.
 
     Args:
         data: Bytes of the file.
         path: Its name.
-        unit_m: Its unit [m]; where None, metres, or millimetres where metres would be too far.
 
     Returns:
         (h, w, 3) of an organised cloud that says so, else (n, 3) [m].
@@ -121,10 +121,8 @@ def read_cloud(data: bytes, path: str, unit_m: float | None = None) -> FloatArra
     there = np.isfinite(points).all(axis=-1) & (points != 0.0).any(axis=-1)
     if not there.any():
         raise DataError(f"{path} holds no point: all are NaN or 0.", culprits=[path])
-    if unit_m is None:
-        unit_m = 1.0 if np.median(np.abs(points[..., 2][there])) < _FARTHEST_M else 0.001
-    points *= unit_m
-    return np.where(there[..., None], points, np.nan)
+    unit_m = 1.0 if np.median(np.abs(points[..., 2][there])) < _FARTHEST_M else 0.001
+    return np.where(there[..., None], points * unit_m, np.nan)
 
 
 def _of_npy(data: bytes) -> FloatArray:
@@ -208,3 +206,19 @@ def _columns(
 
 
 _READERS: dict[str, Any] = {".ply": _of_ply, ".pcd": _of_pcd, ".npy": _of_npy}
+
+
+def ply_of(points_m: FloatArray) -> bytes:
+    """A binary .ply of (..., 3) points, without those that are NaN [m]."""
+    flat = points_m.reshape(-1, 3)
+    flat = flat[np.isfinite(flat[:, 2])]
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(flat)}\n{axes}end_header\n"
+    return head.encode() + flat.astype("<f4").tobytes()
+
+
+def npy_of(points_m: FloatArray) -> bytes:
+    """A .npy of points, in their order [m]."""
+    stored = io.BytesIO()
+    np.save(stored, points_m)
+    return stored.getvalue()

@@ -180,7 +180,7 @@ def result_record(text: str, evidence: Sequence[ViewEvidence]) -> Record:
     views = []
     for view in evidence:
         corners = None if view.corners is None else _found(view.corners)
-        poses = view.base_from_flange, view.cam_from_target
+        poses = view.base_from_flange, view.cam_from_target, view.depth
         views.append((view.view, corners, view.predicted_px, *poses))
     return {"calibration": text, "views": views}
 

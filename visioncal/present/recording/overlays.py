@@ -55,6 +55,7 @@ class Overlay:
 
     def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
         """Logs corners and residuals of all views, in the order of the session."""
+        self._log_depth(stream, [view.depth for view in seen])
         if not self.active:
             return
         empty = np.zeros((0, 2))
@@ -83,6 +84,20 @@ class Overlay:
             arrows = rr.Arrows2D.columns(vectors=vectors, origins=origins + _CENTRE)
             style = rr.Arrows2D.from_fields(colors=colours.RESIDUAL, radii=_LINE * self.width)
             self._send(stream, entity, style, arrows, begins_px)
+
+    def _log_depth(self, stream: rr.RecordingStream, depths: Sequence[FloatArray | None]) -> None:
+        """Logs the deviations of depth, in radii by their size."""
+        cells = [np.zeros((0, 4)) if part is None else part for part in depths]
+        every = np.vstack(cells) if cells else np.zeros((0, 4))
+        if not len(every):
+            return
+        most_m = max(float(np.quantile(np.abs(every[:, 3]), 0.98)), 1e-6)
+        radii = 1.5 * _DOT * self.width * np.clip(np.abs(every[:, 3]) / most_m, 0.1, 1.0)
+        colour = np.where(every[:, 3:] > 0.0, colours.REJECTED, colours.USED)
+        columns = rr.Points2D.columns(positions=every[:, :2] + _CENTRE, colors=colour, radii=radii)
+        self._send(
+            stream, paths.DEPTH, rr.Points2D.from_fields(colors=colours.USED), columns, cells
+        )
 
     def _send(
         self,

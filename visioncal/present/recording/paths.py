@@ -31,6 +31,7 @@ SEEN_TARGET = "/target_as_this_view_sees_it"
 # In the image.
 DETECTED = f"{IMAGE}/detected"
 PREDICTED = f"{IMAGE}/predicted"
+DEPTH = f"{IMAGE}/depth_too_long_red_too_short_blue"
 RESIDUALS_TO_SCALE = f"{IMAGE}/residuals_of_views_not_used_to_scale"
 
 # A cell of several robots: its frame, and who saw whom.

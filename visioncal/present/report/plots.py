@@ -13,11 +13,12 @@ from markupsafe import Markup, escape
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import invert, log
-from visioncal.core.types import FloatArray
+from visioncal.core.types import Camera, FloatArray
 from visioncal.present.advice import contradicts
 from visioncal.present.cell_poses import CellPoses
 from visioncal.present.coverage import coverage_charts
 from visioncal.results import Calibration, ViewResult
+from visioncal.results.depth import DepthResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.views import rms_of
 from visioncal.session import Session, frame_name
@@ -216,6 +217,35 @@ def coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Mark
                 path = dots(*places[:: -(-len(places) // 3000)].T)
                 drawing.path(colour, 2.2 if chart.name == "image" else 5.0, path, _ROUND)
     return drawing.svg("Coverage: corners, viewing directions, rotation axes", side + 20.0)
+
+
+def depth_cells(
+    evidence: Sequence[ViewEvidence], calibration: Calibration, camera: str
+) -> FloatArray | None:
+    """(n, 4) the cells of depth of a camera in all views; None without any."""
+    seer = frame_name("camera", camera)
+    mine = {view.view for view in calibration.views if not camera or view.seer == seer}
+    parts = [view.depth for view in evidence if view.depth is not None and view.view in mine]
+    return np.concatenate(parts) if parts else None
+
+
+def depth_deviations(depth: DepthResult, camera: Camera, cells: FloatArray) -> Markup:
+    """Deviations of (n, 4) cells of depth over the image, as measured and as corrected."""
+    drawing, (width, height) = Drawing(), camera.resolution
+    scale = 0.42 * WIDTH / width
+    px, true_m, excess_m = cells[:, :2], cells[:, 2], cells[:, 3]
+    left_m = depth.true_m(true_m + excess_m, px, camera.resolution) - true_m
+    for index, (words, away_m) in enumerate((("measured", excess_m), ("corrected", left_m))):
+        most_m = max(float(np.quantile(np.abs(away_m), 0.98)), 1e-6)
+        x, y = scale * px.T[0] + (0.04 + 0.5 * index) * WIDTH, scale * px.T[1] + 24.0
+        most = f"the largest dots are off by {significant(1e3 * most_m)} mm"
+        drawing.text((0.25 + 0.5 * index) * WIDTH, 14.0, f"{words}: {most}")
+        for step in np.linspace(0.2, 1.0, 5):
+            sized = np.abs(np.clip(away_m / most_m, -1.0, 1.0))
+            for is_long, colour in ((True, "bad"), (False, "accent")):
+                shown = (sized > step - 0.2) & (sized <= step) & ((away_m > 0.0) == is_long)
+                drawing.path(colour, 7.0 * step, dots(x[shown], y[shown]), _ROUND)
+    return drawing.svg("Deviations of depth over the image", scale * height + 34.0)
 
 
 def residuals_over_joints(

@@ -1,0 +1,221 @@
+"""Depth against the calibrated chain: its model in its own sigmas, and refusals by name."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from support.commands import visioncal
+from support.depth_cells import SMALL, TRUE, calibrated, picks
+
+from visioncal import simulation
+from visioncal.calibration.stages.depth import with_depth
+from visioncal.results import Calibration
+from visioncal.session import MemoryImages
+from visioncal.session.depth import npy_of, read_cloud
+from visioncal.simulation import DepthOptions
+
+FALSE = DepthOptions(boxed=0.5)
+
+
+def made(mount="eye-in-hand", depth=FALSE):
+    """A session with depth, and its calibration."""
+    return calibrated(1, mount, depth, 12)[1:]
+
+
+def without(calibration):
+    """A calibration as it is before its depth."""
+    return replace(
+        calibration,
+        camera=replace(calibration.camera, depth=None),
+        verdict=replace(calibration.verdict, findings=()),
+    )
+
+
+def again(change, **document):
+    """The findings and the depth of the same calibration with changed depth pictures."""
+    session, made_run = made()
+    files = {view.image: session.images.read(view.image) for view in session.views}
+    for view in session.views:
+        raw = cv2.imdecode(np.frombuffer(session.images.read(view.depth), np.uint8), -1)
+        name = view.depth
+        files[name] = cv2.imencode(".png", change(raw, view.number))[1].tobytes()
+    camera = {**session.document["camera"], **document}
+    other = session.with_content(
+        images=MemoryImages(files), document={**session.document, "camera": camera}
+    )
+    result, _ = with_depth(without(made_run.calibration), made_run.evidence, other)
+    findings = {}
+    for found in result.verdict.findings:
+        words = f"{findings[found.kind].words} {found.words}" if found.kind in findings else ""
+        findings[found.kind] = replace(found, words=words or found.words)
+    return findings, result.camera.depth
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_false_depth_is_found_with_a_box_before_the_board(mount):
+    _, result = made(mount)
+    depth = result.calibration.camera.depth
+    error = depth.values - [FALSE.scale, FALSE.offset_m, 0.0, 0.0, FALSE.bowl_m]
+    # Chi-square of five exceeds this in one case of a thousand.
+    assert error @ np.linalg.solve(depth.covariance, error) < 20.5
+    sigmas = np.sqrt(np.diag(depth.covariance))
+    # Far under what is to be found: 0.8 %, 2.5 mm, 4 mm.
+    assert (sigmas < [1e-3, 3e-4, 3e-4, 3e-4, 3e-4]).all()
+    assert depth.ink_m == pytest.approx(FALSE.ink_m, abs=2e-4)
+    # Noise at 0.5 m, of pixels of 0.1 mm.
+    noise = np.hypot(depth.noise_m[0], depth.noise_m[1] * 0.25)
+    assert noise == pytest.approx(np.hypot(FALSE.noise_m * 0.25, 1e-4 / np.sqrt(12)), rel=0.1)
+    (found,) = (one for one in result.calibration.verdict.findings if one.kind == "depth_scale")
+    assert "mm too long" in found.words
+    assert "Correct it" in str(found.do)
+    stored = Calibration.from_json(result.calibration.text, "stored").camera.depth
+    assert stored.values == pytest.approx(depth.values)
+
+
+def test_a_true_depth_is_not_accused():
+    _, result = made(depth=TRUE)
+    words = {found.kind: found.words for found in result.calibration.verdict.findings}
+    assert "depth_scale" not in words
+    assert "depth is true" in words["note"]
+
+
+def test_pictures_in_another_unit_are_named():
+    # 0.1 mm that are said to be millimetres.
+    findings, depth = again(lambda raw, _: raw, depth_unit_m=0.001)
+    assert depth is None
+    assert "10 times" in findings["depth_unit"].words
+    assert "depth_unit_m = 0.0001" in str(findings["depth_unit"].do)
+
+
+@pytest.mark.parametrize("px", [12, 30])
+def test_pictures_that_are_not_aligned_are_named_with_their_shift(px):
+    findings, depth = again(lambda raw, _: np.roll(raw, px, axis=1))
+    assert depth is None
+    assert "not aligned" in findings["depth_shifted"].words
+    found = findings["depth_shifted"].words
+    across, down = map(int, found[found.index("(") + 1 : found.index(")")].split(","))
+    # To a third of it: what is seen beside the board counts, too.
+    assert abs(across - px) <= px / 3
+    assert abs(down) <= px / 3
+
+
+def test_an_empty_picture_and_one_of_another_size_are_named_and_left_out():
+    def change(raw, view):
+        return {1: np.zeros_like(raw), 2: raw[:50]}.get(view, raw)
+
+    session, _ = made()
+    assert {1, 2} <= {view.number for view in session.views}
+    findings, depth = again(change)
+    assert depth is not None
+    said = findings["depth_unread"].words
+    assert re.search("view 1: depth holds no distance: all 256000 are 0 or NaN", said)
+    assert re.search("view 2: depth has 640 x 50 distances, and the image 640 x 400 pixels", said)
+    _, depth = again(lambda raw, _: np.zeros_like(raw))
+    assert depth is None
+
+
+def test_distances_along_the_ray_and_clouds_give_the_same():
+    session, result = made()
+    depth = result.calibration.camera.depth
+    rays = simulation.rays(
+        SMALL, np.stack(np.meshgrid(np.arange(640), np.arange(400)), axis=-1).astype(float)
+    )
+    longer = 1.0 / rays[..., 2]
+    _, along = again(lambda raw, _: np.rint(raw * longer).astype(np.uint16), depth_of="ray")
+    assert along.of == "ray"
+    # The offset and the bowl are those of z, and change with the ray; the scale does not.
+    assert along.scale == pytest.approx(depth.scale, abs=5e-3)
+    files = {view.image: session.images.read(view.image) for view in session.views}
+    cells = []
+    for view in session.views:
+        raw = cv2.imdecode(np.frombuffer(session.images.read(view.depth), np.uint8), -1)
+        z = np.where(raw > 0, raw * 1e-4, np.nan)
+        points = rays / rays[..., 2:] * z[..., None]
+        path = view.depth.replace(".png", ".npy")
+        files[path] = npy_of(points)
+        assert read_cloud(files[path], path).shape == points.shape
+        cells.append([path if name == "depth" else view.cell(name) for name in session.columns])
+    other = session.with_content(images=MemoryImages(files), cells=cells)
+    found, _ = with_depth(without(result.calibration), result.evidence, other)
+    assert found.camera.depth.values == pytest.approx(depth.values, abs=1e-9)
+
+
+def test_without_depth_nothing_of_it_is_loaded():
+    code = (
+        "import sys, numpy as np, visioncal; from visioncal import simulation as s;"
+        "cell = s.simulate(s.CellOptions(views=8));"
+        "visioncal.calibrate(s.cell_session(cell, 'x', seen='poses'));"
+        "print([name for name in sys.modules if name in ('visioncal.calibration.stages.depth', "
+        "'visioncal.session.depth')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_picks_by_depth_are_within_their_radius(mount):
+    cell, _, result = calibrated(1, mount, FALSE, 12)
+    error, raw, radius = picks(cell, result, FALSE, np.random.default_rng(2), 300).T
+    # 95 %, where 300 scatter by 1.3 % and one calibration's errors are common to all.
+    assert 0.89 < np.mean(error < radius) < 0.995
+    assert np.linalg.norm(error) < 0.4 * np.linalg.norm(raw)
+
+
+def test_a_cloud_is_flat_and_in_place_in_the_base(tmp_path):
+    cell, _, result = calibrated(1, "eye-to-hand", FALSE, 12)
+    calibration = result.calibration
+    pose = calibration.edges["base_from_cam"].matrix
+    # The table z = 0.1 of the base, seen along every fifth pixel by the true camera.
+    px = np.stack(np.meshgrid(np.arange(0, 640, 5), np.arange(0, 400, 5)), axis=-1).astype(float)
+    rays = simulation.rays(SMALL, px)
+    rays = rays / rays[..., 2:]
+    table_cam = np.linalg.inv(cell.mountings["cam"]) @ [0.0, 0.0, 0.1, 1.0]
+    normal = cell.mountings["cam"][2, :3]
+    z = (normal @ table_cam[:3]) / (rays @ normal)
+    u, v = np.moveaxis((2 * px + 1) / [640, 400] - 1, -1, 0)
+    measured = FALSE.scale * z + FALSE.offset_m + FALSE.bowl_m * (u**2 + (v * 400 / 640) ** 2)
+    cloud = rays * np.where((z > 0.2) & (z < 1.5), measured, np.nan)[..., None]
+    np.save(tmp_path / "cloud.npy", cloud)
+    calibration.save(tmp_path / "calibration.json")
+    output = tmp_path / "base.npy"
+    visioncal("locate", "-c", tmp_path, "--cloud", tmp_path / "cloud.npy", "-o", output).good()
+    there = np.load(output).reshape(-1, 3)
+    away = there[np.isfinite(there[:, 2]), 2] - 0.1
+    assert len(away) > 1000
+    assert np.abs(np.median(away)) < 2e-4
+    assert np.std(away) < 2e-4
+    visioncal(
+        "locate", "-c", tmp_path, "--cloud", tmp_path / "cloud.npy", "-o", tmp_path / "base.ply"
+    ).good()
+    again_there = read_cloud((tmp_path / "base.ply").read_bytes(), "base.ply")
+    # Floats of the file.
+    assert again_there == pytest.approx(there[np.isfinite(there[:, 2])], abs=1e-6)
+    assert pose.shape == (4, 4)
+
+
+def test_a_pixel_is_located_by_the_depth_of_its_view(tmp_path):
+    _, session, result = calibrated(1, "eye-in-hand", FALSE, 12)
+    session.save(tmp_path / "bin")
+    (tmp_path / "out").mkdir()
+    result.calibration.save(tmp_path / "out" / "calibration.json")
+    view = next(view for view in result.evidence if view.depth is not None)
+    u, v = np.rint(view.depth[0, :2]).astype(int).tolist()
+    locate = ("locate", tmp_path / "bin", "-c", tmp_path / "out", "--view", view.view)
+    seen = visioncal(*locate, "--pixel", f"{u},{v}", "--json").good().out
+    plane = visioncal(
+        *locate, "--pixel", f"{u},{v}", "--plane", "base_from_target", "--json"
+    ).good()
+    (by_depth,), (by_plane,) = json.loads(seen), json.loads(plane.out)
+    away_mm = 1e3 * np.linalg.norm(np.subtract(by_depth["p_base_m"], by_plane["p_base_m"]))
+    # Ink is deeper by up to 2 mm.
+    assert away_mm < 2.0 + 2.0 * by_depth["radius95_mm"]
+    assert "depth" in by_depth["budget_mm"]
+    path = tmp_path / "bin" / session.views[0].image
+    refused = visioncal(*locate, "--pixel", f"{u},{v}", "--depth", path)
+    assert refused.status == 2
+    assert "no depth picture" in refused.err

@@ -1,0 +1,60 @@
+"""Depth of a result: how a camera's distances deviate from the true ones, and their correction."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+
+from visioncal.core.codec import Array, Matrix
+from visioncal.core.types import FloatArray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DepthResult:
+    """Model of a sensor's depth: `depth` of a camera in calibration.json.
+
+    measured = scale * true + offset + tilt . (u, v) + bowl * r^2, where u and v go from -1 to 1
+    over the image, and r is in half widths.
+    """
+
+    scale: float  # Measured over true distance.
+    offset_m: float  # Offset in the image's middle [m].
+    tilt_m: tuple[float, float]  # Change from the middle to the right and the lower edge [m].
+    bowl_m: float  # Change from the middle to the left and right edges [m].
+    # (5, 5) of scale, offset, tilt and bowl.
+    covariance: Annotated[FloatArray, Array((5, 5))]
+    # Noise of a pixel's distance d: the root of the sum of squares of the first and of the second
+    # times d^2 [m], [1/m].
+    noise_m: tuple[float, float]
+    view_m: float  # Standard deviation of an offset that changes from view to view [m].
+    # (5, 12 + k + m) covariance with both transforms, lens and field; None for a whole cell.
+    with_calibration: Matrix | None = None
+    ink_m: float = 0.0  # How much deeper black is read than white [m].
+    distances_m: tuple[float, float]  # Least and greatest true distance of what it is from [m].
+    of: Literal["z", "ray"] = "z"  # Whether distances are along z or along the ray.
+    unit_m: float | None = None  # Unit of depth pictures, where stated [m].
+
+    def true_m(self, measured_m: FloatArray, px: FloatArray, size: tuple[int, int]) -> FloatArray:
+        """(n,) true distances of (n,) measured ones at (n, 2) pixels of an image of a size [m]."""
+        bent = bending(px, size) @ self.values[1:]
+        return np.asarray((measured_m - bent) / self.scale)
+
+    def by_values(self, true_m: FloatArray, px: FloatArray, size: tuple[int, int]) -> FloatArray:
+        """(n, 5) change of measured distances, in true ones, by the model's values."""
+        return np.column_stack([true_m, bending(px, size)]) / self.scale
+
+    def noise_at(self, true_m: float) -> float:
+        """Standard deviation of one corrected distance by the noise of pixel and view [m]."""
+        floor, square = self.noise_m
+        return float(np.linalg.norm([floor, square * true_m**2, self.view_m]) / self.scale)
+
+    @property
+    def values(self) -> FloatArray:
+        """(5,) scale, offset, tilt and bowl, in the order of the covariance."""
+        return np.array([self.scale, self.offset_m, *self.tilt_m, self.bowl_m])
+
+
+def bending(px: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """(n, 4) derivatives of measured distances by offset, tilt and bowl, at (n, 2) pixels."""
+    u, v = ((2.0 * px + 1.0) / size - 1.0).T
+    return np.column_stack([np.ones_like(u), u, v, u**2 + (v * size[1] / size[0]) ** 2])
