@@ -288,10 +288,9 @@ def _log_likelihoods(squares: FloatArray) -> FloatArray:
     Of even noise, and of one that is uneven from pose to pose: a Student distribution with four
     degrees of freedom, under which one pose in fifty is off by thrice the typical noise.
     """
-    scale, freedom = float(np.mean(squares)) / 6.0, 4.0
-    even = -3.0 * len(squares) * (np.log(scale) + 1.0)
+    half, scale = 3.0 * len(squares), float(np.mean(squares)) / 6.0
+    even = -half * (np.log(scale) + 1.0)
     for _ in range(30):
-        weights = (freedom + 6.0) / (freedom + squares / scale)
-        scale = float(np.mean(weights * squares)) / 6.0
-    tails = 0.5 * (freedom + 6.0) * np.log1p(squares / (freedom * scale))
-    return np.array([even, -3.0 * len(squares) * np.log(scale) - float(tails.sum())])
+        scale = float(np.mean(10.0 * squares / (4.0 + squares / scale))) / 6.0
+    tails = 5.0 * np.log1p(squares / (4.0 * scale))
+    return np.array([even, -half * np.log(scale) - float(tails.sum())])

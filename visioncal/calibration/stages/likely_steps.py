@@ -5,16 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS
+from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import ArmErrors, stops_of
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import Solution, by_noise_alone
+from visioncal.estimation.solve import Solution
 from visioncal.estimation.steps import (
     DRIFT,
-    FRAME,
-    SIZE,
     Step,
     drift_of,
     evidence,
@@ -61,8 +59,6 @@ def likely_steps(
         if step.kind == DRIFT or (drift is not None and step.gain - penalty < drift.gain):
             continue
         gain, apart, there = evidence(problem, fit, step)
-        if step.kind in (FRAME, SIZE) and not _leaves_noise(apart, there, step):
-            continue
         # What errors of an arm, correlated by posture or time, explain as well is none.
         for robot, arm in errors.items():
             beside = find_pose_errors(apart, there.state, there.noise, robot)
@@ -77,14 +73,3 @@ def likely_steps(
     if drift is None or (drift.of in errors and drift.gain < errors[drift.of].gain):
         return ()
     return (drift,)
-
-
-def _leaves_noise(problem: Problem, fit: Solution, step: Step) -> bool:
-    """Whether the residuals beside a step are as small as elsewhere, once it is fitted."""
-    # A few wrong views at an end of the session gain by a step, and stay wrong.
-    squares, seen = by_noise_alone(problem, fit), problem.observations
-    behind, involved = seen.stops >= step.stop, seen.involves(step.of)
-    sides = (involved & ~behind, seen.involves([*problem.unknown][-1]) & behind)
-    if step.kind == SIZE:
-        sides = (involved & ~behind, involved & behind)
-    return all(np.median(squares[side]) < CLEAR_RATIO**2 * np.median(squares) for side in sides)

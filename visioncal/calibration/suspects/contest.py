@@ -49,15 +49,6 @@ class Trial:
         noise = np.array([fit.noise.robots.max(axis=0) for _, fit in (self.without, self.cured)])
         return np.asarray(noise[:, ::-1] * [1e3, np.rad2deg(1.0)])
 
-    @property
-    def gain(self) -> float:
-        """Twice the logarithm of the likelihood ratio of the cure to none."""
-        before, after = (
-            robot_likelihood(problem, fit.state, self.cured[1].noise).negative_log_likelihood
-            for problem, fit in (self.without, self.cured)
-        )
-        return 2.0 * (before - after)
-
 
 def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
     """Findings with what their cures leave: whether that proves them, and how much they explain."""
@@ -96,8 +87,12 @@ def _proves(run: RunState, trial: Trial) -> bool:
     # A step is sought in the fit, which has the cure.
     errors = {name: arm.errors for name, arm in arms.items() if arm.errors}
     rivals = likely_steps(*trial.without, errors, joint_offsets(run.cell_fit.arms))
-    about = 2.0 * float(np.log(CheckLimits.ruled_out))
-    return not any(step.gain > trial.gain - about for step in rivals)
+    lost, least = (
+        robot_likelihood(part, solved.state, fit.noise).negative_log_likelihood
+        for part, solved in (trial.without, trial.cured)
+    )
+    gain = 2.0 * (lost - least - float(np.log(CheckLimits.ruled_out)))
+    return all(step.gain <= gain for step in rivals)
 
 
 def _of_step(run: RunState, _: str) -> Trial:
