@@ -4,16 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from support.small_cells import made, pose
+from support.wrong_arms import GOOD
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.fit.candidates import effects_of_frames, scored
 from visioncal.fit.processes import _alone, _boards, _judged, _tried
 from visioncal.fit.score import added_by, of_effect, products
 from visioncal.fit.solve import solve
+from visioncal.model import read_cell
 from visioncal.model.effects import BaseCreeps, BaseTilts, BracketBends, MountCreeps
 from visioncal.model.effects.posture import twists_of_frames
+from visioncal.simulation import cell_session, simulate
 
+MOUNTS = ("eye-in-hand", "eye-to-hand")
 KINDS = {"tilts": BaseTilts, "bends": BracketBends, "creeps": BaseCreeps, "slips": MountCreeps}
 
 
@@ -61,9 +66,9 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
     for effect in effects_of_frames(fit, "flange"):
         each = products(fit, added_by(fit, effect), effect.count)
         alone = _alone(fit, "flange", [each])
-        white = next(_tried(fit, "flange", alone))
+        white = next(_tried(fit, "flange", alone, creeps=True))
         # With boards held as the fit has them.
-        _, left, _ = _judged(white, [], fit.unknowns.count, is_free=False)
+        _, left, _ = _judged(white, [], is_free=False)
         score = of_effect(fit, effect)
         scale = np.sqrt(np.diag(score.information)) + 1e-9 * np.abs(score.information).max() ** 0.5
         assert np.abs((left[:-1, :-1] - score.information) / np.outer(scale, scale)).max() < 1e-4
@@ -103,3 +108,45 @@ def test_sound_arms_and_arms_of_other_errors_open_none():
         cell = replace(small.cell, arms=arms)
         other = solve(replace(cell, moments=replace(cell.moments, poses={"flange": moved}))).fit
         assert not any(effect.frame == "flange" for effect in other.unknowns.effects)
+
+
+def slow(seed, kinds=(), walks=False):
+    """A cell of an arm with joints, that is moved by effects, or that walks from stop to stop."""
+    made, rng = (
+        simulate(replace(GOOD, seed=seed, mount=MOUNTS[seed % 2])),
+        np.random.default_rng([seed, 13]),
+    )
+    session = cell_session(made, "arm", seen="corners")
+    cell = read_cell(session, session.corners)
+    arm, moments = cell.arms["flange"], cell.moments
+    poses, count = arm.poses, len(moments)
+    for kind in kinds:
+        effect = KINDS[kind]("flange", float(rng.choice([0.0, 3.0])))
+        twists = effect.columns(moments, np.ones(count)) @ (1e-3 * rng.normal(size=6))
+        poses = poses @ invert(np.array([exp(twist) for twist in twists]))
+    if walks:
+        steps = rng.normal(size=(count, 6)) * np.repeat([3e-4, 2e-4], 3)
+        away = np.cumsum(steps, axis=0)
+        poses = poses @ np.array([exp(twist) for twist in away - away.mean(axis=0)])
+    arms = {"flange": replace(arm, poses=poses)}
+    moved = replace(cell, arms=arms, moments=replace(moments, poses={"flange": poses}))
+    return moved, {name.split("_from_")[1]: at for name, at in made.transforms.items()}
+
+
+@pytest.mark.parametrize(
+    ("kinds", "walks"), [(("creeps",), False), (("creeps", "slips"), False), ((), True)]
+)
+def test_what_is_slow_is_told_from_errors_that_last_where_joints_are_known(kinds, walks):
+    squares, named = [], 0
+    for seed in range(50, 56):
+        cell, truth = slow(seed, kinds, walks)
+        fit = solve(cell).fit
+        names = {effect.name for effect in fit.unknowns.effects} - fit.unknowns.closed
+        named += names == {f"{KINDS[kind].kind} flange" for kind in kinds}
+        # What creeps is stated of the end of the session, what walks of its mean.
+        away = log(invert(truth["cam"]) @ fit.edge("cam"))
+        squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away) / 6)
+    assert named >= 5
+    # A walk is what it does beyond its mean: the covariance is that of sessions to come.
+    assert np.mean(squares) < chi2.ppf(0.999, 36) / 36
+    assert walks or np.mean(squares) > chi2.ppf(0.001, 36) / 36

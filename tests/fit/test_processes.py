@@ -12,6 +12,7 @@ from visioncal.fit.assemble import mixed_model
 from visioncal.fit.processes import (
     _alone,
     _boards,
+    _independent,
     _judged,
     _tried,
     consider,
@@ -52,7 +53,7 @@ def test_a_process_through_gains_is_its_covariance():
     rng = np.random.default_rng(0)
     poses, gains = made(stops=9).cell.arms["flange"].poses, rng.normal(size=(9, 6, 4))
     levels, flat = np.repeat([1e-4, 5e-5], 3), gains.reshape(54, 4)
-    for process in processes(poses, levels):
+    for process in processes(poses, levels, creeps=True):
         whole = process.covariance(np.arange(9))
         assert np.allclose(process.through(gains), flat.T @ whole @ flat)
         assert np.linalg.eigvalsh(whole).min() > -1e-9 * np.trace(whole)
@@ -113,10 +114,8 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     fit = Search.of(cell, fit.unknowns)._sized(state, fit.used, fit)
     alone = _alone(fit, "flange")
     (board,) = _boards(fit)
-    white = next(_tried(fit, "flange", alone))
-    found = [
-        _judged(white, [board], fit.unknowns.count, is_free=is_free)[0] for is_free in (False, True)
-    ]
+    white = next(_tried(fit, "flange", alone, creeps=True))
+    found = [_judged(white, [board], is_free=is_free)[0] for is_free in (False, True)]
     values = []
     for sigma in (3e-4, 1e-2):
         member = fit.unknowns["shape", "target"]
@@ -130,7 +129,7 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     assert abs(board.past) == pytest.approx(1e-4, rel=0.1)
     assert found[1] - found[0] == pytest.approx(values[1] - values[0], abs=1e-3)
     # Of any size, it is off by what the whole likelihood says.
-    (square,) = _judged(white, [board], fit.unknowns.count, is_free=True)[2]
+    (square,) = _judged(white, [board], is_free=True)[2]
     off = best.values[board.column] + board.past
     own = best.covariance[board.column, board.column]
     assert square == pytest.approx(off**2 + own, rel=1e-3)
@@ -163,3 +162,26 @@ def test_a_board_that_is_doubted_and_not_freed_counts_in_the_covariance():
     assert max(odds) < 7.0
     # Chi-square of 36 over 36 exceeds this in one case of a thousand.
     assert np.mean(squares) < 1.9
+
+
+def test_what_is_judged_by_combinations_of_many_unknowns_is_the_same():
+    fit = solve(made(stops=8, cameras=4).cell).fit
+    alone, boards = _alone(fit, "flange"), _boards(fit)
+    assert fit.unknowns.count > 6 * len(alone.stops)
+    rows, sizes = alone.rows.reshape(-1, alone.rows.shape[2]), np.eye(fit.unknowns.count)
+    found, values = [], []
+    for tried in _tried(fit, "flange", alone, creeps=True):
+        full = _independent(alone, np.arange(8), tried.white)
+        if tried.process is not None:
+            full += tried.size**2 * tried.process.covariance(np.arange(8))
+        total = rows.T @ np.linalg.solve(full, rows) + alone.rest
+        known = replace(tried, total=total, boards=sizes[:, [one.column for one in boards]])
+        for is_free in (False, True):
+            found.append([*_judged(tried, boards, is_free=is_free)[::2]])
+            values.append([*_judged(known, boards, is_free=is_free)[::2]])
+    levels = np.array([[one[0] - some[0][0] for one in some] for some in (found, values)])
+    assert np.ptp(levels[1]) > 3.0
+    # Both have a ridge of a billionth; a twentieth in a log-likelihood decides nothing.
+    assert levels[0] == pytest.approx(levels[1], abs=0.05)
+    squares = np.array([[one[1] for one in some] for some in (found, values)])
+    assert squares[0] == pytest.approx(squares[1], rel=1e-3)

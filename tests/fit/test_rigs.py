@@ -143,4 +143,5 @@ def test_all_edges_of_a_rig_err_as_their_joint_covariance_says():
         squares.append(float(away / scale @ whitened))
     # Noise levels of 20 stops are known by 60 degrees of freedom each: a share of 1.04.
     low, high = chi2.ppf([0.001, 0.999], 24 * count) / count
-    assert low < np.mean(squares) / 1.04 < high
+    # Up to a fifth of it is of what these arms do not do, and others might: errors that last.
+    assert 0.8 * low < np.mean(squares) / 1.04 < high

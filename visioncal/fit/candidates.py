@@ -116,7 +116,7 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
             own = of_effect(fit, effect.typical)
             best = own.best(np.ones(len(own.pull)), bounds.low, bounds.high)
             found.append((effect, *best))
-    if flange and not fit.cell.arms[flange].has_joints:
+    if flange:
         # What gains little beside independent noise gains less beside errors that last; what
         # differs from stop to stop does not last.
         lasting = [one[0] for one in found if one[0].typical is one[0]]

@@ -132,7 +132,7 @@ class Mixed:
         units, common = self.assembled(logs)
         value, inner = 2.0 * sum(t.count * logs[t.size] for t in self.terms if t.size >= 0), []
         for body, (errors, cross) in zip(self.bodies, units, strict=True):
-            root = np.linalg.inv(_factor(errors))
+            root = np.linalg.inv(factors_of(errors))
             value -= 2.0 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
             solved = (root @ cross).reshape(-1, cross.shape[2])
             at = np.append(body.columns, p)
@@ -269,7 +269,7 @@ def inverse(information: FloatArray) -> tuple[FloatArray, float]:
     return np.asarray(covariance), log_det
 
 
-def _factor(errors: FloatArray) -> FloatArray:
+def factors_of(errors: FloatArray) -> FloatArray:
     """Cholesky factors of (u, m, m) information about errors; wild rows may cancel to nothing."""
     diagonal = np.diagonal(errors, axis1=1, axis2=2)[:, :, None] * np.eye(errors.shape[1])
     for ridge in (0.0, *_RIDGES):

@@ -1,6 +1,7 @@
 """Errors of arms that last from stop to stop: they judge no sighting, and move the result last.
 
-Without joint angles, an arm's errors are functions of its posture and of time that nobody knows.
+An arm's errors are functions of its posture and of time that nobody knows; where joint angles are,
+beside those of its links.
 Which sightings agree and how large the noise is is found as if they were independent. The
 covariance is then averaged over processes by posture and by time, each over a grid of sizes and of
 levels of what is independent, by their restricted likelihood (Hoeting, Madigan, Raftery and
@@ -21,7 +22,7 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, evenly
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.fit.fit import Fit
-from visioncal.fit.mixed import body_with, inverse
+from visioncal.fit.mixed import body_with, factors_of, inverse
 from visioncal.fit.score import Products, Score, added_by, products
 from visioncal.fit.unknowns import Key, Prior
 from visioncal.model.effects import Effect
@@ -79,8 +80,12 @@ class Process:
         return total
 
 
-def processes(poses: FloatArray, levels: FloatArray) -> Iterator[Process]:
-    """Processes at (s, 4, 4) flanges, in units of the (6,) levels of the noise."""
+def processes(poses: FloatArray, levels: FloatArray, *, creeps: bool) -> Iterator[Process]:
+    """Processes at (s, 4, 4) flanges, in units of the (6,) levels of the noise.
+
+    `creeps` are a base and a flange that creep evenly until the end: beside these as candidates,
+    they are none of what else may last.
+    """
     count, order = len(poses), np.arange(len(poses))
     size = np.sqrt(np.mean((levels / TWIST_UNITS) ** 2))
     flange = np.broadcast_to(np.diag(levels), (count, 6, 6))
@@ -97,8 +102,9 @@ def processes(poses: FloatArray, levels: FloatArray) -> Iterator[Process]:
     apart = np.abs(order[:, None] - order)
     for memory in _MEMORIES:
         yield Process(1 / 8 / len(_MEMORIES), np.exp(-apart / memory), flange, True)
-    ramp = (order - order.mean()) / order.std()
-    yield Process(1 / 16, np.outer(ramp, ramp), both, True)
+    if creeps:
+        ramp = (order - order[-1]) / order.std()
+        yield Process(1 / 16, np.outer(ramp, ramp), both, True)
 
 
 def _beyond_mean(kernel: FloatArray) -> FloatArray:
@@ -132,22 +138,23 @@ def consider(fit: Fit, flange: str) -> Considered | None:
         return None
     stops, levels, p = len(alone.stops), alone.levels, fit.unknowns.count
     boards, logs, free, kinds = _boards(fit), list[float](), list[float](), []
-    squares = list[FloatArray]()
-    for tried in _tried(fit, flange, alone):
+    off = list[FloatArray]()
+    for tried in _tried(fit, flange, alone, creeps=True):
         ways = (False, True) if boards else (False,)
-        found = [_judged(tried, boards, p, is_free=is_free) for is_free in ways]
+        found = [_judged(tried, boards, is_free=is_free) for is_free in ways]
         logs.append(tried.prior + found[0][0])
         free.append(tried.prior + found[-1][0])
-        squares.append(found[-1][2])
+        off.append(found[-1][2])
         if tried.process is not None:
             kinds.append((tried.process, tried.size, tried.white))
     odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs))
-    mean_squares = np.exp(free - np.logaddexp.reduce(free)) @ np.array(squares)
+    mean_squares = np.exp(free - np.logaddexp.reduce(free)) @ np.array(off)
     shares = np.exp(logs - np.logaddexp.reduce(logs))[len(_WHITE) :]
     # The estimate's response to an error at each stop, which it takes for independent.
     gains = np.linalg.inv(alone.known + np.diag(levels**2)) @ alone.rows[:, :, :p]
     independent = np.einsum("uia,i,uib->ab", gains, levels**2, gains, optimize=True)
     known, excess, shift = fit.estimate.covariance, np.zeros((p, p)), np.zeros(p)
+    added = np.zeros((p, p))
     moved = list[tuple[float, FloatArray]]()
     count = len(_SIZES) * len(_WHITE)
     for at in range(0, len(shares), count):
@@ -159,10 +166,13 @@ def consider(fit: Fit, flange: str) -> Considered | None:
             moved.append((share, values - fit.estimate.values))
             excess += share * (covariance - known)
             continue
-        for share, (_, size, white) in zip(own.tolist(), kinds[at : at + count], strict=True):
-            if share > _LITTLE:
-                added = size**2 * process.through(gains) - (1.0 - white**2) * independent
-                excess += share * (known @ added @ known)
+        shown = [one for one in zip(own.tolist(), kinds[at : at + count], strict=True)
+                 if one[0] > _LITTLE]  # fmt: skip
+        squares = sum(share * size**2 for share, (_, size, _) in shown)
+        missing = sum(share * (1.0 - white**2) for share, (*_, white) in shown)
+        if shown:
+            added += squares * process.through(gains) - missing * independent
+    excess += known @ added @ known
     for share, away in moved:
         shift += share * away
         excess += share * np.outer(away, away)
@@ -194,14 +204,14 @@ def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float
     """
     counts = np.cumsum([0, *(effect.count for effect in effects)]).tolist()
     each = [products(fit, added_by(fit, effect), effect.count) for effect in effects]
-    alone, p, boards = _alone(fit, flange, each), fit.unknowns.count, _boards(fit)
+    alone, boards = _alone(fit, flange, each), _boards(fit)
     if alone is None:
         return []
     sizes, logs = np.geomspace(1e-6, 0.1, 31), list[float]()
     gains = list[list[FloatArray]]()
-    for tried in _tried(fit, flange, alone):
+    for tried in _tried(fit, flange, alone, creeps=False):
         for is_free in (False, True) if boards else (False,):
-            value, left, _ = _judged(tried, boards, p, is_free=is_free)
+            value, left, _ = _judged(tried, boards, is_free=is_free)
             # One board of twenty is of another size.
             logs.append(tried.prior + value + np.log(0.05 if is_free else 0.95))
             of_each = (Score(left[a:b, -1], left[a:b, a:b], np.inf) for a, b in pairwise(counts))
@@ -223,33 +233,70 @@ class _Tried:
     """A process of some size beside independent errors of some level; None beside the first."""
 
     prior: float  # Its logarithm.
-    total: FloatArray  # (p + c + 1, p + c + 1) information under it.
+    # (r + c + 1, r + c + 1) information under it, by r combinations of the unknowns.
+    total: FloatArray
     log_det: float  # Of what stops say.
+    boards: FloatArray  # (r, b) the sizes of boards that are held, by these.
     process: Process | None = None
     size: float = 0.0
     white: float = 1.0
 
 
-def _tried(fit: Fit, flange: str, alone: _Alone) -> Iterator[_Tried]:
+def _tried(fit: Fit, flange: str, alone: _Alone, *, creeps: bool) -> Iterator[_Tried]:
     poses, some = fit.cell.arms[flange].poses[alone.stops], evenly(len(alone.stops), _MOST)
     independent_at = {white: _independent(alone, some, white) for white in _WHITE}
-    rows = alone.rows[some].reshape(-1, alone.rows.shape[2])
+    rows, rest, by_boards = _combined(fit, alone.rows[some], alone.rest, independent_at[1.0])
 
-    def under(covariance: FloatArray) -> tuple[FloatArray, float]:
+    def under(covariance: FloatArray) -> tuple[FloatArray, float, FloatArray]:
         root = np.linalg.cholesky(covariance)
         solved, _ = lapack.dtrtrs(root, rows, lower=1)
-        return solved.T @ solved + alone.rest, 2.0 * float(np.log(np.diag(root)).sum())
+        return solved.T @ solved + rest, 2.0 * float(np.log(np.diag(root)).sum()), by_boards
 
     for white in _WHITE:
         weight = 1 / 4 if white == 1.0 else 1 / 4 / len(_WHITE)
         yield _Tried(float(np.log(weight)), *under(independent_at[white]), white=white)
-    for process in processes(poses, alone.levels):
+    for process in processes(poses, alone.levels, creeps=creeps):
         covariance = process.covariance(some)
         weight = float(np.log(process.prior / len(_SIZES) / len(_WHITE)))
         for size in _SIZES:
             for white in _WHITE:
                 total = independent_at[white] + size**2 * covariance
                 yield _Tried(weight, *under(total), process, size, white)
+
+
+def _combined(
+    fit: Fit, rows: FloatArray, rest: FloatArray, independent: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rows (6 k, r + c + 1), and all else, by those r combinations of p unknowns that they show.
+
+    Whatever the covariance of k stops' errors, it changes no information of others. Thousands of
+    unknowns of lenses are a few hundreds. Where there are less unknowns, they stay as they are.
+
+    Returns:
+        Both, and the (r, b) sizes of boards that are held by these combinations.
+    """
+    p, flat = fit.unknowns.count, rows.reshape(-1, rows.shape[2])
+    boards = np.eye(p)[:, [board.column for board in _boards(fit)]]
+    if p <= len(flat):
+        return flat, rest, boards
+    root = np.linalg.cholesky(independent)
+    solved, _ = lapack.dtrtrs(root, flat, lower=1)
+    whole = solved.T @ solved + rest
+    factor = factors_of(whole[None, :p, :p])[0]
+    # In units of the whole information: by the stops, and by what is asked for.
+    within, _ = lapack.dtrtrs(factor, np.column_stack([solved[:, :p].T, boards]), lower=1)
+    basis, _ = np.linalg.qr(within)
+    map_to, _ = lapack.dtrtrs(factor, basis, lower=1, trans=1)
+    pull, _ = lapack.dtrtrs(factor, whole[:p, p:], lower=1)
+    beyond = pull - basis @ (basis.T @ pull)
+    moved = np.column_stack([flat[:, :p] @ map_to, flat[:, p:]])
+    solved, _ = lapack.dtrtrs(root, moved, lower=1)
+    found, r = -solved.T @ solved, basis.shape[1]
+    found[:r, :r] += np.eye(r)
+    found[:r, r:] += basis.T @ pull
+    found[r:, :r] = found[:r, r:].T
+    found[r:, r:] += whole[p:, p:] - beyond.T @ beyond
+    return moved, found, map_to.T @ boards
 
 
 def _estimated(
@@ -368,33 +415,33 @@ def _boards(fit: Fit) -> list[_Board]:
 
 
 def _judged(
-    tried: _Tried, boards: Sequence[_Board], p: int, *, is_free: bool
+    tried: _Tried, boards: Sequence[_Board], *, is_free: bool
 ) -> tuple[float, FloatArray, FloatArray]:
     """The restricted log-likelihood of a process, with boards as stated or of any size.
 
     Args:
-        tried: The process.
+        tried: The process; c columns beside the unknowns are no part of the likelihood.
         boards: Those whose size is held.
-        p: The number of unknowns; c columns beside them are no part of the likelihood.
         is_free: Whether the boards are of any size.
 
     Returns:
         It; what unknowns and errors leave of the information (c + 1, c + 1) of the columns and the
         residual; and (b,) mean squares of what the boards are off by.
     """
-    own, prior, diagonal = tried.total.copy(), -tried.log_det / 2.0, np.arange(p)
-    for board in boards:
+    own, prior, p = tried.total.copy(), -tried.log_det / 2.0, len(tried.boards)
+    diagonal, by_boards = np.arange(p), tried.boards[:, : len(boards)]
+    for board, by in zip(boards, by_boards.T, strict=True):
         sigma = max(_LOOSE, board.held.considered) if is_free else board.held.considered
         row = np.zeros(len(own))
-        row[[board.column, -1]] = 1.0, -board.past
+        row[:p], row[-1] = by, -board.past
         own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
         prior -= np.log(sigma)
-    own[diagonal, diagonal] *= 1.0 + 1e-9
+    own[diagonal, diagonal] *= 1.0 + 1e-12
     factor = np.linalg.cholesky(own[:p, :p])
     pull, _ = lapack.dtrtrs(factor, own[:p, p:], lower=1)
     left = own[p:, p:] - pull.T @ pull
     value = prior - np.log(np.diag(factor)).sum()
-    of_boards, _ = lapack.dtrtrs(factor, np.eye(p)[:, [board.column for board in boards]], lower=1)
+    of_boards, _ = lapack.dtrtrs(factor, by_boards, lower=1)
     off = of_boards.T @ pull[:, -1] + [board.past for board in boards]
     squares = off**2 + np.sum(of_boards**2, axis=0)
     return float(value - 0.5 * left[-1, -1]), left, squares

@@ -99,13 +99,12 @@ def _solved(cell: Cell) -> CellFit:
         # No stop tells a board of another size from an arm of other lengths.
         search = search.with_unknowns(held)
         fit, left_out = search.run(fit.state, fit.used, fit)
-    bare = [name for name in fit.unknowns.erring if not start.cell.arms[name].has_joints]
-    found = {name: consider(fit, name) for name in bare}
+    found = {name: consider(fit, name) for name in fit.unknowns.erring}
     if any(one is not None and one.board_odds > _CLEAR for one in found.values()):
         # Boards of another size, which no error of an arm's posture explains.
         search = search.with_unknowns(with_free_boards(fit))
         fit, left_out = search.run(fit.state, fit.used, fit)
-        found = {name: consider(fit, name) for name in bare}
+        found = {name: consider(fit, name) for name in fit.unknowns.erring}
     for one in found.values():
         fit = fit if one is None else fit.considering(one.covariance, one.shift)
     doubts = [one for one in found.values() if one is not None]
