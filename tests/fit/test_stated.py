@@ -12,12 +12,14 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.fit.held import with_small_sizes
+from visioncal.fit.lens_field import by_lens
 from visioncal.fit.score import Score
 from visioncal.fit.solve import solve
 from visioncal.model import MeasuredPlace, MeasuredPose, Sighting, read_cell
 from visioncal.model.sightings import is_copy
 from visioncal.simulation import instrument_session, simulate
 from visioncal.simulation.instrument_session import InstrumentOptions, session_of
+from visioncal.vision.camera import intrinsics, project, with_intrinsics
 
 
 def stated(pair, place_m, sigma_m, turn=None, sigma_rad=1.0):
@@ -214,3 +216,31 @@ def test_small_sizes_that_chance_explains_count_as_their_posterior_says():
     added = with_small_sizes(only).considered[own[:, None], own]
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     assert np.abs((added - expected) / scale).max() < 0.02
+
+
+def test_a_stated_lens_leaves_without_its_field_as_matrix_and_distortion_explain_best():
+    small = made(5, stops=24)
+    bent = []
+    for sighting in small.cell.sightings:
+        x, y = ((sighting.corners.px - [640.0, 512.0]) / 640.0).T
+        # A thin prism's: none of the lens's own parameters does just that.
+        px = sighting.corners.px + 1.5 * np.outer(x**2 + y**2, [0.8, 0.6])
+        bent.append(replace(sighting, evidence=replace(sighting.corners, px=px)))
+    fit = solve(small.cell.with_sightings(bent)).fit
+    field, values = fit.unknowns.fields["cam"], fit.state.values["field", "cam"]
+    lens, alone = fit.unknowns.camera(fit.state, "cam"), fit.camera("cam")
+    axes = (np.linspace(0.0, side - 1.0, 33) for side in lens.resolution)
+    px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([(px - lens.matrix[2:]) / lens.matrix[:2], np.ones(len(px))])
+    seen = project(lens, rays)
+
+    def left(camera):
+        return float(np.mean((project(camera, rays) - seen - field.moved(px, values)) ** 2))
+
+    assert left(alone) < 0.5 * left(lens)
+    # No change of matrix or distortion by which corners move by a tenth of a pixel is nearer.
+    for column, step in enumerate(np.eye(9)):
+        by = np.abs(by_lens(lens, px)[:, :, column]).max()
+        for sign in (-1, 1):
+            other = with_intrinsics(alone, intrinsics(alone) + sign * 0.1 / by * step)
+            assert left(other) > left(alone)

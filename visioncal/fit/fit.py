@@ -130,8 +130,19 @@ class Fit:
         return self.state.values["edge", name]
 
     def camera(self, name: str) -> Camera:
-        """A lens alone, without its field: what matrix and distortion explain best."""
-        return with_intrinsics(self.unknowns.lenses[name], self.state.values["lens", name])
+        """A lens alone, without its field: what matrix and distortion explain best.
+
+        A stated lens is as far from itself as they explain of its field, over the image: beyond the
+        corners, where its field fades, distortion that these alone determine would grow.
+        """
+        values, field = self.state.values["lens", name], self.unknowns.fields.get(name)
+        if field is not None and field.instead is None:
+            lens = self.unknowns.camera(self.state, name)
+            axes = (np.linspace(0.0, side - 1.0, 33) for side in lens.resolution)
+            own = field.beside(lens, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)).instead
+            if own is not None:
+                values = values + own @ self.state.values["field", name]
+        return with_intrinsics(self.unknowns.lenses[name], values)
 
     def covariance(self, *keys: Key) -> FloatArray:
         """Joint covariance of some unknowns, in SI units or pixels: of edges, 6 x 6 blocks."""
