@@ -1013,13 +1013,14 @@ def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
     # Nine decimals of millimetres and degrees are written where a text has them.
     np.testing.assert_allclose(found, poses[shown], atol=1e-9)
     if make is stems_with_depth:
-        assert [Path(view.text["source_depth"]).name for view in session.views][1] == "1.png"
+        assert [Path(view.depth).name for view in session.views][1] == "1.png"
+        assert session.images.read(session.views[1].depth).startswith(b"\x89PNG")
         assert "depth pictures #.png (9 files)" in done.err
         assert "Left aside, as rows differ in their shape: joints" in done.err
     if make is two_folders:
         assert "Left out of the images: rgb/frame_#_corners.png (9 files)" in done.err
     if make is among_measurements:
-        assert "views.csv has their paths in source_depth" in done.err
+        assert "they are the views' depth" in done.err
     if make in (sixes, blanks, inverted):
         assert "Found by the images: With the robot's" in done.err
     if make is rapid_with_a_home:

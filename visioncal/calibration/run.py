@@ -106,19 +106,40 @@ def calibrate(
     state = initial_state(session, **asked)
     with_need = state.session.needing(need_mm, need_deg, corrected=corrected)
     state = replace(state, session=with_need, given_corners=corners)
+    if _sees_points(state):
+        return _points_run(state).calibration
     state = run_stages(state)
     return _with_depth(state)[0] if _has_depth(state) else result_of(state)
 
 
 def run(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
-    state = run_stages(initial_state(session, **asked))
+    state = initial_state(session, **asked)
+    if _sees_points(state):
+        return _points_run(state)
+    state = run_stages(state)
     held_out = state.assessment.held_out
     residuals = zip(held_out.residual_m.tolist(), held_out.rms_px.tolist(), strict=True)
     left_out = dict(zip(state.used, residuals, strict=True))
     searches = state.searches if state.dense is None else {}
     result = _with_depth(state) if _has_depth(state) else (result_of(state), view_evidence(state))
     return Run(*result, left_out, searches)
+
+
+def _sees_points(state: RunState) -> bool:
+    return any(table.seeing == "points" for table in state.session.cameras.values())
+
+
+def _points_run(state: RunState) -> Run:
+    """The run of a session whose camera measures points."""
+    # Imported here, as few sessions have them.
+    from visioncal.calibration.stages import points
+
+    with points.named(state.session):
+        solved = run_stages(replace(state, session=points.as_instrument(state.session)))
+    calibration = points.as_hand_eye(result_of(solved), state.session)
+    evidence = tuple(ViewEvidence(view.number) for view in state.session.views)
+    return Run(calibration, evidence)
 
 
 def _has_depth(state: RunState) -> bool:

@@ -77,7 +77,8 @@ class CameraTable(TableModel):
 
     name: str = "camera"
     resolution: Annotated[list[Side], Field(min_length=2, max_length=2)] | None = None
-    model: CameraKind = "brown"
+    # "points": it measures points (meas_x_m ...), as of a ball, and has no lens.
+    seeing: CameraKind | Literal["points"] = Field(default="brown", alias="model")
     matrix: Annotated[list[Number], BeforeValidator(_four)] | None = None
     distortion: Annotated[list[Number], BeforeValidator(_flat)] | None = None
     intrinsics: Literal["auto", "hold", "refine"] = "auto"
@@ -86,6 +87,11 @@ class CameraTable(TableModel):
     # Of depth pictures: their unit [m], and whether they have distances along z or along the ray.
     depth_unit_m: Positive | None = None
     depth_of: Literal["z", "ray"] = "z"
+
+    @property
+    def model(self) -> CameraKind:
+        """The model of its lens."""
+        return "brown" if self.seeing == "points" else self.seeing
 
     @property
     def size(self) -> tuple[int, int] | None:

@@ -123,9 +123,9 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     store = foreign.store
     if store is None:
         paths = _image_paths(foreign.images, foreign.name, notes)
-        store = FileImages(
-            {path: file for path, file in zip(paths, foreign.images, strict=True) if file}
-        )
+        foreign, files = _with_depth(foreign, notes)
+        files += zip(paths, foreign.images, strict=True)
+        store = FileImages({path: file for path, file in files if file})
     else:
         paths = ["" if path is None else path.as_posix() for path in foreign.images]
     images = [path for path in dict.fromkeys(paths) if path]
@@ -134,6 +134,8 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
         document["cameras"] = {name: dict(lens) for name, lens in foreign.lenses.items()}
     elif images:
         document["camera"] = _camera(foreign, store, images)
+    elif (foreign.lens or {}).get("model") == "points":
+        document["camera"] = {"model": "points"}
     target = foreign.target if images else None
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
@@ -161,6 +163,18 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
             f"{len(missing)} of {len(rows)} rows have no pose of the robot: {some_of(missing)}."
         )
     return replace(session, warnings=(*notes, *session.warnings))
+
+
+def _with_depth(
+    foreign: ForeignRecording, notes: list[str]
+) -> tuple[ForeignRecording, list[tuple[str, Path | None]]]:
+    """The recording with paths of depth pictures in the session, and the files that they are of."""
+    columns = dict(foreign.columns)
+    files = [Path(cell) if cell else None for cell in columns.pop("source_depth", ())]
+    paths = _image_paths(files, foreign.name, notes) if any(files) else []
+    paths = [path.replace("images/", "depth/", 1) for path in paths]
+    columns |= {"depth": tuple(paths)} if paths else {}
+    return replace(foreign, columns=columns), [*zip(paths, files, strict=False)]
 
 
 def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:

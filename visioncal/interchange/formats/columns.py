@@ -71,7 +71,9 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         try:
             for more, foreign in _recordings(fields, asked, images, instead):
                 all_notes = (*foreign.notes, *notes)
-                found.append((rank + more, replace(foreign, lens=lens, notes=all_notes)))
+                found.append(
+                    (rank + more, replace(foreign, lens=foreign.lens or lens, notes=all_notes))
+                )
         except DataError as error:
             faults.append(error)
     if not found:
@@ -115,6 +117,11 @@ def _recordings(
     used.update(map(fields.find, joint_fields))
     if not names["robot"] and not joint_fields:
         raise _unnamed(fields, "robot", ", or the joint angles with --joint-{}")
+    # Three numbers of what the camera saw are a point, as of a ball.
+    points = names["camera"]
+    if not points or sum(fields.column(name).shape[1] for name in points) != 3:
+        points = ()
+    names["camera"] = () if points else names["camera"]
     poses: dict[Side, PoseNumbers] = {"robot": PoseNumbers.empty(fields.places)}
     unstated: dict[Side, Unstated] = {}
     joints, notes = _joint_angles(fields, joint_fields, requested, bool(names["robot"]))
@@ -126,8 +133,8 @@ def _recordings(
     if irregular := [name for name in fields.shape_errors if name not in used]:
         notes.append(f"Left aside, as rows differ in their shape: {some_of(irregular)}.")
     columns = dict[str, tuple[str, ...]]()
-    if not unstated:
-        columns, more = _readings(fields, used)
+    if points or not unstated:
+        columns, more = _readings(fields, used, points)
         notes += more
     # Components of a field that is used.
     used |= {text for text in fields.texts if text.rpartition(".")[0] in used}
@@ -145,6 +152,7 @@ def _recordings(
         robot=poses["robot"],
         camera=poses.get("camera"),
         images=pairing.images,
+        lens={"model": "points"} if points else None,
         joints_rad=joints,
         stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
         form=fields.form,
@@ -214,15 +222,17 @@ def _joint_angles(
     return joints, [*notes]
 
 
-def _readings(fields: Fields, used: set[str]) -> tuple[dict[str, tuple[str, ...]], tuple[str, ...]]:
-    """Columns of an instrument's readings beside joint angles, and a note; empty without them."""
+def _readings(
+    fields: Fields, used: set[str], points: tuple[str, ...]
+) -> tuple[dict[str, tuple[str, ...]], tuple[str, ...]]:
+    """Columns of a camera's points, or of readings beside joint angles, and a note; else empty."""
     arrays = [
         (name,)
         for name, numbers in fields.numbers.items()
         if numbers.ndim > 1 and numbers[0].size == 3 and name not in used
     ]
     names = columns_named(fields, ("x", "y", "z")) or (arrays[0] if len(arrays) == 1 else ())
-    if not names:
+    if not (names := points or names):
         return {}, ()
     used.update(names)
     places = np.hstack([fields.column(name) for name in names])
@@ -232,7 +242,8 @@ def _readings(fields: Fields, used: set[str]) -> tuple[dict[str, tuple[str, ...]
     cells = [
         ["" if np.isnan(v) else repr(v) for v in row] for row in (UNITS_M[unit] * places.T).tolist()
     ]
-    note = f"{', '.join(names)} are taken for an instrument's readings in {unit}."
+    whose = "points that the camera measured," if points else "an instrument's readings"
+    note = f"{', '.join(names)} are taken for {whose} in {unit}."
     return dict(zip(INSTRUMENT_POSITION, map(tuple, cells), strict=True)), (note,)
 
 

@@ -365,8 +365,8 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     if depth is not None:
         left.remove(depth[0].listed())
         notes.append(
-            f"The depth pictures {depth[0].listed()} are of the same rows; a session holds none: "
-            "they stay where they are, and views.csv has their paths in source_depth."
+            f"The depth pictures {depth[0].listed()} are of the same rows: they are the views' "
+            "depth, in millimetres unless [camera] depth_unit_m says otherwise."
         )
     if left:
         notes.append(f"Left out of the images: {some_of(left)}.")
