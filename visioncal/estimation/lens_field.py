@@ -4,7 +4,7 @@ A corner is displaced by `(b (d / d0 - 1) + j) (px - centre) + field(px)`: b is 
 the view's distance d over the mean one, j is focus jitter, one per view, and the field is a
 Gaussian process over the image with a squared exponential kernel of one length, less what the
 intrinsics can explain of it over the image: otherwise it would trade with the focal length. Each
-has zero mean and a size of its own, which `lens_levels` estimates. Sizes are in units of the
+has zero mean and a size of its own, which `fit` estimates. Sizes are in units of the
 corners' noise: corners with these effects still have 1 px noise.
 """
 
@@ -16,7 +16,7 @@ from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.field_modes import field_modes
 from visioncal.estimation.linalg import gram
-from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian
+from visioncal.vision.camera import normalise, project_with_jacobian
 
 # Grid points per axis of the image over which the intrinsics' part is removed, and the relative
 # singular value below which a combination of intrinsics is undetermined there.
@@ -33,41 +33,6 @@ class LensLevels:
     jitter: float = 0.0  # Relative change of the focal length from view to view [1/px].
     # Fall of twice the log-likelihood without each of the three.
     gains: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class LensSizes:
-    """Sizes of a given lens's errors: standard deviations of its `lens_modes` [px]."""
-
-    focal: float = 0.0  # Of the focal lengths: of both together, and of their ratio.
-    centre: float = 0.0  # Of the principal point, per axis.
-    shape: float = 0.0  # Of each mode of the distortion.
-
-    def variances(self, count: int) -> FloatArray:
-        """(k,) variances of the modes [px^2]; zeros for a lens without errors."""
-        sizes = np.repeat([self.focal, self.centre, self.shape], [2, 2, count - 4])
-        # A lens that has errors has some of each mode.
-        return np.maximum(sizes, 1e-3) ** 2 if sizes.any() else sizes
-
-
-def lens_modes(camera: Camera) -> FloatArray:
-    """(k, k) intrinsics by modes whose displacements over the image are 1 px (rms), each.
-
-    The first changes both focal lengths by one factor, the second their ratio, the next two the
-    principal point, and the others, orthogonal to these, the distortion.
-    """
-    values = intrinsics(camera)
-    order = np.eye(len(values))
-    order[:2, 0], order[:2, 1] = values[:2], values[:2] * (1.0, -1.0)
-    columns = _over_image(camera)[1].reshape(-1, len(values)) @ order
-    columns /= np.sqrt(len(columns) / 2)
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0.0] = 1.0
-    root = np.asarray(np.linalg.qr(columns / scale, mode="r"))
-    # Combinations that displace nothing have no errors.
-    nothing = np.abs(np.diag(root)) < _DETERMINED
-    root[nothing, nothing] = 1.0 / _DETERMINED
-    return np.asarray(order / scale @ np.linalg.inv(root))
 
 
 def lens_part(camera: Camera, length: float) -> FloatArray:

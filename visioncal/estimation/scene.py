@@ -1,7 +1,7 @@
 """Scene of one camera: its targets and corners, with priors of lens and boards."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,7 @@ from visioncal.estimation.appearance import (
     stated_board_sigma,
 )
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.lens_field import LensLevels, LensSizes, lens_modes, zooms
+from visioncal.estimation.lens_field import LensLevels, zooms
 from visioncal.estimation.linalg import covariance_from
 from visioncal.vision.targets import numbered_positions
 
@@ -43,6 +43,12 @@ class Scene:
     # Whether the focal length varies neither with the distance nor at random.
     is_focus_fixed: bool = False
 
+    @property
+    def printed(self) -> tuple[str, ...]:
+        """Names of the printed targets."""
+        pairs = zip(self.names, self.targets, strict=True)
+        return tuple(name for name, target in pairs if not target.is_rig)
+
 
 @dataclass(frozen=True)
 class BoardSizes:
@@ -67,11 +73,11 @@ class CornerProblem:
     shares: FloatArray
     # Sizes of lens errors beyond the model; None before their estimation.
     levels: LensLevels | None = None
-    # Sizes of a given lens's errors beyond what is stated.
-    lens_sizes: LensSizes = field(default_factory=LensSizes)
+    # (k, k) covariance of a given lens's intrinsics beyond what is stated; None for a sound one.
+    lens_covariance: FloatArray | None = None
     board_sizes: tuple[BoardSizes, ...] = ()  # The same of each printed board.
-    # Whether boards keep their stated scales unless these are wrong by more than is stated: errors
-    # of an arm by its posture look like a scale, and weigh more than white noise does.
+    # Whether boards keep their stated scales: errors of an arm by its posture look like a scale,
+    # and weigh more than white noise does.
     holds_scales: bool = False
 
     @classmethod
@@ -112,9 +118,8 @@ class CornerProblem:
         """(k + s, k + s) prior covariance of lens and boards; zero where it is flat."""
         known = np.where(np.isinf(self.stated_sigma), 0.0, self.stated_sigma)
         covariance, count = np.diag(known**2), len(self.lens)
-        if (variances := self.lens_sizes.variances(count)).any():
-            modes = lens_modes(self.scene.camera)
-            covariance[:count, :count] += modes * variances @ modes.T
+        if self.lens_covariance is not None:
+            covariance[:count, :count] += self.lens_covariance
         for board, sizes in zip(self.printed, self.board_sizes, strict=True):
             scale, (aspect, *bends, shear) = self.scale_of(board), self.shape_of(board)
             covariance[scale, scale] += sizes.scale**2
@@ -137,8 +142,7 @@ class CornerProblem:
         """(k + s,) mask of the values that no fit moves, however uncertain they are."""
         held = np.zeros(len(self.stated_sigma), dtype=bool)
         held[self.lens] = self.scene.mode == "hold" and not self.scene.estimated
-        for board, sizes in zip(self.printed, self.board_sizes, strict=True):
-            held[self.scale_of(board)] = self.holds_scales and sizes.scale == 0.0
+        held[self.scale] = self.holds_scales
         return held
 
     @cached_property

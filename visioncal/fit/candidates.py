@@ -96,6 +96,12 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
             yield Candidate(gain, lens_field(camera, field, size), field=field)
 
 
+def of_stops(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
+    """Those that differ from stop to stop."""
+    yield from of_arms(fit, pairs)
+    yield from scored(fit, [one for one in effects_of_lenses(fit) if isinstance(one, FocusJitter)])
+
+
 def of_arms(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """Those that are of arms and their motion."""
     yield from scored(fit, effects_of_arms(fit))

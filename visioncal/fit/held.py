@@ -19,15 +19,21 @@ from visioncal.fit.unknowns import Key, Vector, given_lens
 _OTHERS = 0.05
 
 
+def doubted_boards(considered: Iterable[Considered]) -> dict[Key, float]:
+    """Mean square of what held boards may be off by beyond what is stated, by their shape's key."""
+    squares = dict[Key, float]()
+    for one in considered:
+        share = float(expit(one.board_odds + logit(_OTHERS)))
+        squares |= {key: share * square for key, square in one.board_squares.items()}
+    return squares
+
+
 def with_held_boards(fit: Fit, considered: Iterable[Considered]) -> Fit:
     """The fit with what boards whose size is held may be off by in its covariance.
 
     They are as stated, or of any size, as `considered` beside lasting errors of an arm.
     """
-    squares = dict[Key, float]()
-    for one in considered:
-        share = float(expit(one.board_odds + logit(_OTHERS)))
-        squares |= {key: share * square for key, square in one.board_squares.items()}
+    squares = doubted_boards(considered)
     covariance, added = fit.estimate.covariance, np.zeros((fit.unknowns.count,) * 2)
     for member in fit.unknowns.members:
         for prior in member.priors:

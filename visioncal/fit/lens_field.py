@@ -15,7 +15,7 @@ from visioncal.core.types import Camera, FloatArray
 from visioncal.vision.camera import project_with_jacobian
 
 # Half waves across at most, and lengths of the field over the width that are tried.
-_WAVES, LENGTHS = 16, (0.12, 0.18, 0.27, 0.4)
+_WAVES, LENGTHS = 16, (0.1, 0.14, 0.2, 0.28, 0.4)
 # Over how many widths the waves are: at their ends they have no slope.
 _WIDTHS = 1.4
 
@@ -26,6 +26,7 @@ class Field:
 
     orders: FloatArray  # (e, 2) half waves across and down.
     width: float  # Of the image [px].
+    length: float  # Of the kernel, over that width.
     sigmas: FloatArray  # (e,) standard deviations of the waves in a field of size one.
     basis: FloatArray  # (e, r) the waves of each function; a field's values have variance one.
     # (q, 2 r) intrinsics that do the same as the field's values, by which the lens is less than as
@@ -97,7 +98,7 @@ def fields_of_lengths(
         # A wave has half of the mean square of a constant.
         sigmas *= np.sqrt(0.5) ** np.sum(orders == 0, axis=1)
         sigmas /= np.sqrt(variances @ sigmas**2)
-        yield Field(orders, width, sigmas, np.diag(sigmas))
+        yield Field(orders, width, length, sigmas, np.diag(sigmas))
 
 
 def by_lens(lens: Camera, px: FloatArray) -> FloatArray:

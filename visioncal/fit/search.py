@@ -112,8 +112,8 @@ class Search:
             moved = np.abs(found.estimate.logs - begin) > _MOVED
             is_open = (high > low) & (found.estimate.logs > low)
             random -= set(np.flatnonzero(is_open & ~moved).tolist())
-        limits = {size: unknowns.sizes[size].limit for size in sorted(random)}
-        found, more = significant(mixed, found, starts, low, high, limits)
+        tested = {at: unknowns.sizes[at] for at in sorted(random)}
+        found, more = significant(mixed, found, starts, low, high, tested)
         names = {unknowns.sizes[size].name for size in more}
         return self._fit(
             state, grams, used, unknowns.closing(unknowns.closed | names), mixed, found

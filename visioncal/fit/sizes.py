@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.mixed import Estimate, Mixed
-from visioncal.model.effects.effect import SIGNIFICANT
+from visioncal.model.effects.effect import SIGNIFICANT, Size
 
 # Most change of a size's logarithm in one search: in the elimination, far sizes cancel to nothing.
 _FAR = 3.0
@@ -79,7 +79,7 @@ def significant(
     start: FloatArray,
     low: FloatArray,
     high: FloatArray,
-    random: Mapping[int, float],
+    random: Mapping[int, Size],
 ) -> tuple[Found, tuple[int, ...]]:
     """Closes, at their lower bounds, the sizes of random unknowns that chance explains.
 
@@ -93,15 +93,17 @@ def significant(
     """  # fmt: skip
     count, logs, best = found.evaluations, found.estimate.logs, found.estimate.value
     little = []
-    for size, limit in random.items():
+    for size, tested in random.items():
         if high[size] > low[size] and logs[size] > low[size]:
             without = logs.copy()
             without[size] = low[size]
             count += 1
-            if mixed.at(without, is_sloped=False).value - best < limit:
+            if mixed.at(without, is_sloped=False).value - best < tested.limit:
                 little.append(size)
         elif high[size] > low[size]:
             little.append(size)
+    owners = {at.of for size, at in random.items() if size not in little and at.of}
+    little = [size for size in little if random[size].of not in owners]
     if not little:
         return replace(found, evaluations=count), ()
     top = high.copy()

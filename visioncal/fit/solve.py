@@ -8,10 +8,10 @@ import numpy as np
 
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.types import FloatArray, Mask
-from visioncal.fit.candidates import candidates, of_arms, opened
+from visioncal.fit.candidates import candidates, of_stops, opened
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.held import with_held_boards, with_held_lenses, with_small_sizes
-from visioncal.fit.processes import ENOUGH_STOPS, consider, held_boards
+from visioncal.fit.processes import ENOUGH_STOPS, Considered, consider, held_boards
 from visioncal.fit.refuse import refuse_open, refuse_unjoined
 from visioncal.fit.search import Effort, Search, nearest
 from visioncal.fit.start import Start, start_of
@@ -49,6 +49,7 @@ class CellFit:
     left_out: LeftOut
     start: Start
     effort: Effort
+    doubts: Sequence[Considered] = ()  # What arms without joint angles err by, and held boards.
 
     @property
     def used(self) -> Mask:
@@ -109,23 +110,28 @@ def _solved(cell: Cell) -> CellFit:
         fit = fit if one is None else fit.considering(one.covariance, one.shift)
     doubts = [one for one in found.values() if one is not None]
     fit = with_held_lenses(with_held_boards(with_small_sizes(fit), doubts))
-    return CellFit(fit, left_out, start, search.effort)
+    return CellFit(fit, left_out, start, search.effort, doubts)
 
 
 def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit, LeftOut]:
-    """A fit, or that with an arm's effect by which most of many sightings agree that did not.
+    """A fit, or that with an effect of arm or lens by which most of many agree that did not.
 
-    Play has one of two values at each stop, and neither half of these shows it.
+    Play has one of two values at each stop, and neither half of these shows it; nor do the views
+    before and after a lens was zoomed.
     """
     lost = int((search.sound & ~fit.used).sum())
     wider = None
     if lost > search.sound.sum() / 10:
         whole = search.with_all(fit)
-        wider = opened(whole, search.pairs, of_arms(whole, search.pairs))
+        wider = opened(whole, search.pairs, of_stops(whole, search.pairs))
     if wider is not None:
         other = search.with_unknowns(wider[0])
         found, left = other.run(wider[1], search.sound, whole)
-        if (search.sound & ~found.used).sum() < lost / 2:
+        # With more noise, anything agrees.
+        is_noise = any(
+            found.sizes[size.name] > 2.0 * fit.sizes[size.name] for size in fit.unknowns.noise
+        )
+        if not is_noise and (search.sound & ~found.used).sum() < lost / 2:
             return other, found, left
     return search, fit, left_out
 

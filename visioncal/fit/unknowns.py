@@ -23,6 +23,9 @@ Key: TypeAlias = tuple[Kind, str]
 # A maker's lens: its centre is in the middle of the image within this share of the width, and p1
 # and p2 are within this.
 _CENTRE, _TANGENTIAL = 0.02, 1e-3
+# Likelihood ratio from which what is off in one of ten cases is likelier so than not: given lenses,
+# and boards that are not flat.
+_ONE_IN_TEN = 2.0 * float(np.log(9.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +248,8 @@ def given_lens(table: CameraTable, frame: str, px: FloatArray, *, is_spare: bool
         for part, (first, last) in parts.items():
             if first >= count:
                 units[first:last] = 1.0 / moved[first:last]
-                size = Size(f"{part} {frame}", 1.0, 1e-3, 100.0)
+                name, of = f"{part} {frame}", f"given lens of {frame}"
+                size = Size(name, 1.0, 1e-3, 100.0, _ONE_IN_TEN, of)
                 priors.append(Prior(np.arange(first, last), size))
         count = len(values)
     return Vector(("lens", frame), tuple(priors), values[:count], units[:count]) if count else None
@@ -275,8 +279,12 @@ def printed_board(frame: str, board: Target | None, *, has_shape: bool, is_sized
     held = Prior(own, sigma=min(share, 1e-6), considered=share)
     priors = [Prior(own, Size(f"scale {frame}", 0.01, share, 0.2)) if is_sized else held]
     if has_shape:
-        priors.append(Prior(np.arange(SHAPES)[PLANE], Size(f"plane {frame}", 3e-4, 1e-7, 0.02)))
-        priors.append(Prior(np.arange(SHAPES)[BEND], Size(f"bend {frame}", 1e-4, 1e-7, 0.05)))
+        for part, columns, bounds in (
+            ("plane", PLANE, (3e-4, 1e-7, 0.02)),
+            ("bend", BEND, (1e-4, 1e-7, 0.05)),
+        ):
+            size = Size(f"{part} {frame}", *bounds, _ONE_IN_TEN, f"shape of {frame}")
+            priors.append(Prior(np.arange(SHAPES)[columns], size))
     count = SHAPES if has_shape else 1
     return Vector(("shape", frame), tuple(priors), np.zeros(count), np.ones(count))
 

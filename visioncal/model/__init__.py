@@ -2,6 +2,7 @@
 
 from visioncal.model.arm import Arm as Arm
 from visioncal.model.arm import Moments as Moments
+from visioncal.model.arm import Reported as Reported
 from visioncal.model.arm import Swept as Swept
 from visioncal.model.cell import Cell as Cell
 from visioncal.model.reading import read_cell as read_cell

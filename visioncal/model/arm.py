@@ -50,6 +50,15 @@ class Arm:
 
 
 @dataclass(frozen=True, eq=False)
+class Reported:
+    """What a robot's rows are known to report, by view."""
+
+    poses: Mapping[int, FloatArray]  # (4, 4) `base_from_flange`.
+    joints: Mapping[int, FloatArray]  # (n,) joint angles that belong to the model [rad].
+    model: Robot | None  # None where no joints belong to one.
+
+
+@dataclass(frozen=True, eq=False)
 class Swept:
     """Sightings by one camera while one robot moved, at poses of that robot by another clock."""
 

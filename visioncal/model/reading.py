@@ -9,7 +9,7 @@ from visioncal.core.number_format import counted
 from visioncal.core.types import Corners, FloatArray
 from visioncal.estimation.poses import FEWEST_CORNERS
 from visioncal.estimation.tree import Branch, Tree
-from visioncal.model.arm import Arm, Moments, Swept, even_progress
+from visioncal.model.arm import Arm, Moments, Reported, Swept, even_progress
 from visioncal.model.cell import Cell
 from visioncal.model.heating import recorded_inputs
 from visioncal.model.priors import stated_sightings
@@ -23,7 +23,10 @@ from visioncal.session.table import loads_of
 
 
 def read_cell(
-    session: Session, corners: Mapping[int, Corners], sweeps: Sequence[Swept] = ()
+    session: Session,
+    corners: Mapping[int, Corners],
+    sweeps: Sequence[Swept] = (),
+    reports: Mapping[str, Reported] | None = None,
 ) -> Cell:
     """Reads a session.
 
@@ -32,6 +35,7 @@ def read_cell(
             of its stop. Rows of sweeps have the robot's poses at their times.
         corners: The corners in its images by view, each numbered on its own board.
         sweeps: What was seen while a robot moved.
+        reports: What is known of robots' rows, by robot; of others, they are taken as they are.
 
     Raises:
         DataError: No row has an observation, or frames are ambiguous.
@@ -45,7 +49,7 @@ def read_cell(
             next_step="Give rows images and cameras, or poses in cft_ columns.",
         )
     stations = {station: at for at, station in enumerate(sorted({row.station for row in rows}))}
-    arms = {arm.flange: arm for arm in _arms(session, rows, stations)}
+    arms = {arm.flange: arm for arm in _arms(session, rows, stations, reports or {})}
     sightings = list[Sighting]()
     of_pair: dict[tuple[object, ...], list[Sighting]] = {}
     absent = dict[int, str]()
@@ -93,25 +97,35 @@ def read_cell(
     )
 
 
-def _arms(session: Session, rows: list[Observation], stations: Mapping[int, int]) -> Iterator[Arm]:
+def _arms(
+    session: Session,
+    rows: list[Observation],
+    stations: Mapping[int, int],
+    reports: Mapping[str, Reported],
+) -> Iterator[Arm]:
     models = {name: Robot.from_document(at) for name, at in session.robot_documents.items()}
     for name in session.robots:
+        report = reports.get(name)
+        model = models.get(name) if report is None else report.model
         poses = np.full((len(stations), 4, 4), np.nan)
-        model = models.get(name)
         joints = np.full((len(stations), model.joint_count if model else 0), np.nan)
         numbers: list[Mapping[str, float]] = [{}] * len(stations)
         approaches = [""] * len(stations)
         for row in rows:
             if name not in row.robots:
                 continue
-            at, angles = stations[row.station], row.robots[name].joints_rad
-            numbers[at] = row.robots[name].numbers
-            approaches[at] = row.robots[name].text.get("approach", "")
+            at, own = stations[row.station], row.robots[name]
+            numbers[at], approaches[at] = own.numbers, own.text.get("approach", "")
+            if report is None:
+                angles, stated = own.joints_rad, own.base_from_flange()
+                pose = None if stated is None else stated.as_matrix()
+            else:
+                view = own.number if own.number in report.poses else row.view.number
+                angles, pose = report.joints.get(view), report.poses.get(view)
             if model is not None and angles is not None:
                 joints[at] = angles
-            reported = row.robots[name].base_from_flange()
-            if reported is not None:
-                poses[at] = reported.as_matrix()
+            if pose is not None:
+                poses[at] = pose
             elif model is not None and angles is not None:
                 poses[at] = model.base_from_flange(angles[None])[0]
         is_known = model is not None and bool(

@@ -18,13 +18,14 @@ from visioncal.calibration.stages.arms import RobotArm, arm_effects, check_arms,
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
+from visioncal.calibration.stages.error_sizes import estimate_error_sizes
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions, without_most_contradicted
 from visioncal.calibration.stages.random_effects import of_random_effects, random_effects
-from visioncal.calibration.stages.refine import PRINTED_SCALE, refine_jointly, with_sizes
+from visioncal.calibration.stages.refine import PRINTED_SCALE, refine_jointly
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.limits import CONTRADICTION
@@ -101,6 +102,8 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     if misread:
         # Misread poses determine neither lens, board and arm nor which views are outliers.
         return _of_misread(initial, observed)
+    if observed.scenes and not inliers.problem.is_combined:
+        initial = replace(initial, sizes=estimate_error_sizes(observed))
     cell_fit = _fit_with_inliers(initial, observed)
     if cell_fit.inlier_fit.problem.is_combined and not observed.scenes:
         cell_fit = _with_likelier_noise(cell_fit, observed)
@@ -109,7 +112,9 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         cell_fit = _fit_with_inliers(cell_fit, observed)
     corners = cell_fit.linearised_corners
     rows = None if corners is None else cell_fit.all_rows(corners)
-    if found := random_effects(cell_fit.inlier_fit, cell_fit.arms, corners, rows):
+    if found := random_effects(
+        cell_fit.inlier_fit, cell_fit.arms, corners, rows, cell_fit.sizes.growth
+    ):
         effects = (*clock_errors, *found)
         cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
@@ -264,7 +269,7 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
         if (corners := cell_fit.linearised_corners) is not None:
             # Where other inliers are too far from the last fit, it starts anew.
             with suppress(ConvergenceError):
-                return refine_jointly(cell_fit, corners.camera_parameters, is_sized=True)
+                return refine_jointly(cell_fit, corners.camera_parameters)
         views = _views_by_camera(observed, cell_fit.poses)
         return refine_jointly(cell_fit, cell_fit.stated_parameters(observed.scenes, views))
     cell_fit = replace(cell_fit, linearised_corners=None)
@@ -308,7 +313,7 @@ def _converge_arms(cell_fit: CellFit) -> CellFit:
         f"arm of {name}" in effects_of_fit and not arm.has_free_errors
         for name, arm in cell_fit.arms.items()
     )
-    for iteration in range(_ROUNDS if is_modelled or is_outdated else 0):
+    for _ in range(_ROUNDS if is_modelled or is_outdated else 0):
         cell_fit = cell_fit.with_arm_poses()
         if cell_fit.linearised_corners is None:
             effects = (*cell_fit.other_effects, *arm_effects(cell_fit.arms))
@@ -316,8 +321,6 @@ def _converge_arms(cell_fit: CellFit) -> CellFit:
         else:
             optics = cell_fit.linearised_corners.camera_parameters
             fitted = fit_jointly(optics, cell_fit, cell_fit.fit.frames)
-            if iteration == 0:  # Errors of the arm may have been attributed to the lens.
-                fitted, _ = with_sizes(cell_fit, fitted)
             cell_fit = cell_fit.with_joint_fit(fitted)
         moved = {name: arm.relinearised(cell_fit.fit) for name, arm in cell_fit.arms.items()}
         cell_fit = replace(cell_fit, arms={name: arm for name, (arm, _) in moved.items()})

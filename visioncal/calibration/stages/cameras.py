@@ -8,11 +8,12 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.stages.detect import Detections, detect, image_of, other_sizes
+from visioncal.calibration.stages.error_sizes import solve_session
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
 from visioncal.calibration.stages.repeats import with_stop_means, without_repeats
-from visioncal.core.errors import VisioncalError
+from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Corners, Rejection, Target
@@ -136,11 +137,28 @@ def estimate_lenses(seen: T) -> T:
             lens = CameraResult(look.table.stated, estimated=False)
         else:
             with _naming(seen, frame):
-                fit = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
-            lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
-            seen = seen.noting(fit.rejections)
+                try:
+                    fit = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
+                    lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
+                    seen = seen.noting(fit.rejections)
+                except (ConvergenceError, DegenerateError) as error:
+                    # Far boards are flat in their images.
+                    lens = _by_motion(seen, frame, error)
+                    words = f"The robot's motion told the lens. By its views alone: {error.message}"
+                    seen = replace(seen, notes=(*seen.notes, f"{words} {error.next_step}"))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
+
+
+def _by_motion(seen: Observed, frame: str, error: VisioncalError) -> CameraResult:
+    """A lens by the robot's motion; raises the error of the views alone where that fails."""
+    try:
+        fit = solve_session(seen).fit
+    except VisioncalError:
+        raise error from None
+    return CameraResult(
+        fit.camera(frame), estimated=True, covariance=fit.covariance(("lens", frame))
+    )
 
 
 def locate_targets(seen: T) -> T:

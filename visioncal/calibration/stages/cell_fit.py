@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
@@ -10,18 +10,16 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm, arm_effects, with_link_errors
 from visioncal.calibration.stages.cell import Cell, ObservationRow
+from visioncal.calibration.stages.error_sizes import ErrorSizes
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.types import Corners, FloatArray, IntArray
-from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.outliers import InlierFit
-from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
-from visioncal.estimation.scene import CornerProblem, Scene
-from visioncal.estimation.solve import fit_problem
+from visioncal.estimation.scene import BoardSizes, CornerProblem, Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +36,7 @@ class CellFit:
     level: str  # The requested calibration level of the arms.
     # Errors of clocks, and those that grow with time, reach or gravity.
     other_effects: tuple[Effect, ...]
+    sizes: ErrorSizes = field(default_factory=ErrorSizes)  # Of errors of lenses and boards.
     solver: str = "joint"  # The solver of the edges.
 
     @property
@@ -116,31 +115,27 @@ class CellFit:
         """The arms without joint angles."""
         return {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
 
-    def pose_errors(self, fitted: Fit) -> dict[str, ArmErrors]:
-        """Errors of the arms without joint angles beside a fit; see `find_pose_errors`."""
-        problem, arms = fitted.problem, self.arms_without_joints
-        for arm in arms.values():
-            problem = arm.without_errors(problem)
-        values, free = problem.start_values.copy(), len(fitted.linearised.free)
-        values[:free] = fitted.state.values[:free]
-        fit = fit_problem(problem, State(fitted.state.edges, values))
-        found = {robot: find_pose_errors(problem, fit.state, fit.noise, robot) for robot in arms}
-        return {robot: errors for robot, errors in found.items() if errors is not None}
-
     def stated_parameters(
         self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]
     ) -> CameraParameters:
-        """The corners of scenes and views (by camera frame), with stated lenses and boards."""
+        """The corners of scenes and views (by camera frame), with stated lenses and boards.
+
+        They have the `sizes` of errors.
+        """
         shares, problems, poses = self._shares, {}, {}
         for frame, scene in scenes.items():
             corners: dict[int, Corners] = {
                 view.view: view.corners for view in views[frame] if view.corners is not None
             }
             problem = CornerProblem.of(scene, corners, shares)
-            problems[frame] = replace(problem, holds_scales=bool(self.arms_without_joints))
+            problems[frame] = problem
             with_corners = [view for view in views[frame] if view.view in corners]
             poses[frame] = np.array([view.cam_from_target[0] for view in with_corners])
-        return CameraParameters.of(problems, poses)
+        sizes, printed = self.sizes, [at for scene in scenes.values() for at in scene.printed]
+        boards = tuple(sizes.boards.get(name, BoardSizes()) for name in dict.fromkeys(printed))
+        return CameraParameters.of(problems, poses).with_sizes(
+            sizes.levels, sizes.lenses, boards, holds_scales=sizes.holds_scales
+        )
 
     @property
     def _shares(self) -> dict[int, float]:

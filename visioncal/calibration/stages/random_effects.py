@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
+from visioncal.calibration.stages.error_sizes import Growth
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import LEVER_M, stops_of
@@ -37,10 +38,12 @@ def random_effects(
     arms: Mapping[str, RobotArm],
     corners: LinearisedCorners | None,
     rows: IntArray | None,
+    growth: Mapping[str, Growth],
 ) -> tuple[Effect, ...]:
     """The random effects that the residuals of the inliers show, for all observations.
 
-    `rows` are the (n,) views of the observations, -1 for none, among the cameras' corners, if any.
+    `rows` are the (n,) views of the observations, -1 for none, among the cameras' corners, if any;
+    `growth` that of lenses which grow, see `ErrorSizes`.
     """
     problem, found = inliers.problem, list[Effect]()
     for robot, arm in arms.items():
@@ -48,11 +51,16 @@ def random_effects(
         if len(stops) < _FEWEST_STOPS or f"arm of {robot}" in problem.effect_columns:
             continue
         candidates = [*_of_flange(problem, robot, stops)]
-        if corners is not None and rows is not None and len(arms) == 1:
-            candidates += _of_sensors(inliers, robot, stops, corners, rows)
         flat = PriorInformation.flat(arm.basis.shape[2])
         nuisance = Effect.free(f"postures of {robot}", flat, None, {robot: arm.basis})
         found += find_random_effects(inliers, candidates, [nuisance])
+        if corners is not None and rows is not None and len(arms) == 1:
+            for _, effect in _of_sensors(inliers, robot, stops, corners, rows):
+                known = growth.get(effect.name.partition(" of ")[2])
+                if known is not None:
+                    information = np.eye(1) / known.sigma**2
+                    prior = PriorInformation(information, -information[0] * known.share)
+                    found.append(replace(effect, prior=prior))
     return tuple(found)
 
 

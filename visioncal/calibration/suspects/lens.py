@@ -18,8 +18,8 @@ from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation import unknowns
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import moved_mahalanobis_sq
-from visioncal.estimation.lens_levels import SIGNIFICANT
 from visioncal.estimation.scene import ONLY_CAMERA
+from visioncal.model.effects.effect import SIGNIFICANT
 from visioncal.results.compare import intrinsics_names
 from visioncal.vision.camera import intrinsics, normalise, project
 

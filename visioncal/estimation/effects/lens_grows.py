@@ -18,8 +18,8 @@ class LensGrows(RandomEffect):
     is_of_sensor = True
 
     def columns(self, stops: Stops) -> FloatArray:
-        """Relative growth of the focal length over the session, towards a final value."""
-        grown = 1.0 - np.exp(-TIME_CONSTANTS * stops.time)
+        """Relative growth of the focal length, towards that at the session's end."""
+        grown = np.exp(-TIME_CONSTANTS) - np.exp(-TIME_CONSTANTS * stops.time)
         return np.asarray((grown[:, None] * stops.by_focal)[:, :, None])
 
     def says(self, values: FloatArray) -> str:
@@ -28,5 +28,5 @@ class LensGrows(RandomEffect):
         share = figure(100.0 * abs(float(values[0])) * (1.0 - np.exp(-TIME_CONSTANTS)))
         return (
             f"The lens's focal length {way} by {share} % during the session, as of a camera that "
-            "warms up. The result is that of its beginning."
+            "warms up. The result is that of its end."
         )

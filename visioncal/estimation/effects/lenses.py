@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress, shape_slices
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.lens_field import LensLevels, LensSizes
+from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.scene import BoardSizes, CornerProblem
@@ -106,7 +106,7 @@ class CameraParameters:
     def with_sizes(
         self,
         levels: Mapping[str, LensLevels],
-        lenses: Mapping[str, LensSizes],
+        lenses: Mapping[str, FloatArray],
         boards: tuple[BoardSizes, ...],
         *,
         holds_scales: bool | None = None,
@@ -115,14 +115,14 @@ class CameraParameters:
 
         Args:
             levels: Sizes of the lens errors beyond the models, by camera.
-            lenses: Sizes of the errors of given lenses, by camera.
+            lenses: (k, k) covariances of given intrinsics, by camera.
             boards: Sizes of the errors of the printed boards.
             holds_scales: See `CornerProblem`; unchanged if None.
         """
         problems = {
             name: replace(
                 problem.with_levels(levels[name]) if name in levels else problem,
-                lens_sizes=lenses.get(name, problem.lens_sizes),
+                lens_covariance=lenses.get(name, problem.lens_covariance),
                 board_sizes=boards,
                 holds_scales=problem.holds_scales if holds_scales is None else holds_scales,
             )

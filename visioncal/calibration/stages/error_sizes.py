@@ -1,0 +1,163 @@
+"""Sizes of the errors of lenses and boards, by the one likelihood of a session; see `fit`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from visioncal.calibration.stages.observed import Observed
+from visioncal.core.errors import VisioncalError
+from visioncal.core.types import Corners, FloatArray
+from visioncal.estimation.lens_field import LensLevels, lens_part
+from visioncal.estimation.scene import BoardSizes
+from visioncal.fit.fit import Fit
+from visioncal.fit.held import doubted_boards
+from visioncal.fit.solve import CellFit, solve
+from visioncal.fit.unknowns import Key
+from visioncal.model import Reported, Swept, read_cell
+from visioncal.model.effects import LensGrows
+from visioncal.session import frame_name
+from visioncal.vision.camera import intrinsics
+from visioncal.vision.targets import first_corners
+
+
+@dataclass(frozen=True)
+class Growth:
+    """A lens's growth, of which `effects.lens_grows` has the columns."""
+
+    share: float  # Of the focal length.
+    sigma: float
+    gain: float  # Twice the gain in log-likelihood.
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSizes:
+    """Sizes of errors; none of a lens or a board that is absent."""
+
+    levels: Mapping[str, LensLevels] = field(default_factory=dict)  # Beyond the model, by camera.
+    # (k, k) covariances of given intrinsics beyond what is stated, by camera.
+    lenses: Mapping[str, FloatArray] = field(default_factory=dict)
+    boards: Mapping[str, BoardSizes] = field(default_factory=dict)  # By the session's name.
+    growth: Mapping[str, Growth] = field(default_factory=dict)  # Of lenses that grow, by camera.
+    # Whether boards keep their stated sizes: errors of arms are confounded with them.
+    holds_scales: bool = False
+
+
+def estimate_error_sizes(observed: Observed) -> ErrorSizes:
+    """The sizes by a session's corners; none where they do not come to rest."""
+    try:
+        solved = solve_session(observed)
+    except VisioncalError:
+        # The fit of poses says why.
+        return ErrorSizes()
+    session = observed.timed
+    fit, doubted = solved.fit, doubted_boards(solved.doubts)
+    levels = {name: _levels(fit, name) for name in fit.unknowns.lenses}
+    boards, held = dict[str, BoardSizes](), False
+    for name, target in session.boards.items():
+        key: Key = ("shape", frame_name("target", name))
+        if key in fit.unknowns:
+            scale, plane, bend = (_size(fit, f"{of} {key[1]}") for of in ("scale", "plane", "bend"))
+            stated = target.square_sigma_m / target.square_m
+            square = max(scale**2 - stated**2, doubted.get(key, 0.0))
+            # A doubt within what is stated leaves the board as it is.
+            beyond = float(np.sqrt(square)) if square > stated**2 else 0.0
+            boards[name] = BoardSizes(beyond, plane, bend)
+            held |= any(prior.considered > 0.0 for prior in fit.unknowns[key].priors)
+    # Positive evidence (Kass and Raftery 1995, 3.2) frees them, within what they may be off by; but
+    # not where links may be as much longer.
+    if not any(_size(fit, f"links {name}") for name in fit.cell.arms):
+        held &= all(one.board_odds < np.log(3.0) for one in solved.doubts)
+    given = (name for name in levels if observed.cameras[name].table.stated is not None)
+    lenses = {name: _covariance(fit, name, levels[name]) for name in given}
+    lenses = {name: covariance for name, covariance in lenses.items() if covariance.any()}
+    growth = {
+        effect.frame: _growth(fit, effect)
+        for effect in fit.unknowns.effects
+        if isinstance(effect, LensGrows) and _size(fit, effect.name)
+    }
+    for name, grown in growth.items():
+        # In each view, the lens is another than on average, by a quarter of its growth (rms).
+        px = _size(fit, f"px {name}") or 1.0
+        jitter = float(np.hypot(levels[name].jitter, abs(grown.share) / (4.0 * px)))
+        levels[name] = replace(levels[name], jitter=jitter)
+    return ErrorSizes(levels, lenses, boards, growth, held)
+
+
+def solve_session(observed: Observed) -> CellFit:
+    """The one likelihood of what is known of a session; raises what `solve` raises."""
+    session = observed.timed
+    sweeps = [
+        Swept(
+            pair.camera,
+            frame_name("flange", pair.robot),
+            clocked.speeds,
+            clocked.prior_sigma_s(erring=pair.robot in session.robot_documents),
+        )
+        for pair, clocked in observed.clocks.items()
+        if clocked.speeds
+    ]
+    reports = dict[str, Reported]()
+    for name, at in observed.robots.items():
+        model = None if at.joints_rad is None or at.matched is None else at.matched.robot
+        reports[name] = Reported(at.base_from_flange, at.joints_rad or {}, model)
+    return solve(read_cell(session, _own_corners(observed), sweeps, reports))
+
+
+def _own_corners(observed: Observed) -> dict[int, Corners]:
+    """The corners of the views that a fit may use, each numbered on its own board."""
+    session = observed.session
+    starts = dict(
+        zip(session.boards, first_corners(tuple(session.boards.values())).tolist(), strict=True)
+    )
+    board_of = {view.number: session.board_of(view) for view in session.views}
+    return {
+        view: replace(corners, ids=corners.ids - starts[board_of[view]])
+        for view, corners in observed.corners.items()
+        if view not in observed.reasons and view not in observed.spared
+    }
+
+
+def _size(fit: Fit, name: str) -> float:
+    """A size; zero where chance explains it."""
+    return 0.0 if name in fit.unknowns.closed else fit.sizes.get(name, 0.0)
+
+
+def _levels(fit: Fit, camera: str) -> LensLevels:
+    """Sizes of a lens's errors beyond its model, in units of the noise of its corners."""
+    names = [f"{of} {camera}" for of in ("field", "breathing", "focus jitter")]
+    px, at = _size(fit, f"px {camera}") or 1.0, fit.unknowns.fields.get(camera)
+    field_px, breathing, jitter = (_size(fit, name) / px for name in names)
+    of_field, of_breathing, of_jitter = (_gain(fit, name) for name in names)
+    gains = (of_field, of_breathing, of_jitter)
+    return LensLevels(field_px, at.length if at else 0.2, breathing, jitter, gains)
+
+
+def _growth(fit: Fit, effect: LensGrows) -> Growth:
+    """The growth of a focal length; its centre moves with it."""
+    key: Key = ("effect", effect.name)
+    share, sigma = fit.state.values[key][0], np.sqrt(fit.covariance(key)[0, 0])
+    return Growth(float(share), float(sigma), _gain(fit, effect.name))
+
+
+def _gain(fit: Fit, name: str) -> float:
+    """Fall of twice the log-likelihood without what has a size."""
+    if not _size(fit, name):
+        return 0.0
+    logs, at = fit.estimate.logs.copy(), fit.unknowns.size_of(name)
+    logs[at] = fit.unknowns.bounds()[0][at]
+    return float(fit.mixed.at(logs, is_sloped=False).value - fit.estimate.value)
+
+
+def _covariance(fit: Fit, camera: str, levels: LensLevels) -> FloatArray:
+    """(k, k) covariance of given intrinsics by their sizes; a field displaces by these, too."""
+    lens = fit.unknowns.lenses[camera]
+    sigmas = np.zeros(len(intrinsics(lens)))
+    if ("lens", camera) in fit.unknowns:
+        member = fit.unknowns["lens", camera]
+        for prior in member.priors:
+            if prior.size is not None:
+                sigmas[prior.columns] = _size(fit, prior.size.name) * member.units[prior.columns]
+    field_px = levels.field * (_size(fit, f"px {camera}") or 1.0)
+    by_field = field_px * lens_part(lens, levels.length)
+    return np.asarray(np.diag(sigmas**2) + by_field @ by_field.T)

@@ -1,1 +1,0 @@
-"""A flat print found in an image by all its pixels."""
