@@ -427,6 +427,39 @@ def test_a_short_command_loads_what_it_uses(words, most, used, tmp_path):
     assert int(count) <= most
 
 
+def test_what_is_said_is_of_use_where_it_is_said(rendered, pairs, tmp_path, monkeypatch):
+    """Coverage, verdicts beside exports, what could not be checked, and guards without looks."""
+    out = tmp_path / "out"
+    said = visioncal("calibrate", rendered, "-o", out, "--no-recording").out
+    assert re.search(r"^Corners in \d+ of 40 fields of the image\.$", said, re.MULTILINE)
+    (count,) = re.findall(r"Coverage: corners in (\d+) of 40", (out / "report.html").read_text())
+    assert 10 < int(count) < 40
+    assert "Corners in" not in visioncal("calibrate", pairs, "-o", tmp_path / "pairs").out
+    for name in ("fanuc", "yaskawa", "zivid"):
+        file = tmp_path / f"{name}.out"
+        visioncal("export", out, "--to", name, "-o", file, "--force").good()
+        beside = file.with_name(f"{file.name}.txt")
+        assert f"verdict {Calibration.load(out).verdict.status}" in beside.read_text()
+        beside.write_text("another's")
+        file.unlink()
+        assert beside.name in visioncal("export", out, "--to", name, "-o", file).err
+        assert not file.exists()
+    visioncal("export", out, "--to", "kuka", "-o", tmp_path / "kuka", "--force").good()
+    assert not (tmp_path / "kuka.txt").exists()
+    against = ("--against", tmp_path / "pairs")
+    assert "could not be checked" not in visioncal("verify", pairs, *against).out
+    rows = (pairs / "views.csv").read_text().splitlines()
+    warm = shutil.copytree(pairs, tmp_path / "warm")
+    (warm / "views.csv").write_text(
+        "\n".join([f"{rows[0]},ambient_c", *(f"{row},20.5" for row in rows[1:])])
+    )
+    said = visioncal("verify", warm, *against).out
+    assert "could not be checked: the ambient temperature" in said
+    assert "payload" not in said.partition("could not be checked")[2]
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    visioncal("guard", *against).refused("no look came on stdin", "guard --example")
+
+
 def test_a_bad_result_has_status_3_and_is_used_by_force_alone(pairs, tmp_path):
     # No cell of this kind reaches it: the probability of the need is zero.
     out, need = tmp_path / "out", ("--need-mm", "0.001")

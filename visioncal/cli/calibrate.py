@@ -48,7 +48,7 @@ def calibrate_command(options: CalibrateOptions) -> None:
     if options.as_json:
         typer.echo(result.calibration.text)
     else:
-        print_summary(result.calibration, verbose=options.verbose)
+        print_summary(result.calibration, result.evidence, verbose=options.verbose)
     if left is not None:
         say(left.words)
     report_written(written, quiet=options.as_json, status=exit_status(result.calibration.verdict))

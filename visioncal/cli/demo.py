@@ -111,7 +111,7 @@ def demo_command(options: DemoOptions) -> None:
         done = run(loaded, progress=progress).with_paths(session, result)
         progress("write", 0, 1)
         written = write_outputs(result, loaded, done)
-    print_summary(done.calibration, verbose=True)
+    print_summary(done.calibration, done.evidence, verbose=True)
     truth = read_truth(session)
     rows = truth_rows(done.calibration, truth.transforms, truth.camera)
     print_table(("against the truth", "error", "sigma", "error / sigma"), rows)

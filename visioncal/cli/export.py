@@ -36,6 +36,13 @@ def export_command(options: ExportOptions) -> None:
     if options.out is None or options.out == Path("-"):
         typer.echo(written.text, nl=False)
         return
-    check_free(options.out, force=options.force)
-    write_atomically(options.out, written.text)
-    say(f"wrote {options.out}")
+    # A format without comments carries its verdict beside it.
+    files = {options.out: written.text}
+    if written.notes:
+        heading = "\n".join((*written.notes, *written.warnings, ""))
+        files = {options.out.with_name(f"{options.out.name}.txt"): heading} | files
+    for file in files:
+        check_free(file, force=options.force)
+    for file, text in files.items():
+        write_atomically(file, text)
+        say(f"wrote {file}")

@@ -1,6 +1,7 @@
 """`visioncal guard`."""
 
 import json
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.verification.guard import Guard, Look
 from visioncal.calibration.verification.scene_guard import scene_looks
-from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT
+from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, say
 from visioncal.cli.result_options import GuardOptions
 from visioncal.core.documents.jsons import parse_json, parse_stored
 from visioncal.core.errors import DataError, VisioncalError
@@ -40,7 +41,9 @@ def guard_command(options: GuardOptions) -> None:
         except DataError as error:
             step = "Delete it, if it is the guard's, which then learns anew; else name another."
             raise DataError(error.message, culprits=[str(options.state)], next_step=step) from error
-    holds, is_refused = guard.holds, False
+    if sys.stdin.isatty():
+        say("Looks are read from the keyboard, a JSON line each; Ctrl-D ends them.")
+    holds, is_refused, count = guard.holds, False, 0
     try:
         for count, answer in enumerate(_answers(guard), 1):
             typer.echo(json.dumps(answer, allow_nan=False))
@@ -52,6 +55,13 @@ def guard_command(options: GuardOptions) -> None:
                 _keep(guard, options.state)
     finally:
         _keep(guard, options.state)
+    if not count:
+        raise DataError(
+            "no look came on stdin, so that nothing was judged.",
+            culprits=["stdin"],
+            next_step="Give it a JSON line a look, such as: visioncal guard --example | visioncal "
+            f"guard --against {shlex.quote(str(options.against))}",
+        )
     if not guard.holds or is_refused:
         raise typer.Exit(EXIT_NO_RESULT if guard.holds else EXIT_BAD)
 

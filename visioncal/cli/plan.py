@@ -7,6 +7,7 @@ from shlex import quote
 from typing import Any, TypeAlias
 
 import numpy as np
+import tomli_w
 from scipy.spatial.transform import Rotation
 
 from visioncal.cli.console import answer, print_json, report_written, say, warn
@@ -20,7 +21,7 @@ from visioncal.core.transforms import compose
 from visioncal.core.types import Camera, FloatArray, Need, Progress
 from visioncal.estimation.problem_parts import Noise
 from visioncal.interchange.formats.intrinsics import read_intrinsics, target_named
-from visioncal.interchange.outputs import CALIBRATION, write_plan, write_stops
+from visioncal.interchange.outputs import BOARD, CALIBRATION, write_plan, write_stops
 from visioncal.interchange.result_files import content_of, load_calibration, load_stored
 from visioncal.live.planning.cell import (
     TYPICAL_NOISE,
@@ -42,7 +43,7 @@ from visioncal.robot import Robot, load_robot
 from visioncal.robot.conversion import has_ur_axes
 from visioncal.session import Session
 from visioncal.session.selecting import ANY, LENS, Choice, must_select_one, select
-from visioncal.vision.targets import target_from_document
+from visioncal.vision.targets import stored_target, target_from_document
 
 _SHOWN = 12
 _SESSION = "session.toml"
@@ -146,11 +147,17 @@ def _plan_to_verify(
             except DataError as error:
                 warn(f"the way between calibrated stops is not planned: {error.message}")
     if plan is None:
-        record = f"--arm manual --target {words.target or 'BOARD'}"
-        if not words.target:
+        board = words.target or "BOARD"
+        boards: dict[str, str] = {}
+        if known := targets.get(words.target or ""):
+            content, tables = stored_target(known, Path(BOARD).stem)
+            boards = {BOARD: tomli_w.dumps(content), **tables}
+            board = quote(str(options.out / BOARD))
+        record = f"--arm manual --target {board}"
+        if board == "BOARD":
             say("In the command, BOARD stands for the target's name, or the path of its .toml.")
         document: dict[str, Any] = {"views": spread.views, "poses": spread.poses.tolist()}
-        written = write_stops(options.out, spread.table())
+        written = write_stops(options.out, spread.table(), boards)
     else:
         arm = "ur:HOST" if has_ur_axes(plan.cell.robot) else "manual"
         record = f"--arm {arm} --plan {options.out}"

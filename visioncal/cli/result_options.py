@@ -114,7 +114,11 @@ class ShowOptions:
 
     first: ClassVar = "out viewer view certificate"
     result: Path = argument("An output folder, its calibration.json, or an .rrd.", metavar="OUT")
-    out: Path | None = option("The page; report.html or certificate.html otherwise.", "-o", "--out")
+    out: Path | None = option(
+        "The page; report.html here, or certificate.html beside the result, otherwise.",
+        "-o",
+        "--out",
+    )
     viewer: bool = flag("Open the recording in the rerun viewer, instead.")
     web: bool = flag("With --viewer: in a browser, not in a window.", needs="viewer")
     view: int | None = option("With --viewer: at which view; else the worst.", needs="viewer")

@@ -24,7 +24,8 @@ def show_command(options: ShowOptions) -> None:
 
         stored = load_stored(options.result)
         if options.certificate:
-            out = options.out or Path("certificate.html")
+            folder = options.result if options.result.is_dir() else options.result.parent
+            out = options.out or folder / "certificate.html"
             signed = {"operator": options.operator} if options.operator else {}
             signed |= dict(options.serial or ())
             write_certificate(out, stored.calibration, stored.session, signed)

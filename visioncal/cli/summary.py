@@ -9,8 +9,10 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Camera, FloatArray
 from visioncal.present.advice import left_out
+from visioncal.present.coverage import image_coverage
 from visioncal.present.facts import solver_table
 from visioncal.results import Calibration, Remedy, Verdict, ViewResult
+from visioncal.results.evidence import ViewEvidence
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
 
@@ -43,7 +45,9 @@ def print_conditions(calibration: Calibration) -> None:
         answer(words, "only where: ", "bold yellow")
 
 
-def print_summary(calibration: Calibration, *, verbose: bool) -> None:
+def print_summary(
+    calibration: Calibration, evidence: Sequence[ViewEvidence] = (), *, verbose: bool
+) -> None:
     """Prints a result: the verdict first, then the transforms and errors."""
     cell = calibration.cell
     print_verdict(calibration.verdict, calibration.session_name)
@@ -75,6 +79,8 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
             + ("" if held.deg is None else f", {figure(held.deg)} deg")
             + (f", {figure(held.px)} px" if held.px and held.px < 1e4 else "")
         )
+        if covered := image_coverage(calibration, evidence):
+            answer(f"{covered}.")
     for suspects in left_out(_not_in_verdict(calibration.verdict, calibration.views)):
         answer(f"  {suspects.words}")
     if cell is not None and calibration.verdict.has_accuracy:

@@ -67,8 +67,15 @@ def verify_command(options: VerifyOptions) -> None:
         print_steps(verdict.next_steps)
         for view, reason in sorted(check.predicted.observed.reasons.items()):
             answer(f"  view {view} was not used: {reason}")
+        # An unknown one names its column, which nobody misses who never had it.
+        had = {*calibration.means}.union(*(view.numbers for view in loaded.views))
         for state, (begin, style) in _TRIGGERED.items():
-            words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)
+            words = "; ".join(
+                trigger.words
+                for trigger in triggers
+                if trigger.state == state
+                and (state != "unknown" or any(column in trigger.words for column in had))
+            )
             if words:
                 answer(words, begin, style)
     report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
 VERIFY = "verify.json"
 STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
+BOARD = "board.toml"
 
 _Writer: TypeAlias = Callable[[Path], None]
 
@@ -153,9 +154,11 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
     return _write(folder, results, {PREVIEW: draw}, (PROGRAM,))
 
 
-def write_stops(folder: Path, table: str) -> Written:
-    """Writes the table of a plan without a model of its robot; see `write_plan`."""
-    return _write(folder, {STOPS: _text(table)}, {}, (PLAN, PROGRAM, PREVIEW))
+def write_stops(folder: Path, table: str, boards: Mapping[str, str]) -> Written:
+    """Writes the table and the board of a plan without a model of its robot; see `write_plan`."""
+    texts = {STOPS: table, **boards}
+    results = {name: _text(text) for name, text in texts.items()}
+    return _write(folder, results, {}, (PLAN, PROGRAM, PREVIEW, BOARD))
 
 
 def write_motions(

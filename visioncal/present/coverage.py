@@ -24,6 +24,19 @@ class PointChart:
     words: Sequence[tuple[tuple[float, float], str]]  # Labels with their positions.
 
 
+def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> str:
+    """How much of the image the used views' corners reach, in words; empty where unknown."""
+    if calibration.cell is not None or calibration.camera is None:
+        return ""
+    used = {view.view for view in calibration.views if view.used}
+    px = [view.corners.px for view in evidence if view.corners is not None and view.view in used]
+    if not px:
+        return ""
+    sizes = np.array(calibration.camera.camera.resolution) / _CELLS
+    fields = np.unique(np.floor((np.vstack(px) + 0.5) / sizes).astype(int), axis=0)
+    return f"Corners in {len(fields)} of {_CELLS[0] * _CELLS[1]} fields of the image"
+
+
 def coverage_charts(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> list[PointChart]:
     """Coverage of the image, of directions and of rotation axes, where known; none for a cell."""
     if calibration.cell is not None:

@@ -12,6 +12,7 @@ from visioncal.core.files import write_atomically
 from visioncal.core.number_format import significant
 from visioncal.present import advice, facts, result_parts
 from visioncal.present.advice import named
+from visioncal.present.coverage import image_coverage
 from visioncal.present.report import content, network
 from visioncal.present.report.templates import template
 from visioncal.present.report.thumbnails import Thumbnail, thumbnail
@@ -63,6 +64,7 @@ def render(
         seen=evidence,
         # Coverage and joint plots are for one camera, one board and one robot.
         evidence=evidence if calibration.cell is None else (),
+        covered=image_coverage(calibration, evidence),
         review=f"{review} --view" if review else "",
         suspects=suspects,
         outlying=tuple(sorted(at for group in suspects if group.used for at in group.views)),
