@@ -19,10 +19,11 @@ from visioncal import dynamics
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = dict(every_command())
-FRONT = ROOT / "README.md"
+FRONT, AROUND = ROOT / "README.md", sorted((ROOT / "docs").glob("*.md"))
 PACKAGES = sorted(path.parent for path in (ROOT / "visioncal").glob("*/__init__.py"))
 PAGES = [
     FRONT,
+    *AROUND,
     ROOT / "visioncal" / "README.md",
     *(package / "README.md" for package in PACKAGES),
     *sorted(FOLDER.glob("*.md")),
@@ -199,7 +200,11 @@ def test_the_front_page_s_session_is_calibrated(rendered, tmp_path):
     assert visioncal.calibrate(visioncal.Session.load(tmp_path)).verdict.status == "good"
 
 
-def test_the_front_page_shows_what_recipes_print():
+def test_the_front_page_is_short():
+    assert len(text_of(FRONT).splitlines()) <= 180
+
+
+def test_the_front_page_and_those_around_it_show_what_recipes_print():
     """Recipes are run; see test_cookbook."""
     expected = [
         " ".join(text.split())
@@ -209,9 +214,10 @@ def test_the_front_page_shows_what_recipes_print():
     ]
     shown = [
         " ".join(text.split())
-        for language, _, text in BLOCK.findall(text_of(FRONT))
+        for page in (FRONT, *AROUND)
+        for language, _, text in BLOCK.findall(text_of(page))
         if language == "text"
     ]
-    assert len(shown) >= 7
+    assert len(shown) >= 10
     for name in shown:
         assert any(name in text for text in expected), name
