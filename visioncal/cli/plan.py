@@ -148,7 +148,7 @@ def _plan_to_verify(
                 warn(f"the way between calibrated stops is not planned: {error.message}")
     if plan is None:
         board = words.target or "BOARD"
-        boards: dict[str, str] = {}
+        boards: dict[str, str | bytes] = {}
         if known := targets.get(words.target or ""):
             content, tables = stored_target(known, Path(BOARD).stem)
             boards = {BOARD: tomli_w.dumps(content), **tables}

@@ -154,7 +154,7 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
     return _write(folder, results, {PREVIEW: draw}, (PROGRAM,))
 
 
-def write_stops(folder: Path, table: str, boards: Mapping[str, str]) -> Written:
+def write_stops(folder: Path, table: str, boards: Mapping[str, str | bytes]) -> Written:
     """Writes the table and the board of a plan without a model of its robot; see `write_plan`."""
     texts = {STOPS: table, **boards}
     results = {name: _text(text) for name, text in texts.items()}
@@ -227,5 +227,5 @@ def _write(
     return Written(write_generation(folder, names, write), tuple(undrawn))
 
 
-def _text(content: str) -> _Writer:
+def _text(content: str | bytes) -> _Writer:
     return lambda path: write_atomically(path, content)
