@@ -153,6 +153,7 @@ class BoardOptions:
     border: int | None = option("Dark modules around their bits: 2, as Kalibr has it.")
     diameter_mm: float | None = option("Diameter of circles.")
     asymmetric: bool = flag("Every second row of circles is shifted by half.")
+    width_mm: float | None = option("Printed width of a picture.")
     name: str = option("Name of a board described by options.", default="")
 
 
@@ -166,7 +167,7 @@ class TargetMakeOptions(BoardOptions):
 
     first: ClassVar = "out page kind columns rows square_mm marker_mm"
     target: str | None = argument(
-        "A board of visioncal's, or a .toml; or see --kind.", default=None
+        "A board of visioncal's, a .toml, or a picture; or see --kind.", default=None
     )
     out: Path = option("Folder for the files.", "-o", "--out", default=Path(), file_okay=False)
     page: str | None = option("A5 to A0, letter, legal, tabloid, or 500x300 (mm); else as it fits.")

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import tomli_w
@@ -12,10 +13,12 @@ from visioncal.cli.session_options import BoardOptions, TargetCheckOptions, Targ
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, one_line, write_atomically
 from visioncal.core.number_format import known_name
+from visioncal.core.types import Target
 from visioncal.vision.boards import KINDS, kind_of
 from visioncal.vision.boards.identify import Identity, describe, identify
 from visioncal.vision.boards.imaging import read_image
-from visioncal.vision.boards.kind import BoardRequest, side_metres
+from visioncal.vision.boards.kind import BoardRequest, metres, side_metres
+from visioncal.vision.boards.picture import kept_picture, unfit
 from visioncal.vision.printing.files import write_board
 from visioncal.vision.printing.page import arrange, pages_named
 from visioncal.vision.printing.request import requested_target
@@ -28,6 +31,8 @@ from visioncal.vision.targets import (
 
 # Page sizes to try in order where none is named.
 _PAGES = ("A4", "A3", "A2", "A1", "A0")
+# Files of pictures.
+_PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 def target_make_command(options: TargetMakeOptions) -> None:
@@ -39,8 +44,13 @@ def target_make_command(options: TargetMakeOptions) -> None:
             next_step=f"The boards are {', '.join(target_names())}.",
         )
     board = {field.name: getattr(options, field.name) for field in fields(BoardOptions)}
-    _refuse_unused(kind, board)
-    request = None
+    made = [name for name, at in KINDS.items() if at.options and name != "picture"]
+    if kind is not None:
+        known_name("kind of board", kind, made, "--kind")
+    picture = Path(options.target or "")
+    is_picture = picture.suffix.lower() in _PICTURES
+    _refuse_unused("picture" if is_picture else kind, board)
+    request, width_mm = None, board.pop("width_mm")
     if kind is not None:
         size_mm = board.pop("size_mm")
         board["square_mm"] = board["square_mm"] if size_mm is None else size_mm
@@ -48,7 +58,10 @@ def target_make_command(options: TargetMakeOptions) -> None:
     sized = request is None or request.square_mm is not None
     names = [options.page] if options.page is not None else _PAGES if sized else _PAGES[:1]
     pages = tuple(page for name in names for page in pages_named(name, options.landscape))
-    chosen = requested_target(request, pages) if request else load_target(str(options.target))
+    if is_picture:
+        chosen = _pictured(picture, width_mm, options.name or picture.stem)
+    else:
+        chosen = requested_target(request, pages) if request else load_target(str(options.target))
     sheet = arrange(chosen, pages)
     files = write_board(options.out, sheet, dpi=options.dpi, force=options.force)
     for file in files:
@@ -59,11 +72,29 @@ def target_make_command(options: TargetMakeOptions) -> None:
     say(f"Print it on {sheet.page} at 100 %, and check both rulers.")
 
 
+def _pictured(file: Path, width_mm: float | None, name: str) -> Target:
+    """The target that a file's picture is; raises DataError where no pose is known by it."""
+    if width_mm is None:
+        raise DataError(
+            f"{file.name} does not say how wide it is printed.",
+            culprits=["--width-mm"],
+            next_step="Give --width-mm, from the picture's left edge to its right one.",
+        )
+    described = {"kind": "picture", "width_m": metres(width_mm), "image": kept_picture(file)}
+    target = target_from_document(described, name)
+    grey = kind_of(target).picture(target)
+    if grey is not None and (lack := unfit(grey)):
+        raise DataError(
+            f"{file.name} {lack}.",
+            culprits=[file.name],
+            next_step="Take another picture, or put something of its own beside it: letters, a "
+            "photograph.",
+        )
+    return target
+
+
 def _refuse_unused(kind: str | None, board: Mapping[str, object]) -> None:
     """Refuses options that have no effect."""
-    made = [name for name, board_kind in KINDS.items() if board_kind.options]
-    if kind is not None:
-        known_name("kind of board", kind, made, "--kind")
     used = KINDS[kind].options.split() if kind is not None else []
     default = vars(BoardOptions())
     given = [name for name, value in board.items() if value != default[name] and name != "kind"]

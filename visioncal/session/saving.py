@@ -70,9 +70,13 @@ def _write_below(folder: Path, path: str, data: bytes | str) -> None:
     write_atomically(folder / path, data)
 
 
-def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str]]:
+def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str | bytes]]:
     """Moves target and robot files into the session's folder."""
-    declaration, placed, texts = session.declaration, dict(session.document), dict[str, str]()
+    declaration, placed, texts = (
+        session.declaration,
+        dict(session.document),
+        dict[str, str | bytes](),
+    )
     stored: tuple[tuple[Kind, str, Mapping[str, Any] | None], ...] = (
         ("target", "target", session.target_document),
         ("robot", "model", session.robot_document),
@@ -80,7 +84,7 @@ def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str]]:
     for kind, field, documents in stored:
         several = len(getattr(declaration, f"{kind}s")) > 1
         for name, table in declaration.named(kind).items():
-            stated, tables = getattr(table, field), dict[str, str]()
+            stated, tables = getattr(table, field), dict[str, str | bytes]()
             described = (documents or {}).get(name) if several else documents
             if described is None or not is_file(stated):
                 continue

@@ -129,8 +129,8 @@ def target_document(target: Target) -> dict[str, Any]:
 
 def stored_target(
     document: Mapping[str, Any], stem: str
-) -> tuple[Mapping[str, Any], dict[str, str]]:
-    """The content of `STEM.toml` for a `target_document`, and texts of its tables by name."""
+) -> tuple[Mapping[str, Any], dict[str, str | bytes]]:
+    """The content of `STEM.toml` for a `target_document`, and its other files by name."""
     return KINDS[document["kind"]].stored(document, stem)
 
 

@@ -94,9 +94,9 @@ class CaptureFacts(RecordedCell):
             "" if plan is None else plan.digest,
         )
 
-    def texts(self) -> dict[str, str]:
+    def texts(self) -> dict[str, str | bytes]:
         """Files of the session besides its views, by name; session.toml is the last."""
-        texts: dict[str, str] = {}
+        texts: dict[str, str | bytes] = {}
         target, robot, lens = self.target, self.robot, self.lens
         document: dict[str, Any] = {"schema": 1, "name": self.name, "mount": self.mount}
         # Boards and arms that come with visioncal are named.

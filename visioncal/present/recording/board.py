@@ -6,6 +6,7 @@ import rerun as rr
 
 from visioncal.core.types import Image, Target
 from visioncal.present.recording import colours
+from visioncal.vision.boards import kind_of
 from visioncal.vision.printing.pattern import dark_cells, dark_discs
 from visioncal.vision.targets import corner_positions, extent_m, outline
 
@@ -31,6 +32,9 @@ def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
 
 def picture(target: Target) -> Image:
     """The printed pattern as a grey image, x to the right and y down."""
+    own = kind_of(target).picture(target)
+    if own is not None:
+        return own
     low, high = extent_m(target)
     side_px = 2000 * target.square_m / float(np.max(high - low))
     # Shows the markers' bits; a large board's pattern is smaller.

@@ -14,6 +14,7 @@ from visioncal.vision.boards.gridboard import GridBoard
 from visioncal.vision.boards.imaging import blur_at_corners
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
 from visioncal.vision.boards.marker import MarkerKind
+from visioncal.vision.boards.picture import Picture
 from visioncal.vision.boards.points import Rig
 
 __all__ = ["KINDS", "DetectedCorners", "NotFound", "blur_of", "find_target", "kind_of"]
@@ -22,7 +23,7 @@ KINDS: Mapping[str, BoardKind] = {
     kind.name: kind
     for kind in (
         *(Charuco(), Checkerboard(), AprilGrid(), GridBoard()),
-        *(CircleGrid(), MarkerKind(), Rig(), Dots()),
+        *(CircleGrid(), MarkerKind(), Rig(), Dots(), Picture()),
     )
 }
 

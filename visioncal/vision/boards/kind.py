@@ -157,10 +157,15 @@ class BoardKind(ABC):
 
     def stored(
         self, document: Mapping[str, Any], stem: str
-    ) -> tuple[Mapping[str, Any], dict[str, str]]:
-        """The inverse of `loaded`: the content of `STEM.toml`, and texts of its tables by name."""
+    ) -> tuple[Mapping[str, Any], dict[str, str | bytes]]:
+        """The inverse of `loaded`: the content of `STEM.toml`, and its other files by name."""
         del stem
         return document, {}
+
+    def picture(self, target: Target) -> Image | None:
+        """(h, w) grey levels over its extent, where it has no cells and discs."""
+        del target
+        return None
 
     def scaled(self, target: Target, factor: float) -> Target:
         """A board whose printed sizes are larger by a factor."""

@@ -74,7 +74,7 @@ class PointsKind(BoardKind):
 
     def stored(
         self, document: Mapping[str, Any], stem: str
-    ) -> tuple[Mapping[str, Any], dict[str, str]]:
+    ) -> tuple[Mapping[str, Any], dict[str, str | bytes]]:
         """The content of its `.toml`, and its table `STEM.points.csv`."""
         table = f"{stem}.points.csv"
         points = document["points"]

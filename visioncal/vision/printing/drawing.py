@@ -17,6 +17,7 @@ from matplotlib.transforms import Affine2D, Transform
 
 from visioncal.core.threads import DRAWING
 from visioncal.core.types import FloatArray
+from visioncal.vision.boards import kind_of
 from visioncal.vision.printing.page import FONT_PT, LINE_MM, Sheet
 
 _MM_PER_INCH = 25.4
@@ -78,6 +79,14 @@ def _figure(sheet: Sheet) -> Figure:
     on_page = inches_from_mm.scale(1.0 / _MM_PER_INCH) + figure.dpi_scale_trans
     origin = np.array(sheet.origin_mm)
     _fill(figure, [origin + 1e3 * loop for loop in sheet.pattern.loops], "black", on_page)
+    picture = kind_of(sheet.target).picture(sheet.target)
+    if picture is not None:
+        left, top, right, bottom = 1e3 * np.array(sheet.pattern.box) + np.tile(origin, 2)
+        size = np.array([page.width_mm, page.height_mm])
+        place = np.array([left, page.height_mm - bottom, right - left, bottom - top])
+        axes = figure.add_axes(tuple((place / np.tile(size, 2)).tolist()))
+        axes.imshow(picture, cmap="gray", vmin=0, vmax=255, aspect="auto", interpolation="none")
+        axes.set_axis_off()
     for axis in (0, 1):
         _draw_ruler(figure, sheet, axis, on_page)
     x, y = sheet.text_mm

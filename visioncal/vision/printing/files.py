@@ -88,7 +88,7 @@ def _describes(path: Path, target: Target) -> bool:
     return described == target
 
 
-def _described(sheet: Sheet) -> dict[str, str]:
+def _described(sheet: Sheet) -> dict[str, str | bytes]:
     """Texts of the board's `.toml` and of its tables, by name."""
     left, top, right, bottom = sheet.pattern.box
     page, name = sheet.page, sheet.target.name

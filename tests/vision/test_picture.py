@@ -1,0 +1,94 @@
+"""Pictures as targets: found, refused in words, printed and kept."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from support.boards import any_page, raster
+from support.commands import visioncal
+from support.printed import Look, label, photographed, pose_at, poster
+
+from visioncal.core.errors import DataError
+from visioncal.simulation import CAMERAS
+from visioncal.vision.boards import NotFound, find_target
+from visioncal.vision.boards.picture import kept_picture, unfit
+from visioncal.vision.camera import project
+from visioncal.vision.printing.drawing import to_pdf
+from visioncal.vision.targets import corner_positions, load_target, target_from_document
+
+WIDE = CAMERAS["wide"]
+# A quarter of the pixels.
+CAMERA = replace(WIDE, resolution=(640, 400), matrix=WIDE.matrix / 2)
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory):
+    path = tmp_path_factory.mktemp("picture") / "poster.png"
+    cv2.imwrite(str(path), poster())
+    described = {"kind": "picture", "width_m": 0.3, "image": kept_picture(path)}
+    return target_from_document(described, "poster")
+
+
+def seen(picture, covered=0.0, seed=0):
+    rng = np.random.default_rng(seed + 10)
+    pose = pose_at(rng.uniform(0.4, 0.5), rng.uniform(10, 40), np.array([0.15, 0.11, 0]), rng, 180)
+    return photographed(picture, 0.3, CAMERA, pose, Look(covered=covered), seed), pose
+
+
+@pytest.mark.parametrize("covered", [0.0, 0.15])
+def test_patches_are_where_they_are_through_a_lens_that_nobody_states(target, covered):
+    image, pose = seen(poster(), covered)
+    found = find_target(image, target)
+    places = corner_positions(target)[found.ids]
+    off = found.px - project(CAMERA, places @ pose[:3, :3].T + pose[:3, 3])
+    assert len(found.ids) > 60
+    # The lens bends the print by 6 px; a fiftieth of a pixel is noise.
+    assert np.median(np.abs(off)) < 0.03
+    assert np.sqrt(np.mean((off * found.weights[:, None]) ** 2)) < 0.05
+
+
+def test_other_pictures_are_not_found_and_mirrored_ones_are_named(target):
+    image, _ = seen(poster())
+    mirrored = find_target(np.ascontiguousarray(image[:, ::-1]), target)
+    assert isinstance(mirrored, NotFound)
+    assert "mirrored" in mirrored.reason
+    for other in (label(), poster(7)):
+        found = find_target(seen(other)[0], target)
+        assert "is not seen" in found.reason
+    plain = find_target(np.full((400, 640), 120, np.uint8), target)
+    assert "the image is plain" in plain.reason
+
+
+def test_pictures_by_which_no_pose_is_known_are_refused():
+    half = poster()[:450]
+    turned = np.concatenate([half, half[::-1, ::-1]])
+    tile = cv2.resize(poster(), (300, 225))
+    assert unfit(poster()) == ""
+    assert unfit(label()) == ""
+    assert "turned by a half" in unfit(turned)
+    assert "repeats itself" in unfit(np.tile(tile, (4, 4)))
+    assert "too plain" in unfit(np.full((300, 400), 90, np.uint8))
+    quarter = poster(size=(450, 450))
+    square = np.block([[quarter, np.rot90(quarter, 3)], [np.rot90(quarter), np.rot90(quarter, 2)]])
+    assert "turned by a" in unfit(np.ascontiguousarray(square))
+
+
+def test_a_picture_is_printed_at_its_size_and_read_again(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("flyer.png", poster())
+    visioncal("target", "make", "flyer.png", "--width-mm", "120", "-o", "boards")
+    made = load_target("boards/flyer.toml")
+    assert (made.kind, made.square_m) == ("picture", 0.12)
+    assert load_target("boards/flyer.toml") == made
+    page = raster(to_pdf(any_page(made)), 254)
+    # Ten pixels a millimetre; the picture is as it was, to its compression and one pixel's place.
+    best = cv2.matchTemplate(page, cv2.resize(poster(), (1200, 900)), cv2.TM_CCOEFF_NORMED)
+    assert best.max() > 0.98
+    away = 'kind = "picture"\nwidth_m = 0.1\nimage = "../flyer.png"\n'
+    (tmp_path / "boards/away.toml").write_text(away, "utf-8")
+    with pytest.raises(DataError, match="leads out of the folder"):
+        load_target("boards/away.toml")
+    refused = visioncal("target", "make", "flyer.png", "-o", "boards")
+    assert refused.status == 2
+    assert "--width-mm" in refused.err

@@ -1,0 +1,287 @@
+"""Any flat print as a target: a poster, a label, a circuit board, by its picture.
+
+Features give the start (Lowe 2004, SIFT; Barath et al. 2020, MAGSAC++), and the picture is then
+registered to all pixels. What leaves are the places of some hundred patches, each by its own
+pixels, which serve as a board's corners do.
+"""
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import cv2
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import DocumentTable, is_inside, read_bytes
+from visioncal.core.types import FloatArray, Image, Target
+from visioncal.vision.boards.imaging import decode_image
+from visioncal.vision.boards.kind import (
+    BoardKind,
+    DetectedCorners,
+    NotFound,
+    sigma_of,
+    size_of,
+)
+
+if TYPE_CHECKING:
+    from visioncal.vision.register.image_model import Print
+
+# Longest side of a picture that is kept [px]: a camera resolves no more of a print in its view.
+_LONGEST_PX = 1600
+# Number of patches, features, and features that agree where the picture is seen.
+_PATCHES, _FEATURES, _FEWEST = 120, 2500, 14
+# Long side of images that are searched, and pixels of a print that are registered.
+_SEARCHED_PX, _REGISTERED = 1000, 3e5
+# Correlation of a picture with itself, turned or shifted, from which on it looks the same, and the
+# least spread of its grey levels.
+_SAME, _PLAIN = 0.9, 4.0
+# Least share of the image's variance that a picture explains.
+_EXPLAINED = 0.8
+
+
+@dataclass(frozen=True)
+class PictureTarget(Target):
+    """A picture: its `square_m` is the printed width, columns and rows those of its patches."""
+
+    image: str = ""  # Its file, in base64.
+
+
+class Picture(BoardKind):
+    """A picture. Its origin is its upper left corner; its corners are the middles of patches."""
+
+    name: ClassVar[str] = "picture"
+    noun = "picture"
+    keys = "width_m square_sigma_m image"
+    size_key = "width_m"
+    options = "--width-mm --name"
+    side, sides, unit = "width of the print", "a width", "width"
+    is_seen_in_part = True
+
+    def read(self, table: DocumentTable, name: str) -> Target:
+        """Reads width_m, square_sigma_m and image, which `loaded` has read from its file."""
+        width_m = table.number("width_m", positive=True)
+        # A poster may be wider than any square.
+        width_m = width_m if width_m <= 3.0 else size_of(table, "width_m")
+        image = table.text("image")
+        grey = _grey(image)
+        if isinstance(grey, str):
+            raise table.refuse("image", image[:40], f"the path of a picture (it is {grey})")
+        aspect = grey.shape[1] / grey.shape[0]
+        columns = min(max(round(float(np.sqrt(_PATCHES * aspect))), 4), 30)
+        rows = min(max(round(_PATCHES / columns), 4), 30)
+        return PictureTarget(
+            name, self.name, columns, rows, width_m, sigma_of(table, width_m), image=image
+        )
+
+    def document(self, target: Target) -> dict[str, Any]:
+        """The target as the content of a `.toml`, with its picture."""
+        picture = cast("PictureTarget", target)
+        sizes = {"width_m": target.square_m, "square_sigma_m": target.square_sigma_m}
+        return sizes | {"image": picture.image}
+
+    def loaded(self, document: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """The content of its `.toml` with its picture's file, reduced where it is large."""
+        name = document.get("image")
+        if not isinstance(name, str):
+            return document
+        path = folder / name.replace("\\", "/")
+        if not is_inside(path, folder):
+            raise DataError(
+                f"image = {name[:80]!r} leads out of the folder of the target's file.",
+                culprits=["image"],
+                next_step="Copy the picture beside the target's file.",
+            )
+        return document | {"image": kept_picture(path)}
+
+    def stored(
+        self, document: Mapping[str, Any], stem: str
+    ) -> tuple[Mapping[str, Any], dict[str, str | bytes]]:
+        """The content of its `.toml`, and its picture `STEM.picture.jpg`."""
+        name = f"{stem}.picture.jpg"
+        return {**document, "image": name}, {name: base64.b64decode(document["image"])}
+
+    def corners(self, target: Target) -> FloatArray:
+        """(n, 3) middles of its patches [m], row by row."""
+        _, (width, height) = self.extent_m(target)
+        x = (np.arange(target.columns) + 0.5) * width / target.columns
+        y = (np.arange(target.rows) + 0.5) * height / target.rows
+        return np.pad(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), ((0, 0), (0, 1)))
+
+    def words(self, target: Target, size: str) -> str:
+        """The picture in a few words."""
+        del size
+        return f"picture {target.name}"
+
+    def picture(self, target: Target) -> Image | None:
+        """(h, w) its grey levels."""
+        grey = _grey(cast("PictureTarget", target).image)
+        return None if isinstance(grey, str) else grey
+
+    def extent_m(self, target: Target) -> tuple[FloatArray, FloatArray]:
+        """Low and high x, y of the print [m]."""
+        grey = self.picture(target)
+        shape = (1, 1) if grey is None else grey.shape
+        return np.zeros(2), target.square_m * np.array([1.0, shape[0] / shape[1]])
+
+    def on_sheet(self, target: Target) -> tuple[str, str, str]:
+        """What a printed sheet says of it."""
+        width, height = (1e3 * self.extent_m(target)[1]).tolist()
+        return (
+            f"picture, {width:g} x {height:.4g} mm",
+            "the picture's upper left corner",
+            "Measure the picture's width and write it into width_m, in metres.",
+        )
+
+    def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
+        """Places of its patches in a (h, w) grey image, or why it is not found."""
+        from visioncal.vision.patches import places_of, started, usual_lens, usual_sigma
+        from visioncal.vision.register.fit import register
+        from visioncal.vision.register.image_model import Seen
+
+        picture = _known(cast("PictureTarget", target))
+        if picture.unfit:
+            return NotFound(f"the picture {picture.unfit}")
+        start = picture.matched(image)
+        if isinstance(start, str):
+            turned = picture.matched(np.ascontiguousarray(image[:, ::-1]))
+            return NotFound(start if isinstance(turned, str) else "the picture is seen mirrored")
+        print_ = picture.print_
+        ends = cv2.perspectiveTransform(print_.outline_m[None, :, :2], start[0])
+        area = cv2.contourArea(ends.astype(np.float32))
+        lens, pose = started(*start, usual_lens(image))
+        factor = max(1, round(float(np.sqrt(area / _REGISTERED))))
+        found = register(
+            image,
+            print_,
+            lens,
+            Seen(pose),
+            lens_sigma=usual_sigma(lens),
+            factors=(2 * factor, factor),
+        )
+        if found is None or found.explained < _EXPLAINED:
+            return NotFound("the picture is another one: features agree, and all pixels do not")
+        half_m = 0.5 * target.square_m / target.columns
+        ids, px, sigma_px = places_of(found, self.corners(target), half_m)
+        if len(ids) < self.fewest:
+            return NotFound(f"too little of the picture is free: {len(ids)} patches of it")
+        typical = float(np.median(sigma_px))
+        return DetectedCorners(ids, px, typical / sigma_px, blur_px=found.seen.gauss_px)
+
+
+def kept_picture(path: Path) -> str:
+    """A picture's file in base64: as it is, or reduced, grey and compressed where it is large.
+
+    Raises:
+        DataError: There is no such file, or it is no image.
+    """
+    data = read_bytes(path)
+    grey = decode_image(data)
+    if isinstance(grey, str):
+        raise DataError(f"{path} is {grey}.", culprits=[str(path)])
+    shrink = _LONGEST_PX / max(grey.shape)
+    if shrink < 1.0:
+        grey = _shrunk(grey, shrink)
+    elif data.startswith(b"\xff\xd8\xff"):
+        return base64.b64encode(data).decode()
+    _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    return base64.b64encode(encoded.tobytes()).decode()
+
+
+@lru_cache(maxsize=16)
+def _grey(image: str) -> Image | str:
+    """(h, w) grey levels of a file in base64, or why there are none. Read only."""
+    try:
+        return decode_image(base64.b64decode(image, validate=True))
+    except ValueError:
+        return "no picture"
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """A picture with its features."""
+
+    print_: "Print"
+    px: FloatArray  # (n, 2) features [px of the picture].
+    described: FloatArray  # (n, 128).
+    unfit: str  # Why no pose is known by it; empty where it is.
+
+    def matched(self, image: Image) -> tuple[FloatArray, FloatArray, FloatArray] | str:
+        """(3, 3) from the print [m] to an image, (n, 3) features and (n, 2) pixels; or why not."""
+        shrink = min(1.0, _SEARCHED_PX / max(image.shape))
+        px, described = _features(_shrunk(image, shrink))
+        if len(px) < _FEWEST:
+            return "the picture is not seen: the image is plain"
+        pairs = cv2.BFMatcher().knnMatch(self.described, described, k=2)
+        good = [one for one, other in pairs if one.distance < 0.8 * other.distance]
+        if len(good) >= _FEWEST:
+            places = self.print_.texel_m * (self.px[[match.queryIdx for match in good]] + 0.5)
+            seen = (px[[match.trainIdx for match in good]] + 0.5) / shrink - 0.5
+            flat, inside = cv2.findHomography(places, seen, cv2.USAC_MAGSAC, 3.0 / shrink)
+            if flat is not None and inside.sum() >= max(_FEWEST, 0.15 * len(good)):
+                ends = cv2.perspectiveTransform(self.print_.outline_m[None, :, :2], flat)
+                if cv2.isContourConvex(ends.astype(np.float32)) and np.linalg.det(flat[:2, :2]) > 0:
+                    off = cv2.perspectiveTransform(places[None], flat)[0] - seen
+                    # So far a lens bends what is straight.
+                    near = np.linalg.norm(off, axis=1) < 0.03 * max(image.shape)
+                    return (
+                        np.asarray(flat, float),
+                        np.pad(places, ((0, 0), (0, 1)))[near],
+                        seen[near],
+                    )
+        return f"the picture is not seen: {len(good)} features are like its own, and do not agree"
+
+
+def _features(grey: Image) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) places of features and (n, 128) their descriptions."""
+    points, described = cv2.SIFT.create(nfeatures=_FEATURES).detectAndCompute(grey, None)
+    if not points:
+        return np.zeros((0, 2)), np.zeros((0, 128))
+    root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
+    return np.array([point.pt for point in points]), np.asarray(root, np.float32)
+
+
+@lru_cache(maxsize=8)
+def _known(target: PictureTarget) -> _Known:
+    from visioncal.vision.register.image_model import Print
+
+    grey = Picture().picture(target)
+    assert grey is not None
+    print_ = Print(np.asarray(grey / 255, np.float32), target.square_m / grey.shape[1], np.zeros(2))
+    shrink = min(1.0, _SEARCHED_PX / max(grey.shape))
+    px, described = _features(_shrunk(grey, shrink))
+    return _Known(print_, (px + 0.5) / shrink - 0.5, described, unfit(grey, len(px)))
+
+
+def unfit(grey: Image, features: int | None = None) -> str:
+    """Why no pose is known by a picture (h, w), as a part of a sentence; empty where one is."""
+    if grey.std() < _PLAIN or (len(_features(grey)[0]) if features is None else features) < 60:
+        return "is too plain: it has too few features to be found by"
+    small = _shrunk(grey, 48 / max(grey.shape)).astype(float)
+    if _alike(small, small[::-1, ::-1]):
+        return "looks the same turned by a half: its pose would have two answers"
+    square = np.asarray(cv2.resize(small, (48, 48)), float)
+    if 0.9 < grey.shape[0] / grey.shape[1] < 1.1 and _alike(square, np.rot90(square)):
+        return "looks the same turned by a quarter: its pose would have four answers"
+    rows, columns = small.shape
+    for down in range(rows // 2):
+        for along in range(-columns // 2, columns // 2 + 1):
+            far = down > rows // 8 or abs(along) > columns // 8
+            a = small[down:, max(along, 0) : columns + min(along, 0)]
+            b = small[: rows - down, max(-along, 0) : columns - max(along, 0)]
+            if far and _alike(a, b):
+                return "repeats itself: shifted, it looks the same"
+    return ""
+
+
+def _shrunk(grey: Image, by: float) -> Image:
+    return np.asarray(cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _alike(a: FloatArray, b: FloatArray) -> bool:
+    if min(a.std(), b.std()) < 0.1 * _PLAIN:
+        return False
+    return bool(np.corrcoef(a.ravel(), b.ravel())[0, 1] > _SAME)

@@ -1,0 +1,121 @@
+"""Where patches of a registered print are, each by its own pixels, whatever the lens.
+
+A patch has a shift of its own against the registered print, and light of its own, so that a lens
+that is bent in another way biases none. Patches that share no pixel are independent.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from visioncal.core.types import Camera, FloatArray, Image, IntArray
+from visioncal.vision.camera import normalise, project
+from visioncal.vision.register.fit import Registered
+
+# Side of the blocks within a patch whose errors go together [px], and fewest pixels of a patch.
+_BLOCK_PX, _FEWEST = 6, 60
+# Least share of a patch's pixels that is free: what covers a third has a shadow, too.
+_FREE = 0.65
+
+
+def places_of(
+    found: Registered, points_m: FloatArray, half_m: float
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Places of square patches in the image.
+
+    What their shifts scatter by beyond their noise counts in their sigmas.
+
+    Args:
+        found: The registered print.
+        points_m: (n, 3) middles of patches on the target [m].
+        half_m: Half of a patch's side [m].
+
+    Returns:
+        (m,) indices of the patches that are seen, (m, 2) their pixels, and (m,) the standard
+        deviation of a coordinate, along which a patch tells least [px].
+    """
+    look, level = found.look, found.look.level
+    light = look.drawn.light
+    gy, gx = np.gradient((look.gain * light.ravel()).reshape(light.shape))
+    columns = np.stack([-gx.ravel(), -gy.ravel(), light.ravel(), np.ones(gx.size)])
+    v, u = np.divmod(np.arange(gx.size), light.shape[1])
+    blocks = v // _BLOCK_PX * gx.size + u // _BLOCK_PX
+    at, (x, y) = look.drawn.places_m.reshape(2, -1), points_m[:, :2].T.astype(np.float32)
+    rows: list[tuple[int, FloatArray, float, float]] = []
+    for number in range(len(points_m)):
+        near = (np.abs(at[0] - x[number]) < half_m) & (np.abs(at[1] - y[number]) < half_m)
+        inside = np.flatnonzero(near)
+        taken = inside[look.weights[inside] > 0.3]
+        if len(taken) < max(_FEWEST, _FREE * len(inside)):
+            continue
+        own, weights = columns[:, taken], look.weights[taken].astype(float)
+        normal = (own * weights) @ own.T
+        inverse = np.linalg.inv(normal + 1e-9 * (np.trace(normal) + 1e-9) * np.eye(4))
+        solved = inverse @ (own * weights) @ look.residuals[taken]
+        rest = look.residuals[taken] - solved @ own
+        variance = float(weights @ rest**2) / (float(weights.sum()) - 4)
+        _, block = np.unique(blocks[taken], return_inverse=True)
+        scores = np.stack([np.bincount(block, row) for row in own * weights * rest])
+        ratio = float(np.sum((inverse @ scores)[:2] ** 2) / (variance * np.trace(inverse[:2, :2])))
+        worst = variance * float(np.linalg.eigvalsh(inverse[:2, :2])[1])
+        rows.append((number, solved[:2], worst, ratio))
+    if not rows:
+        return np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0)
+    ids, shifts, variances, ratios = (np.array(column) for column in zip(*rows, strict=True))
+    # Errors of neighbouring pixels go together alike in all patches.
+    variances = variances * max(float(np.median(ratios)), 1.0)
+    # The median of a squared length of two coordinates is 2 log 2 variances.
+    scatter = float(np.median(np.sum(shifts**2, axis=1))) / (2 * np.log(2.0))
+    sigma = np.sqrt(variances + max(scatter - float(np.median(variances)), 0.0))
+    # Farther, a shift is beyond its linearisation: something else is there.
+    kept = (np.linalg.norm(shifts, axis=1) < 1.0) & (sigma < 0.5)
+    px = level.pixels_of(found.seen, points_m[ids]) + level.factor * shifts
+    return ids[kept], px[kept], level.factor * sigma[kept]
+
+
+def usual_lens(image: Image) -> Camera:
+    """A lens of 60 deg without distortion, which a (h, w) image may be of."""
+    height, width = image.shape
+    focal = 0.9 * float(np.hypot(height, width))
+    matrix = np.array([focal, focal, (width - 1) / 2, (height - 1) / 2])
+    return Camera("brown", (width, height), matrix, np.zeros(5))
+
+
+def usual_sigma(camera: Camera) -> FloatArray:
+    """(4,) standard deviations of focal length, centre [px] and k1 of lenses, as `register`'s."""
+    focal = float(camera.matrix[:2].mean())
+    return np.array([0.4 * focal, 0.1 * focal, 0.1 * focal, 0.4])
+
+
+def started(
+    flat: FloatArray, places_m: FloatArray, px: FloatArray, lens: Camera
+) -> tuple[Camera, FloatArray]:
+    """Lens and (4, 4) pose of a plane that fit most of its features, from a homography of some.
+
+    Args:
+        flat: (3, 3) from the plane [m] to pixels.
+        places_m: (n, 3) features on the plane [m].
+        px: (n, 2) where these may be seen.
+        lens: The lens as far as it is known, to within `usual_sigma`.
+    """
+    rays = normalise(lens, cv2.perspectiveTransform(places_m[None, :, :2], flat)[0])
+    found = cv2.solvePnPGeneric(places_m, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    first = np.concatenate([found[1][0][:, 0], found[2][0][:, 0], np.zeros(4)])
+    sigma = usual_sigma(lens)
+
+    def bent(values: FloatArray) -> Camera:
+        matrix = lens.matrix + sigma[[0, 0, 1, 2]] * values[[6, 6, 7, 8]]
+        return replace(lens, matrix=matrix, distortion=sigma[3] * values[9] * np.eye(5)[0])
+
+    def residuals(values: FloatArray) -> FloatArray:
+        points = places_m @ cv2.Rodrigues(values[:3])[0].T + values[3:6]
+        off = np.nan_to_num(project(bent(values), points) - px, nan=1e3)
+        return np.concatenate([off.ravel(), values[6:]])
+
+    # The pixel or two to which features are found; others agree by chance.
+    best = least_squares(residuals, first, loss="soft_l1", x_scale="jac", max_nfev=40).x
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(best[:3])[0], best[3:6]
+    return bent(best), pose

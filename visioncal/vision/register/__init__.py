@@ -1,0 +1,1 @@
+"""A flat print found in an image by all its pixels."""

@@ -1,0 +1,281 @@
+"""Registration of a flat print to all pixels of an image: nonlinear least squares with covers.
+
+Levenberg and Marquardt's method over pose, blur, motion and lens, with the light eliminated in each
+step (Golub and Pereyra 1973), in reduced copies of the image first. Pixels that something covers
+have residuals which neither noise nor a small shift of the print explains; they leave with their
+surroundings, and Cauchy's weights hold down single ones. The covariance is the sandwich of White
+(1980) over blocks of pixels, within which errors of the model go together (Liang and Zeger 1986).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from visioncal.core.transforms import skew
+from visioncal.core.types import Camera, FloatArray, Image
+from visioncal.vision.register.image_model import Level, Pixels, Print, Rendered, Seen, moved_px
+
+# Side of blocks [px], and fewest pixels to fit.
+_BLOCK_PX, _FEWEST = 16, 200
+# Least noise of a pixel, a share of its range: that of rounding to 8 bits, and of a print's ink.
+_LEAST_NOISE = 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One rendering beside the image, with the light that fits it best."""
+
+    level: Level
+    seen: Seen
+    drawn: Rendered
+    terms: Pixels  # (19, n) columns of the light.
+    gain: Pixels  # (n,) derivative of the image by the print's light.
+    residuals: Pixels  # (n,) image less model.
+    inside: Pixels  # (n,) 1 where a pixel sees nothing but the print, through all blur.
+    weights: Pixels  # (n,).
+    noise: float  # Robust standard deviation of a pixel.
+    # (p,) information that is known before on pose, blur, twist and lens, and what it is on.
+    prior: FloatArray
+    changes: FloatArray
+
+    @property
+    def cost(self) -> float:
+        """Weighted sum of squares, and those of what is known before."""
+        known = self.noise**2 * float(self.prior @ self.changes**2)
+        return float((self.weights * self.residuals) @ self.residuals) + known
+
+    def normal(self) -> tuple[FloatArray, FloatArray, Pixels]:
+        """Normal matrix (p + 19)^2 and right side by parameters and light, and weighted columns."""
+        slopes = self.drawn.slopes.reshape(len(self.drawn.slopes), -1)
+        jacobian = np.concatenate([slopes * self.gain, self.terms])
+        weighed = jacobian * self.weights
+        normal, goal = (
+            (weighed @ jacobian.T).astype(float),
+            (weighed @ self.residuals).astype(float),
+        )
+        known = np.arange(len(self.prior))
+        normal[known, known] += self.noise**2 * self.prior
+        goal[known] -= self.noise**2 * self.prior * self.changes
+        return normal, goal, weighed
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """A print registered to an image."""
+
+    seen: Seen
+    # (6 + l, 6 + l) of the right perturbation of `cam_from_target` (rotation, translation) [rad, m]
+    # and of the lens's changes.
+    covariance: FloatArray
+    explained: float  # Share of the variance of the pixels taken that the print explains.
+    shown: float  # Share of the print's pixels within the image that nothing covers.
+    look: Look
+
+
+def register(
+    image: Image,
+    flat: Print,
+    camera: Camera,
+    start: Seen,
+    *,
+    lens_sigma: FloatArray | None = None,
+    moving: bool = False,
+    factors: tuple[int, ...] = (4, 2),
+    rough: bool = False,
+) -> Registered | None:
+    """Registers a print to a (h, w) grey image.
+
+    Args:
+        image: Grey levels that are proportional to the light, or nearly.
+        flat: The print.
+        camera: The lens as far as it is known.
+        start: Where the print is expected, to a pixel or two of the coarsest copy.
+        lens_sigma: (l,) standard deviations of the changes of fx = fy, cx, cy and coefficients of
+            the lens: these are estimated too, and count in the covariance; None for a known lens.
+        moving: Whether the print moves during the exposure.
+        factors: By how much the copies are reduced, in this order.
+        rough: Whether blur and light are unknown: several are tried.
+
+    Returns:
+        The registration; None where too little of the print is in the image.
+    """
+    lens_sigma = np.zeros(0) if lens_sigma is None else lens_sigma
+    seen, look, is_blurred = replace(start, lens=np.zeros(len(lens_sigma))), None, rough
+    for factor in factors:
+        blur_px = max(seen.gauss_px, seen.disc_px / 2, moved_px(camera, flat, seen) / 4)
+        # Blur leaves nothing finer.
+        if look is not None and blur_px > 2.5 * look.level.factor:
+            break
+        level = Level.of(image, factor, flat, camera, seen, len(lens_sigma))
+        if level is None:
+            return None
+        fitter = Fitter(level, flat, lens_sigma, moving, 0.02 * is_blurred)
+        if look is None and rough:
+            look = fitter.rough(seen)
+            seen = seen if look is None else look.seen
+        look = fitter.fitted(seen, look)
+        if look is None:
+            return None
+        sigma, found = look.seen.gauss_px, look
+        if is_blurred and not moving and sigma > 0.5 * factor and not look.seen.disc_px:
+            # A Gaussian of half a disc's radius is the nearest one.
+            disc = replace(look.seen, gauss_px=0.4 * sigma, disc_px=1.8 * sigma)
+            found = fitter.steps(fitter.look(disc, look.weights, look.noise), 8) or look
+        look = min(look, found, key=lambda one: one.cost)
+        seen, rough = look.seen, False
+    return None if look is None else _result(look)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitter:
+    """A print and a reduced image that it is fitted to."""
+
+    level: Level
+    flat: Print
+    lens_sigma: FloatArray
+    moving: bool
+    misfit: float  # Error of the model of blur, a share of the contrast.
+
+    def look(self, seen: Seen, weights: Pixels | None = None, noise: float = _LEAST_NOISE) -> Look:
+        """Renders the print and fits the light; by all pixels inside where weights are None."""
+        drawn = self.level.rendered(self.flat, seen, moving=self.moving)
+        light, image = drawn.light.reshape(1, -1), self.level.image.ravel()
+        terms = np.concatenate([self.level.nodes * light, self.level.nodes, light**2])
+        inside = self._inside(drawn, seen)
+        weights = inside if weights is None else weights
+        weighed = terms * weights
+        normal = (weighed @ terms.T).astype(float)
+        normal += 1e-6 * (float(np.trace(normal)) / len(normal) + 1e-3) * np.eye(len(normal))
+        solved = np.linalg.solve(normal, (weighed @ image).astype(float)).astype(np.float32)
+        gain = solved[:9] @ self.level.nodes + 2 * solved[18] * light[0]
+        # A print moves by no more than a fifth of itself, nor turns by as much.
+        still = np.repeat([1 / (0.2 * self.flat.size_m.max()), 1 / 0.2], 3) ** 2
+        known = [np.zeros(7 + (seen.disc_px > 0)), still[: 6 * self.moving], self.lens_sigma**-2.0]
+        changes = [known[0], seen.twist[: 6 * self.moving], seen.lens]
+        return Look(
+            self.level, seen, drawn, terms, gain, image - solved @ terms, inside, weights, noise,
+            np.concatenate(known), np.concatenate(changes),
+        )  # fmt: skip
+
+    def _inside(self, drawn: Rendered, seen: Seen) -> Pixels:
+        camera = self.level.camera
+        blur_px = 3 * seen.gauss_px + seen.disc_px + 0.8 * self.level.factor
+        blur_px += moved_px(camera, self.flat, seen) / 2
+        pixel_m = self.flat.middle_at(seen.cam_from_target)[2] / camera.matrix[:2].mean()
+        rim = min(blur_px * pixel_m, 0.12 * self.flat.size_m.min())
+        at = drawn.places_m - self.flat.corner_m[:, None, None]
+        inside = ((at > rim) & (at < (self.flat.size_m - rim)[:, None, None])).all(axis=0)
+        return np.asarray(inside & self.level.is_sound, np.float32).ravel()
+
+    def weighed(self, look: Look, slack_px: float) -> Look:
+        """With weights by the residuals: of what covers the print, and of single pixels.
+
+        A shift of `slack_px` of this level is no cover yet.
+        """
+        shape = self.level.image.shape
+        taken = look.weights > 0
+        if taken.sum() < _FEWEST:
+            return look
+        noise = max(1.4826 * float(np.median(np.abs(look.residuals[taken]))), _LEAST_NOISE)
+        gy, gx = np.gradient((look.gain * look.drawn.light.ravel()).reshape(shape))
+        known = noise**2 + (self.misfit * float(np.median(look.gain))) ** 2
+        allowed = 4 * known + slack_px**2 * (gx**2 + gy**2).ravel()
+        side = (5, 5) if self.level.factor > 2 else (7, 7)
+        squares, inside = look.residuals**2 / allowed * look.inside, look.inside.reshape(shape)
+        local = cv2.blur(squares.reshape(shape), side) / np.maximum(cv2.blur(inside, side), 0.05)
+        # Of noise alone the mean is a quarter.
+        free = (local < (0.45 if slack_px <= 0.3 else 0.75)).astype(np.float32)
+        free = np.asarray(cv2.erode(free, np.ones(side, np.uint8)))
+        weights = look.inside * free.ravel() / (1 + look.residuals**2 / (4 * allowed))
+        return self.look(look.seen, weights.astype(np.float32), noise)
+
+    def fitted(self, seen: Seen, before: Look | None) -> Look | None:
+        """Fits from a start, with weights anew after each round; first those of a look before."""
+        look: Look | None = self.look(seen)
+        if before is not None and look is not None:
+            # Blurs differ between levels, and would pass for covers.
+            weights = look.inside * self.level.resampled(before.level, before.weights)
+            look = self.steps(self.look(seen, weights, before.noise), 5)
+        is_first = before is None or before.level is self.level
+        for slack in (0.6, 0.3) if is_first else (0.3, 0.2):
+            look = None if look is None else self.steps(self.weighed(look, slack), 6)
+        return look
+
+    def steps(self, look: Look, most: int) -> Look | None:
+        """Levenberg and Marquardt's steps; None where too little is left to fit."""
+        damping = 1e-3
+        for _ in range(most):
+            if look.weights.sum() < _FEWEST:
+                return None
+            normal, goal, _ = look.normal()
+            scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * normal.max()))
+            before, scaled = look, normal / np.outer(scale, scale)
+            for _ in range(4):
+                step = np.linalg.solve(scaled + damping * np.eye(len(scale)), goal / scale) / scale
+                seen = look.seen.moved(step[: len(look.prior)], self.moving)
+                tried = self.look(seen, look.weights, look.noise)
+                if tried.cost <= look.cost:
+                    look, damping = tried, damping / 10
+                    break
+                damping *= 10
+            # Less is below what noise moves.
+            if before.cost - look.cost < 1e-2 * look.noise**2 + 1e-6 * look.cost:
+                break
+        return look
+
+    def rough(self, seen: Seen) -> Look | None:
+        """The best fit from several blurs or motions, with all pixels."""
+
+        def quality(look: Look) -> float:
+            return look.cost / float(look.weights.sum())
+
+        tried = (self.steps(self.look(start), 2) for start in self._blurs(seen))
+        first = sorted((look for look in tried if look is not None), key=quality)[:3]
+        settled = (self.steps(look, 15) for look in first)
+        return min((look for look in settled if look is not None), key=quality, default=None)
+
+    def _blurs(self, seen: Seen) -> Iterator[Seen]:
+        """Starts with blurs, or motions in the image's plane, from which all others are reached."""
+        if not self.moving:
+            yield from (replace(seen, gauss_px=px) for px in (0.8, 2.0, 4.5, 8.0))
+            return
+        depth_m = self.flat.middle_at(seen.cam_from_target)[2]
+        for length in (3.0, 7.0, 13.0, 22.0):
+            for angle in np.pi / 6 * np.arange(6):
+                along = length * np.array([np.cos(angle), np.sin(angle), 0.0, 0.0, 0.0, 0.0])
+                twist = along * depth_m / self.level.camera.matrix[:2].mean()
+                yield replace(seen, gauss_px=max(0.8, 0.1 * length), twist=twist)
+
+
+def _result(look: Look) -> Registered:
+    height, width = look.level.image.shape
+    normal, _, weighed = look.normal()
+
+    def by_block(array: Pixels) -> FloatArray:
+        rows = np.add.reduceat(array.reshape(-1, height, width), np.arange(0, height, _BLOCK_PX), 1)
+        sums = np.add.reduceat(rows, np.arange(0, width, _BLOCK_PX), 2)
+        return sums.reshape(len(array), -1).astype(float)
+
+    scores = by_block(weighed * look.residuals)
+    used = int((by_block(look.weights[None]) > _BLOCK_PX**2 / 4).sum())
+    meat = scores @ scores.T * used / max(used - len(normal), 5)
+    known = np.arange(len(look.prior))
+    meat[known, known] += look.noise**4 * look.prior
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * normal.max()))
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale), 1e-10) / np.outer(scale, scale)
+    lens = len(look.seen.lens)
+    kept = np.r_[:6, len(known) - lens : len(known)]
+    # From left perturbations (translation, rotation) to right ones (rotation, translation).
+    back = look.seen.cam_from_target[:3, :3].T
+    turned = np.eye(6 + lens)
+    turned[:6, :6] = np.block(
+        [[np.zeros((3, 3)), back], [back, -back @ skew(look.seen.cam_from_target[:3, 3])]]
+    )
+    covariance = turned @ (inverse @ meat @ inverse)[np.ix_(kept, kept)] @ turned.T
+    taken, image = look.weights.astype(float), look.level.image.ravel()
+    varied = np.sum(taken * (image - np.average(image, weights=taken)) ** 2)
+    explained = 1.0 - float(np.sum(taken * look.residuals**2) / max(varied, 1e-12))
+    shown = float((taken > 0).sum()) / max(float(look.inside.sum()), 1.0)
+    return Registered(look.seen, covariance, explained, shown, look)

@@ -1,0 +1,300 @@
+"""The image of a flat print: camera, light, blur and motion, with closed derivatives.
+
+    grey(p) = o(p) + g(p) S(p) + q S(p)^2,    S = gauss * disc * mean over s of L(X(p, s)),
+
+with L the print, X the place on the print that a pixel's ray meets, s the time from -1/2 to 1/2 of
+the exposure, in which the print moves by a twist, and o and g bilinear between 3 x 3 nodes. The ray
+of a pixel is fixed, so that the print's place X = R^T (P - t) moves with the pose by
+
+    dX/dxi = -R_2^T (I - r n^T / (n . r)) [I, -[P]_x],    P = r (n . t) / (n . r),
+
+with r the ray, n the print's normal and R_2 the first two columns of R. Slopes of X change little
+within a blur, so that those of S are slopes of X times the blurred slopes of L.
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Self, TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import RectBivariateSpline
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.transforms import apply
+from visioncal.core.types import Camera, FloatArray, Image
+from visioncal.vision.camera import normalise, project, project_with_jacobian
+
+Pixels: TypeAlias = npt.NDArray[np.float32]
+
+_EDGE = cv2.BORDER_REPLICATE
+# Gaussian of print and of reduced images before they are sampled [px]: the narrowest at which
+# sampling at each pixel aliases by less than noise does; and the narrowest blur after it.
+_SAMPLED_PX, _SHARPEST_PX = 0.5, 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Print:
+    """A flat print: grey levels, 0 for dark and 1 for light, on squares of `texel_m`."""
+
+    grey: Pixels  # (h, w).
+    texel_m: float
+    corner_m: FloatArray  # (2,) outer corner of the first texel in the target's frame [m].
+    _reduced: dict[int, tuple[Pixels, int]] = field(default_factory=dict, repr=False)
+
+    @property
+    def size_m(self) -> FloatArray:
+        """(2,) width and height [m]."""
+        return self.texel_m * np.array(self.grey.shape[::-1], float)
+
+    def middle_at(self, pose: FloatArray) -> FloatArray:
+        """(3,) its middle at a (4, 4) pose [m]."""
+        return pose[:3, :2] @ (self.corner_m + self.size_m / 2) + pose[:3, 3]
+
+    @property
+    def outline_m(self) -> FloatArray:
+        """(4, 3) its corners [m]."""
+        return np.pad(
+            self.corner_m + self.size_m * [[0, 0], [1, 0], [1, 1], [0, 1]], ((0, 0), (0, 1))
+        )
+
+    def blurred(self, sigma_m: float) -> tuple[Pixels, int]:
+        """(h, w, 3) grey and its slopes [1/m], blurred, and by how much it is reduced."""
+        step = round(4 * np.log2(max(sigma_m / self.texel_m, 0.5)))
+        if step not in self._reduced:
+            sigma = 2.0 ** (step / 4)
+            by = max(1, int(sigma / 1.3))
+            smooth = np.asarray(cv2.GaussianBlur(self.grey, (0, 0), sigma, borderType=_EDGE))
+            grey = smooth[by // 2 :: by, by // 2 :: by]
+            wide = cv2.copyMakeBorder(grey, 1, 1, 1, 1, _EDGE) / (2 * by * self.texel_m)
+            slopes = wide[1:-1, 2:] - wide[1:-1, :-2], wide[2:, 1:-1] - wide[:-2, 1:-1]
+            self._reduced[step] = np.dstack([grey, *slopes]).astype(np.float32), by
+        return self._reduced[step]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """How a print is seen: what an image determines."""
+
+    cam_from_target: FloatArray  # (4, 4) in the middle of the exposure.
+    gauss_px: float = 1.0  # Sigma of the isotropic blur beyond that of sampling [px].
+    disc_px: float = 0.0  # Radius of the disc of defocus [px]; 0 for none.
+    # (6,) translation and rotation during the exposure, in the camera's frame [m, rad].
+    twist: FloatArray = field(default_factory=lambda: np.zeros(6))
+    # (l,) changes of fx = fy together, cx, cy and the first l - 3 coefficients of the lens.
+    lens: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def moved(self, step: FloatArray, moving: bool) -> Self:
+        """After a step along pose (6), blur (1 or 2), twist (6 if moving) and lens."""
+        pose, at = self.cam_from_target, 7 + (self.disc_px > 0.0)
+        blurs = [
+            float(np.clip(old + np.clip(by, -0.4 * old - 0.2, 0.4 * old + 0.2), low, 40.0))
+            for old, by, low in zip(
+                (self.gauss_px, self.disc_px), step[6:at], (_SHARPEST_PX, 0.5), strict=False
+            )
+        ]
+        return replace(
+            self,
+            cam_from_target=_exp(step[:6]) @ pose,
+            gauss_px=blurs[0],
+            disc_px=blurs[1] if len(blurs) > 1 else 0.0,
+            twist=self.twist + step[at : at + 6] if moving else self.twist,
+            lens=self.lens + step[len(step) - len(self.lens) :],
+        )
+
+
+def _exp(twist: FloatArray) -> FloatArray:
+    """(4, 4) motion by a translation and a rotation vector (6,)."""
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(twist[3:]).as_matrix()
+    motion[:3, 3] = twist[:3]
+    return motion
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """The print as it is seen, in light 1, and its derivatives."""
+
+    light: Pixels  # (h, w).
+    # (p, h, w) by pose, as left perturbation (translation, rotation), blur, twist and lens.
+    slopes: Pixels
+    places_m: Pixels  # (2, h, w) place on the target in the middle of the exposure [m].
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """A part of an image, reduced by a factor, around where a print is expected."""
+
+    factor: int
+    corner_px: tuple[int, int]  # The first pixel's in the image (u, v).
+    image: Pixels  # (h, w) grey, 0 to 1.
+    is_sound: npt.NDArray[np.bool_]  # (h, w) neither saturated nor without a ray.
+    camera: Camera
+    rays: Pixels  # (2, h, w) of the lens as given, at depth 1.
+    bends: Pixels  # (l, 2, h, w) derivatives of the rays by `Seen.lens`.
+
+    @classmethod
+    def of(
+        cls, image: Image, factor: int, flat: Print, camera: Camera, seen: Seen, columns: int
+    ) -> "Level | None":
+        """Cuts a (h, w) image around a print, with `columns` of the lens; None where it is not."""
+        px = project(camera, apply(seen.cam_from_target, flat.outline_m))
+        size = np.array(image.shape[::-1]) // factor
+        if not np.isfinite(px).all():
+            return None
+        low = np.clip(np.floor(px.min(axis=0) / factor) - 3, 0, size).astype(int)
+        high = np.clip(np.ceil(px.max(axis=0) / factor) + 3, 0, size).astype(int)
+        if (high - low < 12).any():
+            return None
+        (u, v), (w, h) = (low * factor).tolist(), (high - low).tolist()
+        part = image[v : v + factor * h, u : u + factor * w]
+        layers = [_pixels(part / 255), _pixels((part > 1) & (part < 254))]
+        if factor > 1:
+            # The box of the reduction alone would alias.
+            layers[0] = _gauss(layers[0], factor * float(np.sqrt(_SAMPLED_PX**2 - 1 / 12)))
+            layers = [_pixels(cv2.resize(a, (w, h), interpolation=cv2.INTER_AREA)) for a in layers]
+        origin = low * factor + (factor - 1) / 2
+        # Cubic between nodes, as lenses are smooth.
+        ends = [origin[1 - axis] + factor * np.arange(count) for axis, count in enumerate((h, w))]
+        nodes = [np.linspace(end[0], end[-1], max(4, len(end) * factor // 24)) for end in ends]
+        at = np.stack(np.meshgrid(nodes[1], nodes[0]), axis=-1).reshape(-1, 2)
+        rays, bends = _bends(camera, at, columns)
+        table = np.concatenate([rays, bends.reshape(len(at), -1), np.ones((len(at), 1))], axis=1)
+        table = np.where(np.isfinite(table).all(axis=1, keepdims=True), table, 0.0)
+        shape = -1, len(nodes[0]), len(nodes[1])
+        drawn = [RectBivariateSpline(*nodes, layer)(*ends) for layer in table.T.reshape(shape)]
+        is_sound = (layers[1] > 0.99) & (np.abs(drawn.pop() - 1.0) < 1e-6)
+        found = _pixels(np.stack(drawn))
+        slopes = found[2:].reshape(columns, 2, h, w)
+        return cls(factor, (u, v), layers[0], is_sound, camera, found[:2], slopes)
+
+    @cached_property
+    def nodes(self) -> Pixels:
+        """(9, h w) bilinear weights of 3 x 3 nodes."""
+        at = (np.linspace(0, 2, count) - np.arange(3)[:, None] for count in self.image.shape)
+        down, along = (np.clip(1 - np.abs(off), 0, 1) for off in at)
+        return _pixels(down[:, None, :, None] * along[None, :, None]).reshape(9, -1)
+
+    def resampled(self, other: "Level", values: Pixels) -> Pixels:
+        """(n,) values at this level's pixels, of (m,) at another one's around the same print."""
+        at = [
+            (np.arange(count) * self.factor + first - zero) // other.factor
+            for count, first, zero in zip(
+                self.image.shape, self.corner_px[::-1], other.corner_px[::-1], strict=True
+            )
+        ]
+        rows, columns = (
+            np.clip(a, 0, size - 1) for a, size in zip(at, other.image.shape, strict=True)
+        )
+        return values.reshape(other.image.shape)[np.ix_(rows, columns)].ravel()
+
+    def rendered(self, flat: Print, seen: Seen, *, moving: bool = False) -> Rendered:
+        """The print and its derivatives, with those by the twist where it is moving."""
+        pose, middle = seen.cam_from_target, flat.middle_at(seen.cam_from_target)
+        pixel_m = self.factor * float(middle[2] / self.camera.matrix[:2].mean())
+        # A slanted pixel sees more of the print along one direction.
+        slant = abs(float(pose[:3, 2] @ middle)) / float(np.linalg.norm(middle))
+        table, by = flat.blurred(_SAMPLED_PX * pixel_m / max(slant, 0.2) ** 0.5)
+        count = 1 + 2 * moving * int(
+            np.clip(moved_px(self.camera, flat, seen) / self.factor / 3, 2, 6)
+        )
+        x, y = self.rays + np.tensordot(_pixels(seen.lens), self.bends, 1)
+        layers = np.zeros((5 if moving else 3, *x.shape), np.float32)
+        place = np.zeros((2, *x.shape), np.float32)
+        for k in range(count):
+            at = (k + 0.5) / count - 0.5
+            own = _exp(at * seen.twist) @ pose
+            # From rays to the plane of the print.
+            rows = _pixels(np.linalg.inv(np.c_[own[:3, :2], own[:3, 3]]))
+            gx, gy, depth = (row[0] * x + row[1] * y + row[2] for row in rows)
+            on = np.stack([gx / depth, gy / depth])
+            corner = _pixels(flat.corner_m)[:, None, None]
+            texels = _pixels(((on - corner) / np.float32(flat.texel_m) - 0.5 - by // 2) / by)
+            drawn = cv2.remap(table, texels[0], texels[1], cv2.INTER_LINEAR, None, _EDGE)
+            layers[:3] += np.moveaxis(_pixels(drawn), -1, 0)
+            if moving:
+                layers[3:] += np.float32(at) * np.moveaxis(_pixels(drawn), -1, 0)[1:]
+            place = on if 2 * k + 1 == count else place
+        layers, sigma = layers / np.float32(count), seen.gauss_px / self.factor
+        by_disc = []
+        if seen.disc_px > 0.0:
+            radius, sharp = seen.disc_px / self.factor, layers[0]
+            layers = np.stack([_through(layer, _disc(radius)) for layer in layers])
+            wider = _through(sharp, _disc(1.02 * radius)) - layers[0]
+            by_disc = [_gauss(wider, sigma) / np.float32(0.02 * seen.disc_px)]
+        layers = np.stack([_gauss(layer, sigma) for layer in layers])
+        ray, n, along = (x, y, np.ones_like(x)), _pixels(pose[:3, 2]), _pixels(pose[:3, :2])
+        across = 1 / sum(n[i] * ray[i] for i in range(3))
+        depth = np.float32(n @ pose[:3, 3]) * across
+        point = [depth * one for one in ray]
+
+        def by_point(gx: Pixels, gy: Pixels) -> list[Pixels]:
+            """Slopes by a motion of the point that is seen, its ray being fixed: (3) of (h, w)."""
+            g = [along[i, 0] * gx + along[i, 1] * gy for i in range(3)]
+            off = sum(g[i] * ray[i] for i in range(3)) * across
+            return [g[i] - n[i] * off for i in range(3)]
+
+        def by_pose(q: list[Pixels]) -> list[Pixels]:
+            crossed = [q[i - 2] * point[i - 1] - q[i - 1] * point[i - 2] for i in range(3)]
+            return [*(-one for one in q), *crossed]
+
+        q = by_point(layers[1], layers[2])
+        bent = cv2.Laplacian(layers[0], cv2.CV_32F, ksize=1, borderType=_EDGE)
+        slopes = [*by_pose(q), bent * np.float32(sigma / self.factor), *by_disc]
+        slopes += by_pose(by_point(layers[3], layers[4])) if moving else []
+        slopes += [depth * (q[0] * bend[0] + q[1] * bend[1]) for bend in self.bends]
+        return Rendered(layers[0], _pixels(np.stack(slopes)), place)
+
+    def pixels_of(self, seen: Seen, places_m: FloatArray) -> FloatArray:
+        """(n, 2) pixels of the image at which (n, 3) places of the target are seen [px]."""
+        points = apply(seen.cam_from_target, places_m)
+        px = project(self.camera, points)
+        # The lens's changes belong to pixels: a fixed point.
+        for _ in range(20 if len(seen.lens) else 0):
+            bends = _bends(self.camera, px, len(seen.lens))[1]
+            rays = points[:, :2] / points[:, 2:] - np.einsum("l,nlk->nk", seen.lens, bends)
+            px = project(self.camera, np.column_stack([rays, np.ones(len(rays))]))
+        return px
+
+
+def moved_px(camera: Camera, flat: Print, seen: Seen) -> float:
+    """Length of the motion during the exposure, at the print's middle [px]."""
+    middle = flat.middle_at(seen.cam_from_target)
+    moved = seen.twist[:3] + np.cross(seen.twist[3:], middle)
+    return float(camera.matrix[:2].mean() * np.linalg.norm(moved[:2]) / middle[2])
+
+
+def _pixels(values: npt.ArrayLike) -> Pixels:
+    return np.asarray(values, np.float32)
+
+
+def _bends(camera: Camera, px: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) rays of (n, 2) pixels, and (n, l, 2) their derivatives by the lens."""
+    rays = normalise(camera, px)
+    found = project_with_jacobian(camera, np.column_stack([rays, np.ones(len(rays))]))
+    by_lens = found.jacobian_intrinsics
+    by_lens = np.concatenate([by_lens[:, :, :1] + by_lens[:, :, 1:2], by_lens[:, :, 2:]], axis=2)
+    by_ray = np.where(
+        np.isfinite(found.jacobian_point[:, :, :2]), found.jacobian_point[:, :, :2], np.eye(2)
+    )
+    return rays, -np.swapaxes(np.linalg.solve(by_ray, by_lens[:, :, :columns]), 1, 2)
+
+
+def _gauss(layer: Pixels, sigma: float) -> Pixels:
+    """A (h, w) layer through a Gaussian [px]."""
+    sigma = max(sigma, _SHARPEST_PX)
+    size = max(2 * int(3 * sigma + 0.5) + 1, 5)
+    return _pixels(cv2.GaussianBlur(layer, (size, size), sigma, borderType=_EDGE))
+
+
+def _through(layer: Pixels, kernel: Pixels) -> Pixels:
+    return _pixels(cv2.filter2D(layer, -1, kernel, borderType=_EDGE))
+
+
+def _disc(radius: float) -> Pixels:
+    """Kernel of a disc [px], with its rim by area."""
+    reach = int(np.ceil(radius + 0.5))
+    at = np.arange(-reach, reach + 1)
+    kernel = np.clip(radius + 0.5 - np.hypot(at, at[:, None]), 0, 1)
+    return _pixels(kernel / kernel.sum())
