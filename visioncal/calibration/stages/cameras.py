@@ -30,6 +30,8 @@ T = TypeVar("T", bound=Observed)
 # Stated intrinsics belong to another camera where estimated ones fit clearly better, and either
 # a focal length differs by more than any focusing [share] or the stated ones fit badly.
 _OTHER_FOCAL = 0.1
+# Travel during an exposure from which on it matters when the robot's pose was read [m].
+_TRAVEL_M = 2e-4
 
 
 def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
@@ -112,6 +114,11 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
         f"The corners of view {ranges(found)} are by all pixels of their images (--dense), "
         "as these are blurred."
     )
+    if (most := max(at.motion_m for at in found.values())) > _TRAVEL_M:
+        note += (
+            f" The board moves by up to {figure(1e3 * most)} mm during an exposure: the poses "
+            "of the robot must be those of mid-exposure (see [clock])."
+        )
     dense_seen = replace(seen, dense={**(seen.dense or {}), **found}, notes=(*seen.notes, note))
     return dense_seen, replace(
         detections,

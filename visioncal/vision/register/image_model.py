@@ -262,7 +262,8 @@ def moved_px(camera: Camera, flat: Print, seen: Seen) -> float:
     """Length of the motion during the exposure, at the print's middle [px]."""
     middle = flat.middle_at(seen.cam_from_target)
     moved = seen.twist[:3] + np.cross(seen.twist[3:], middle)
-    return float(camera.matrix[:2].mean() * np.linalg.norm(moved[:2]) / middle[2])
+    focal = camera.matrix[:2].mean() + sum(seen.lens[:1])
+    return float(focal * np.linalg.norm(moved[:2]) / middle[2])
 
 
 def _pixels(values: npt.ArrayLike) -> Pixels:
