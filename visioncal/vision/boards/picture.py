@@ -222,8 +222,11 @@ class _Known:
             seen = (px[[match.trainIdx for match in good]] + 0.5) / shrink - 0.5
             flat, inside = cv2.findHomography(places, seen, cv2.USAC_MAGSAC, 3.0 / shrink)
             if flat is not None and inside.sum() >= max(_FEWEST, 0.15 * len(good)):
-                ends = cv2.perspectiveTransform(self.print_.outline_m[None, :, :2], flat)
-                if cv2.isContourConvex(ends.astype(np.float32)) and np.linalg.det(flat[:2, :2]) > 0:
+                outline = self.print_.outline_m[None, :, :2].astype(np.float32)
+                ends = cv2.perspectiveTransform(outline, flat)
+                # Seen from its front: the outline keeps its sense.
+                is_front = cv2.contourArea(ends, True) * cv2.contourArea(outline, True) > 0.0
+                if cv2.isContourConvex(ends) and is_front:
                     off = cv2.perspectiveTransform(places[None], flat)[0] - seen
                     # So far a lens bends what is straight.
                     near = np.linalg.norm(off, axis=1) < 0.03 * max(image.shape)
