@@ -1,5 +1,6 @@
 """Commands as a user runs them: exit status, messages, streams, and advice that is typed."""
 
+import csv
 import gzip
 import io
 import json
@@ -44,6 +45,7 @@ from visioncal.results.history import History
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, read_truth, simulate, write_session
 from visioncal.simulation.dynamics import exercise_session, real_dynamics, record, slow_sweep
+from visioncal.vision.targets import load_target
 
 FILES = ["calibration.json", "recording.rrd", "report.html"]
 # What moves a terminal's cursor, colours it, or turns the direction of its text.
@@ -458,6 +460,30 @@ def test_what_is_said_is_of_use_where_it_is_said(rendered, pairs, tmp_path, monk
     assert "payload" not in said.partition("could not be checked")[2]
     monkeypatch.setattr(sys, "stdin", io.StringIO(""))
     visioncal("guard", *against).refused("no look came on stdin", "guard --example")
+
+
+def test_stops_to_repeat_come_with_the_board_of_the_result(rendered, tmp_path, monkeypatch):
+    """Of an arm without a model, whose way to the stops nobody plans."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(rendered, "cell")
+    declared, table = Path("cell/session.toml"), Path("cell/views.csv")
+    declared.write_text(re.sub(r"\[robot\]\n(?:.+\n)*", "", declared.read_text("utf-8")), "utf-8")
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = [
+            {name: cell for name, cell in row.items() if not re.fullmatch(r"q\d_rad", name)}
+            for row in csv.DictReader(file)
+        ]
+    with table.open("w", newline="", encoding="utf-8") as file:
+        written = csv.DictWriter(file, rows[0])
+        written.writeheader()
+        written.writerows(rows)
+    visioncal("calibrate", "cell", "-o", "out", "--no-recording", "--no-report").good()
+    done = visioncal("plan", "out", "--verify", "--stops", 3, "-o", "again").good()
+    assert "visioncal record --arm manual --target again/board.toml" in done.out
+    assert load_target("again/board.toml").square_m == 0.03
+    recovering = visioncal("recover", "act", "--against", "out", "--count", 9)
+    assert "--target act/plan/board.toml" in recovering.err
+    assert "BOARD" not in recovering.err
 
 
 def test_a_bad_result_has_status_3_and_is_used_by_force_alone(pairs, tmp_path):
