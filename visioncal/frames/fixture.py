@@ -146,14 +146,12 @@ class PointsFit:
         if suspected is not None:
             at, level_m = suspected
             place = f" ({self.places[at]})" if self.places[at] else ""
-            yield Finding(
-                "suspected",
+            words = (
                 f"{self.names[at]}{place} is the likeliest to be wrong: without it the others "
                 f"agree to {figure(1e3 * level_m)} mm per axis, and with it to "
-                f"{figure(1e3 * self.agreement.fit.sigma)} mm, which is too little to leave it "
-                "out.",
-                Remedy(_TOUCH_AGAIN, AGAIN),
+                f"{figure(1e3 * self.agreement.fit.sigma)} mm: too little to leave it out."
             )
+            yield Finding("suspected", words, Remedy(_TOUCH_AGAIN, AGAIN))
         yield from found
 
     def _doubts(self, setting: FitSettings) -> Iterator[Finding]:
@@ -454,21 +452,17 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
 
 def _finding_of(mistake: Mistake, drawing: NominalPoints) -> Finding:
     """The finding that two names are exchanged, or the drawing mirrored."""
-    pairs = [" and ".join(names) for names in mistake.exchanged if names]
-    agree = f"all points agree to {figure(1e3 * mistake.rms_m)} mm (rms), and to "
-    agree += f"{figure(1e3 * mistake.declared_m)} mm as they are."
-    mirror = "with the other sign of one axis, or two axes exchanged,"
-    if pairs:
-        also = f" Or {drawing.source} is a mirror image: {mirror} they agree, too."
-        return Finding(
-            "exchanged_names",
-            f"Of {', or of '.join(pairs)}, the names are exchanged: with the other name for each, "
-            f"{agree}{also * (() in mistake.exchanged)}",
-            Remedy("Look which points were touched, and write their names in the rows.", AGAIN),
-        )
-    return Finding(
-        "mirrored",
-        f"{drawing.source} is a mirror image of the part: {mirror} {agree}",
-        Remedy("Correct the sign or the order of its columns, as the part has them.", AGAIN),
-        is_fatal=True,
+    pairs = ", or of ".join(" and ".join(names) for names in mistake.exchanged if names)
+    good, off = (figure(1e3 * rms_m) for rms_m in (mistake.rms_m, mistake.declared_m))
+    mirror = f"{drawing.source} is a mirror image of the part: with the other sign of one axis, or "
+    mirror += (
+        f"two axes exchanged, all points agree to {good} mm (rms), and to {off} mm as they are."
     )
+    if not pairs:
+        do = Remedy("Correct the sign or the order of its columns, as the part has them.", AGAIN)
+        return Finding("mirrored", mirror, do, is_fatal=True)
+    words = f"Of {pairs}, the names are exchanged: with the other name for each, all points agree "
+    words += f"to {good} mm (rms), and to {off} mm as they are."
+    words += f" Or {mirror}" * (() in mistake.exchanged)
+    do = Remedy("Look which points were touched, and write their names in the rows.", AGAIN)
+    return Finding("exchanged_names", words, do)
