@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.boards import any_page, raster
 from support.commands import visioncal
-from support.printed import Look, label, photographed, pose_at, poster
+from support.printed import PICTURES, Look, label, photographed, pose_at, poster
 
 from visioncal.core.errors import DataError
 from visioncal.simulation import CAMERAS
@@ -46,6 +46,19 @@ def test_patches_are_where_they_are_through_a_lens_that_nobody_states(target, co
     # The lens bends the print by 6 px; a fiftieth of a pixel is noise.
     assert np.median(np.abs(off)) < 0.03
     assert np.sqrt(np.mean((off * found.weights[:, None]) ** 2)) < 0.05
+
+
+@pytest.mark.parametrize("kind", ["label", "board"])
+def test_prints_of_many_alike_features_are_found(kind, tmp_path):
+    picture = PICTURES[kind](0)
+    cv2.imwrite(str(tmp_path / "print.png"), picture)
+    image = kept_picture(tmp_path / "print.png")
+    target = target_from_document({"kind": "picture", "width_m": 0.3, "image": image}, kind)
+    image, pose = seen(picture, 0.15, 1)
+    found = find_target(image, target)
+    places = corner_positions(target)[found.ids]
+    off = found.px - project(CAMERA, places @ pose[:3, :3].T + pose[:3, 3])
+    assert np.median(np.abs(off)) < 0.03
 
 
 def test_other_pictures_are_not_found_and_mirrored_ones_are_named(target):

@@ -215,11 +215,12 @@ class _Known:
         px, described = _features(_shrunk(image, shrink))
         if len(px) < _FEWEST:
             return "the picture is not seen: the image is plain"
-        pairs = cv2.BFMatcher().knnMatch(self.described, described, k=2)
+        # From the image's: a picture has more, and several of them would share one of few.
+        pairs = cv2.BFMatcher().knnMatch(described, self.described, k=2)
         good = [one for one, other in pairs if one.distance < 0.8 * other.distance]
         if len(good) >= _FEWEST:
-            places = self.print_.texel_m * (self.px[[match.queryIdx for match in good]] + 0.5)
-            seen = (px[[match.trainIdx for match in good]] + 0.5) / shrink - 0.5
+            places = self.print_.texel_m * (self.px[[match.trainIdx for match in good]] + 0.5)
+            seen = (px[[match.queryIdx for match in good]] + 0.5) / shrink - 0.5
             flat, inside = cv2.findHomography(places, seen, cv2.USAC_MAGSAC, 3.0 / shrink)
             if flat is not None and inside.sum() >= max(_FEWEST, 0.15 * len(good)):
                 outline = self.print_.outline_m[None, :, :2].astype(np.float32)
