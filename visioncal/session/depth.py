@@ -76,8 +76,7 @@ def read_depth(
             f"{size[0]} x {size[1]} pixels.",
             culprits=[path],
             next_step="Align depth to the image (RealSense: rs.align; OAK: setDepthAlign; "
-            "ROS: aligned_depth_to_color), or state the lens of the depth camera in "
-            "[cameras.depth] and its place in [prior.cam_from_depth].",
+            "ROS: aligned_depth_to_color), and record again.",
         )
     return _checked(depth, path)
 
