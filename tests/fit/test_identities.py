@@ -306,6 +306,28 @@ def test_errors_are_as_large_as_the_covariance_says(given, in_hand):
     assert low < np.mean(squares) / 1.04 < high
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("in_hand", [True, False])
+def test_errors_of_200_cells_scatter_as_the_covariance_says_in_every_direction(in_hand):
+    whitened = []
+    for seed in range(1000, 1200):
+        small = made(seed, stops=12, in_hand=in_hand)
+        # Errors that last, which these arms do not have, would add to it.
+        fit = replace(solve(small.cell).fit, considered=None, shift=None)
+        away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
+        root = np.linalg.cholesky(fit.covariance(("edge", "cam")))
+        whitened.append(np.linalg.solve(root, away))
+    scatter, mean = np.cov(np.array(whitened).T), np.mean(whitened, axis=0)
+    # As of 200 draws of six normal numbers, each as uncertain as noise of 12 stops: 1.04.
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 199) / 199
+    assert (np.diag(scatter) > low).all()
+    assert (np.diag(scatter) / 1.04 < high).all()
+    assert np.sum(mean**2) * 200 / 1.04 < chi2.ppf(0.9999, 6)
+    between = scatter / np.sqrt(np.outer(np.diag(scatter), np.diag(scatter)))
+    # 15 correlations of 200 draws, of which four sigma are one in ten thousand.
+    assert np.abs(between - np.eye(6)).max() < 4.0 / np.sqrt(200)
+
+
 def test_predictions_err_as_much_as_they_say():
     squares = []
     for seed in range(40):

@@ -12,7 +12,14 @@ from visioncal.fit.lens_field import Field
 from visioncal.fit.linearise import Pair, images_of
 from visioncal.fit.score import best_field, of_effect
 from visioncal.fit.trials import gain_of
-from visioncal.fit.unknowns import State, Unknowns, Vector, lens_field, random_effect
+from visioncal.fit.unknowns import (
+    State,
+    Unknowns,
+    Vector,
+    given_lens,
+    lens_field,
+    random_effect,
+)
 from visioncal.model.effects import (
     SIGNIFICANT,
     BaseCreeps,
@@ -75,10 +82,14 @@ def opened(
         if one.effect is not None:
             unknowns = replace(unknowns, effects=(*unknowns.effects, one.effect))
         if one.field is not None:
-            field = one.field
-            if fit.cell.cameras[one.lens].stated is None:
-                px = np.concatenate([pair.px for pair in images_of(pairs, one.lens)])
+            field, table = one.field, fit.cell.cameras[one.lens]
+            px = np.concatenate([pair.px for pair in images_of(pairs, one.lens)])
+            if table.stated is None:
                 field = field.beside(unknowns.lenses[one.lens], px)
+            elif table.intrinsics == "auto":
+                # A field may stand for parameters that were held since corners were few.
+                given = given_lens(table, one.lens, px, is_spare=True)
+                unknowns = unknowns.with_members(*([] if given is None else [given]))
             unknowns = replace(unknowns, fields={**unknowns.fields, one.lens: field})
     return unknowns, State(values, fit.state.errors)
 
@@ -90,7 +101,8 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     for flange in fit.unknowns.erring:
         yield from scored(fit, effects_of_frames(fit, flange), flange)
     for camera in fit.unknowns.lenses:
-        is_free = ("lens", camera) in fit.unknowns and camera not in fit.unknowns.fields
+        is_free = fit.cell.cameras[camera].intrinsics != "hold" or ("lens", camera) in fit.unknowns
+        is_free &= camera not in fit.unknowns.fields
         if is_free and images_of(pairs, camera):
             field, size, gain = best_field(fit, pairs, camera)
             yield Candidate(gain, lens_field(camera, field, size), field=field)

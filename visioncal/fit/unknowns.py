@@ -239,8 +239,8 @@ def given_lens(table: CameraTable, frame: str, px: FloatArray, *, is_spare: bool
     if stated is not None:
         priors.append(Prior(np.arange(4), sigma=stated))
     if is_spare and table.intrinsics == "refine":
-        held = {prior.columns[0]: prior for prior in estimated_lens(frame, lens).priors}
-        priors += [prior for first, prior in held.items() if first >= count]
+        own = {prior.columns[0]: prior for prior in estimated_lens(frame, lens).priors}
+        priors += [prior for first, prior in own.items() if first >= count]
         count = len(values)
     elif is_spare and table.intrinsics == "auto":
         moved = np.sqrt(np.nanmean(by_lens(lens, px) ** 2, axis=(0, 1)) * 2.0)
