@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
-from support.cells import known_of, showing
+from support.cells import calibrated, known_of, reporting, session_of, showing
 
 import visioncal
-from visioncal.calibration.stages.cameras import estimate_lenses
+from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses
 from visioncal.calibration.stages.error_sizes import estimate_error_sizes
 from visioncal.core.transforms import invert, log
 from visioncal.estimation.lens_field import LensLevels, displacements
+from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
 
 
@@ -66,3 +67,33 @@ def test_sizes_of_a_field_are_found_and_of_a_sound_cell_none():
     # In units of the corners' noise. Of some dozen functions, the size is known to a third.
     assert 0.2 < levels.field * cell.options.pixel_sigma_px < 0.45
     assert levels.gains[0] > 13.8
+
+
+def test_what_a_held_lens_is_off_by_counts():
+    cell = simulate(CellOptions(views=22, seed=6))
+    session = session_of(cell)
+    camera = session.document["camera"]
+    longer = (np.array(camera["matrix"]) * [1.01, 1.01, 1.0, 1.0]).tolist()
+    rows = [[view.cell(column) for column in session.columns] for view in session.views]
+    off = Session.assemble(
+        {**session.document, "camera": {**camera, "matrix": longer, "intrinsics": "hold"}},
+        session.columns,
+        rows,
+        session.images,
+        target_document=session.target_document,
+    )
+    found = {seen.view: seen for seen in cell.corners}
+    known = replace(known_of(cell, joints=False), session=off, cameras={})
+    known = estimate_lenses(detect_targets(known, found))
+    (covariance,) = estimate_error_sizes(known).lenses.values()
+    # By a size in pixels: half of one per cent of the focal length at least.
+    assert np.sqrt(covariance[0, 0]) > 0.005 * longer[0]
+
+
+def test_no_board_explains_poses_that_agree_nowhere():
+    cell = simulate(CellOptions(views=14, seed=3))
+    places = cell.robot.base_from_flange.copy()
+    places[:, :3, 3] = places[:, [0, 2, 1], 3]
+    known = calibrated(reporting(cell, base_from_flange=places), joints=False)
+    assert known.cell_fit.sizes.holds_scales
+    assert "board_size" not in {cause.kind for cause in known.verdict.causes}

@@ -48,8 +48,8 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
     try:
         solved = solve_session(observed)
     except VisioncalError:
-        # The fit of poses says why.
-        return ErrorSizes()
+        # The fit of poses says why; what comes to no rest tells nothing of boards.
+        return ErrorSizes(holds_scales=True)
     session = observed.timed
     fit, doubted = solved.fit, doubted_boards(solved.doubts)
     levels = {name: _levels(fit, name) for name in fit.unknowns.lenses}
@@ -101,7 +101,15 @@ def solve_session(observed: Observed) -> CellFit:
     for name, at in observed.robots.items():
         model = None if at.joints_rad is None or at.matched is None else at.matched.robot
         reports[name] = Reported(at.base_from_flange, at.joints_rad or {}, model)
-    return solve(read_cell(session, _own_corners(observed), sweeps, reports))
+    cell = read_cell(session, _own_corners(observed), sweeps, reports)
+    # The fit of poses holds a lens; what it may be off by counts.
+    cameras = {
+        name: table.model_copy(update={"intrinsics": "auto"})
+        if table.intrinsics == "hold"
+        else table
+        for name, table in cell.cameras.items()
+    }
+    return solve(replace(cell, cameras=cameras))
 
 
 def _own_corners(observed: Observed) -> dict[int, Corners]:
