@@ -330,7 +330,8 @@ def test_what_comes_on_stdin_is_refused_by_the_line(program, inputs, tmp_path):
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     assert ["error" in answer for answer in answers] == [True, True, False]
     assert (done.returncode, done.stderr) == (2, b"")
-    assert called(program, words, None).returncode == 0
+    none = called(program, words, None)
+    assert (none.returncode, b"guard --example" in none.stderr + none.stdout) == (2, True)
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     cv2.imwrite(str(pictures / "0.png"), np.zeros((48, 64), np.uint8))

@@ -34,6 +34,8 @@ def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -
         return ""
     sizes = np.array(calibration.camera.camera.resolution) / _CELLS
     fields = np.unique(np.floor((np.vstack(px) + 0.5) / sizes).astype(int), axis=0)
+    # Corners by another program may lie beside the image.
+    fields = fields[((fields >= 0) & (fields < _CELLS)).all(axis=1)]
     return f"Corners in {len(fields)} of {_CELLS[0] * _CELLS[1]} fields of the image"
 
 
