@@ -67,6 +67,12 @@ def test_sizes_of_a_field_are_found_and_of_a_sound_cell_none():
     # In units of the corners' noise. Of some dozen functions, the size is known to a third.
     assert 0.2 < levels.field * cell.options.pixel_sigma_px < 0.45
     assert levels.gains[0] > 13.8
+    # Corners of a stated noise have the same field, in units of that.
+    px = 2.0 * cell.options.pixel_sigma_px
+    stated = showing(moved, [replace(seen, stated_px=px) for seen in moved.corners])
+    found = estimate_error_sizes(estimate_lenses(known_of(stated, joints=False)))
+    (levels,) = found.levels.values()
+    assert 0.2 < levels.field * px < 0.45
 
 
 def test_what_a_held_lens_is_off_by_counts():

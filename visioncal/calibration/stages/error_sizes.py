@@ -48,7 +48,7 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
     try:
         solved = solve_session(observed)
     except VisioncalError:
-        # The fit of poses says why; what comes to no rest tells nothing of boards.
+        # The fit of poses says why; what comes to no rest determines no board.
         return ErrorSizes(holds_scales=True)
     session = observed.timed
     fit, doubted = solved.fit, doubted_boards(solved.doubts)
@@ -78,8 +78,8 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
     }
     for name, grown in growth.items():
         # In each view, the lens is another than on average, by a quarter of its growth (rms).
-        px = _size(fit, f"px {name}") or 1.0
-        jitter = float(np.hypot(levels[name].jitter, abs(grown.share) / (4.0 * px)))
+        own = abs(grown.share) / (4.0 * _noise_px(fit, name))
+        jitter = float(np.hypot(levels[name].jitter, own))
         levels[name] = replace(levels[name], jitter=jitter)
     return ErrorSizes(levels, lenses, boards, growth, held)
 
@@ -131,10 +131,17 @@ def _size(fit: Fit, name: str) -> float:
     return 0.0 if name in fit.unknowns.closed else fit.sizes.get(name, 0.0)
 
 
+def _noise_px(fit: Fit, camera: str) -> float:
+    """Noise of a corner's coordinate, as estimated or as stated [px]."""
+    own = (one.corners for one in fit.cell.sightings if one.seer == camera)
+    stated = [at.stated_px for at in own if at is not None and at.stated_px is not None]
+    return fit.sizes.get(f"px {camera}") or float(np.median(stated))
+
+
 def _levels(fit: Fit, camera: str) -> LensLevels:
     """Sizes of a lens's errors beyond its model, in units of the noise of its corners."""
     names = [f"{of} {camera}" for of in ("field", "breathing", "focus jitter")]
-    px, at = _size(fit, f"px {camera}") or 1.0, fit.unknowns.fields.get(camera)
+    px, at = _noise_px(fit, camera), fit.unknowns.fields.get(camera)
     field_px, breathing, jitter = (_size(fit, name) / px for name in names)
     of_field, of_breathing, of_jitter = (_gain(fit, name) for name in names)
     gains = (of_field, of_breathing, of_jitter)
@@ -166,6 +173,6 @@ def _covariance(fit: Fit, camera: str, levels: LensLevels) -> FloatArray:
         for prior in member.priors:
             if prior.size is not None:
                 sigmas[prior.columns] = _size(fit, prior.size.name) * member.units[prior.columns]
-    field_px = levels.field * (_size(fit, f"px {camera}") or 1.0)
+    field_px = levels.field * _noise_px(fit, camera)
     by_field = field_px * lens_part(lens, levels.length)
     return np.asarray(np.diag(sigmas**2) + by_field @ by_field.T)
