@@ -187,7 +187,7 @@ def test_a_lens_that_far_views_leave_open_hears_what_to_state():
     known = calibrated(cell)
     assert known.assessment.edges["cam"].sigma_mm > 1.0
     assert misfit(known.assessment.edges["cam"], cell.transforms["flange_from_cam"]) < 22.5
-    (words,) = (note for note in known.notes if "robot's motion told the lens" in note)
+    (words,) = (note for note in known.notes if "robot's motion determined the lens" in note)
     assert "over 5 % of the image's width" in words
     assert "role = intrinsics" in words
 

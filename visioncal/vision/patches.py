@@ -34,7 +34,7 @@ def places_of(
 
     Returns:
         (m,) indices of the patches that are seen, (m, 2) their pixels, and (m,) the standard
-        deviation of a coordinate, along which a patch tells least [px].
+        deviation of a coordinate, along which a patch determines least [px].
     """
     look, level = found.look, found.look.level
     light = look.drawn.light

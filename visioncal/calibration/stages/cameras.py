@@ -151,8 +151,9 @@ def estimate_lenses(seen: T) -> T:
                 except (ConvergenceError, DegenerateError) as error:
                     # Far boards are flat in their images.
                     lens = _by_motion(seen, frame, error)
-                    words = f"The robot's motion told the lens. By its views alone: {error.message}"
-                    seen = replace(seen, notes=(*seen.notes, f"{words} {error.next_step}"))
+                    alone = f"By its views alone: {error.message} {error.next_step}"
+                    words = f"The robot's motion determined the lens. {alone}"
+                    seen = replace(seen, notes=(*seen.notes, words))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
 

@@ -110,11 +110,6 @@ class CellFit:
         """Tests for errors of the arms that are not free yet."""
         return replace(self, arms=with_link_errors(self.arms, fitted))
 
-    @property
-    def arms_without_joints(self) -> dict[str, RobotArm]:
-        """The arms without joint angles."""
-        return {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
-
     def stated_parameters(
         self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]
     ) -> CameraParameters:
@@ -122,20 +117,21 @@ class CellFit:
 
         They have the `sizes` of errors.
         """
-        shares, problems, poses = self._shares, {}, {}
+        shares, sizes, problems, poses = self._shares, self.sizes, {}, {}
         for frame, scene in scenes.items():
             corners: dict[int, Corners] = {
                 view.view: view.corners for view in views[frame] if view.corners is not None
             }
-            problem = CornerProblem.of(scene, corners, shares)
-            problems[frame] = problem
+            problem, levels = CornerProblem.of(scene, corners, shares), sizes.levels.get(frame)
+            problems[frame] = replace(
+                problem if levels is None else problem.with_levels(levels),
+                lens_covariance=sizes.lenses.get(frame),
+                board_sizes=tuple(sizes.boards.get(at, BoardSizes()) for at in scene.printed),
+                holds_scales=sizes.holds_scales,
+            )
             with_corners = [view for view in views[frame] if view.view in corners]
             poses[frame] = np.array([view.cam_from_target[0] for view in with_corners])
-        sizes, printed = self.sizes, [at for scene in scenes.values() for at in scene.printed]
-        boards = tuple(sizes.boards.get(name, BoardSizes()) for name in dict.fromkeys(printed))
-        return CameraParameters.of(problems, poses).with_sizes(
-            sizes.levels, sizes.lenses, boards, holds_scales=sizes.holds_scales
-        )
+        return CameraParameters.of(problems, poses)
 
     @property
     def _shares(self) -> dict[int, float]:

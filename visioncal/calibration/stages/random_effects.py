@@ -54,7 +54,7 @@ def random_effects(
         flat = PriorInformation.flat(arm.basis.shape[2])
         nuisance = Effect.free(f"postures of {robot}", flat, None, {robot: arm.basis})
         found += find_random_effects(inliers, candidates, [nuisance])
-        if corners is not None and rows is not None and len(arms) == 1:
+        if growth and corners is not None and rows is not None and len(arms) == 1:
             for _, effect in _of_sensors(inliers, robot, stops, corners, rows):
                 known = growth.get(effect.name.partition(" of ")[2])
                 if known is not None:

@@ -19,7 +19,7 @@ def _found(effect: RandomEffect, run: RunState) -> Iterator[Finding]:
         values = fit.values((effect.kind, owner))
         covariance = fit.covariance((effect.kind, owner))
         squared = float(values @ np.linalg.solve(covariance, values))
-        # Of a lens, all corners have told.
+        # Of a lens, all corners are the evidence.
         if effect.is_of_sensor:
             squared = max(squared, run.cell_fit.sizes.growth[owner].gain)
         if squared > chi2_limit(FALSE_ALARM, len(values)):

@@ -14,10 +14,9 @@ from scipy.linalg import block_diag
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress, shape_slices
 from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
-from visioncal.estimation.scene import BoardSizes, CornerProblem
+from visioncal.estimation.scene import CornerProblem
 from visioncal.estimation.unknowns import BOARD, LENS
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
@@ -103,41 +102,6 @@ class CameraParameters:
             self.problems, {name: np.zeros((0, 4, 4)) for name in self.problems}
         ).values
 
-    def with_sizes(
-        self,
-        levels: Mapping[str, LensLevels],
-        lenses: Mapping[str, FloatArray],
-        boards: tuple[BoardSizes, ...],
-        *,
-        holds_scales: bool | None = None,
-    ) -> "CameraParameters":
-        """Returns them with other sizes of errors; values without errors are the stated ones.
-
-        Args:
-            levels: Sizes of the lens errors beyond the models, by camera.
-            lenses: (k, k) covariances of given intrinsics, by camera.
-            boards: Sizes of the errors of the printed boards.
-            holds_scales: See `CornerProblem`; unchanged if None.
-        """
-        problems = {
-            name: replace(
-                problem.with_levels(levels[name]) if name in levels else problem,
-                lens_covariance=lenses.get(name, problem.lens_covariance),
-                board_sizes=boards,
-                holds_scales=problem.holds_scales if holds_scales is None else holds_scales,
-            )
-            for name, problem in self.problems.items()
-        }
-        sized = replace(self, problems=problems)
-        values, moving = self.stated.copy(), np.setdiff1d(sized.free, sized.held)
-        values[moving] = self.values[moving]
-        return replace(sized, values=values)
-
-    @property
-    def board_sizes(self) -> tuple[BoardSizes, ...]:
-        """Sizes of the errors of the printed boards."""
-        return self._one.board_sizes
-
     def weighed(self, seen: "LinearisedCorners") -> "CameraParameters":
         """Returns them with views reweighted by the residuals of all corners."""
         problems = {
@@ -215,19 +179,16 @@ class LinearisedCorners:
     compressed: tuple[Compressed, ...]  # Normal equations of each camera's corners.
     sigmas_px: tuple[float, ...]  # Each camera's noise of a corner's coordinate [px].
     corners: PriorInformation  # Information of the corners on all values, with free poses.
-    # Whether all values are free, without priors.
-    is_flat: bool = False
 
     @cached_property
     def free(self) -> IntArray:
         """(f,) indices of the uncertain values: those that a fit moves, and held ones."""
-        optics = self.camera_parameters
-        return np.arange(len(optics.values)) if self.is_flat else optics.free
+        return self.camera_parameters.free
 
     @property
     def held(self) -> Mask:
         """(f,) mask of the held ones among the `free` values."""
-        return np.isin(self.free, self.camera_parameters.held) & (not self.is_flat)
+        return np.isin(self.free, self.camera_parameters.held)
 
     @property
     def moving(self) -> IntArray:
@@ -239,8 +200,6 @@ class LinearisedCorners:
         """Information on the free values from corners and priors, without any robot."""
         optics, free = self.camera_parameters, self.free
         corners = self.corners.information[np.ix_(free, free)]
-        if self.is_flat:
-            return PriorInformation(corners, self.corners.gradient[free])
         prior = optics.prior_information[np.ix_(free, free)]
         gradient = prior @ (optics.values - optics.stated)[free]
         return PriorInformation(corners + prior, self.corners.gradient[free] + gradient)
