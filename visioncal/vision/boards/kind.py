@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
+from visioncal.core.files import DocumentTable, is_inside
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.boards.template import Refined, unrefined
@@ -216,6 +216,18 @@ class BoardKind(ABC):
         """The board without markers that a (h, w) grey image shows whole, with sides of 1 m."""
         del image
         return None
+
+
+def file_beside(folder: Path, key: str, name: str, what: str) -> Path:
+    """The path of a file that a target's `.toml` names, which must lie in its folder."""
+    path = folder / name.replace("\\", "/")
+    if not is_inside(path, folder):
+        raise DataError(
+            f"{key} = {name[:80]!r} leads out of the folder of the target's file.",
+            culprits=[key],
+            next_step=f"Copy the {what} beside the target's file.",
+        )
+    return path
 
 
 def size_of(table: DocumentTable, key: str) -> float:

@@ -16,13 +16,14 @@ import cv2
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, is_inside, read_bytes
+from visioncal.core.files import DocumentTable, read_bytes
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.boards.kind import (
     BoardKind,
     DetectedCorners,
     NotFound,
+    file_beside,
     sigma_of,
     size_of,
 )
@@ -88,13 +89,7 @@ class Picture(BoardKind):
         name = document.get("image")
         if not isinstance(name, str):
             return document
-        path = folder / name.replace("\\", "/")
-        if not is_inside(path, folder):
-            raise DataError(
-                f"image = {name[:80]!r} leads out of the folder of the target's file.",
-                culprits=["image"],
-                next_step="Copy the picture beside the target's file.",
-            )
+        path = file_beside(folder, "image", name, "picture")
         return document | {"image": kept_picture(path)}
 
     def stored(

@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.core.documents.columns import Column, TableReader
 from visioncal.core.documents.tables import read_table
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, is_inside
+from visioncal.core.files import DocumentTable
 from visioncal.core.limits import FAR_M
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.kind import (
@@ -20,6 +20,7 @@ from visioncal.vision.boards.kind import (
     DetectedCorners,
     NotFound,
     dictionary_size,
+    file_beside,
     marker_cells,
 )
 from visioncal.vision.boards.layout import find_tags
@@ -45,13 +46,7 @@ class PointsKind(BoardKind):
         name = document.get("points")
         if not isinstance(name, str):
             return document
-        path = folder / name.replace("\\", "/")
-        if not is_inside(path, folder):
-            raise DataError(
-                f"points = {name!r} leads out of the folder of the target's file.",
-                culprits=["points"],
-                next_step="Copy the table of points beside the target's file.",
-            )
+        path = file_beside(folder, "points", name, "table of points")
         table, needed = read_table(path), self.table_columns[: self.needed_columns]
         unknown = [column for column in table.columns if column not in self.table_columns]
         missing = [column for column in needed if column not in table.columns]
