@@ -502,5 +502,5 @@ def _judged(
         f"The camera's depth is {abs(centre):.1f} mm too {'long' if centre > 0 else 'short'} at "
         f"{middle:.2f} m in the image's middle, and over the board from {off.min():.1f} to "
         f"{off.max():.1f} mm: {figures}.{ink}{further}",
-        Remedy("Correct it: visioncal locate does, and calibration.json has it as camera.depth."),
+        Remedy("Correct it: visioncal locate applies camera.depth of calibration.json."),
     )

@@ -58,8 +58,9 @@ def _found(run: RunState) -> Iterator[Finding]:
             "active on the controller when they were recorded? Then they are of its tip, and the "
             "transform is from there, and not from the flange.",
             Remedy(
-                "Measure roughly whether that is so. If not, set the controller's tool to zero and "
-                "record again, or use the result with that tool active alone."
+                f"Measure roughly how far the {thing} is from the flange. If it is not {where} it, "
+                "set the controller's tool to zero and record again, or use the result with that "
+                "tool active alone."
             ),
         )
 
