@@ -46,6 +46,7 @@ from visioncal.session.selecting import ANY, LENS, Choice, must_select_one, sele
 from visioncal.vision.targets import stored_target, target_from_document
 
 _SHOWN = 12
+_USUAL = "hand-eye"  # What stops of a camera are for.
 _SESSION = "session.toml"
 # Options without which a cell is not known.
 _NEEDED = ("target", "camera", "cam", "board")
@@ -83,8 +84,13 @@ def plan_command(options: PlanOptions, session: Path | None = None) -> str:
         floor_of(options),
     )
     kept = (limits, boxes_of(options))
-    purpose_of(options.purpose, "--for")
+    purpose_of(options.purpose or _USUAL, "--for")
     start, words = chosen_part(find_source(options.source), options)
+    # Few plans are for instruments.
+    from visioncal.cli import plan_instrument
+
+    if plan_instrument.is_for_instrument(words, start):
+        return plan_instrument.plan_instrument(words, start, kept)
     if options.to_verify:
         return _plan_to_verify(options, start, words, kept, session)
     if words.add is not None and words.stops is not None:
@@ -177,7 +183,7 @@ def _plan_to_verify(
 
 def _request(stops: PlanOptions, cell: PlanCell) -> PlanRequest:
     """The request for the planner."""
-    purpose = purpose_of(stops.purpose, "--for")
+    purpose = purpose_of(stops.purpose or _USUAL, "--for")
     form = ",".join(f"q{index + 1}" for index in range(cell.robot.joint_count))
     start = stops.start_joints and numbers_in(stops.start_joints, "--start-joints", form)
     has_no_need = stops.need_mm is None and stops.need_deg is None
@@ -188,6 +194,7 @@ def _request(stops: PlanOptions, cell: PlanCell) -> PlanRequest:
         np.array(start) if start else None,
         stops.seed,
         None if has_no_need else Need(stops.need_mm, stops.need_deg),
+        stops.criterion or "I",
     )
 
 
@@ -346,10 +353,14 @@ def cell_of(source: Source, words: PlanOptions, kept: Kept) -> PlanCell:
 def pose_of(words: str, option: str) -> FloatArray:
     """Parses a rough pose: x, y, z [mm] and angles about the fixed axes x, y, z [deg]; (4, 4) [m].
 
+    Three numbers are a place alone, which is not turned.
+
     Raises:
-        DataError: It is not six numbers.
+        DataError: They are not as many.
     """
-    numbers = numbers_in(",".join(words.replace(",", " ").split()), option, "x,y,z,rx,ry,rz")
+    parts = words.replace(",", " ").split()
+    parts += ["0"] * 3 if len(parts) == 3 else []
+    numbers = numbers_in(",".join(parts), option, "x,y,z,rx,ry,rz")
     turn = Rotation.from_euler("xyz", numbers[3:], degrees=True).as_matrix()
     return compose(turn, 1e-3 * np.array(numbers[:3]))
 

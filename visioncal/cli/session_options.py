@@ -29,6 +29,7 @@ from visioncal.core.choices import (
     SIMULATED_CELLS,
     UNITS_M,
     CameraMount,
+    Criterion,
     Mount,
 )
 from visioncal.live.capture.devices import CAMERAS
@@ -124,8 +125,14 @@ class SimulateOptions:
     depth_bowl_mm: float = option("How much deeper it is at the sides (mm).", default=4.0)
     depth_box: bool = flag("A box stands before the board in half of the depth pictures.")
     currents: bool = option("Currents, with --warm-up or --torques.", default=False)
-    stiffness_knm: float | None = option("Stiffness of every joint (kN m/rad).", min=0.1)
+    stiffness_knm: list[float] | None = option(
+        "Stiffness of every joint, or repeated for each (kN m/rad).", min=0.1
+    )
     payload_kg: list[float] | None = option("Payload (kg); repeated for stops in turn.", min=0.0)
+    force_n: list[float] | None = option(
+        "With --instrument: pull on the flange, downwards (N); repeated for stops in turn.", min=0.0
+    )
+    at: Path | None = option("With --instrument: a plan's folder; each stop under each load.")
     recording: int = option("Number of another recording of the cell.", default=0, min=0)
     camera_moved_mm: float = _size("How far the first camera was knocked (mm).")
     seed: int = seed_option()
@@ -220,8 +227,10 @@ class PlanOptions(ClearanceOptions):
     to_verify: bool = flag(
         "Calibrated stops to repeat for visioncal verify, five by default.", "--verify"
     )
-    purpose: str = _what(
-        "What they are for.", "--for", default="hand-eye", metavar="|".join(PURPOSES)
+    purpose: str | None = _what(
+        "What they are for; hand-eye, for an instrument kinematics.",
+        "--for",
+        metavar="|".join(PURPOSES),
     )
     stops: int | None = _what(f"How many stops: {_USUAL_STOPS}.", min=1, max=500)
     need_mm: float | None = _what(
@@ -231,16 +240,23 @@ class PlanOptions(ClearanceOptions):
     start_joints: str | None = _what(
         "The arm's present joints [rad], for the way to the first.", metavar="Q1,Q2,..."
     )
+    criterion: Criterion | None = _what(
+        "Least mean variance of positions (I), for an instrument determinant of the covariance (D)."
+    )
     candidates: int = _what("Number of candidate stops.", default=1500, min=12, max=20000)
     seed: int = _what("Random seed of the candidate stops.", default=0, min=0)
     robot: str | None = _cell("The robot, where a session names none.")
     target: str | None = _cell(_BOARD)
     camera: str | None = _cell("Numbers [px], or a file of the lens.", metavar="FX,FY,CX,CY | FILE")
     resolution: tuple[int, int] | None = _cell("Size of the images in pixels.", **SIZE)
-    mount: Mount | None = _cell("Where the camera is.")
-    cam: str | None = _cell(f"Rough camera on the flange (or in the base). {_ROUGH}", metavar=_POSE)
+    mount: Mount | None = _cell("Where the camera is, or that it is an instrument.")
+    instrument: str | None = _cell("A known instrument, such as leica-at960.", metavar="NAME")
+    probe: Literal["point", "pose"] | None = _cell("What it reads on the flange: point (default).")
+    cam: str | None = _cell(
+        f"Rough camera on the flange (or in the base, as an instrument). {_ROUGH}", metavar=_POSE
+    )
     board: str | None = _cell(
-        "Rough board in the base (or on the flange); face up: 180 0 0.", metavar=_POSE
+        "Rough board in the base (or on the flange, as a probe); face up: 180 0 0.", metavar=_POSE
     )
     guess_mm: float = _certainty("Sigma of both places, in mm.", default=20.0, min=0.1, max=500.0)
     guess_deg: float = _certainty("The same of both rotations.", default=5.0, min=0.01, max=45.0)

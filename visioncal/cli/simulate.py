@@ -2,13 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from visioncal.cli.console import say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import Instrument, SimulateOptions
+from visioncal.core.codec import reading
+from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
+from visioncal.core.files import read_text
+from visioncal.core.types import FloatArray
+from visioncal.interchange.outputs import PLAN
 from visioncal.session import frame_name
 from visioncal.session.saving import refuse_filled
 from visioncal.simulation import (
@@ -69,7 +75,7 @@ _TAKES: Mapping[str, frozenset[str]] = {
     "instrument": frozenset(
         (
             *("robot_sigma_mm", "robot_sigma_mrad", "arm_sigma_mm", "arm_sigma_mrad"),
-            *("stiffness_knm", "payload_kg", "views", "robot", "seed"),
+            *("stiffness_knm", "payload_kg", "force_n", "at", "views", "robot", "seed"),
         )
     ),
     "torques": frozenset(("robot", "payload_kg", "currents", "seed")),
@@ -85,8 +91,11 @@ def simulate_command(asked: SimulateOptions) -> None:
     # Checked first, as rendering takes long.
     refuse_filled(folder.absolute())
     compliance: tuple[float, ...] = ()
-    if asked.stiffness_knm is not None:
-        compliance = (1e-3 / asked.stiffness_knm,) * len(arm_named(asked.robot).offset)
+    if asked.stiffness_knm:
+        each = tuple(1e-3 / stiff for stiff in asked.stiffness_knm)
+        compliance = each if len(each) > 1 else each * len(arm_named(asked.robot).offset)
+    loads = [Payload(kg, _CENTRE_M) for kg in asked.payload_kg or ()]
+    loads += [Payload(force_n=(0.0, 0.0, -newtons)) for newtons in asked.force_n or ()]
     options = CellOptions(
         robot=asked.robot,
         mount=asked.mount,
@@ -101,7 +110,7 @@ def simulate_command(asked: SimulateOptions) -> None:
         wrong_views=asked.wrong_views,
         board_scale=asked.board_scale,
         compliance_rad_per_nm=compliance,
-        payloads=tuple(Payload(kg, _CENTRE_M) for kg in asked.payload_kg or ()),
+        payloads=tuple(loads),
         second=Second() if asked.second_board else None,
         recording=asked.recording,
         camera_moved_m=1e-3 * asked.camera_moved_mm,
@@ -117,7 +126,8 @@ def simulate_command(asked: SimulateOptions) -> None:
             seed=options.seed,
             **options.part(ArmOptions),
         )
-        write_tracked(tracked(instrument), folder)
+        joints = None if asked.at is None else _planned(asked.at, max(len(loads), 1))
+        write_tracked(tracked(instrument, joints), folder)
     elif asked.torques:
         write_exercise(_exercise_options(asked, asked.robot, asked.seed), folder)
     elif asked.warm_up:
@@ -184,6 +194,13 @@ def _write(cell: SimulatedCell, asked: SimulateOptions) -> None:
 
 def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}" if name else "a plain cell of one robot"
+
+
+def _planned(plan: Path, times: int) -> FloatArray:
+    """(k times, n) joint angles of a plan's k stops, each several times [rad]."""
+    document = parse_stored(read_text(plan / PLAN), str(plan / PLAN))
+    with reading(str(plan), "a plan", "Make one with visioncal plan."):
+        return np.repeat(np.array([stop["q"] for stop in document["stops"]]), times, axis=0)
 
 
 def _whole_cell(name: str, options: CellOptions, asked: SimulateOptions) -> SimulatedCell:

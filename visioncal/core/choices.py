@@ -20,6 +20,8 @@ MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
 # Mount of the observing device: a camera on the flange, a fixed camera, or a fixed measuring
 # instrument that observes a probe or points on the flange.
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
+# What planned stops minimise: the mean variance of positions, or the determinant of the covariance.
+Criterion: TypeAlias = Literal["I", "D"]
 # Simulated arms, and built-in descriptions of whole cells.
 SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
 SIMULATED_CELLS = ("camera-and-tracker", "two-arms", "two-cameras")

@@ -154,9 +154,12 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
     return _write(folder, results, {PREVIEW: draw}, (PROGRAM,))
 
 
-def write_stops(folder: Path, table: str, boards: Mapping[str, str | bytes]) -> Written:
-    """Writes the table and the board of a plan without a model of its robot; see `write_plan`."""
-    texts = {STOPS: table, **boards}
+def write_stops(folder: Path, table: str, others: Mapping[str, str | bytes]) -> Written:
+    """Writes a plan without a preview: its table, and its board or other files; see `write_plan`.
+
+    Those of an earlier plan that this one lacks are removed.
+    """
+    texts = {STOPS: table, **others}
     results = {name: _text(text) for name, text in texts.items()}
     return _write(folder, results, {}, (PLAN, PROGRAM, PREVIEW, BOARD))
 

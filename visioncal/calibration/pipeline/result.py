@@ -201,8 +201,8 @@ def _noise(run: RunState) -> dict[str, float]:
 
 
 def _joint_fit(run: RunState) -> JointFit | None:
-    """The unknowns of the fit with their covariance; None for a calibration by an instrument."""
-    if run.mount == "instrument":
+    """The unknowns of the fit with their covariance; None for several points of an instrument."""
+    if run.readings is not None and len(run.readings.names) > 1:
         return None
     boards, fit = run.session.boards, run.assessment.fit
     names = [

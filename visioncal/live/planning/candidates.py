@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, Mask, Progress
-from visioncal.live.planning.cell import PlanCell, collision_model
+from visioncal.live.planning.cell import AnyCell, PlanCell, collision_model
 from visioncal.live.planning.visibility import BoardViews, Occlusion
 from visioncal.robot.collision import Collisions
 from visioncal.robot.inverse import Inverse
@@ -94,7 +94,7 @@ def candidates(
     # A tenth of the requested number, or what a plan needs.
     if len(search.kept) < (least or max(0.1 * count, min(12, count))):
         raise search.error()
-    q = _unwind(cell, search.collisions, np.array([posture for posture, _ in search.kept]))
+    q = unwound(cell, search.collisions, np.array([posture for posture, _ in search.kept]))
     shares = np.array([share for _, share in search.kept])
     return Candidates(q, cell.cam_from_target(q), shares, dict((+search.lost).most_common()))
 
@@ -220,7 +220,7 @@ class _CandidateSearch:
         self.kept += zip(q[kept], share[kept].tolist(), strict=True)
 
 
-def _unwind(cell: PlanCell, collisions: Collisions, q: FloatArray) -> FloatArray:
+def unwound(cell: AnyCell, collisions: Collisions, q: FloatArray) -> FloatArray:
     """Shifts joints of postures (k, n) by full turns, so that straight paths are possible."""
     # A joint cannot pass a wide range of angles in which no stop has it and most postures collide,
     # with the floor for example: its angles are counted from the middle of that range.

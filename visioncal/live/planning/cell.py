@@ -15,7 +15,15 @@ from visioncal.results import Calibration
 from visioncal.results.arm import StoredRobot
 from visioncal.results.lens import StoredCamera
 from visioncal.robot import Robot
-from visioncal.robot.collision import Body, Collisions, arm_bodies, camera_body, capsule
+from visioncal.robot.collision import (
+    SLACK_M,
+    Body,
+    Collisions,
+    arm_bodies,
+    camera_body,
+    capsule,
+)
+from visioncal.session.kinds import Instrument
 from visioncal.vision.targets import (
     corner_positions,
     extent_m,
@@ -146,6 +154,10 @@ class PlanCell:
                     f"the guesses: {name} is {getattr(self, name)}; zero or more is needed."
                 )
 
+    def collisions(self) -> Collisions:
+        """See `collision_model`."""
+        return collision_model(self)
+
     def cam_from_target(self, q: FloatArray) -> FloatArray:
         """Predicts (k, 4, 4) `cam_from_target` [m] at (k, n) joint angles [rad] by the guesses."""
         return self.seen_from(self.robot.base_from_flange(q))
@@ -169,6 +181,33 @@ class PlanCell:
             twists = draws @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
         moves = exp(twists.reshape(count, 2, 6))
         return tuple(replace(self, x=self.x @ by_x, z=self.z @ by_z) for by_x, by_z in moves)
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentCell:
+    """An instrument beside an arm that carries its probe, with rough guesses of both places."""
+
+    robot: Robot
+    instrument: Instrument
+    x: FloatArray  # (4, 4) `base_from_instrument` [m].
+    z: FloatArray  # (4, 4) `flange_from_probe`; of a point only its position counts.
+    are_poses: bool  # Whether the probe's rotation is read, too.
+    noise: Noise  # Noise of the robot's poses.
+    limits: Limits = field(default_factory=Limits)
+    boxes: tuple[Box, ...] = ()
+    mount: Mount = "instrument"
+
+    def collisions(self) -> Collisions:
+        """Collision model of the arm, the probe with its holder, and obstacles."""
+        hand, flange = self.robot.joint_count, self.robot.chain.placements[-1]
+        # The probe is as thick as the holder of a camera.
+        tip = capsule("probe", hand, flange[:3, 3], (flange @ self.z)[:3, 3], 0.02)
+        bodies = [*arm_bodies(self.robot), tip, *(box.body for box in self.boxes)]
+        limits = self.limits
+        return Collisions(self.robot, bodies, limits.clearance_m + SLACK_M, limits.floor_m)
+
+
+AnyCell: TypeAlias = PlanCell | InstrumentCell
 
 
 def flange_at(

@@ -1,18 +1,20 @@
-"""Choosing the most informative stops: I-optimal design by greedy selection and exchange.
+"""Choosing the most informative stops: I- or D-optimal design by greedy selection and exchange.
 
-The criterion is the mean variance of the positions that count, over the possible cells ("worlds")
-(Atkinson, Donev and Tobias 2007, chapter 10).
+The I criterion is the mean variance of the positions that count, over the possible cells
+("worlds"); the D criterion is the determinant of the covariance of all unknowns (Atkinson, Donev
+and Tobias 2007, chapter 10).
 
 A stop adds six rows F, so that its effect on a covariance C is a rank-six update (Woodbury):
 `C - C F^T (1 + F C F^T)^-1 F C`, computed for all candidates in a few products.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.threads import one_blas_thread
@@ -79,12 +81,13 @@ class _Selection:
     """Chosen candidates, and their information in each world."""
 
     problem: tuple[_Reduced, ...]
+    criterion: Criterion = "I"
     rows: tuple[int, ...] = ()  # The chosen candidates, beside the recorded stops.
 
     @classmethod
-    def of(cls, worlds: Sequence[World]) -> "_Selection":
+    def of(cls, worlds: Sequence[World], criterion: Criterion = "I") -> "_Selection":
         """Starts with no candidate, only the recorded stops."""
-        return cls(tuple(map(_Reduced, worlds)))
+        return cls(tuple(map(_Reduced, worlds)), criterion)
 
     @property
     def left(self) -> list[int]:
@@ -94,7 +97,7 @@ class _Selection:
 
     def with_rows(self, added: list[int]) -> "_Selection":
         """Adds candidates."""
-        return _Selection(self.problem, (*self.rows, *added))
+        return replace(self, rows=(*self.rows, *added))
 
     def with_best(self) -> "_Selection":
         """Adds the candidate that reduces the value most."""
@@ -103,7 +106,7 @@ class _Selection:
     def without_least(self) -> "_Selection":
         """Removes the chosen candidate without which the value rises least."""
         row = self._best(list(self.rows), -1.0)
-        return _Selection(self.problem, tuple(other for other in self.rows if other != row))
+        return replace(self, rows=tuple(other for other in self.rows if other != row))
 
     @cached_property
     def covariances(self) -> tuple[FloatArray, ...]:
@@ -127,6 +130,14 @@ class _Selection:
         return sums / len(self.problem)
 
     @property
+    def value(self) -> float:
+        """The minimised value: a variance, for D the geometric mean of those of all unknowns."""
+        if self.criterion == "I":
+            return float(self.variances[0])
+        logs = [np.linalg.slogdet(each)[1] / len(each) for each in self.covariances]
+        return float(np.exp(np.mean(logs)))
+
+    @property
     def accuracy(self) -> Accuracy:
         """The predicted accuracy."""
         return Accuracy.of(*self.variances[1:].tolist())
@@ -138,6 +149,9 @@ class _Selection:
             factors = world.factors[rows]
             carried = factors @ covariance
             changed = np.eye(6) + sign * carried @ np.swapaxes(factors, 1, 2)
+            if self.criterion == "D":
+                gains += sign * np.linalg.slogdet(changed)[1]
+                continue
             moved = carried @ world.roots[0].T
             squares = moved @ np.swapaxes(moved, 1, 2)
             gains += sign * np.trace(np.linalg.solve(changed, squares), axis1=1, axis2=2)
@@ -165,7 +179,7 @@ class Design:
         return self.history[0]
 
 
-def choose_stops(worlds: Sequence[World], count: int) -> Design:
+def choose_stops(worlds: Sequence[World], count: int, criterion: Criterion = "I") -> Design:
     """Chooses `count` of the candidates to add to the recorded stops, the most informative.
 
     Stops are added greedily; then the best unused candidate replaces the least informative stop
@@ -182,22 +196,22 @@ def choose_stops(worlds: Sequence[World], count: int) -> Design:
             next_step="Ask for fewer stops, or make more candidates.",
         )
     with one_blas_thread():
-        state = _Selection.of(worlds)
+        state = _Selection.of(worlds, criterion)
         for _ in range(count):
             state = state.with_best()
         # Stops are exchanged while that gains; their number stays.
         for _ in state.rows:
             if not state.left:
                 break
-            enough = (1.0 - 1e-4) * state.variances[0]
+            enough = (1.0 - 1e-4) * state.value
             exchanged = state.with_best().without_least()
-            if not exchanged.variances[0] < enough:
+            if not exchanged.value < enough:
                 exchanged = state.without_least().with_best()
-            if not exchanged.variances[0] < enough:
+            if not exchanged.value < enough:
                 break
             state = exchanged
         rows = np.array(state.rows, dtype=np.int64)
-        ranking = _Selection.of([world.of_candidates(rows) for world in worlds])
+        ranking = _Selection.of([world.of_candidates(rows) for world in worlds], criterion)
         history = [ranking.accuracy]
         for _ in rows:
             ranking = ranking.with_best()

@@ -34,7 +34,7 @@ from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.workspace import postures
-from visioncal.live.planning.cell import PlanCell
+from visioncal.live.planning.cell import AnyCell, PlanCell, seen_from
 from visioncal.live.planning.purposes import Purpose
 from visioncal.robot import Robot
 from visioncal.vision.camera import project
@@ -149,9 +149,7 @@ def stop_factors(
     information = free.information if recorded is None else recorded.shared
     # The other shared parameters do not affect a stop at which the arm stands still.
     others = np.zeros((int(seen.sum()), 6, len(information) - len(free.columns)))
-    factors = np.zeros(
-        (len(q), 6, 12 + len(information) + _arm_size(cell.robot, purpose, recorded))
-    )
+    factors = np.zeros((len(q), 6, 12 + len(information) + arm_size(cell.robot, purpose, recorded)))
     if seen.any():
         compressed = compress(stack, free.basis, free.appearance, poses[seen])
         flange = cell.robot.base_from_flange(q[seen])
@@ -167,7 +165,7 @@ def stop_factors(
         arm = None if recorded is None else recorded.arm
         if arm is not None:
             arm = replace(arm, basis=link_basis(cell.robot, q[seen]))
-        problem = _with_arm_errors(cell, purpose, problem, q[seen], arm)
+        problem = with_arm_errors(cell, purpose, problem, q[seen], arm)
         state = State(np.stack([cell.x, cell.z]), problem.start_values)
         linear = problem.linear(state, ideal=True)
         root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise))
@@ -198,8 +196,8 @@ def _world(
 ) -> World:
     shared = stated(cell).information if recorded is None else recorded.shared
     factors = stop_factors(cell, purpose, q, recorded)
-    shared_count, sigma = len(shared), _arm_sigma(purpose)
-    arm = _arm_size(cell.robot, purpose, recorded)
+    shared_count, sigma = len(shared), arm_sigma(purpose)
+    arm = arm_size(cell.robot, purpose, recorded)
     if recorded is not None and not purpose.blocks and recorded.arm is not None:
         # Errors that a fit treats as noise are not unknowns.
         arm *= recorded.arm.is_estimated
@@ -219,20 +217,12 @@ def _world(
         position[:, :, 3:6] = point[:, :, 3:6] = rotation[:, :, :3] = np.eye(3)
         point[:, :, :3] = -skew(observed[:, :3])
     else:
-        # The pose of what the arm carries, relative to what is fixed in the base.
-        q = postures(cell.robot)
-        flange = cell.robot.base_from_flange(q)
-        problem = chain(cell.mount, flange[:1], cell.cam_from_target(q[:1]))
-        start = State(np.stack([cell.x, cell.z]), np.zeros(0))
-        pair = ArmPair.of(problem, start, problem.robots[0])
-        # (w, 4, 4) poses of the camera-board pair, and their Jacobian (w, 6, 12 + a).
-        poses, jacobian = pair.jacobian(flange, _arm_model(cell.robot, purpose).basis(q))
-        position = point = pair.place_jacobian(poses, jacobian, middle)
-        rotation = jacobian[:, :3]
+        position, rotation = workspace_jacobian(cell, purpose, middle)
+        point = position
     # Zeros for lens and board follow the edges.
     at = np.full(shared_count, 12)
     place, turn, spot = (
-        np.insert(np.insert(_mean_square(part), at, 0.0, axis=0), at, 0.0, axis=1)
+        np.insert(np.insert(mean_square(part), at, 0.0, axis=0), at, 0.0, axis=1)
         for part in (position, rotation, point)
     )
     misfit, gradient = factors[:, :, size:], recorded_information[:size, size:]
@@ -256,6 +246,27 @@ def _world(
     )
 
 
+def workspace_jacobian(
+    cell: AnyCell, purpose: Purpose, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of what the arm carries all over its workspace, by the edges and the arm's errors.
+
+    Returns:
+        (w, 3, 12 + a) of the position of a point `at` (3,) of the observed frame, relative to what
+        is fixed in the base, and (w, 3, 12 + a) of its rotation.
+    """
+    q = postures(cell.robot)
+    flange = cell.robot.base_from_flange(q)
+    problem = chain(cell.mount, flange[:1], seen_from(cell.mount, cell.x, cell.z, flange[:1]))
+    start = State(np.stack([cell.x, cell.z]), np.zeros(0))
+    pair = ArmPair.of(problem, start, problem.robots[0])
+    basis = np.zeros((len(q), 6, 0))
+    if purpose.blocks:
+        basis = arm_model(cell.robot, purpose).basis(q)
+    poses, jacobian = pair.jacobian(flange, basis)
+    return pair.place_jacobian(poses, jacobian, at), jacobian[:, :3]
+
+
 def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedStops) -> FloatArray:
     """Information (p + a, p + a) of recorded stops and hand measurements, without priors."""
     q = recorded.q
@@ -267,7 +278,7 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
         )
     stops = len(next(iter(recorded.fit.flanges.values())))
     joints = np.zeros((stops, cell.robot.joint_count)) if q is None else q
-    problem = _with_arm_errors(cell, purpose, recorded.fit.problem, joints, recorded.arm)
+    problem = with_arm_errors(cell, purpose, recorded.fit.problem, joints, recorded.arm)
     # Further boards keep their pose relative to the planned one.
     boards = cell.z @ invert(recorded.edges[1]) @ recorded.edges[1:]
     state = State(np.concatenate([cell.x[None], boards]), problem.start_values)
@@ -281,13 +292,17 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
     return np.delete(np.delete(information, further, axis=0), further, axis=1) - eliminated
 
 
-def _with_arm_errors(
-    cell: PlanCell, purpose: Purpose, problem: Problem, q: FloatArray, arm: ArmErrors | None
+def with_arm_errors(
+    cell: AnyCell,
+    purpose: Purpose,
+    problem: Problem,
+    q: FloatArray,
+    arm: ArmErrors | None = None,
 ) -> Problem:
     """Adds errors of the arm to a problem: the purpose's, or those that the stops show."""
     if purpose.blocks:
-        basis = _arm_model(cell.robot, purpose).basis(q)
-        arm = ArmErrors(basis, _arm_sigma(purpose), 0.0, of_links=True)
+        basis = arm_model(cell.robot, purpose).basis(q)
+        arm = ArmErrors(basis, arm_sigma(purpose), 0.0, of_links=True)
     elif arm is not None:
         arm = replace(arm, basis=arm.sigma * arm.basis, sigma=1.0)
     if arm is None:
@@ -301,10 +316,11 @@ def _effect_information(problem: Problem) -> FloatArray:
     return np.asarray(block_diag(np.zeros((0, 0)), *priors))
 
 
-def _arm_model(robot: Robot, purpose: Purpose) -> ArmModel:
-    sigma = _arm_sigma(purpose)
+def arm_model(robot: Robot, purpose: Purpose) -> ArmModel:
+    """The nominal arm with the unknown errors of a purpose; raises DataError."""
+    sigma = arm_sigma(purpose)
     weights = {name: block / sigma for name, block in purpose.blocks.items()}
-    model = ArmModel(robot, np.eye(4), weights, np.zeros(_arm_size(robot, purpose)))
+    model = ArmModel(robot, np.eye(4), weights, np.zeros(arm_size(robot, purpose)))
     if COMPLIANCE not in weights:
         return model
     if robot.masses is None:
@@ -317,13 +333,13 @@ def _arm_model(robot: Robot, purpose: Purpose) -> ArmModel:
     return model.loaded(postures(robot))
 
 
-def _arm_sigma(purpose: Purpose) -> float:
+def arm_sigma(purpose: Purpose) -> float:
     """Unit of the arm's unknowns: the first block's prior sigma [rad]."""
     return next(iter(purpose.blocks.values()), 1.0)
 
 
-def _arm_size(robot: Robot, purpose: Purpose, recorded: RecordedStops | None = None) -> int:
-    """Number of errors of the arm that `_with_arm_errors` adds."""
+def arm_size(robot: Robot, purpose: Purpose, recorded: RecordedStops | None = None) -> int:
+    """Number of errors of the arm that `with_arm_errors` adds."""
     if purpose.blocks or recorded is None or recorded.arm is None:
         return sum(block_size(name, robot.joint_count) for name in purpose.blocks)
     return int(recorded.arm.basis.shape[2])
@@ -356,7 +372,7 @@ def _predicted_corners(
     return stack, shows
 
 
-def _mean_square(jacobian: FloatArray) -> FloatArray:
+def mean_square(jacobian: FloatArray) -> FloatArray:
     """Mean over m of J^T J: (m, 3, p) to (p, p)."""
     rows = jacobian.reshape(-1, jacobian.shape[2])
     return np.asarray(rows.T @ rows / len(jacobian))

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
-from visioncal.live.planning.cell import PlanCell, collision_model
+from visioncal.live.planning.cell import AnyCell
 from visioncal.robot.collision import Collisions
 
 # Draws per search, and the length of one step [rad].
@@ -51,7 +51,7 @@ class _Tree:
 class _Detours:
     """Planner of collision-free paths between postures."""
 
-    def __init__(self, cell: PlanCell, collisions: Collisions, seed: int) -> None:
+    def __init__(self, cell: AnyCell, collisions: Collisions, seed: int) -> None:
         margin = cell.limits.joint_margin_rad
         self._lower = cell.robot.lower_rad + margin
         self._upper = cell.robot.upper_rad - margin
@@ -114,7 +114,7 @@ class Route:
     unreachable: Mapping[int, str]
 
 
-def order_stops(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed: int = 0) -> Route:
+def order_stops(cell: AnyCell, start_q: FloatArray | None, q: FloatArray, seed: int = 0) -> Route:
     """Orders stops for a short path of the joints, and finds collision-free segments.
 
     The order is that of nearest neighbours, improved by reversals (Croes 1958, 2-opt). Each segment
@@ -132,7 +132,7 @@ def order_stops(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed:
     Raises:
         DataError: The start violates the clearance.
     """
-    collisions = collision_model(cell)
+    collisions = cell.collisions()
     if start_q is not None and (contact := int(collisions.first_contact(start_q[None])[0])) >= 0:
         first_body, second_body = collisions.names[contact]
         apart_m, needed_m = collisions.distances(start_q)[contact], collisions.needed_m()[contact]

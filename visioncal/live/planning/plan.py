@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from visioncal.core.arguments import typed
+from visioncal.core.choices import Criterion
 from visioncal.core.codec import Key, Matrix, Vector, WrittenForm
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CalibrationLimits
@@ -57,6 +58,7 @@ class PlanRequest:
     seed: int = 0
     # Tolerance of picks at which fewer are enough; None for none.
     need: Annotated[Need, _NEED] | None = None
+    criterion: Criterion = "I"  # What the stops minimise; see `choose_stops`.
 
 
 # An accuracy in plan.json; open where a direction is not determined.
@@ -210,7 +212,7 @@ class _Planning:
         request, recorded = self.request, () if self.begun is None else self.begun.views
         needed_stops = CalibrationLimits.stops[0] - len(recorded)
         worlds = tuple(world.of_candidates(rows) for world in self.worlds)
-        design = choose_stops(worlds, request.count)
+        design = choose_stops(worlds, request.count, request.criterion)
         if request.need is not None:
             picking = Picking(self.cells, worlds, self.found.q[rows], request.need)
             fewest, share = picking.fewest(design.rows)
@@ -227,7 +229,7 @@ class _Planning:
             # The first stops of a large design are not the best small design, which may need one
             # stop less.
             for count in range(max(fewest - 1, 1), len(design.rows)):
-                smaller = choose_stops(worlds, count)
+                smaller = choose_stops(worlds, count, request.criterion)
                 if count >= needed_stops and picking.chance(smaller.rows) >= share:
                     design = smaller
                     break

@@ -1,7 +1,7 @@
 """Files of a plan: table of stops, program for a UR controller, and plan.json with its reader."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,6 +23,7 @@ from visioncal.live.planning.plan import (
     Stop,
     StoredPurpose,
 )
+from visioncal.robot import Robot
 from visioncal.robot.conversion import has_ur_axes
 from visioncal.session.columns import POSE, pose_row
 
@@ -40,7 +41,7 @@ def stops_table(plan: Plan) -> str:
     return csv_text(rows)
 
 
-def _image_of(stop: PlannedStop) -> str:
+def _image_of(stop: Stop) -> str:
     """Name of the image to be taken at a stop."""
     return f"images/{stop.view:03d}.png"
 
@@ -64,7 +65,7 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
         "purpose": request.purpose.name,
         "judged": request.purpose.errors,
         "predicted": predicted,
-        "criterion": {"name": "I", "value": design.sigma_mm},
+        "criterion": {"name": request.criterion, "value": design.sigma_mm},
         "stops": [write(PlannedStop, stop) for stop in plan.stops],
         "joints": list(plan.cell.robot.joint_names),
         "path_rad": plan.length_rad,
@@ -87,41 +88,69 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
 
 
 def program_of(plan: Plan) -> str:
-    """Writes a program that drives a UR to the stops and waits at each; empty for other arms.
+    """Writes a program that drives a UR to the stops and waits at each; empty for other arms."""
+    cell = plan.cell
+    named = f"Robot {cell.robot.name}, {cell.mount}, board {cell.target.name}."
+    begins = plan.request.start_q is not None
+    return ur_program(
+        cell.robot, plan.request.purpose.name, named, plan.stops, _image_taken, begins=begins
+    )
+
+
+def _image_taken(stop: Stop) -> str:
+    return f"take {_image_of(stop)}"
+
+
+def ur_program(
+    robot: Robot,
+    purpose: str,
+    named: str,
+    stops: Sequence[Stop],
+    act: Callable[[Stop], str],
+    *,
+    begins: bool,
+) -> str:
+    """Writes a program that drives a UR to stops and waits at each; empty for other arms.
 
     Between postures it moves straight in joint space, without blending: the path that was checked.
+
+    Args:
+        robot: The arm.
+        purpose: What the stops are for.
+        named: A sentence that names the cell.
+        stops: The stops in driving order.
+        act: Says what a person does at a stop.
+        begins: Whether the way from where the arm stands was looked at.
     """
-    cell = plan.cell
     start: tuple[str, ...] = ()
-    if not has_ur_axes(cell.robot):
+    if not has_ur_axes(robot):
         return ""
-    named = one_line(f"Robot {cell.robot.name}, {cell.mount}, board {cell.target.name}.")
-    if plan.request.start_q is None:
+    if not begins:
         start = (
             "# The way from where the arm stands now to the first stop was not looked at: bring it",
             "# there by hand first.",
         )
     lines = [
-        f"# visioncal {__version__}: {len(plan.stops)} stops for {plan.request.purpose.name}",
-        f"# {named.encode('ascii', 'replace').decode()}",
+        f"# visioncal {__version__}: {len(stops)} stops for {purpose}",
+        f"# {one_line(named).encode('ascii', 'replace').decode()}",
         "# Look at plan.rrd first, then run it at reduced speed, with a hand on the stop button.",
         "# The ways were looked at with capsules for the arm and with what was declared of the",
         "# cell: floor, boxes, board, camera. Cables, grippers and people are not known to it.",
         *start,
-        "# At each stop the program waits: take the image that it names, write down the pose.",
+        "# At each stop the program waits: do what it asks for, write down the pose.",
         "def visioncal_plan():",
         f"  speed = {PLAN_SPEED}          # rad/s",
         f"  acceleration = {PLAN_ACCELERATION}   # rad/s^2",
         "  settling = 0.5       # s",
     ]
-    for stop in plan.stops:
+    for stop in stops:
         words = ["on the way"] * len(stop.via) + [f"view {stop.view}"]
         for posture, word in zip((*stop.via, stop.q), words, strict=True):
             joints = ", ".join(f"{value:.6f}" for value in posture)
             lines.append(f"  movej([{joints}], a=acceleration, v=speed)  # {word}")
         lines.append("  sleep(settling)")
         lines.append(
-            f'  popup("View {stop.view}: take {_image_of(stop)}, then continue.", '
+            f'  popup("View {stop.view}: {act(stop)}, then continue.", '
             'title="visioncal", blocking=True)'
         )
     lines.append('  popup("All stops are done.", title="visioncal", blocking=True)')

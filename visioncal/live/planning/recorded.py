@@ -205,14 +205,6 @@ def _posterior_edges(fit: Fit, mount: Mount) -> tuple[FloatArray, FloatArray]:
 
 def _missing_input_error(run: RunState) -> DataError:
     session, missing = run.session, []
-    if session.mount == "instrument":
-        return DataError(
-            f"session {session.name!r} is of an instrument; stops are planned for cameras that see "
-            "a board.",
-            culprits=[session.name],
-            next_step="Choose stops that turn the flange by 30 degrees or more about two axes, all "
-            "over the workspace.",
-        )
     if run.robot is None:
         missing.append("a model of its robot, which says where the arm reaches")
     if not session.boards:

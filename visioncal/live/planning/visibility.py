@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import Camera, FloatArray, Mask
-from visioncal.live.planning.cell import PlanCell, board_size_m
+from visioncal.live.planning.cell import AnyCell, PlanCell, board_size_m
 from visioncal.robot.collision import Body, arm_bodies
 from visioncal.vision.camera import normalise, project_with_jacobian
 from visioncal.vision.targets import extent_m, outline
@@ -205,7 +205,7 @@ class Occlusion:
         points: (p, 3) the points of the print, in the target frame [m].
     """
 
-    def __init__(self, cell: PlanCell, points: FloatArray) -> None:
+    def __init__(self, cell: AnyCell, points: FloatArray) -> None:
         self.cell, self.points = cell, points
         # Those on the last link carry camera or board, and do not move relative to it.
         hand = cell.robot.joint_count
