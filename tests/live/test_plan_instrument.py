@@ -21,6 +21,7 @@ from visioncal.simulation.instrument_session import InstrumentOptions, session_o
 
 ARM = "generic-6r-1800"
 TRACKER = ("--instrument", "leica-at960", "--cam", "2500 -1000 400", "--board", "30 -20 120")
+AT500 = ("--instrument", "leica-at500", *TRACKER[2:])
 
 
 def cell_of(*, are_poses: bool = False, at=(2.5, -1.0, 0.4), **limits) -> InstrumentCell:
@@ -121,8 +122,7 @@ def test_stops_are_added_to_a_session_and_what_was_recorded_counts(tmp_path):
         ((ARM, "--mount", "instrument", "--add", 3), "holds no recorded session"),
         ((ARM, "--mount", "instrument", *TRACKER, "--target", "x"), "sees no board"),
         (
-            (ARM, "--mount", "instrument", "--probe", "pose", "--instrument", "leica-at500")
-            + TRACKER[2:],
+            (ARM, "--mount", "instrument", "--probe", "pose", *AT500),
             "reads rotations is not known",
         ),
     ],

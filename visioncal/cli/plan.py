@@ -353,14 +353,10 @@ def cell_of(source: Source, words: PlanOptions, kept: Kept) -> PlanCell:
 def pose_of(words: str, option: str) -> FloatArray:
     """Parses a rough pose: x, y, z [mm] and angles about the fixed axes x, y, z [deg]; (4, 4) [m].
 
-    Three numbers are a place alone, which is not turned.
-
     Raises:
-        DataError: They are not as many.
+        DataError: It is not six numbers.
     """
-    parts = words.replace(",", " ").split()
-    parts += ["0"] * 3 if len(parts) == 3 else []
-    numbers = numbers_in(",".join(parts), option, "x,y,z,rx,ry,rz")
+    numbers = numbers_in(",".join(words.replace(",", " ").split()), option, "x,y,z,rx,ry,rz")
     turn = Rotation.from_euler("xyz", numbers[3:], degrees=True).as_matrix()
     return compose(turn, 1e-3 * np.array(numbers[:3]))
 

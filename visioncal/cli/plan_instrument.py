@@ -157,9 +157,9 @@ def _cell(
     else:
         x, z, noise = np.eye(4), np.eye(4), TYPICAL_NOISE
     if options.cam is not None:
-        x = pose_of(options.cam, "--cam")
+        x = _placed(options.cam, "--cam")
     if options.board is not None:
-        z = pose_of(options.board, "--board")
+        z = _placed(options.board, "--board")
     missing = [f"--{name}" for name in ("cam", "board") if getattr(options, name) is None]
     instrument, are_poses = _instrument(options, session)
     missing += ["--instrument"] if instrument is None else []
@@ -178,6 +178,11 @@ def _cell(
         recorded = _recorded(session, robot)
         first = 1 + max(view.number for view in session.views)
     return cell, recorded, first
+
+
+def _placed(words: str, option: str) -> FloatArray:
+    """A rough pose as `pose_of` reads it; three numbers are a place alone, which is not turned."""
+    return pose_of(words + " 0 0 0" * (len(words.replace(",", " ").split()) == 3), option)
 
 
 def _robot(options: PlanOptions, source: Source, found: Calibration | None) -> Robot:
