@@ -84,12 +84,71 @@ def copied(robot, boards, start=12):
     return robot, boards
 
 
+def unsigned(robot, boards):
+    robot = robot.copy()
+    robot[:, 1, 3] = np.abs(robot[:, 1, 3])
+    return robot, boards
+
+
 PLANTED = {
     "shifted_rows": (shifted, [*range(10, 22)], "From view 10 on, images and poses are 2 rows"),
     "turned_board": (turned, [1, 4, 5, 8, 11, 13, 16, 19], "turned by 180 deg"),
     "flipped_poses": (flipped, [0, 2, 10, 14, 15, 20], "tilted the other way"),
     "copied_poses": (copied, [*range(12, 24)], "to the last digit"),
 }
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_positions_that_lost_a_sign_get_it_back_by_the_printed_command(
+    tmp_path, monkeypatch, mount
+):
+    monkeypatch.chdir(tmp_path)
+    robot, boards = poses_of(mount)
+    negative = np.flatnonzero(robot[:, 1, 3] < 0.0)
+    if len(negative) > len(robot) / 2:
+        # The other half of the views is what is read otherwise.
+        robot = exp(np.array([0.0, 0.0, np.pi, 0.0, 0.0, 0.0])) @ robot
+        negative = np.flatnonzero(robot[:, 1, 3] < 0.0)
+    sound = visioncal.calibrate(pairs_session(mount, robot, boards))
+    pairs_session(mount, *unsigned(robot, boards)).save(tmp_path / "cell")
+    cause = visioncal.calibrate(tmp_path / "cell").verdict.causes[0]
+    assert cause.kind == "lost_sign"
+    assert {*cause.views} <= {*negative.tolist()}
+    # A position within the noise of the boundary has either sign.
+    assert np.abs(robot[sorted({*negative.tolist()} - {*cause.views}), 1, 3]).max(initial=0) < 0.05
+    assert follow("calibrate", "cell", "-o", "out").last.status == 0
+    mended = visioncal.calibrate(tmp_path / "cell-fixed")
+    for name, edge in sound.edges.items():
+        # A few views with the sign of a position near zero are within the noise.
+        np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("column", ["", "rail_m", "rail_mm"])
+def test_a_rail_that_is_in_no_pose_is_named_and_added_from_its_column(
+    tmp_path, monkeypatch, mount, column
+):
+    monkeypatch.chdir(tmp_path)
+    robot, boards = poses_of(mount)
+    places = np.random.default_rng(1).uniform(-1.0, 1.0, len(robot))
+    logged = robot.copy()
+    logged[:, 1, 3] -= places
+    sound = visioncal.calibrate(pairs_session(mount, robot, boards))
+    pairs_session(mount, logged, boards).save(tmp_path / "cell")
+    if column:
+        path = tmp_path / "cell/views.csv"
+        lines, unit = path.read_text().splitlines(), 1e3 if column.endswith("_mm") else 1.0
+        cells = [column, *(repr(value) for value in (unit * places).tolist())]
+        path.write_text("".join(f"{a},{b}\n" for a, b in zip(lines, cells, strict=True)))
+    cause = visioncal.calibrate(tmp_path / "cell").verdict.causes[0]
+    assert cause.kind == "misread_poses"
+    assert "lack a motion along y of its base" in cause.words
+    assert (f"Column {column} of views.csv has it" in cause.words) == bool(column)
+    if column:
+        assert follow("calibrate", "cell", "-o", "out").last.status == 0
+        mended = visioncal.calibrate(tmp_path / "cell-fixed")
+        for name, edge in sound.edges.items():
+            np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=1e-6)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -46,6 +46,7 @@ def convert_command(options: ConvertOptions) -> None:
             exchange=options.exchange,
             shift=options.shift,
             turned=options.turned,
+            positions=options.positions,
             mends_images=options.mend_images,
         )
     for warning in session.warnings:

@@ -1,6 +1,7 @@
 """Parses option values: lists of numbers, views, sizes, planes."""
 
 import math
+import re
 from collections.abc import Mapping
 
 from visioncal.core.errors import DataError
@@ -13,6 +14,9 @@ FORMS = (
     "may point down: a board's points into it), or nx,ny,nz,d (a normal, and its product with any "
     "of the plane's points in mm)"
 )
+
+# A column, with its sign and a factor before it.
+_TERM = r"([+-]?)(?:(\d[\d.]*(?:e-?\d+)?)\*)?([A-Za-z_]\w*)"
 
 
 def numbers_in(words: str, option: str, form: str = "", scale: float = 1.0) -> tuple[float, ...]:
@@ -65,6 +69,28 @@ def turn_in(words: str, option: str) -> tuple[tuple[int, ...], tuple[float, ...]
     """Parses views, and an angle [deg] and a point [mm], written as 3,7:180,80,60."""
     views, _, turn = words.partition(":")
     return views_in(views, option), numbers_in(turn, option, "deg,x,y")
+
+
+def places_in(
+    words: str, option: str
+) -> tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]]:
+    """Parses views, and what their positions are, by axis: factors and names of columns.
+
+    Written as 0,4-6:x,-y,z+0.001*rail_mm, in which x, y and z are the columns x_m, y_m and z_m.
+    """
+    views, _, axes = words.partition(":")
+    parsed = tuple(
+        tuple(
+            (float(f"{sign}{factor or 1}"), f"{name}_m" if name in ("x", "y", "z") else name)
+            for sign, factor, name in re.findall(_TERM, axis)
+        )
+        for axis in axes.split(",")
+    )
+    is_right = len(parsed) == 3 and all(
+        re.fullmatch(f"(?:{_TERM})+", axis) for axis in axes.split(",")
+    )
+    _check(is_right, words, option, "views and three axes are needed, as 0,4-6:x,-y,z+rail_m")
+    return views_in(views, option), parsed
 
 
 def serial_in(words: str, option: str) -> tuple[str, str]:

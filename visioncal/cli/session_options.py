@@ -21,7 +21,7 @@ from visioncal.cli.options import (
     session_argument,
     yes_flag,
 )
-from visioncal.cli.parsing import names_in, pair_in, shift_in, turn_in
+from visioncal.cli.parsing import names_in, pair_in, places_in, shift_in, turn_in
 from visioncal.core.choices import (
     PLAN_SPEED,
     POSE_FORMS,
@@ -396,6 +396,10 @@ class ConvertOptions(RobotPoseOptions):
     turned: tuple[tuple[int, ...], tuple[float, ...]] | None = _doubt(
         "Views whose board is read turned, by degrees about a point in mm: 3,7:180,80,60.",
         parse=turn_in,
+    )
+    positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = _doubt(
+        "Views whose positions are made of other columns: 0,4-6:x,-y,z+rail_m.",
+        parse=places_in,
     )
     mend_images: bool = _doubt(
         "Mirror, turn and scale images back.", "--mend-images", default=False

@@ -119,6 +119,11 @@ def some_of(names: Sequence[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
+def view_words(views: Sequence[int]) -> str:
+    """Views in a sentence: `view 3`, or `views 3, 6 and 9 more`."""
+    return f"view{'s' * (len(views) > 1)} {some_of([*map(str, views)])}"
+
+
 def known_name(
     what: str, name: str, known: Collection[_Name], culprit: str = "", next_step: str = ""
 ) -> _Name:

@@ -123,6 +123,16 @@ def _left_handed(poses: Poses, rng: np.random.Generator) -> Poses:
     return replace(poses, robot=numbers(poses.true_robot * np.outer(mirror, mirror)))
 
 
+def _axes(poses: Poses, rng: np.random.Generator) -> Poses:
+    """Positions by other axes or with another sign of one, beside rotations that are right."""
+    told = numbers(poses.true_robot)
+    order = ((0, 2, 1), (1, 0, 2), (2, 1, 0), (1, 2, 0), (0, 1, 2))[rng.integers(5)]
+    signs = np.ones(3)
+    if order == (0, 1, 2):
+        signs[rng.integers(3)] = -1.0
+    return replace(poses, robot=replace(told, positions=told.positions[:, order] * signs))
+
+
 def _board_mm(poses: Poses, _: np.random.Generator) -> Poses:
     camera = replace(poses.camera, positions=1e3 * poses.camera.positions)
     return replace(poses, camera=camera, true_scale=1e-3)
@@ -141,4 +151,5 @@ MISTAKES: Mapping[str, Plant] = {
     "matrices transposed": _transposed,
     "one axis left-handed": _left_handed,
     "board's size in mm": _board_mm,
+    "axes of positions": _axes,
 }

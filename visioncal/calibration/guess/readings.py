@@ -3,7 +3,7 @@
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import product
+from itertools import permutations, product
 from typing import Any, Literal
 
 import numpy as np
@@ -30,14 +30,16 @@ class SideReading(Reading):
     # Whether rotations are transposed while positions are not those of an inverse.
     transposed: bool = False
     mirrored: bool = False  # Whether the frame is left-handed.
+    # Which number of a recorded position is that along each axis, and the signs of the axes.
+    axes: tuple[int, int, int] = (0, 1, 2)
+    signs: tuple[int, int, int] = (1, 1, 1)
     scale: float = 1.0  # Factor of all distances, beside the unit.
 
     @property
     def reading(self) -> Reading | None:
         """The equivalent `Reading` of the recorded numbers; None where there is none."""
-        if self.written or self.transposed or self.mirrored or self.scale != 1.0:
-            return None
-        return Reading(self.rotation, self.unit, self.inverse)
+        plain = Reading(self.rotation, self.unit, self.inverse)
+        return plain if self == SideReading(**vars(plain)) else None
 
     def rotations(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 3, 3) rotations as they are written; NaN where the numbers give none."""
@@ -52,7 +54,7 @@ class SideReading(Reading):
     def poses(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 4, 4) transforms [m]; NaN in rows without a pose."""
         rotations = self.rotations(numbers)
-        positions = self.scale * UNITS_M[self.unit] * numbers.positions
+        positions = self.scale * UNITS_M[self.unit] * numbers.positions[:, self.axes] * self.signs
         if self.mirrored:
             rotations, positions = rotations * np.outer(_MIRROR, _MIRROR), positions * _MIRROR
         if self.transposed:
@@ -159,6 +161,7 @@ def changes(declared: Hypothesis, is_measured: bool, count: int) -> Iterator[Cha
     yield from _changes_of_side("robot", declared.robot)
     words = "the images mirrored, or the robot's poses in a left-handed frame (one axis mirrored)"
     yield Change(words, "robot", {"mirrored": True})
+    yield from _axes()
     if is_measured:
         yield from _units("camera", declared.camera, "the board's size in")
     else:
@@ -169,6 +172,20 @@ def changes(declared: Hypothesis, is_measured: bool, count: int) -> Iterator[Cha
         # Fewer than eleven rows are the same sorted as text.
         if not np.array_equal(rows(count), np.arange(count)):
             yield Change(order, "chain", {"order": order})
+
+
+def _axes() -> Iterator[Change]:
+    """Positions whose axes are exchanged, or have another sign, beside rotations that are right."""
+    for axes in (*permutations(range(3)),):
+        if axes != (0, 1, 2):
+            named = ", ".join("xyz"[axis] for axis in axes)
+            words = f"the numbers of the robot's positions taken as {named}"
+            yield Change(words, "robot", {"axes": axes}, 1 + (axes in ((1, 2, 0), (2, 0, 1))))
+    for signs in product((1, -1), repeat=3):
+        if min(signs) < 0:
+            named = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
+            words = f"another sign of {named} in the robot's positions"
+            yield Change(words, "robot", {"signs": signs}, signs.count(-1))
 
 
 def _units(part: Literal["robot", "camera"], side: SideReading, words: str) -> Iterator[Change]:

@@ -13,10 +13,11 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
+from visioncal.calibration.suspects.missing_axis import missing_axes
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
-from visioncal.core.types import FloatArray, Mount
+from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy
 from visioncal.estimation.chain import robot_part
 
@@ -68,7 +69,10 @@ def with_undone(run: RunState) -> RunState:
     Of a whole cell, each robot is tested with one camera and one target alone.
     """
     if run.mount is not None:
-        return undone(run, likeliest(run))
+        # Each mistake hides the next.
+        while (mistake := likeliest(run)) is not None:
+            run = undone(run, mistake)
+        return run
     for robot in run.session.robots:
         for pair in pairs_of(run, robot):
             mistake = likeliest(_of_pair(run, robot, pair))
@@ -128,13 +132,16 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
 
 def _unrecorded(run: RunState) -> Iterator[Finding]:
     """The finding that the robot's poses are not those of the images, whatever the frames are."""
-    both = _both_sides(run.base_from_flange, run.poses_of_one_board)
-    both = both[thinned(np.arange(len(both)))]
+    views, both = _both_sides(run.base_from_flange, run.poses_of_one_board)
+    kept = thinned(np.arange(len(both)))
+    views, both = views[kept], both[kept]
     if len(both) < FEWEST_ROWS:
         return
     # Both turn by the same angle between two views, whatever the unknown frames.
     by_robot, by_camera = (relative_angles(both[:, side, :3, :3]) for side in (0, 1))
     away = np.abs(by_robot - by_camera)
+    if np.quantile(away, PAIRS_SHARE) < _ALIKE_RAD:
+        yield from missing_axes(run, views, both)
     alike = float(np.mean(away < _ALIKE_RAD))
     words = "The robot's poses are not those of the images: "
     if np.ptp(both[:, 0, :3, 3], axis=0).max() < _STILL_M:
@@ -193,7 +200,7 @@ def closes(
     base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
 ) -> bool:
     """Whether the chain of one robot closes as declared; true with too few views to show it."""
-    both = _both_sides(base_from_flange, seen)
+    _, both = _both_sides(base_from_flange, seen)
     robot, camera = np.moveaxis(both, 1, 0)
     return (
         len(robot) < FEWEST_ROWS
@@ -203,16 +210,17 @@ def closes(
 
 def _both_sides(
     base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses]
-) -> FloatArray:
-    """(m, 2, 4, 4) poses of the robot, and of the target by each image alone, with both."""
+) -> tuple[IntArray, FloatArray]:
+    """(m,) views, and (m, 2, 4, 4) poses of the robot and of the target by each image alone."""
     turned = {view: pose[:3, :3] for view, pose in base_from_flange.items()}
-    both = [(base_from_flange[view], pose) for view, pose in alike_turning(turned, seen).items()]
-    return np.array(both).reshape(-1, 2, 4, 4)
+    alike = alike_turning(turned, seen)
+    both = [(base_from_flange[view], pose) for view, pose in alike.items()]
+    return np.array([*alike], dtype=int), np.array(both).reshape(-1, 2, 4, 4)
 
 
 # Findings measured through the robot, which mean nothing where its poses are misread.
 BY_CHAIN = (
     *(*STEPS, ARM_ERRORS, "prior"),
-    *("board_size", "board_shape", "lens", "lens_field", "corner_noise"),
+    *("board_size", "board_shape", "lens", "lens_field", "corner_noise", "tool_frame"),
 )
 MISREAD_POSES = Suspect("misread_poses", None, 1e-3, True, (CHAIN, *BY_CHAIN), SOURCES)

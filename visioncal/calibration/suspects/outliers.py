@@ -12,7 +12,7 @@ from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.suspect import EXCHANGED
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS
-from visioncal.core.number_format import figure, mm_and_deg, some_of
+from visioncal.core.number_format import figure, mm_and_deg, some_of, view_words
 from visioncal.core.transforms import invert, log, mean_transform, pose_difference
 from visioncal.core.types import IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
@@ -115,7 +115,7 @@ def _fault(
 ) -> PoseFault:
     """A fault of some observations, in words in which {views} are theirs."""
     views = tuple(cell_fit.cell.rows[row].view for row in rows)
-    words = words.format(views=f"views {some_of([*map(str, views)])}")
+    words = words.format(views=view_words(views))
     found = Finding(kind, f"{words[0].upper()}{words[1:]}", do, views)
     return PoseFault(found, tuple(rows), short)
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 # Kinds that several modules name.
 ARM_ERRORS, EXCHANGED, UNEXPLAINED = "arm_errors", "exchanged_views", "unexplained"
-UNDONE = ("shifted_rows", "turned_board", "flipped_poses", "copied_poses")
+UNDONE = ("shifted_rows", "turned_board", "flipped_poses", "copied_poses", "lost_sign")
 # All that explains that views disagree, or that the flange is off.
 CHAIN = "chain"
 STEPS = ("moved_at_once", "joint_slipped", "board_changed")

@@ -1,7 +1,7 @@
 """Mistakes of a record that, undone, make the views agree.
 
 Rows may be shifted from one on, boards read as if they were turned or tilted the other way, poses
-repeated.
+repeated, signs of positions lost.
 
 Each hypothesis pairs views with poses of the robot otherwise, or turns boards back. It is compared
 with the record as it stands, in which the same views are wrong for no known reason, by likelihoods
@@ -23,9 +23,9 @@ from visioncal.calibration.guess.search import CLEAR, EVIDENCE
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
-from visioncal.core.number_format import counted, ranges, some_of
+from visioncal.core.number_format import counted, ranges, some_of, view_words
 from visioncal.core.transforms import compose, exp, invert, rotation_angle
-from visioncal.core.types import FloatArray, IntArray, Mask, Rejection
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Rejection
 from visioncal.core.verdict import Finding, mending, or_alone
 from visioncal.estimation.chain import robot_part
 from visioncal.vision.targets import rotation_transforms
@@ -51,6 +51,7 @@ class _Record:
 
     views: IntArray  # (n,) numbers of the session's rows.
     robot: FloatArray  # (n, 4, 4) the robot's part of the chain; NaN where unknown.
+    mount: Mount
     rows: IntArray  # (m,) the rows that show the board.
     camera: FloatArray  # (m, c, 4, 4) `cam_from_target` with all rivals.
 
@@ -71,8 +72,9 @@ class _Record:
                 camera.append((seen[view].cam_from_target[:, None] @ turns).reshape(-1, 4, 4))
         most = max(map(len, camera), default=0)
         padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
-        known = robot_part(robot, run.mount or "eye-in-hand")
-        return cls(np.array(views), known, np.array(rows, dtype=int), np.array(padded))
+        mount: Mount = run.mount or "eye-in-hand"
+        known, shown = robot_part(robot, mount), np.array(rows, dtype=int)
+        return cls(np.array(views), known, mount, shown, np.array(padded))
 
     def paired(self, order: IntArray) -> IntArray:
         """(m,) the robot's row of each view that shows the board; -1 where it has no pose."""
@@ -152,10 +154,8 @@ class Undoing:
     short: str  # The same as a clause, for each of the views.
 
 
-def undone(run: RunState, found: Undoing | None) -> RunState:
+def undone(run: RunState, found: Undoing) -> RunState:
     """Leaves out the views that a mistake of the record explains, and names it."""
-    if found is None:
-        return run
     views = set(found.found.views)
     left = {view: pose for view, pose in run.poses.items() if view not in views}
     if len(left) <= FEWEST_COMPARED:
@@ -192,6 +192,7 @@ def likeliest(run: RunState) -> Undoing | None:
     rivals = [
         *_copied(record, apart, own, agrees),
         *_flipped(record, best, own, apart, float(base)),
+        *_signed(record, best, own, apart, float(base)),
         *_turned(record, best, own, apart, float(base)),
         *_shifted(record, every, pairs, float(base)),
     ]
@@ -209,13 +210,13 @@ def _copied(record: _Record, apart: FloatArray, own: IntArray, agrees: Mask) -> 
     chance = max(float((record.copies & agrees).mean()), _EQUAL)
     views = tuple(record.views[record.rows[copied]].tolist())
     others = record.views[record.rows[~copied]].tolist()
-    words = f"Views {some_of([*map(str, views)])} have the robot's pose of the row before once more"
+    whose = f"{view_words(views).capitalize()} {'have' if len(views) > 1 else 'has'}"
     yield Undoing(
         _MISTAKE - len(views) * float(np.log(chance)),
         Finding(
             "copied_poses",
-            f"{words}, to the last digit, though their images differ: the log repeated a pose that "
-            "was read before. They were left out.",
+            f"{whose} the robot's pose of the row before once more, to the last digit, though the "
+            "images differ: the log repeated a pose that was read before. Left out.",
             or_alone("Record them anew, or calibrate the other views alone.", others),
             views,
         ),
@@ -235,27 +236,17 @@ def _flipped(
     mirror = np.eye(3) - 2.0 * sight @ np.swapaxes(sight, -1, -2)
     other = compose(mirror @ seen[..., :3, :3] @ np.diag([1.0, 1.0, -1.0]), seen[..., :3, 3])
     mirrored = replace(edges, record=replace(record, camera=other)).of(own)
-    # Views by how much better the other pose is; any number of them is as likely, and any choice.
-    there, here = (np.where(own < 0, 1.0, at.sum(axis=1)) for at in (mirrored, apart))
-    order = np.argsort((there + _LEAST**2) / (here + _LEAST**2), kind="stable")
-    number = np.arange(1, len(own) + 1)
-    flips = np.argsort(order) < number[:, None]
-    squares = np.where(flips[..., None], mirrored, apart)
-    logs, agrees = _evidence(squares)
-    choices = gammaln(len(own) + 2) - gammaln(number + 1) - gammaln(len(own) - number + 1)
-    odds = EVIDENCE * (logs - base) + _MISTAKE - choices
-    at = int(odds.argmax())
-    wrong = flips[at] & agrees[at]
+    odds, wrong = _chosen(own, apart, mirrored, base)
     views = tuple(record.views[record.rows[wrong]].tolist())
-    if not views or squares[at][agrees[at]].mean() > CLOSING_SCORE**2:
+    if not views:
         return
     others = record.views[record.rows[~wrong]].tolist()
     short = "the board's pose is the other one of the two that a flat board's image nearly fits"
     yield Undoing(
-        float(odds[at]),
+        odds,
         Finding(
             "flipped_poses",
-            f"In views {some_of([*map(str, views)])} {short}: tilted the other way about the line "
+            f"In {view_words(views)} {short}: tilted the other way about the line "
             "of sight. They were left out.",
             or_alone(
                 "Have the detector give both poses and take the other one in these views (OpenCV: "
@@ -266,6 +257,51 @@ def _flipped(
         ),
         short,
     )
+
+
+def _chosen(own: IntArray, apart: FloatArray, other: FloatArray, base: float) -> tuple[float, Mask]:
+    """Log odds that some views are otherwise, with other squares (m, 2), and the views (m,).
+
+    Any number of them is as likely, and any choice: they are those that it helps most.
+    """
+    there, here = (np.where(own < 0, 1.0, at.sum(axis=1)) for at in (other, apart))
+    order = np.argsort((there + _LEAST**2) / (here + _LEAST**2), kind="stable")
+    number = np.arange(1, len(own) + 1)
+    some = np.argsort(order) < number[:, None]
+    squares = np.where(some[..., None], other, apart)
+    logs, agrees = _evidence(squares)
+    choices = gammaln(len(own) + 2) - gammaln(number + 1) - gammaln(len(own) - number + 1)
+    odds = EVIDENCE * (logs - base) + _MISTAKE - choices
+    at = int(odds.argmax())
+    closes = squares[at][agrees[at]].mean() < CLOSING_SCORE**2
+    return float(odds[at]), some[at] & agrees[at] & closes
+
+
+def _signed(
+    record: _Record, edges: _Edges, own: IntArray, apart: FloatArray, base: float
+) -> Iterator[Undoing]:
+    """Views whose position lost the sign of one axis."""
+    for axis, name in enumerate("xyz"):
+        flanges = robot_part(record.robot, record.mount).copy()
+        flanges[:, axis, 3] *= -1.0
+        signed = replace(record, robot=robot_part(flanges, record.mount))
+        odds, wrong = _chosen(own, apart, replace(edges, record=signed).of(own), base)
+        views = tuple(record.views[record.rows[wrong]].tolist())
+        if not views:
+            continue
+        short = f"{name} of the robot's position has the other sign"
+        axes = ",".join(f"-{each}" if each == name else each for each in "xyz")
+        yield Undoing(
+            odds - float(np.log(3.0)),
+            Finding(
+                "lost_sign",
+                f"In {view_words(views)} {short}: with its own, they agree with the others. They "
+                "were left out.",
+                mending("it has its own", f"--positions {ranges(views)}:{axes}"),
+                views,
+            ),
+            short,
+        )
 
 
 def _turned(
@@ -298,7 +334,7 @@ def _turned(
             odds,
             Finding(
                 "turned_board",
-                f"In views {some_of([*map(str, views)])} {short} in its plane, about "
+                f"In {view_words(views)} {short} in its plane, about "
                 f"({centre[0]:.1f}, {centre[1]:.1f}) mm. They were left out.",
                 mending("it is turned back", f"--turned {ranges(views)}:{about}"),
                 views,

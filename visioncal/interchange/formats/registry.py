@@ -28,6 +28,7 @@ from visioncal.interchange.formats.rereading import (
     settled,
     shift_views,
     turn_boards,
+    write_positions,
 )
 from visioncal.interchange.formats.sources import describe, unknown
 from visioncal.interchange.formats.views import VISP, ZIVID
@@ -68,6 +69,7 @@ def convert(
     exchange: tuple[int, int] | None = None,
     shift: tuple[tuple[int, ...], int] | None = None,
     turned: tuple[tuple[int, ...], tuple[float, ...]] | None = None,
+    positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = None,
     mends_images: bool = False,
 ) -> Session:
     """Writes a session or a foreign recording as a session's folder or as a recording.
@@ -87,6 +89,8 @@ def convert(
         shift: Views whose poses of the robot stand so many rows later (earlier where negative).
         turned: Views in which the board was read turned in its plane; by which angle [deg], and
             about which point of the board [mm] (x, y).
+        positions: Views whose positions are sums of columns, and these sums by axis: pairs of a
+            factor and a column's name.
         mends_images: Whether images are mirrored, turned and scaled back: see `mend_images`.
 
     Returns:
@@ -135,6 +139,7 @@ def convert(
         (exchange_views, exchange),
         (shift_views, shift),
         (turn_boards, turned),
+        (write_positions, positions),
     )
     for mend, asked in mends:
         session = session if asked is None else mend(session, *asked)

@@ -25,7 +25,7 @@ from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
-from visioncal.core.number_format import ranges
+from visioncal.core.number_format import ranges, some_of
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import MOUNTS, FloatArray, Progress, Searched, evenly
 from visioncal.core.verdict import Finding
@@ -630,3 +630,39 @@ def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -
         corners = replace(corners, points=ids)
     note = f"the board was turned back by {degrees:g} deg in views {ranges(chosen)}"
     return _with_cells(session, cells, note, corners=corners)
+
+
+def write_positions(
+    session: Session, views: Sequence[int], axes: Sequence[Sequence[tuple[float, str]]]
+) -> Session:
+    """Writes the robot's positions in some views as sums of columns.
+
+    Args:
+        session: A session.
+        views: Their numbers.
+        axes: Factors and names of columns, for x, y and z each; positions are in metres.
+
+    Raises:
+        DataError: There are no such views or columns, or a cell has no number.
+    """
+    chosen = _chosen_views(session, views, "--positions")
+    named = {name for axis in axes for _, name in axis}
+    if missing := sorted(named - {*session.columns}):
+        raise DataError(
+            f"Session {session.name!r} has no column {missing[0]} in its views.csv.",
+            culprits=["--positions"],
+            next_step=f"Name columns among {some_of(session.columns)}.",
+        )
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    for view, row in zip(session.views, cells, strict=True):
+        if view.number not in chosen:
+            continue
+        empty = next((name for name in named if not is_number(row[name])), None)
+        if empty is not None:
+            words = f"views.csv: view {view.number} has no number in column {empty}."
+            raise DataError(words, culprits=[empty], next_step="Fill it in, or name other views.")
+        sums = [sum(factor * float(row[name]) for factor, name in axis) for axis in axes]
+        row |= dict(zip(POSE, map(repr, sums), strict=False))
+    sums_of = ("".join(f"{factor:+g} {name} " for factor, name in axis).strip() for axis in axes)
+    note = f"the positions of views {ranges(chosen)} are {', '.join(sums_of)}"
+    return _with_cells(session, cells, note)

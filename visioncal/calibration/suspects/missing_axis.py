@@ -1,0 +1,115 @@
+"""An axis that moved the robot and is in no pose, as a rail under its base."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from visioncal.calibration.guess.fit import CLOSING_SCORE, distance_rows, robust_fits
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.core.conventions import UNITS_M
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
+from visioncal.core.number_format import figure, ranges
+from visioncal.core.types import FloatArray, IntArray, Mount
+from visioncal.core.verdict import Finding, Remedy, mending
+from visioncal.estimation.chain import robot_part
+
+# Steps by which the direction is found, and what a direction differs by from an axis of the base
+# [rad]: as a rail is mounted.
+_STEPS, _ALONG_RAD = 20, 0.03
+# A column is the axis where its factor is that of a unit but for this share.
+_UNIT = 0.03
+
+
+def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[Finding]:
+    """The finding that positions lack a motion along one line, which the camera saw.
+
+    Rotations of robot and camera determine the rotation of X; places then are linear in the
+    translations of both edges, and what remains of them lies on a line of the base.
+
+    Args:
+        run: The run, of one robot and camera.
+        views: (m,) numbers of the views that have both poses.
+        both: (m, 2, 4, 4) poses of the robot, and of the target by each image alone.
+    """
+    if run.mount is None or len(views) <= FEWEST_COMPARED:
+        return
+    direction, motion, away_m = _line(both, run.mount)
+    distance_m = float(np.median(np.linalg.norm(both[:, 1, :3, 3], axis=1)))
+    if away_m > CLOSING_SCORE * distance_m or np.ptp(motion) < CLEAR_RATIO * away_m:
+        return
+    axis = int(np.abs(direction).argmax())
+    is_axis = np.arccos(min(abs(direction[axis]), 1.0)) < _ALONG_RAD
+    name = "xyz"[axis] if is_axis else f"({', '.join(f'{part:.2f}' for part in direction)})"
+    words = (
+        f"The robot's positions lack a motion along {name} of its base: across it, robot and "
+        f"camera agree to {figure(1e3 * away_m)} mm, and along it they differ by up to "
+        f"{figure(1e3 * float(np.ptp(motion)))} mm, as where a rail, a gantry or another external "
+        "axis moved that is in no pose."
+    )
+    do = Remedy(
+        f"In views.csv, add this axis's position to {name}_m of each row (m; or as a column of its "
+        "own, whose motion is then found), or calibrate views at one place of it."
+        if is_axis
+        else "Write poses that contain this axis, or calibrate views at one place of it."
+    )
+    by_view = dict(zip(views.tolist(), motion.tolist(), strict=True))
+    for column, factor in _columns(run, by_view, away_m):
+        terms = ",".join(
+            f"{at}{factor * part:+g}*{column}" if abs(part) > np.sin(_ALONG_RAD) else at
+            for at, part in zip("xyz", np.round(direction, 3 if not is_axis else 0), strict=True)
+        )
+        every = ranges([view.number for view in run.session.views])
+        words += f" Column {column} of views.csv has it."
+        do = mending("it is added to the positions", f"--positions {every}:{terms}")
+        break
+    yield Finding("misread_poses", words, do)
+
+
+def _line(both: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float]:
+    """Direction (3,) in the base, (m,) motion along it [m], and rms by axis across it [m]."""
+    flanges, camera = both[:, 0], both[:, 1]
+    robot = robot_part(flanges, mount)
+    x = robust_fits(robot[None], camera[None])[0].x
+    by_edges, seen = distance_rows(robot, camera, x)
+    rows, places = by_edges[..., :6], seen + by_edges[..., 6]
+    if mount == "eye-to-hand":
+        # In the axes of the base, in which a rail lies still.
+        turned = -flanges[:, :3, :3]
+        rows, places = turned @ rows, (turned @ places[..., None])[..., 0]
+    best = np.eye(3)[0], np.zeros(len(both)), np.inf
+    for start in np.eye(3):
+        direction = start
+        for _ in range(_STEPS):
+            across = np.eye(3) - np.outer(direction, direction)
+            edges = np.linalg.lstsq((across @ rows).reshape(-1, 6), -(places @ across).ravel())[0]
+            left = places + rows @ edges
+            # What is the same in all views is a place of the target.
+            left -= np.median(left, axis=0)
+            direction = np.linalg.svd(left, full_matrices=False)[2][0]
+        outside = left - np.outer(left @ direction, direction)
+        # Half of the views may be wrong.
+        away = float(np.sqrt(np.median(np.sum(outside**2, axis=1)) / 2.0))
+        if away < best[2]:
+            direction = direction * np.sign(direction[np.abs(direction).argmax()])
+            best = direction, -left @ direction, away
+    return best
+
+
+def _columns(run: RunState, motion: dict[int, float], away_m: float) -> Iterator[tuple[str, float]]:
+    """Columns that have this motion [m], with their factors."""
+    rows = {view.number: view for view in run.session.views if view.number in motion}
+    along = np.array([motion[view] for view in rows])
+    for column in run.session.columns:
+        try:
+            values = np.array([float(view.cell(column)) for view in rows.values()])
+        except ValueError:
+            continue
+        if not np.isfinite(values).all() or np.ptp(values) == 0.0:
+            continue
+        factor, _ = np.polyfit(values, along, 1)
+        left = along - factor * values
+        if np.median(np.abs(left - np.median(left))) > max(3.0 * away_m, 1e-4):
+            continue
+        for unit_m in UNITS_M.values():
+            if abs(abs(factor) / unit_m - 1.0) < _UNIT:
+                yield column, float(np.copysign(unit_m, factor))
