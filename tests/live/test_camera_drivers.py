@@ -8,7 +8,7 @@ import threading
 import time
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
@@ -256,6 +256,115 @@ def test_a_realsense_gives_colour_its_time_and_its_factory_lens(end):
         end()
         time.sleep(0.05)
         raised(DriverError, "stalls", camera.frame, timeout_s=0.2)
+
+
+def a_realsense(rs, pictures, depth, size, translation):
+    """A RealSense in software: colour and depth sensors, and what sends a pair of pictures."""
+    device = rs.software_device()
+    device.register_info(rs.camera_info.serial_number, "123")
+    device.register_info(rs.camera_info.name, "RealSense D435")
+    profiles = []
+    for name, kind, form, shape in (
+        ("RGB Camera", rs.stream.color, rs.format.bgr8, pictures[0].shape),
+        ("Stereo Module", rs.stream.depth, rs.format.z16, size[::-1]),
+    ):
+        video, lens = rs.video_stream(), rs.intrinsics()
+        lens.height, lens.width = video.height, video.width = shape[:2]
+        # Both see the same angle.
+        lens.fx = lens.fy = 0.9 * lens.width
+        lens.ppx, lens.ppy, lens.coeffs = (lens.width - 1) / 2, (lens.height - 1) / 2, [0.0] * 5
+        lens.model = rs.distortion.brown_conrady
+        video.type, video.fmt, video.intrinsics, video.fps = kind, form, lens, 30
+        video.bpp = video.uid = len(shape)
+        sensor = device.add_sensor(name)
+        profiles.append((sensor, sensor.add_video_stream(video).as_video_stream_profile()))
+    profiles[1][0].add_read_only_option(rs.option.depth_units, 1e-4)
+    between = rs.extrinsics()
+    between.rotation, between.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], translation
+    profiles[1][1].register_extrinsics_to(profiles[0][1], between)
+    device.create_matcher(rs.matchers.default)
+
+    def send(number, at):
+        for (sensor, profile), pixels in zip(profiles, (pictures[at], depth[at]), strict=True):
+            frame = rs.software_video_frame()
+            frame.pixels, frame.bpp = np.ascontiguousarray(pixels), pixels.ndim
+            frame.stride = frame.bpp * pixels.shape[1]
+            frame.timestamp, frame.domain = 1e3 * time.time(), rs.timestamp_domain.system_time
+            frame.frame_number, frame.profile = number, profile
+            if pixels.ndim == 2:
+                frame.depth_units = 1e-4
+            sensor.on_video_frame(frame)
+
+    return device, send
+
+
+@contextmanager
+def sent_by(monkeypatch, rs, device, send, at):
+    """While pairs of pictures number `at()` come."""
+    monkeypatch.setattr(rs, "context", lambda: SimpleNamespace(query_devices=lambda: [device]))
+    ended = threading.Event()
+
+    def run():
+        number = 0
+        while not ended.wait(0.02):
+            send(number := number + 1, at())
+
+    with ThreadPoolExecutor(1) as pool:
+        sending = pool.submit(run)
+        try:
+            yield
+        finally:
+            ended.set()
+            sending.result()
+
+
+def test_a_realsense_is_recorded_with_its_depth_bit_for_bit(seen, tmp_path, monkeypatch):
+    rs = pytest.importorskip("pyrealsense2")
+    lines, pictures = seen
+    colour = [np.dstack([picture] * 3) for picture in pictures]
+    rng, (height, width) = np.random.default_rng(0), pictures[0].shape
+    depth = [rng.integers(0, 65536, (height, width)).astype(np.uint16) for _ in pictures]
+    # Depth that comes aligned, as from a D405.
+    device, send = a_realsense(rs, colour, depth, (width, height), [0.0, 0.0, 0.0])
+    typed = []
+
+    def typing(_):
+        typed.append(lines[len(typed)])
+        return typed[-1]
+
+    shown = SimpleNamespace(readline=typing, isatty=lambda: False, reconfigure=lambda **_: None)
+    out = tmp_path / "live"
+    with sent_by(monkeypatch, rs, device, send, lambda: max(len(typed) - 1, 0)):
+        monkeypatch.setattr(sys, "stdin", shown)
+        visioncal(
+            *("record", *TYPED, "--camera", "realsense", "-o", out, "--views", len(lines))
+        ).good()
+    session = Session.load(out)
+    assert session.declaration.camera.depth_unit_m == 1e-4
+    assert len(session.views) == len(lines)
+    for view, picture, distances in zip(session.views, colour, depth, strict=True):
+        assert view.depth == view.image.replace("images", "depth")
+        assert np.array_equal(cv2.imread(str(out / view.image), -1), picture)
+        assert np.array_equal(cv2.imread(str(out / view.depth), -1), distances)
+
+
+def test_depth_of_a_realsense_from_elsewhere_is_aligned(monkeypatch):
+    rs = pytest.importorskip("pyrealsense2")
+    picture, depth = np.zeros((120, 160, 3), np.uint8), np.full((60, 80), 8000, np.uint16)
+    depth[20:40, 30:50] = 5000
+    device, send = a_realsense(rs, [picture], [depth], (80, 60), [0.05, 0.0, 0.0])
+    with (
+        sent_by(monkeypatch, rs, device, send, lambda: 0),
+        closing(open_camera("realsense", DeviceSetup())) as camera,
+    ):
+        found = camera.frame(timeout_s=PATIENT_S).depth
+    assert camera.settings["depth_unit_m"] == 1e-4
+    assert found.shape == (120, 160)
+    # The middle of the near square by the colour's lens: 0.5 m away, 50 mm to the side.
+    ray = np.array([0.05 / 0.5, 0.0])
+    rows, columns = np.nonzero(found == 5000)
+    # Pixels of half the size are rounded to whole ones.
+    assert [columns.mean(), rows.mean()] == pytest.approx(ray * 144 + [79.5, 59.5], abs=1.0)
 
 
 def test_a_lens_of_uncertain_direction_is_not_passed_off_as_opencvs():

@@ -3,6 +3,7 @@
 import time
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from support.refusals import raised
@@ -17,6 +18,8 @@ try:
 except DriverError:
     pytest.skip("depthai, which the extra oak brings, is not installed", allow_module_level=True)
 
+PERSPECTIVE = dai.CameraModel.Perspective
+PINHOLE = [[250, 0, 159.5], [0, 250, 99.5], [0, 0, 1]]
 # A busy machine may take its time; nothing here is about speed.
 PATIENT_S = 20.0
 
@@ -51,7 +54,41 @@ class CameraNode(dai.node.ThreadedHostNode):
             message.cam.exposureTimeUs, message.cam.sensitivityIso = 6000, 320
             message.cam.lensPosition = 131
             message.setTimestamp(dai.Clock.now())
+            if self.seen.transformation is not None:
+                message.setTransformation(self.seen.transformation)
             self.out.send(message)
+            time.sleep(0.02)
+
+
+class DepthNode(dai.node.ThreadedHostNode):
+    """A stereo pair's depth, on this host: a near square before a wall, 30 mm beside the colour."""
+
+    def __init__(self, seen):
+        dai.node.ThreadedHostNode.__init__(self)
+        self.depth, self.seen = self.createOutput(), seen
+
+    def build(self, rate_hz):
+        """Has a rate."""
+        self.seen.depth_hz = rate_hz
+        return self
+
+    getSupportedAlgorithms = staticmethod(lambda device: device.depths)  # noqa: N815
+
+    def run(self):
+        """Sends distances [mm]."""
+        distances = np.full((200, 320), 800, np.uint16)
+        distances[90:130, 220:260] = 500
+        shift = dai.Extrinsics(
+            [[1, 0, 0, -3], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dai.CameraBoardSocket.CAM_A
+        )
+        while self.isRunning():
+            message = dai.ImgFrame()
+            message.setCvFrame(distances, dai.ImgFrame.Type.RAW16)
+            message.setTransformation(
+                dai.ImgTransformation(320, 200, PINHOLE, PERSPECTIVE, [0.0] * 14, shift)
+            )
+            message.setTimestamp(dai.Clock.now())
+            self.depth.send(message)
             time.sleep(0.02)
 
 
@@ -73,7 +110,8 @@ def a_device(monkeypatch, *, lens=0, coefficients=(), is_colour=True, has_autofo
         hasAutofocus=has_autofocus,
         supportedTypes=[kind],
     )
-    device, seen = SimpleNamespace(sensor=sensor, is_closed=False), SimpleNamespace(sent=[])
+    device = SimpleNamespace(sensor=sensor, is_closed=False, depths=[])
+    seen = SimpleNamespace(sent=[], transformation=None)
     device.getDeviceName, device.readCalibrationOrDefault = (lambda: "OAK-D"), (lambda: handler)
     device.getConnectedCameraFeatures = lambda: [device.sensor]
     device.close = lambda: setattr(device, "is_closed", True)
@@ -85,15 +123,18 @@ def a_device(monkeypatch, *, lens=0, coefficients=(), is_colour=True, has_autofo
             self.real = dai.Pipeline(createImplicitDevice=False)
 
         def create(self, node):
-            """Makes a node; the camera's tells what it is asked."""
-            return self.real.create(node, seen) if node is CameraNode else self.real.create(node)
+            """Makes a node; the device's own tell what they are asked."""
+            own = node in (CameraNode, DepthNode)
+            return self.real.create(node, seen) if own else self.real.create(node)
 
         def __getattr__(self, name):
             return getattr(self.real, name)
 
     library = SimpleNamespace(**{name: getattr(dai, name) for name in dir(dai) if name[0] != "_"})
     library.Device, library.Pipeline = lambda *_: device, Pipeline
-    library.node = SimpleNamespace(Camera=CameraNode)
+    library.node = SimpleNamespace(
+        Camera=CameraNode, Depth=DepthNode, Align=dai.node.Align, Sync=dai.node.Sync
+    )
     monkeypatch.setattr(oak, "depthai", lambda: library)
     # Long enough for a picture or two.
     monkeypatch.setattr(stream, "SETTLE_S", 0.1)
@@ -149,6 +190,34 @@ def test_a_lens_that_no_model_of_ours_describes_is_not_taken(monkeypatch):
     camera.close()
     assert camera.factory is None
     assert "thin-prism" in camera.settings["factory_intrinsics"]
+
+
+def test_depth_is_that_of_each_pixel_of_a_distorted_picture(monkeypatch):
+    coefficients = (-0.3, 0.1, 0.0, 0.0, 0.0)
+    device, seen = a_device(monkeypatch, coefficients=coefficients)
+    device.depths, matrix = ["stereo"], np.array([[250, 0, 159.5], [0, 250, 99.5], [0, 0, 1.0]])
+    handler = device.readCalibrationOrDefault()
+    handler.setCameraIntrinsics(device.sensor.socket, matrix.tolist(), 320, 200)
+    here = dai.Extrinsics(np.eye(4).tolist(), device.sensor.socket)
+    distortion = [*coefficients, *[0.0] * 9]
+    seen.transformation = dai.ImgTransformation(320, 200, PINHOLE, PERSPECTIVE, distortion, here)
+    camera = OakCamera("", DeviceSetup((320, 200)))
+    frame = camera.frame(timeout_s=PATIENT_S)
+    camera.close()
+    assert device.is_closed
+    assert camera.settings["depth_unit_m"] == 0.001
+    assert frame.depth.shape == frame.image.shape[:2]
+    assert set(np.unique(frame.depth)) == {0, 500, 800}
+    # The near square's corners, as OpenCV has them in the colour camera's picture.
+    corners = np.array([[u, v, 1.0] for u in (220, 259) for v in (90, 129)]) - [159.5, 99.5, 0.0]
+    corners = 0.5 * corners / [250, 250, 1] - [0.03, 0.0, 0.0]
+    px = cv2.projectPoints(corners, np.zeros(3), np.zeros(3), matrix, np.array(coefficients))[0]
+    v, u = np.nonzero(frame.depth == 500)
+    assert [u.min(), v.min()] == pytest.approx(px[:, 0].min(axis=0), abs=1.5)
+    assert [u.max(), v.max()] == pytest.approx(px[:, 0].max(axis=0), abs=1.5)
+    # Without the distortion it would be elsewhere by more than that.
+    straight = cv2.projectPoints(corners, np.zeros(3), np.zeros(3), matrix, None)[0]
+    assert np.abs(straight.max(axis=0) - px.max(axis=0)).max() > 2.5
 
 
 def test_a_device_without_that_camera_is_refused_and_let_go(monkeypatch):

@@ -24,7 +24,7 @@ from visioncal.core.files import (
     remove_abandoned,
     write_atomically,
 )
-from visioncal.core.types import Camera, Mount, Target
+from visioncal.core.types import Camera, Image, Image16, Mount, Target
 from visioncal.core.version import __version__
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.take import TakenView
@@ -41,13 +41,13 @@ from visioncal.vision.targets import load_target, stored_target, target_document
 
 # File that names devices and plan; written before the first view.
 PROVENANCE = "recorded.toml"
-_IMAGES, _TABLE, _TARGET_FILE = "images", "views.csv", "target.toml"
+_IMAGES, _DEPTH, _TABLE, _TARGET_FILE = "images", "depth", "views.csv", "target.toml"
 _SESSION = "session.toml"
 # Columns that belong to a row's picture; all others belong to its pose.
-_OF_PICTURE = re.compile("stamp_s|blur_px|motion_px|exposure_ms|picture|device_.*")
+_OF_PICTURE = re.compile("depth|stamp_s|blur_px|motion_px|exposure_ms|picture|device_.*")
 # Column of the form in which a pose was typed or sent.
 _FORM = "pose_form"
-# End of the name of an image that is to replace its row's.
+# End of the name of a picture that is to replace its row's.
 _AGAIN = "-again.png"
 _Cell = TypeVar("_Cell", float, str)
 # Reserve for tables, folders and the disk's own use.
@@ -105,10 +105,12 @@ class CaptureFacts(RecordedCell):
             document["target"] = _TARGET_FILE
             content, tables = stored_target(target_document(target), Path(_TARGET_FILE).stem)
             texts |= {**tables, _TARGET_FILE: tomli_w.dumps(content)}
-        camera = {"name": self.camera, "resolution": list(self.resolution)}
+        camera: dict[str, Any] = {"name": self.camera, "resolution": list(self.resolution)}
         if lens is not None:
             camera |= {"model": lens.model, "matrix": lens.matrix.tolist()}
             camera["distortion"] = lens.distortion.tolist()
+        if "depth_unit_m" in self.settings:
+            camera["depth_unit_m"] = self.settings["depth_unit_m"]
         document["camera"] = camera
         if robot is not None:
             arms = {name: load_robot(name) for name in robot_names()}
@@ -138,8 +140,18 @@ class CaptureFacts(RecordedCell):
             "plan": self.plan,
         }
 
-    def view_of(self, number: int, image: str, taken: TakenView, unix_offset_s: float) -> View:
-        """Builds the row of views.csv for a view; the offset is from monotonic to UNIX time [s]."""
+    def view_of(
+        self, number: int, files: Sequence[str], taken: TakenView, unix_offset_s: float
+    ) -> View:
+        """Builds the row of a view in views.csv.
+
+        Args:
+            number: The view's.
+            files: Paths of its image, and of its depth where it has one.
+            taken: What was taken.
+            unix_offset_s: From monotonic to UNIX time [s].
+        """
+        image, *depth = files
         state, frame = taken.state, taken.frame
         numbers = {
             "stamp_s": round(frame.stamp_s + unix_offset_s, 6),
@@ -164,7 +176,12 @@ class CaptureFacts(RecordedCell):
             "blur_px": f"{taken.corners.blur_px:.2f}",
             "motion_px": f"{taken.motion_px:.3f}",
         }
-        named = {"picture": frame.name, "typed": state.typed, _FORM: state.pose_form}
+        named = {
+            "depth": "".join(depth),
+            "picture": frame.name,
+            "typed": state.typed,
+            _FORM: state.pose_form,
+        }
         texts |= {name: text for name, text in named.items() if text}
         if state.flange_from_tool is not None:
             tcp = pose_row(state.flange_from_tool).values()
@@ -272,7 +289,7 @@ class Journal:
             DataError: The folder holds views of another recording, or something else.
         """
         path = folder / PROVENANCE
-        for place in (folder, folder / _IMAGES):
+        for place in (folder, folder / _IMAGES, folder / _DEPTH):
             remove_abandoned(place)
         if not path.is_file():
             with named_errors(folder), suppress(FileNotFoundError):
@@ -332,12 +349,17 @@ class Journal:
         rows = {view.number: view for view in self.views}
         for number, view in taken.items():
             image = f"{_IMAGES}/{number:03d}{_AGAIN if number in rows else '.png'}"
-            # Low compression: noise hardly compresses, and speed matters more.
-            _, png = cv2.imencode(".png", view.frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-            data = png.tobytes()
-            self._check_room(len(data), f"view {number}")
-            self._write(image, data)
-            rows[number] = self._facts.view_of(number, image, view, self._offset_s)
+            pictures: dict[str, Image | Image16] = {image: view.frame.image}
+            if view.frame.depth is not None:
+                with named_errors(self.folder):
+                    (self.folder / _DEPTH).mkdir(exist_ok=True)
+                pictures[image.replace(_IMAGES, _DEPTH, 1)] = view.frame.depth
+            for name, pixels in pictures.items():
+                # Low compression: noise hardly compresses, and speed matters more.
+                _, png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                self._check_room(len(png), f"view {number}")
+                self._write(name, png.tobytes())
+            rows[number] = self._facts.view_of(number, [*pictures], view, self._offset_s)
         self.rewrite([*rows.values()])
 
     def rewrite(self, views: Sequence[View]) -> None:
@@ -363,26 +385,28 @@ class Journal:
             self.form = form
         if views:
             self._write(_TABLE, write_csv(columns, views))
-        gone = {view.image for view in self.views} - {view.image for view in views}
+        before, after = ({path for view in of for path in view.files} for of in (self.views, views))
         # A table without rows is none, and one whose images are gone is no session.
-        for name in (*(() if views else (_TABLE,)), *gone):
+        for name in (*(() if views else (_TABLE,)), *(before - after)):
             with named_errors(self.folder / name):
                 (self.folder / name).unlink(missing_ok=True)
         self.views, self._columns = tuple(views), columns if views else ()
         self._settle()
 
     def _settle(self) -> None:
-        """Gives images that replaced others their rows' own names; raises DataError."""
+        """Gives pictures that replaced others their rows' own names; raises DataError."""
         if any(view.image.endswith(_AGAIN) for view in self.views):
             views = [*self.views]
             for row, view in enumerate(views):
                 if view.image.endswith(_AGAIN):
-                    image = f"{view.image.removesuffix(_AGAIN)}.png"
-                    self._write(image, self.image(view))
-                    views[row] = replace(view, image=image)
+                    own = {path: f"{path.removesuffix(_AGAIN)}.png" for path in view.files}
+                    for before, name in own.items():
+                        self._write(name, read_bytes(self.folder / before))
+                    depth = {"depth": own[view.depth]} if view.depth else {}
+                    views[row] = replace(view, image=own[view.image], text={**view.text, **depth})
             self._write(_TABLE, write_csv(self._columns, views))
             self.views = tuple(views)
-        for path in (self.folder / _IMAGES).glob(f"*{_AGAIN}"):
+        for path in self.folder.glob(f"*/*{_AGAIN}"):
             with named_errors(path):
                 path.unlink(missing_ok=True)
 

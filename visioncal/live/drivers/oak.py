@@ -10,12 +10,14 @@ from dataclasses import replace
 from datetime import timedelta
 from types import ModuleType
 
+import cv2
 import numpy as np
 
 from visioncal.core.extras import Handle, client_library
-from visioncal.core.types import Camera, Image
+from visioncal.core.types import Camera, Image, Image16
 from visioncal.live.drivers import stream
 from visioncal.live.drivers.protocols import DeviceSetup
+from visioncal.vision.camera import matrix_3x3
 
 # The camera that every OAK has: the colour camera, or the only one.
 _SOCKET = "CAM_A"
@@ -84,15 +86,19 @@ class OakCamera(stream.StreamingCamera):
             output = node.requestOutput(resolution, kind, crop, _RATE_HZ, False)
             control = node.inputControl.createInputQueue()
             queue = output.createOutputQueue(maxSize=4, blocking=False)
+            depth = _aligned_depth(dai, device, pipeline, output)
             pipeline.start()
             # A pipeline that still runs when Python ends aborts the process.
             closing.callback(weakref.finalize(self, _stop, pipeline))
             held = _hold_settings(dai, name, requested, sensor, queue, control)
-        self.factory, source = _factory_intrinsics(dai, calibration, sensor.socket, resolution)
+        lens, source = _factory_intrinsics(dai, calibration, sensor.socket, resolution)
+        self.factory = lens
         if self.factory is not None and focus is not None:
             source += f", for focus {focus}"
         settings = {"rate_hz": _RATE_HZ, "factory_intrinsics": source, **held}
-        return name, _arrivals(dai, queue), settings
+        if depth is None or lens is None:
+            return name, _arrivals(dai, queue), settings
+        return name, _arrivals(dai, depth, lens), settings | {"depth_unit_m": 0.001}
 
 
 def _open_device(dai: ModuleType, address: str) -> Handle:
@@ -139,19 +145,54 @@ def _hold_settings(
     return held
 
 
-def _arrivals(dai: ModuleType, queue: Handle) -> Iterator[stream.Arrival | None]:
+def _aligned_depth(
+    dai: ModuleType, device: Handle, pipeline: Handle, colour: Handle
+) -> Handle | None:
+    """The queue of pictures with their depth, aligned to those without distortion."""
+    if not dai.node.Depth.getSupportedAlgorithms(device):
+        return None
+    align, pairs = pipeline.create(dai.node.Align), pipeline.create(dai.node.Sync)
+    for node in (align, pairs):
+        node.setRunOnHost(True)
+    pairs.setSyncThreshold(timedelta(seconds=0.5 / _RATE_HZ))
+    pipeline.create(dai.node.Depth).build(_RATE_HZ).depth.link(align.input)
+    colour.link(align.inputAlignTo)
+    colour.link(pairs.inputs["colour"])
+    align.outputAligned.link(pairs.inputs["depth"])
+    return pairs.out.createOutputQueue(maxSize=4, blocking=False)
+
+
+def _arrivals(
+    dai: ModuleType, queue: Handle, lens: Camera | None = None
+) -> Iterator[stream.Arrival | None]:
+    """Pictures; with a lens, those of pairs with their depth."""
+
     def decode() -> Image:
         return np.array(message.getCvFrame(), dtype=np.uint8)
 
+    def distances() -> Image16:
+        found = cv2.remap(pair["depth"].getFrame(), across, down, cv2.INTER_NEAREST)
+        return np.asarray(found, dtype=np.uint16)
+
+    if lens is not None:
+        # Each pixel's place in a picture without distortion.
+        width, height = lens.resolution
+        px = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+        matrix, by = matrix_3x3(lens), cv2.fisheye if lens.model == "fisheye" else cv2
+        places = by.undistortPoints(px.reshape(-1, 1, 2), matrix, lens.distortion, P=matrix)
+        across, down = np.moveaxis(places.reshape(px.shape), -1, 0)
     while True:
-        message = queue.get(timedelta(seconds=0.1))
+        message = pair = queue.get(timedelta(seconds=0.1))
         if message is None:
             yield None
             continue
+        if lens is not None:
+            message = pair["colour"]
         # Depthai's clock is this host's monotonic one.
         middle_s = message.getTimestamp(dai.CameraExposureOffset.MIDDLE).total_seconds()
         began_s = middle_s - 0.5 * message.getExposureTime().total_seconds()
-        yield stream.Arrival(time.monotonic(), decode, (began_s, middle_s))
+        exposed_s, depth = (began_s, middle_s), None if lens is None else distances
+        yield stream.Arrival(time.monotonic(), decode, exposed_s, depth)
 
 
 def _stop(pipeline: Handle) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
-from visioncal.core.types import Camera, FloatArray, Image
+from visioncal.core.types import Camera, FloatArray, Image, Image16
 
 # Whether the arm may move; `reduced` still moves, slowly.
 Safety = Literal["normal", "reduced", "protective-stop", "emergency-stop", "fault"]
@@ -46,6 +46,8 @@ class Frame:
     stamp_s: float  # Middle of the exposure, on the host's monotonic clock [s].
     exposure_s: float | None = None  # Exposure time [s], where the camera reports it.
     name: str = ""  # Name of the file that it was; empty for none.
+    # (h, w) its distances in units of the setting `depth_unit_m`, 0 where there is none.
+    depth: Image16 | None = None
 
 
 class Arm(Protocol):

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import TypeAlias
 
 from visioncal.core.errors import DriverError
-from visioncal.core.types import Camera, Image
+from visioncal.core.types import Camera, Image, Image16
 from visioncal.live.drivers.protocols import DeviceSetup, Frame, Stopwatch
 
 # The longest wait, in intervals between this camera's pictures: one under way at the request, the
@@ -35,6 +35,8 @@ class Arrival:
     decode: Callable[[], Image | None]
     # Begin and middle of its exposure by that clock, where the camera reports them [s].
     exposed_s: tuple[float, float] | None = None
+    # Its distances, aligned to it, where the camera measures them; valid likewise.
+    depth: Callable[[], Image16] | None = None
 
 
 # What a driver opens: a camera's name in messages; its pictures, which end where the camera does,
@@ -69,10 +71,10 @@ class StreamingCamera:
         self._arrivals_s: deque[float] = deque(maxlen=50)
         self._news = threading.Condition()
         # The moment after which the exposure of a requested picture begins, how many were too old
-        # for it, and the picture with its stamp.
+        # for it, and the stamp, the picture and its depth.
         self._request_s: float | None = -math.inf
         self._too_old = 0
-        self._answer: tuple[float, Image] | None = None
+        self._answer: tuple[float, Image, Image16 | None] | None = None
         self._error: Exception | None = None
         self._is_closing = False
         read, name = (arrivals, closing), f"pictures of {self.name}"
@@ -129,8 +131,8 @@ class StreamingCamera:
                         step += "resolution."
                     raise camera_error(self.name, why, step)
                 self._news.wait(0.05)
-            stamp_s, image = self._answer
-        return Frame(image, stamp_s, self._exposure_s or None)
+            stamp_s, image, depth = self._answer
+        return Frame(image, stamp_s, self._exposure_s or None, depth=depth)
 
     def _read(self, arrivals: Iterator[Arrival | None], closing: ExitStack) -> None:
         ended = "gives no picture: it is unplugged, or closed its stream"
@@ -172,9 +174,10 @@ class StreamingCamera:
             # The next one may be newer, or whole.
             self._too_old += 1
             return
+        depth = None if arrival.depth is None else arrival.depth()
         with self._news:
             if self._request_s == request_s:
-                self._request_s, self._answer = None, (middle_s, image)
+                self._request_s, self._answer = None, (middle_s, image, depth)
                 self._news.notify_all()
 
     def _interval_s(self) -> float:
