@@ -128,7 +128,7 @@ SMALL = (
 CALIBRATING = (
     # A calibration waits for no plots, and for nothing that few sessions need.
     (
-        "visioncal.calibration.pipeline, visioncal.frames, visioncal.interchange.outputs",
+        "visioncal.calibration.run, visioncal.frames, visioncal.interchange.outputs",
         {"matplotlib", "rerun", "pinocchio", "torch", "jinja2", "yaml", "defusedxml"}
         | {"xml.sax", "urllib.request", "scipy.optimize", "scipy.fft", "scipy.sparse.csgraph"}
         | {"scipy.stats", "scipy.ndimage", "scipy.signal", "scipy.interpolate"}

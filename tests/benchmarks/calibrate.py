@@ -1,8 +1,9 @@
-"""Time of a whole calibration against detection alone with OpenCV.
+"""Time of a whole calibration against detection alone with OpenCV, and against its own whole.
 
 Both sides work on the same 40 five-megapixel images with the same number of threads, one after the
 other in turns. The peer reads each file and calls OpenCV's ChArUco detector. visioncal is the
 command with report and recording, started anew; and its API without outputs in a warm process.
+OpenCV's own whole reads, detects, and calibrates lens and hand-eye in a program that starts anew.
 Processor time counts all threads, and other programs on the machine move it less than wall time.
 
     PYTHONPATH=tests python tests/benchmarks/calibrate.py [REPEATS] [--quick]
@@ -10,6 +11,7 @@ Processor time counts all threads, and other programs on the machine move it les
 
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -17,6 +19,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -24,13 +27,14 @@ import numpy as np
 from results import few, wished, write_section
 
 import visioncal
-from visioncal.simulation import CAMERAS, CellOptions, simulate, write_session
+from visioncal.simulation import CAMERAS, CellOptions, SimulatedCell, simulate, write_session
 from visioncal.vision.boards.charuco import charuco_board
 
 VIEWS = few(40, 5)
 # As many as are wished on the command line.
 REPEATS = wished(3)
 THREADS = [name for name in (1, 2, 4) if name <= (os.cpu_count() or 1)]
+PEER = Path(__file__).with_name("opencv_whole.py")
 COMMAND = [sys.executable, "-m", "visioncal"]
 
 
@@ -45,6 +49,40 @@ def opencv_alone(files: list[Path], board: cv2.aruco.CharucoBoard, threads: int)
     cv2.setNumThreads(1)
     with ThreadPoolExecutor(threads) as pool:
         return sum(pool.map(corners, files))
+
+
+def corners_of(simulated: SimulatedCell, folder: Path) -> Path:
+    """Writes a session of corners without images."""
+    session = write_session(simulated, folder)
+    shutil.rmtree(session / "images")
+    table = (session / "views.csv").read_text(encoding="utf-8").splitlines()
+    rows = (line.split(",") for line in table)
+    text = "\n".join(",".join([first, image if first == "view" else "", *others])
+                     for first, image, *others in rows)  # fmt: skip
+    (session / "views.csv").write_text(text, encoding="utf-8")
+    lines = ["view,point,u_px,v_px"]
+    for at in simulated.corners:
+        lines += [f"{at.view},{point},{u},{v}" for point, (u, v) in zip(at.ids, at.px, strict=True)]
+    (session / "corners.csv").write_text("\n".join(lines), encoding="utf-8")
+    return session
+
+
+def wholes(folder: Path) -> list[list[str]]:
+    """Rows of the whole command beside OpenCV's whole, and of corners alone without outputs."""
+    rows = []
+    kinds = {"1280 x 800, png": ("wide", None, VIEWS), "2448 x 2048, jpg": ("fine", 95, VIEWS)}
+    for name, (camera, quality, views) in kinds.items():
+        options = CellOptions(views=views, camera=CAMERAS[camera], jpeg_quality=quality, seed=1)
+        session = write_session(simulate(options), folder / camera)
+        ours = [*COMMAND, "calibrate", str(session), "-o", str(folder / "out")]
+        peer = [sys.executable, str(PEER), str(session)]
+        times = medians(partial(of_program, ours), partial(of_program, peer))[:, 1]
+        rows.append([name, *(f"{one:.2f}" for one in (*times, times[0] / times[1]))])
+    options = CellOptions(views=22, seed=2)
+    session = corners_of(simulate(options), folder / "corners")
+    ours = [*COMMAND, "calibrate", str(session), "-o", str(folder / "out"), "--no-report"]
+    time_s = medians(partial(of_program, [*ours, "--no-recording"]))[0, 1]
+    return [*rows, ["22 views of corners, no outputs", f"{time_s:.2f}", "", ""]]
 
 
 def seconds(work: Callable[[], object]) -> np.ndarray:
@@ -116,6 +154,9 @@ def main() -> None:
         head = ["files", "level", "threads", "command [s]", "API [s]", "OpenCV detection [s]",
                 "command / OpenCV", "API / OpenCV", "command / OpenCV, wall",
                 "API / OpenCV, wall"]  # fmt: skip
+        heads = ["whole", "command [s]", "OpenCV's whole [s]", "ratio"]
+        table = [heads, ["---"] * len(heads), *wholes(folder)]
+        text += "\n\n" + "".join("| " + " | ".join(row) + " |\n" for row in table)
         lines = ("| " + " | ".join(row) + " |\n" for row in (head, ["---"] * len(head), *rows))
         text += "\n\n" + "".join(lines)
     print(text)

@@ -399,6 +399,7 @@ try:
 finally:
     heavy = "cv2.typing jinja2 matplotlib pandas pinocchio pyarrow rerun scipy.optimize scipy.stats"
     heavy = {*heavy.split(), "scipy.io", "visioncal.calibration", "visioncal.interchange.formats"}
+    heavy |= {"numpy.f2py", "numpy.testing"}
     print(len(sys.modules), *heavy & set(sys.modules), file=sys.stderr)
 """
 

@@ -15,7 +15,7 @@ import visioncal
 from visioncal.core import transforms
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, rounded_up, significant
-from visioncal.core.quantiles import chi2_limit, f_limit, t_chance
+from visioncal.core.quantiles import chi2_limit, f_limit, root_of, t_chance
 from visioncal.core.types import FloatArray, scalar_of
 from visioncal.robot.model import REPEATABILITY
 
@@ -85,6 +85,10 @@ CHANCES = (0.5, 0.05, 1e-4, 1e-9)
 
 
 # Two ways to the same quantile: a few thousand units in the last place.
+def test_a_root_lies_within_the_tolerance():
+    assert abs(root_of(lambda value: value**3 - 2.0, 0.0, 2.0, 1e-9) - 2.0 ** (1 / 3)) < 1e-9
+
+
 @pytest.mark.parametrize("chance", CHANCES)
 def test_limits_are_the_distributions_upper_quantiles(chance):
     freedoms = np.array([1, 6, 40, 300])

@@ -12,7 +12,8 @@ class SmallLibraries:
     """Keeps libraries small within its block, which save half the time of a short command.
 
     Arrow would import pandas, where installed, to check for arrays of it. SciPy parses and rewrites
-    hundreds of docstrings as it is imported. Many modules import OpenCV for what few commands do.
+    hundreds of docstrings as it is imported, and loads all parts of NumPy. Many modules import
+    OpenCV for what few commands do.
     """
 
     def find_spec(self, fullname: str, path: object, target: object = None) -> None:
@@ -20,9 +21,12 @@ class SmallLibraries:
         del path, target
         if fullname == "pandas":
             raise ModuleNotFoundError("commands do without pandas", name=fullname)
-        if fullname == "scipy._lib._util":
-            # Both of its decorators take the class from there.
+        if fullname in {"scipy._lib._array_api", "scipy._lib._util"}:
+            # Their decorators take the class from there.
             vars(import_module("scipy._lib._docscrape")).update(FunctionDoc=_Undocumented)
+            numpy = vars(import_module("numpy"))
+            for part in ("ctypeslib", "f2py", "ma", "polynomial", "random", "testing"):
+                numpy.setdefault(part, _Postponed(f"numpy.{part}"))
 
     def __enter__(self) -> None:
         sys.meta_path.insert(0, self)

@@ -1,7 +1,9 @@
-"""Upper quantiles of chi-square and F, and tail probability of t.
+"""Upper quantiles of chi-square and F, tail probability of t, and roots of such functions.
 
-By scipy.special, because scipy.stats takes longer to import than a calibration to run.
+By scipy.special, because SciPy's statistics and optimisers take longer to import than these to run.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -29,3 +31,11 @@ def f_limit(chance: float, freedom: npt.ArrayLike, of_noise: float) -> FloatArra
 def t_chance(value: float, freedom: float) -> float:
     """Two-sided tail probability of Student's t."""
     return float(2.0 * stdtr(freedom, -abs(value)))
+
+
+def root_of(rising: Callable[[float], float], low: float, high: float, tolerance: float) -> float:
+    """Where a rising function is zero between two bounds, by bisection."""
+    while high - low > tolerance:
+        middle = (low + high) / 2
+        low, high = (low, middle) if rising(middle) > 0.0 else (middle, high)
+    return (low + high) / 2

@@ -16,6 +16,7 @@ from functools import cache
 import numpy as np
 from scipy.special import fdtr, ndtri
 
+from visioncal.core.quantiles import root_of
 from visioncal.core.types import FloatArray
 
 _POINTS, _SIZE = 4096, 6
@@ -58,9 +59,6 @@ def radius_within(
 
     Other arguments are those of `chance_within`.
     """
-    # Imported late: scipy.optimize takes a tenth of the time that a calibration needs to start.
-    from scipy.optimize import brentq
-
     errors, known = (part[:, 3:] for part in _errors(spreads, offsets))
     guess = float(np.linalg.norm(errors, axis=1).max() + np.linalg.norm(known, axis=1).max())
     if not guess > 0.0:
@@ -70,7 +68,7 @@ def radius_within(
         limit = guess * float(np.exp(logarithm))
         return _mean_chance([_crossings(errors, known, limit)], freedom) - share
 
-    root = brentq(missing, -np.log(_INFINITE), np.log(_INFINITE), xtol=_TOLERANCE)
+    root = root_of(missing, -np.log(_INFINITE), np.log(_INFINITE), _TOLERANCE)
     # Rounded up, so that the share is reached at the radius.
     return guess * float(np.exp(root + 2.0 * _TOLERANCE))
 

@@ -8,7 +8,7 @@ variances are draws of one inverse gamma distribution, whose two parameters all 
 import numpy as np
 from scipy.special import digamma, polygamma
 
-from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit, root_of
 from visioncal.core.types import FloatArray
 
 # Bounds of the logarithm of the distribution's shape.
@@ -29,12 +29,9 @@ def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | No
     deviations = logs - np.average(logs, weights=1.0 / by_chance)
     if np.sum(deviations**2 / by_chance) < chi2_limit(FALSE_ALARM, len(logs) - 1):
         return None
-    # Imported here for `locate`, which rarely needs it: the import takes a tenth of a second.
-    from scipy.optimize import brentq
-
     most, least = polygamma(1, np.exp(_LOGS))
     between = float(np.clip(np.var(logs, ddof=1) - np.mean(by_chance), least, most))
-    half = float(np.exp(brentq(lambda value: polygamma(1, np.exp(value)) - between, *_LOGS)))
+    half = np.exp(root_of(lambda log: between - polygamma(1, np.exp(log)), *_LOGS, 1e-12))
     scale = np.exp(np.mean(logs) + digamma(half))
     variances = (scale + squares / 2.0) / (half + freedom / 2.0)
     return np.asarray(np.exp(np.mean(np.log(variances)) / 2.0) / np.sqrt(variances), dtype=float)

@@ -12,7 +12,6 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FEWEST_VIEWS
@@ -245,6 +244,9 @@ def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:
             if places.are_joined(*s.pair)
         ]
         return float(np.mean(np.sort(off)[: len(off) // 2 + 1])) if off else np.inf
+
+    # Imported here, as a stated lens needs none of SciPy's optimisers.
+    from scipy.optimize import minimize_scalar
 
     logs = np.log(lens.resolution[0] * np.geomspace(*_FOCAL, _FOCALS))
     values = [closing(float(value)) for value in logs]

@@ -1,10 +1,9 @@
-"""The arm of a URDF, by Pinocchio, which is imported when needed."""
+"""The arm of a URDF, by Pinocchio, which is imported when needed, as is the reader of XML."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from visioncal.core.documents.structured import parse_xml
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import did_you_mean
@@ -40,6 +39,8 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
             one degree of freedom.
     """
     import pinocchio as pin
+
+    from visioncal.core.documents.structured import parse_xml
 
     text = table.text("urdf")
     joints = text.count("<joint")

@@ -6,7 +6,6 @@ Corners that another detector found (corners.csv) are used as they are.
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -82,6 +81,8 @@ def detect(
     views = [view for view in among if view.image and not view.has_corners]
     given = [view for view in among if view.has_corners]
     found = dict[int, Searched]()
+    # Imported here, as it loads the library of logs, too.
+    from concurrent.futures import ThreadPoolExecutor
 
     def search(view: View) -> Searched:
         return _search(session, view, picture=pictures)
