@@ -1,17 +1,20 @@
 """`visioncal calibrate`."""
 
+from pathlib import Path
+
 import typer
 
 from visioncal.calibration.pipeline.run_state import CalibrationOptions
-from visioncal.calibration.run import run
+from visioncal.calibration.run import Run, run
 from visioncal.cli.console import exit_status, report_written, say, with_run_paths
 from visioncal.cli.history import enter
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import CalibrateOptions
 from visioncal.cli.summary import print_summary
+from visioncal.core.errors import DataError
 from visioncal.core.verdict import need_options
 from visioncal.interchange.outputs import write_outputs
-from visioncal.interchange.result_files import frames_to_keep
+from visioncal.interchange.result_files import frames_to_keep, load_calibration
 from visioncal.results.history import entries_of
 from visioncal.session import Session
 
@@ -25,6 +28,9 @@ def calibrate_command(options: CalibrateOptions) -> None:
         )
         if options.views is not None:
             loaded = loaded.only(options.views)
+    if options.against is not None:
+        _calibrate_loaded(options, loaded, options.against)
+        return
     asked = CalibrationOptions(
         solver=options.solver,
         level=options.level,
@@ -51,4 +57,26 @@ def calibrate_command(options: CalibrateOptions) -> None:
         print_summary(result.calibration, result.evidence, verbose=options.verbose)
     if left is not None:
         say(left.words)
+    report_written(written, quiet=options.as_json, status=exit_status(result.calibration.verdict))
+
+
+def _calibrate_loaded(options: CalibrateOptions, loaded: Session, against: Path) -> None:
+    """Adds the stiffness of a loaded session to an earlier calibration, in another folder."""
+    # Few sessions have loads.
+    from visioncal.calibration.loaded import calibrate_loaded
+
+    if options.out.absolute() == (against if against.is_dir() else against.parent).absolute():
+        raise DataError(
+            f"-o {options.out} is the calibration of the unloaded arm itself.",
+            culprits=["-o", "--against"],
+            next_step="Name another folder with -o: the unloaded one stays for further loads.",
+        )
+    result = Run(calibrate_loaded(loaded, load_calibration(against)), ())
+    result = result.with_paths(options.session, options.out)
+    written = write_outputs(options.out, None, result)
+    enter(options, options.session, entries_of(result.calibration), options.out)
+    if options.as_json:
+        typer.echo(result.calibration.text)
+    else:
+        print_summary(result.calibration, result.evidence, verbose=options.verbose)
     report_written(written, quiet=options.as_json, status=exit_status(result.calibration.verdict))

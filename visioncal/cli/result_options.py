@@ -74,6 +74,9 @@ class CalibrateOptions(NeedOptions, WorkOptions, ActOptions):
         metavar="auto|hand-eye|offsets|kinematics|elastic|thermal",
     )
     convention: Convention | None = option("Of the arm's joint table; else as stated.")
+    against: Path | None = option(
+        "Of the unloaded arm: a session under loads adds its joints' stiffness.", metavar="OUT"
+    )
     corrected: bool = flag("Targets are sent corrected (visioncal correct), and judged so.")
     dense: bool = flag("Fit the board to all pixels of images that are too blurred for corners.")
     as_json: bool = json_flag()

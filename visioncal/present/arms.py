@@ -121,9 +121,8 @@ def spring_facts(elastic: ElasticResult) -> Iterator[Fact]:
     """Deflection of the flange under the stops' loads, and the payload."""
     median, most = significant(elastic.sag_mm.median), significant(elastic.sag_mm.most)
     yield Fact("the flange gives way by", f"{median} mm", f"median; at most {most} mm")
-    low, high = map(significant, elastic.payload_kg)
-    if elastic.payload_kg[1] > 0.0:
-        yield Fact("payload", f"{low} to {high} kg")
+    if elastic.payload_kg[1] > 0.0 or elastic.force_n is not None:
+        yield Fact("load", elastic.loads_words)
     if elastic.payload_factor is not None:
         factor = elastic.payload_factor
         note = f"\N{PLUS-MINUS SIGN} {significant(factor.sigma)}; 1 where load and bend fit"

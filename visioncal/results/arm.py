@@ -8,6 +8,7 @@ import numpy as np
 
 from visioncal.core.choices import Convention
 from visioncal.core.codec import Array, Key, Matrix, Section, WrittenForm
+from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.results.edge import Covariance
 from visioncal.robot import Robot
@@ -235,14 +236,28 @@ class ElasticResult(Section):
 
     joints: tuple[JointSpring, ...]  # One entry for each joint.
     not_determined: tuple[str, ...]  # Joints whose compliance the loads do not determine.
-    weight: str  # Whether the links' weight is from the model's masses, or unknown.
+    # Whether the links' weight is from the model's masses, unknown, or compensated.
+    weight: str
     payload_kg: tuple[float, float]  # Smallest and largest payload [kg].
     sag_mm: Sag  # Flange deflection under the loads of the stops.
+    force_n: tuple[float, float] | None = None  # Smallest and largest force [N]; None for none.
     # (n, 4 n) compliance times unknown masses and first moments of links (see
     # `robot.deflected_joints`); None where the masses are known, or have little effect.
     weight_moments: Matrix | None = None
     # Ratio of the effective payload and force to the stated ones; None where there was no payload.
     payload_factor: Factor | None = None
+
+    @property
+    def most_nm(self) -> float:
+        """Largest torque on any joint [N m]."""
+        return max(abs(end) for joint in self.joints for end in joint.torque_nm)
+
+    @property
+    def loads_words(self) -> str:
+        """The loads of the stops: `0 to 5 kg`, `10 to 50 N`, or both."""
+        loads = ((self.payload_kg, "kg"), (self.force_n or (0.0, 0.0), "N"))
+        words = [f"{figure(low)} to {figure(most)} {unit}" for (low, most), unit in loads if most]
+        return " and ".join(words) or "0 kg"
 
     @cached_property
     def compliance(self) -> FloatArray:

@@ -82,11 +82,10 @@ def _of_arm(arm: ArmSections, verdict: Verdict, robot: str) -> Iterator[Conditio
             "arm (visioncal export --to robot-urdf).",
         )
     if arm.elastic is not None:
-        least, most = (figure(mass) for mass in arm.elastic.payload_kg)
         yield Condition(
             "load",
             f"{of}The joints bend under load, by up to {figure(arm.elastic.sag_mm.most)} mm at the "
-            f"flange under the {least} to {most} kg of the stops.",
+            f"flange under the {arm.elastic.loads_words} of the stops.",
             "State the payload with the targets (visioncal correct --payload-kg).",
         )
     if arm.thermal is not None:

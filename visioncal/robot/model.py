@@ -38,7 +38,8 @@ BODY_KEYS = ("body_radius_m", "body_offset_m")
 # Optional keys of link and drive in a joint's table: all that is not geometry.
 LINK_KEYS = (*BODY_KEYS, *MASS_KEYS, INERTIA_KEY, *RATE_KEYS)
 # Optional keys of the whole arm beside its geometry.
-ARM_KEYS = ("gravity_m_s2", "repeatability_mm", "repeatability_deg")
+COMPENSATED = "weight_compensated"
+ARM_KEYS = ("gravity_m_s2", "repeatability_mm", "repeatability_deg", COMPENSATED)
 # Standard deviation of an industrial arm's flange from stop to stop [mm], [deg].
 REPEATABILITY = (0.1, 0.01)
 
@@ -62,6 +63,8 @@ class Robot:
     gravity: FloatArray  # (3,) gravitational acceleration in the base's frame [m/s^2].
     # Standard deviation of the flange from stop to stop [mm], [deg].
     repeatability: tuple[float, float]
+    # Whether the controller compensates what the links' own weight bends: loads alone bend it then.
+    weight_compensated: bool = False
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "Robot":
@@ -72,8 +75,9 @@ class Robot:
                 the URDF's text; or a chain as `corrected` writes it. A table's or a chain's joints
                 may state their links' `mass_kg` and its centre `com_m`, in the frame in which the
                 joint's row ends, their `inertia_kg_m2` about it, and limits of their drives; any
-                description the `gravity_m_s2` in its base, and the flange's `repeatability_mm` and
-                `repeatability_deg`.
+                description the `gravity_m_s2` in its base, the flange's `repeatability_mm` and
+                `repeatability_deg`, and whether the controller has the arm's own weight
+                `weight_compensated`.
 
         Raises:
             DataError: A field is missing or out of range, the URDF cannot be parsed, or it lacks
@@ -101,7 +105,13 @@ class Robot:
         repeats_mm = table.number("repeatability_mm", REPEATABILITY[0], positive=True)
         repeats_deg = table.number("repeatability_deg", REPEATABILITY[1], positive=True)
         facts = (masses, inertias, rates, gravity, (repeats_mm, repeats_deg))
-        return cls(name, tip, dict(document), chain, *facts)
+        return cls(name, tip, dict(document), chain, *facts, bool(document.get(COMPENSATED)))
+
+    @property
+    def with_weight_compensated(self) -> "Robot":
+        """The same arm by a controller that compensates what its own weight bends."""
+        document = {**self.document, COMPENSATED: True}
+        return replace(self, document=document, weight_compensated=True)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -255,10 +265,12 @@ class Robot:
         """Torques (m, n) of weight, payload and force on the joints [N m; N if prismatic].
 
         That of the links' weight is the negative of the generalised gravity (Featherstone 2008,
-        section 5.3), zero where masses are unknown; those at the flange follow by the transpose of
-        the geometric Jacobian.
+        section 5.3), zero where masses are unknown or the controller compensates it; those at the
+        flange follow by the transpose of the geometric Jacobian.
         """
         torques = -self.gravity_torques(q)
+        if self.weight_compensated:
+            torques = np.zeros_like(torques)
         if loads is None or not loads.any:
             return torques
         base_from_flange = self.base_from_flange(q)

@@ -126,6 +126,8 @@ class ArmOptions:
     # Compliance of each joint; empty for a rigid arm.
     compliance_rad_per_nm: tuple[float, ...] = ()
     payloads: tuple[Payload, ...] = ()  # Payloads, cycled over the stops; empty for none.
+    # Whether the controller compensates what the arm's own weight bends: only loads show then.
+    weight_compensated: bool = False
     # Backlash of each joint; empty for none. With backlash, stops are approached from alternating
     # sides.
     backlash_rad: tuple[float, ...] = ()
@@ -198,7 +200,10 @@ class ArmOptions:
         if approach is not None and self.backlash_rad:
             # A joint that approached from above stops short of its encoder angle.
             q = q + 0.5 * approach[:, None] * np.array(self.backlash_rad)
-        return forward(arm, loaded_joints(arm, self.compliance_rad_per_nm, q, payloads))
+        bent = loaded_joints(arm, self.compliance_rad_per_nm, q, payloads)
+        if self.weight_compensated:
+            bent = bent - loaded_joints(arm, self.compliance_rad_per_nm, q) + q
+        return forward(arm, bent)
 
     def jitter(self, stops: int, rng: np.random.Generator) -> FloatArray:
         """(stops, 4, 4) repeatability errors of the flange, in its own frame."""

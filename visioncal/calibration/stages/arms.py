@@ -38,7 +38,7 @@ from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
 from visioncal.estimation.unknowns import ARM, EDGE
 from visioncal.results.arm import ArmErrorsResult, ArmSections
-from visioncal.robot import Loads
+from visioncal.robot import Loads, Robot
 from visioncal.session import Session, View
 from visioncal.session.table import loads_of
 
@@ -293,24 +293,23 @@ class RobotArm:
             return self
         if functions and (HARMONICS not in ASKED[asked] or len(q) < _FEWEST_FOR_FUNCTIONS):
             return self
-        model = ArmModel.of(self.matched.robot, q, used.reported).loaded(q, used.loads)
-        bases = {
-            name: self._by_stop(model.columns(name, every, self.loads))
-            for name in blocks_of(model.nominal, self.loads)
-        }
-        harmonics = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
-        kinematics = select_errors(
-            problem,
-            start,
-            self.robot,
-            bases,
-            model.torque_nm,
-            asked,
-            noise,
-            None if harmonics is None else self._by_stop(harmonics),
-        )
-        if kinematics is None:
+        found_levels = []
+        for robot in self._hypotheses(used.loads):
+            model = ArmModel.of(robot, q, used.reported).loaded(q, used.loads)
+            bases = {
+                name: self._by_stop(model.columns(name, every, self.loads))
+                for name in blocks_of(model.nominal, self.loads)
+            }
+            harmonics = model.robot.harmonic_jacobian(every, most_orders()) if functions else None
+            waves = None if harmonics is None else self._by_stop(harmonics)
+            kinematics = select_errors(
+                problem, start, self.robot, bases, model.torque_nm, asked, noise, waves
+            )
+            if kinematics is not None:
+                found_levels.append((kinematics, model))
+        if not found_levels:
             return self
+        kinematics, model = max(found_levels, key=lambda pair: pair[0].fit.gain)
         mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
         kinematics = replace(kinematics, views=tuple(views[index] for index in mine))
         arm = replace(self, kinematics=kinematics)
@@ -322,6 +321,19 @@ class RobotArm:
         fit = kinematics.nominal.fit
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
+
+    def _hypotheses(self, loads: Loads) -> Iterator[Robot]:
+        """The arm as stated; where loads could tell, also with its weight compensated."""
+        if self.matched is None:
+            return
+        # Of functions of the joints only that arm is tried which the loads have shown.
+        shown = None if self.model is None else self.model.nominal.weight_compensated
+        stated = self.matched.robot
+        is_testable = stated.masses is not None and loads.any and not stated.weight_compensated
+        if not (shown and is_testable):
+            yield stated
+        if shown is not False and is_testable:
+            yield stated.with_weight_compensated
 
     def relinearised(self, fit: Fit) -> tuple[Self, float]:
         """Relinearises the calibrated arm at a fit.

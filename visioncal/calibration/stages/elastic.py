@@ -1,6 +1,7 @@
 """Joint stiffness and backlash by the stops, and the check of stated loads against deflections."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.results.arm import ElasticResult, Factor, JointBacklash, JointSpring, Sag
+from visioncal.robot import Loads, Robot
 
 
 def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult | None:
@@ -56,12 +58,27 @@ def elastic_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> ElasticResult |
     return ElasticResult(
         joints=tuple(springs),
         not_determined=tuple(spring.joint for spring in springs if not spring.determined),
-        weight="unknown" if model.nominal.masses is None else "of the model's masses",
-        payload_kg=(float(loads.payload_kg.min()), float(loads.payload_kg.max())),
+        weight=weight_words(model.nominal),
+        **load_ranges(loads),
         sag_mm=Sag(float(np.median(sag_mm)), float(sag_mm.max())),
         weight_moments=model.moments,
         payload_factor=_payload_factor(arm),
     )
+
+
+def weight_words(robot: Robot) -> str:
+    """Where the deflection by the links' own weight comes from."""
+    if robot.weight_compensated:
+        return "compensated by the controller"
+    return "unknown" if robot.masses is None else "of the model's masses"
+
+
+def load_ranges(loads: Loads) -> dict[str, Any]:
+    """Smallest and largest payload [kg] and, where there is one, force [N]."""
+    force = np.linalg.norm(loads.force_n, axis=1)
+    kg = (float(loads.payload_kg.min()), float(loads.payload_kg.max()))
+    stated = {"force_n": (float(force.min()), float(force.max()))} if force.any() else {}
+    return {"payload_kg": kg, **stated}
 
 
 def _payload_factor(arm: ArmData) -> Factor | None:
@@ -100,6 +117,11 @@ def remarks(elastic: ElasticResult) -> Iterator[str]:
             f"The joints bend under load: their stiffness is {words}. At these stops that moves "
             f"the flange by up to {figure(elastic.sag_mm.most)} mm."
         )
+    if elastic.weight.startswith("compensated"):
+        yield (
+            "Loads bend the arm, and its own weight does not: its controller compensates that, as "
+            "those of KUKA and ABB do."
+        )
     if elastic.weight_moments is not None:
         yield (
             "The arm yields to its own weight, of which its model states nothing: how far is "
@@ -111,7 +133,7 @@ def remarks(elastic: ElasticResult) -> Iterator[str]:
 def doubts(elastic: ElasticResult) -> Iterator[Finding]:
     """Findings where the stated load contradicts the deflection."""
     factor = elastic.payload_factor
-    if factor is not None and elastic.weight != "unknown" and factor.is_off:
+    if factor is not None and elastic.weight.startswith("of ") and factor.is_off:
         more = "heavier or hangs farther out" if factor.value > 1.0 else "lighter or hangs nearer"
         yield Finding(
             "load",

@@ -93,7 +93,7 @@ def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
     """
     if readings.are_poses:
         return {number: _probe(view) for number, view in readings.views.items()}
-    stop_of, names = _stops(session), readings.names
+    stop_of, names = stops_of_views(session), readings.names
     stops: dict[Hashable, dict[str, View]] = defaultdict(dict)
     for number, view in readings.views.items():
         stops[stop_of[number]][view.point] = view
@@ -105,7 +105,7 @@ def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
     return {group[0].number: align(at, positions[0]) for group, at in pairs}
 
 
-def _stops(session: Session) -> dict[int, Hashable]:
+def stops_of_views(session: Session) -> dict[int, Hashable]:
     """The stop of each view."""
     return {observation.view.number: observation.station for observation in session.observations}
 
@@ -140,7 +140,7 @@ def check_readings(observed: Observed, readings: Readings) -> None:
         DataError: No view can be used.
         DegenerateError: There are too few stops.
     """
-    stop_of, points = _stops(observed.session), len(readings.names)
+    stop_of, points = stops_of_views(observed.session), len(readings.names)
     usable = readings.views.keys() & observed.base_from_flange.keys() - observed.held_back
     if not usable:
         raise nothing_seen(observed)
