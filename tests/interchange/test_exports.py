@@ -33,6 +33,7 @@ FRAME_READERS = TOOL_READERS | FIXTURE_READERS
 # Those of easy_handeye hold the camera alone.
 ANY_EDGE = sorted(set(READERS) - {"easy-handeye", "easy-handeye2"})
 ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan", "kuka-tool", "kuka-base"}
+ANGLES |= {"halcon"}
 ANGLES |= {"xarm", "mecademic", "kawasaki", "comau", "realman", "techman", "epson"}
 # With the axes of its first and last angles nearly along each other.
 TINY = {("tiny", name) for name in ("doosan", "kawasaki", "comau")}
@@ -87,6 +88,7 @@ def test_any_edge_and_frame_and_its_inverse(name):
 
 def test_every_format_is_read_by_a_test_and_has_a_name_of_its_own():
     known = {*READERS, *FRAME_READERS, *readers.ARM_FORMATS, "camera-info", "kalibr"}
+    known |= {"halcon-camera"}
     assert FORMATS.keys() == known
     assert len(EXPORT_FORMATS) == len(known)
 
@@ -336,6 +338,56 @@ def test_lenses_are_written_to_the_last_digit(model, distortion, ros_model, kali
         "resolution": [1280, 800],
         "rostopic": "/left/image_raw",
     }
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion", "most_px"),
+    [
+        # Its polynomial is of the inverse: what it cannot hold grows with the distortion.
+        ("brown", [-0.01, 0.0, 1e-5, -2e-5, 0.0], 1e-3),
+        ("brown", [-0.3, 0.12, 5e-4, -1e-3, -0.02], 0.5),
+        ("fisheye", [0.02, -0.01, 0.004, -0.001], 0.01),
+    ],
+)
+def test_halcon_undistorts_its_lens_as_opencv_does(model, distortion, most_px):
+    camera = Camera(
+        model, (1280, 800), np.array([1400.1, 1402.2, 640.3, 395.2]), np.array(distortion)
+    )
+    source = replace(SAMPLE, camera=CameraResult(camera, estimated=True))
+    written = document(source, "halcon-camera")
+    found = readers.halcon_camera(written.text)
+    assert (found["ImageWidth"], found["ImageHeight"]) == camera.resolution
+    axes = (np.linspace(0, side - 1, 13) for side in camera.resolution)
+    px = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    # MVTec, calibrate_cameras: distorted places u, v of the image plane to undistorted ones.
+    u, v = (px.T - [[found["Cx"]], [found["Cy"]]]) * [[found["Sx"]], [found["Sy"]]]
+    k1, k2, k3, p1, p2 = (found[f"Poly{at}"] for at in range(1, 6))
+    r2 = u * u + v * v
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    plane = [
+        u * radial + p1 * (r2 + 2 * u * u) + 2 * p2 * u * v,
+        v * radial + 2 * p1 * u * v + p2 * (r2 + 2 * v * v),
+    ]
+    matrix = np.array([[1400.1, 0, 640.3], [0, 1402.2, 395.2], [0, 0, 1]])
+    if model == "fisheye":
+        rays = cv2.fisheye.undistortPoints(px[:, None], matrix, camera.distortion)[:, 0]
+    else:
+        # To its end: by default it stops after five steps.
+        ends = (cv2.TERM_CRITERIA_COUNT, 100, 0.0)
+        none = (np.eye(3), np.eye(3))
+        rays = cv2.undistortPointsIter(px[:, None], matrix, camera.distortion, *none, ends)[:, 0]
+    off_px = np.abs(1400.1 * (np.array(plane).T / found["Focus"] - rays)).max()
+    assert off_px < most_px
+    stated_px = float(re.search(r"leaves at most (?:under )?(\S+) px", written.text)[1])
+    assert off_px <= stated_px
+    assert any("HALCON" in words for words in written.warnings) == (stated_px > 0.05)
+
+
+def test_halcon_holds_no_rays_beside_the_plane():
+    source = with_lens("fisheye", [-0.05, 0.0, 0.0, 0.0])
+    wide = replace(source.camera.camera, matrix=np.array([300.0, 300.0, 640.0, 400.0]))
+    source = replace(source, camera=replace(source.camera, camera=wide))
+    raised(DataError, r"80 degrees.*camera-info", export, source, "halcon-camera")
 
 
 def test_a_field_is_told_beside_the_coefficients_that_come_nearest_to_the_lens():

@@ -128,6 +128,23 @@ def zivid(text):
     return transform(matrix_mm[:3, :3], matrix_mm[:3, 3] / 1000)
 
 
+def halcon(text):
+    """A pose of write_pose with code 0: R = Rx Ry Rz of angles in degrees, metres."""
+    lines = (line.split() for line in code(text, "#").splitlines() if line.strip())
+    words = {name: [float(word) for word in rest] for name, *rest in lines}
+    assert words.keys() == {*"frt"}
+    assert words["f"] == [0]
+    x, y, z = np.radians(words["r"])
+    return transform(rx(x) @ ry(y) @ rz(z), words["t"])
+
+
+def halcon_camera(text):
+    """Numbers of a file of write_cam_par by name: an entry is `Name:short: value;` and its type."""
+    assert 'ParGroup: Camera: Parameter;\n  "' in text
+    found = re.findall(r"^(\w+):\w+: *(\S+);\n +(?:DOUBLE|INT):", code(text, "#"), re.MULTILINE)
+    return {name: float(value) for name, value in found}
+
+
 def plain(text):
     return np.loadtxt(text.splitlines())
 
@@ -292,6 +309,7 @@ READERS = {
     "urdf": urdf,
     "opencv": opencv,
     "zivid": zivid,
+    "halcon": halcon,
     "text": plain,
     "mujoco": mujoco,
     "ur": ur,

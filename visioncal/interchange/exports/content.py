@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import yaml
@@ -10,7 +11,7 @@ import yaml
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.number_format import did_you_mean, figure
-from visioncal.core.types import FloatArray, Mount
+from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 from visioncal.results.conditions import Condition
@@ -325,6 +326,34 @@ class ExportFormat(Format[Content]):
     frames: Mapping[str, str] = field(default_factory=dict)
     # Builds the document of all transforms of a cell; None where it holds one.
     write_all: Callable[[Sequence[Content]], str] | None = None
+
+
+def camera_of(content: Content) -> Camera:
+    """The camera of a format of lenses; raises DataError where there is none."""
+    if content.lens is None:
+        raise DataError(
+            "This calibration has no camera: its session brought measured poses of the target, "
+            "and no images. A lens is calibrated with images.",
+            culprits=["calibration.json: camera"],
+            next_step="Export its transform, as with --to ros.",
+        )
+    return content.lens.camera
+
+
+def lens_notes(content: Content) -> list[str]:
+    """Comment lines of a lens: origin, verdict, and what its model leaves."""
+    estimated = content.lens is not None and content.lens.estimated
+    how = "estimated from the session's images" if estimated else "as the session gave it"
+    said = f"verdict {content.verdict.status}; the lens is {how}"
+    return [*filter(None, (content.origin, said, content.field_error_words))]
+
+
+def warn_of_field(content: Content) -> list[str]:
+    """Warns of the remaining error of a lens with a field."""
+    return [f"{content.field_error_words}."] * bool(content.field_error_words)
+
+
+LENS_FORMAT = partial(ExportFormat, holds="lens", frames={"cam": "camera"}, warn=warn_of_field)
 
 
 def numbers(values: FloatArray) -> list[float]:

@@ -30,6 +30,7 @@ from visioncal.interchange.exports.content import (
     placements,
     worst_of,
 )
+from visioncal.interchange.exports.halcon import HALCON
 from visioncal.interchange.exports.mujoco import MUJOCO
 from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import FILES, ROS_FORMATS
@@ -39,6 +40,7 @@ from visioncal.session.selecting import ARM, EYE, PARTS, Choice
 EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     *ROS_FORMATS,
     *FILES,
+    *HALCON,
     MUJOCO,
     *ROBOTS,
     *ARMS,

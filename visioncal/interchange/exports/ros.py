@@ -17,13 +17,17 @@ import numpy as np
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
-from visioncal.core.types import Camera, FloatArray
+from visioncal.core.types import FloatArray
 from visioncal.interchange.exports.content import (
+    LENS_FORMAT,
     Content,
     ExportFormat,
+    camera_of,
     comments,
+    lens_notes,
     numbers,
     rows,
+    warn_of_field,
     xml_comments,
     yaml_text,
 )
@@ -31,29 +35,6 @@ from visioncal.vision.camera import matrix_3x3
 
 # By number of coefficients: OpenCV's five, eight, and the fisheye's four.
 _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
-
-
-def _camera_of(content: Content) -> Camera:
-    if content.lens is None:
-        raise DataError(
-            "This calibration has no camera: its session brought measured poses of the target, "
-            "and no images. A lens is calibrated with images.",
-            culprits=["calibration.json: camera"],
-            next_step="Export its transform, as with --to ros.",
-        )
-    return content.lens.camera
-
-
-def _lens_notes(content: Content) -> list[str]:
-    estimated = content.lens is not None and content.lens.estimated
-    how = "estimated from the session's images" if estimated else "as the session gave it"
-    said = f"verdict {content.verdict.status}; the lens is {how}"
-    return [*filter(None, (content.origin, said, content.field_error_words))]
-
-
-def _warn_of_field(content: Content) -> list[str]:
-    """Warns of the remaining error of a lens with a field."""
-    return [f"{content.field_error_words}."] * bool(content.field_error_words)
 
 
 def _array(matrix: FloatArray) -> dict[str, int | list[float]]:
@@ -64,7 +45,7 @@ def _write_camera_info(content: Content) -> str:
     """Writes a camera_info file (image_common, camera_calibration_parsers/src/parse_yml.cpp)."""
     # Models by sensor_msgs/distortion_models.hpp. A single camera is not rectified: R is the
     # identity, and P repeats the camera matrix.
-    camera = _camera_of(content)
+    camera = camera_of(content)
     matrix = matrix_3x3(camera)
     document = {
         "image_width": camera.resolution[0],
@@ -76,13 +57,13 @@ def _write_camera_info(content: Content) -> str:
         "rectification_matrix": _array(np.eye(3)),
         "projection_matrix": _array(np.hstack([matrix, np.zeros((3, 1))])),
     }
-    return comments("#", _lens_notes(content)) + yaml_text(document, short_lists=True)
+    return comments("#", lens_notes(content)) + yaml_text(document, short_lists=True)
 
 
 def _write_kalibr(content: Content) -> str:
     """Writes a camchain.yaml (Kalibr's wiki, "Yaml formats") of one camera."""
     # Without `T_cam_imu`, from an inertial sensor to the camera: none was calibrated.
-    camera = _camera_of(content)
+    camera = camera_of(content)
     coefficients = numbers(camera.distortion)
     if camera.model == "brown":
         beyond = [coefficient for coefficient in coefficients[4:] if coefficient != 0.0]
@@ -106,7 +87,7 @@ def _write_kalibr(content: Content) -> str:
             "rostopic": f"/{content.child}/image_raw",
         }
     }
-    return comments("#", _lens_notes(content)) + yaml_text(document, short_lists=True)
+    return comments("#", lens_notes(content)) + yaml_text(document, short_lists=True)
 
 
 def _write_text(content: Content) -> str:
@@ -146,15 +127,14 @@ def _write_zivid(content: Content) -> str:
     return version + yaml_text({"FloatMatrix": {"Data": rows(matrix_mm)}}, short_lists=True)
 
 
-_LENS_FORMAT = partial(ExportFormat, holds="lens", frames={"cam": "camera"}, warn=_warn_of_field)
 FILES = (
-    _LENS_FORMAT("camera-info", "the lens as ROS's camera_info YAML [px]", _write_camera_info),
-    _LENS_FORMAT("kalibr", "the lens as Kalibr's camchain.yaml [px]", _write_kalibr),
+    LENS_FORMAT("camera-info", "the lens as ROS's camera_info YAML [px]", _write_camera_info),
+    LENS_FORMAT("kalibr", "the lens as Kalibr's camchain.yaml [px]", _write_kalibr),
     ExportFormat(
         "opencv",
         "OpenCV's FileStorage: transform, R, t and any lens [m]",
         _write_opencv,
-        warn=_warn_of_field,
+        warn=warn_of_field,
     ),
     ExportFormat(
         "zivid", "a Matrix4x4 of Zivid's SDK as YAML [mm]", _write_zivid, has_comments=False
