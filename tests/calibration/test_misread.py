@@ -228,6 +228,27 @@ def test_a_planted_mistake_is_named(make, mount, views):
         assert not any("sorted as text" in change.words for change in tried)
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("order", ["xyz", "ZYZ"])
+def test_angles_in_degrees_that_lost_turns_are_named_and_not_made_up(tmp_path, mount, order):
+    poses = cell_poses(mount)
+    told = misread(f"euler-{order}-deg", "m", Reading(f"euler-{order}-rad"))(poses)
+    robot = told.robot.poses()
+    guess = guessed(replace(poses, robot=numbers(robot)))
+    assert guess.stands_out
+    # Angles about fixed axes are those about moving ones in reverse order.
+    assert f"{'ZYX' if order == 'xyz' else order} about moving axes in degrees" in guess.sentence
+    assert "taken for radians" in guess.sentence
+    session = pairs_session(mount, robot, poses.camera.poses())
+    session.save(tmp_path / "cell")
+    (cause, *_) = visioncal.calibrate(session).verdict.causes
+    assert "degrees=True" in cause.do.words
+    assert not cause.do.command
+    done = typed("convert", tmp_path / "cell", tmp_path / "fixed", "--guess", "--yes")
+    assert done.status == 2
+    assert "lost whole turns" in done.said
+
+
 def test_both_sides_in_millimetres_and_inverse_poses_of_the_camera_are_read_right():
     poses = cell_poses()
     camera, told = (

@@ -80,6 +80,12 @@ def _degrees(poses: Poses, rng: np.random.Generator) -> Poses:
     return replace(told, robot=numbers(told.robot.poses()))
 
 
+def _wrapped(poses: Poses, _: np.random.Generator) -> Poses:
+    """Degrees taken for radians that were made into quaternions, and lost their whole turns."""
+    told = _told(poses, "rotation-vector-deg", "m", Reading("rotation-vector"))
+    return replace(told, robot=numbers(told.robot.poses()))
+
+
 def _mount(poses: Poses, _: np.random.Generator) -> Poses:
     return replace(poses, mount=OTHER[poses.mount])
 
@@ -144,6 +150,7 @@ MISTAKES: Mapping[str, Plant] = {
     "quaternion w, x, y, z": _wxyz,
     "Euler ZYX taken for XYZ": _order,
     "degrees and radians": _degrees,
+    "degrees that lost turns": _wrapped,
     "the other mount": _mount,
     "rows shifted by one": _shifted,
     "two rows exchanged": _swapped,

@@ -27,6 +27,8 @@ class SideReading(Reading):
     # Where the recorded rotations came from misreading others: the form in which those were
     # misread. Writing the rotations in it gets them back, and they are read as `rotation`.
     written: str = ""
+    # Rotations of rows, by their places, that no formula gives back.
+    by_place: tuple[tuple[str, tuple[float, ...]], ...] = ()
     # Whether rotations are transposed while positions are not those of an inverse.
     transposed: bool = False
     mirrored: bool = False  # Whether the frame is left-handed.
@@ -41,8 +43,17 @@ class SideReading(Reading):
         plain = Reading(self.rotation, self.unit, self.inverse)
         return plain if self == SideReading(**vars(plain)) else None
 
+    @property
+    def has_lost_turns(self) -> bool:
+        """Whether whole turns about the tool's last axis are lost, which a camera cannot show."""
+        return bool(self.by_place) and self.rotation.startswith("euler")
+
     def rotations(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 3, 3) rotations as they are written; NaN where the numbers give none."""
+        if self.by_place:
+            there, none = dict(self.by_place), (np.nan,) * 9
+            rows = [there.get(place, none) for place in numbers.places]
+            return np.array(rows).reshape(-1, 3, 3)
         recorded = numbers.rotations
         if self.written:
             rotations = ROTATION_FORMS[numbers.reading.rotation].read(recorded)

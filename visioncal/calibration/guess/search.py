@@ -7,14 +7,14 @@ angle is also the same for a pose and its inverse: inverses, and all that concer
 distinguished by the fits.
 """
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import combinations, product
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import STARTS, Fit, distance_rows, robust_fits
+from visioncal.calibration.guess.fit import CLOSING_SCORE, STARTS, Fit, distance_rows, robust_fits
 from visioncal.calibration.guess.readings import (
     ROW_ORDERS,
     Change,
@@ -23,7 +23,8 @@ from visioncal.calibration.guess.readings import (
     changes,
     rewritten,
 )
-from visioncal.core.conventions import UNITS_M, PoseNumbers
+from visioncal.calibration.guess.unwrapping import unwrapped
+from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Mount
@@ -190,11 +191,33 @@ def search(recording: Recording) -> list[Candidate]:
             break
     near = _near([*labels], scores)
     refined = [declared, *(reading for reading in near if reading != declared)]
+    if min(scores) > CLOSING_SCORE and mismatch(declared) > _TURNS_AGREE_RAD:
+        for change in _unwrapped(recording):
+            reading = change.of(declared)
+            labels[reading] = (reading,)
+            refined.append(reading)
     found = fitted(recording, refined, rows, STARTS)
     first, *others = (replace(item, labels=labels[item.hypothesis]) for item in found)
     others += _of_another_size(recording, [first, *others], rows)
     others.sort(key=lambda item: -item.log_posterior)
     return [first, *others]
+
+
+def _unwrapped(recording: Recording) -> Iterator[Change]:
+    """The reading of rotations whose degrees were taken for radians."""
+    rows, declared = recording.common_rows, recording.declared
+    numbers = recording.robot.rows(rows)
+    poses = declared.robot.poses(numbers)
+    seen = declared.camera.poses(recording.camera.rows(rows))
+    there = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2))
+    found = unwrapped(poses[there, :3, :3], poses[there, :3, 3], seen[there], recording.mount)
+    if found is None:
+        return
+    form, rotations = found
+    places = (numbers.places[at] for at in np.flatnonzero(there))
+    by_place = zip(places, map(tuple, rotations.reshape(-1, 9).tolist()), strict=True)
+    words = f"the robot's rotations as {ROTATION_FORMS[form].words}, which were taken for radians"
+    yield Change(words, "robot", {"rotation": form, "by_place": tuple(by_place)}, 2)
 
 
 def _of_another_size(

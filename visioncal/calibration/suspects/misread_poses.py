@@ -37,6 +37,11 @@ _MIRRORED = Remedy(
     "the right and v_px down), and calibrate anew. Only where the robot's frame is left-handed, "
     "convert with --guess --mirror-poses."
 )
+_LOST_TURNS = Remedy(
+    "Where the poses were made of the robot's angles, convert these to radians first (np.deg2rad, "
+    "or degrees=True of SciPy), and write the poses anew; or convert the robot's own log. The "
+    "session cannot be mended: whole turns about the last axis of the tool are lost."
+)
 _UNRECORDED = Remedy(
     "Convert the recording itself again with --guess, if the session was made of one: angles that "
     "were misread cannot all be read anew from here. Or look how the poses were recorded, and how "
@@ -124,7 +129,9 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
         # Too little to guess from; the calibration's own error says so.
         return
     if guess.stands_out:
-        step = _MIRRORED if guess.best.hypothesis.robot.mirrored else READ_AGAIN
+        robot = guess.best.hypothesis.robot
+        step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
+        step = _MIRRORED if robot.mirrored else step
         yield Finding("misread_poses", guess.sentence, step)
     elif not guess.declared.fit.closes:
         yield from _unrecorded(run)

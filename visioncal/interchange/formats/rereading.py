@@ -415,6 +415,13 @@ def reread(
             next_step="Turn the images back, and find their corners anew; only where the robot's "
             "frame is left-handed, mirror its poses with --mirror-poses.",
         )
+    if candidate.hypothesis.robot.has_lost_turns:
+        raise DataError(
+            "Nothing was written: angles in degrees that were taken for radians lost whole turns, "
+            "and those about the last axis of the tool cannot be found again.",
+            culprits=[candidate.words],
+            next_step="Convert the robot's own log, or make the poses anew from angles in radians.",
+        )
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     camera = doubtful.camera or numbers_in(session, MEASURED_CAM_POSE)
     robot = doubtful.robot or numbers_in(session, POSE)

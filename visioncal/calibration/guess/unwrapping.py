@@ -1,0 +1,131 @@
+"""Rotations whose angles in degrees were taken for radians, which lost whole turns.
+
+The robot's positions, which are right, place both edges but for a rotation of the tool. The
+recorded rotation of one view gives it for each number of turns that its angles may have lost; the
+others show which one is right, and then how many turns each of them lost. Turns of all views about
+the last axis of Euler angles are turns of the tool, and stay open.
+"""
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+
+from visioncal.calibration.guess.fit import CLOSING_SCORE
+from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS
+from visioncal.core.transforms import invert, nearest_rotation, rotation_angle
+from visioncal.core.types import FloatArray, Mount
+
+_TURN = 2.0 * np.pi
+# Rotations by angles 57 times as large are alike to this [rad], by chance in one view of 150. So
+# many views decide, but for a few that may be wrong, as may be the first.
+_ALIKE_RAD, _CHECKED, _WRONG = 0.5, 8, 2
+
+
+def _forms() -> Iterator[str]:
+    """Names, without unit, of rotations that robot makers write in degrees."""
+    orders = {form.rotation.split("-")[1] for form in POSE_FORMS.values() if "eul" in form.rotation}
+    # Angles about fixed axes are those about moving ones in reverse order.
+    moving = {order if order.isupper() else order[::-1].upper() for order in orders}
+    # Roll, pitch and yaw first: they are the most common.
+    yield from ("rotation-vector", *(f"euler-{order}" for order in sorted(moving, reverse=True)))
+
+
+def unwrapped(
+    recorded: FloatArray, positions: FloatArray, camera: FloatArray, mount: Mount
+) -> tuple[str, FloatArray] | None:
+    """Rotations before their degrees were taken for radians, after the name of their form.
+
+    Args:
+        recorded: (n, 3, 3) rotations of the flange as recorded.
+        positions: (n, 3) its positions.
+        camera: (n, 4, 4) `cam_from_target`.
+        mount: How the camera is mounted.
+    """
+    if len(camera) <= _CHECKED:
+        return None
+    turned = _turned_as_seen(positions, invert(camera) if mount == "eye-in-hand" else camera)
+    for form, first in product(_forms() if len(turned) else (), range(_WRONG + 1)):
+        rotations = _with_turns(recorded, turned, first, form)
+        if rotations is not None:
+            return f"{form}-deg", rotations
+    return None
+
+
+def _turned_as_seen(positions: FloatArray, seen: FloatArray) -> FloatArray:
+    """(n, 3, 3) rotations of the flange, but for one of its tool, by its positions alone.
+
+    The flange's places in what stands still with the robot are linear in its place in the tool, and
+    in its turned positions. Of (n, 4, 4) poses of the camera in the target, or the other way round;
+    empty where positions do not determine them.
+    """
+    rows = np.zeros((len(seen), 3, 15))
+    for axis in range(3):
+        rows[:, axis, 3 * axis : 3 * axis + 3] = positions - positions.mean(axis=0)
+    rows[:, :, 9:12], rows[:, :, 12:] = -np.eye(3), -seen[:, :3, :3]
+    weights = np.ones(len(seen))
+    for _ in range(10):
+        sides = rows * weights[:, None, None], seen[:, :3, 3] * weights[:, None]
+        solution, _, rank, _ = np.linalg.lstsq(sides[0].reshape(-1, 15), sides[1].ravel())
+        if rank < 15:
+            return np.zeros((0, 3, 3))
+        # Least absolute distances: some views may be wrong.
+        away = np.linalg.norm(rows @ solution - seen[:, :3, 3], axis=1)
+        weights = 1.0 / np.sqrt(np.maximum(away, 1e-4))
+    # Positions of other rows, or in other units, place nothing.
+    if np.median(away) > CLOSING_SCORE * np.median(np.linalg.norm(seen[:, :3, 3], axis=1)):
+        return np.zeros((0, 3, 3))
+    matrices: FloatArray = np.asarray(solution[:9]).reshape(1, 3, 3)
+    turn = nearest_rotation(matrices)[0].T
+    return np.asarray(turn @ seen[:, :3, :3])
+
+
+def _with_turns(
+    recorded: FloatArray, turned: FloatArray, first: int, form: str
+) -> FloatArray | None:
+    """(n, 3, 3) rotations with their whole turns; None where the views show none that fit."""
+    rad = ROTATION_FORMS["rotation-vector" if form == "rotation-vector" else f"{form}-rad"]
+    deg = ROTATION_FORMS[f"{form}-deg"]
+    tools = turned[first].T @ deg.read(_rivals(rad.write(recorded[[first]])[0], form))
+    wrong = 0
+    for view in [at for at in range(len(recorded)) if at != first][:_CHECKED]:
+        again = rad.read(deg.write(turned[view] @ tools))
+        near = rotation_angle(np.swapaxes(again, 1, 2) @ recorded[view]) < _ALIKE_RAD
+        tools, wrong = (tools[near], wrong) if near.any() else (tools, wrong + 1)
+    if wrong > _WRONG:
+        return None
+    expected = deg.write(turned @ tools[0])
+    rivals = np.array([_solutions(angles, form) for angles in rad.write(recorded)])
+    if form == "rotation-vector":
+        angle = np.linalg.norm(rivals, axis=2, keepdims=True)
+        along = np.sum(rivals * expected[:, None], axis=2, keepdims=True) / angle
+        rivals = rivals / angle * (angle + _TURN * np.round((along - angle) / _TURN))
+    else:
+        rivals = rivals + _TURN * np.round((expected[:, None] - rivals) / _TURN)
+    nearest = np.linalg.norm(rivals - expected[:, None], axis=2).argmin(axis=1)
+    return deg.read(rivals[np.arange(len(rivals)), nearest])
+
+
+def _solutions(angles: FloatArray, form: str) -> FloatArray:
+    """(s, 3) numbers [rad] of the same rotation, but for whole turns."""
+    order = form.split("-")[1]
+    if order == "vector":
+        return angles[None]
+    middle = -angles[1] if order[0] == order[2] else np.pi - angles[1]
+    return np.array([angles, [angles[0] + np.pi, middle, angles[2] + np.pi]])
+
+
+def _rivals(angles: FloatArray, form: str) -> FloatArray:
+    """(k, 3) numbers in degrees that are the same rotation as (3,) numbers in radians."""
+    turns = _TURN * np.arange(-29, 30)
+    if form == "rotation-vector":
+        size = max(float(np.linalg.norm(angles)), 1e-9)
+        return np.asarray(np.outer(size + turns, angles / size))
+    grids = [
+        np.stack(np.meshgrid(*(angle + turns for angle in each), indexing="ij"), -1).reshape(-1, 3)
+        for each in _solutions(angles, form)
+    ]
+    every = np.concatenate(grids)
+    low, high = (0.0, 180.0) if form[6] == form[8] else (-90.0, 90.0)
+    is_one = (np.abs(every[:, ::2]) <= 180.0).all(axis=1)
+    return np.asarray(every[is_one & (low <= every[:, 1]) & (every[:, 1] <= high)])
