@@ -310,6 +310,18 @@ def test_a_stated_lens_counts_by_its_prior_and_is_refined_where_that_helps(
     assert limits[0] < np.mean(surprises) < limits[1]
 
 
+def test_a_held_distortion_that_does_not_fit_is_named_and_freed_by_what_is_advised():
+    cell = simulate(replace(FINE, camera=CAMERAS["wide"], seed=4))
+    held = calibrated(cell, session=with_camera(cell, distortion=[0.0] * 5, **HOLD))
+    (cause, *_) = held.verdict.causes
+    assert cause.kind == "lens"
+    assert "the distortion, k1, k2, p1, p2, k3, would move corners by up to" in cause.words
+    assert cause.do.words.startswith('In session.toml, write intrinsics = "refine"')
+    freed = calibrated(cell, session=with_camera(cell, distortion=[0.0] * 5, **REFINE))
+    # Chi-square of 12 over 12: beyond in one case of a thousand.
+    assert mahalanobis_sq(cell, freed) < 2.74
+
+
 def test_a_fisheye_camera_goes_the_whole_way():
     surprises = []
     for seed in range(2):

@@ -13,7 +13,7 @@ from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation import unknowns
 from visioncal.estimation.fit import Fit
@@ -21,7 +21,7 @@ from visioncal.estimation.joint import moved_mahalanobis_sq
 from visioncal.estimation.scene import ONLY_CAMERA
 from visioncal.model.effects.effect import SIGNIFICANT
 from visioncal.results.compare import intrinsics_names
-from visioncal.vision.camera import intrinsics, normalise, project
+from visioncal.vision.camera import intrinsics, normalise, project, with_intrinsics
 
 # Changes of intrinsics or corners below this show in no image [px].
 _LEAST_MOVE_PX = 0.1
@@ -30,6 +30,12 @@ _BETTER = 1.1
 _NEW_LENS = Remedy(
     "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
     "the camera anew.",
+    CALIBRATE,
+)
+
+
+_FREE_LENS = Remedy(
+    'In session.toml, write intrinsics = "refine" in [camera], or calibrate the camera anew.',
     CALIBRATE,
 )
 
@@ -79,17 +85,7 @@ def _of_camera(fitted: Fit, camera: str) -> Iterator[Finding]:
         sigmas_px = problem.stated_sigma[:4]
         moved = f"fx, fy, cx, cy moved by {_px(moves)} px."
         stated, refined = problem.scene.camera, optics.camera(camera)
-        rays = normalise(stated, stack.px)
-        rays = np.column_stack([rays, np.ones(len(rays))])
-        # By the matrix alone, the rest is the distortion's.
-        before, unbent, after = (
-            project(at, rays)
-            for at in (stated, replace(refined, distortion=stated.distortion), refined)
-        )
-        moved_px, bent_px = (
-            float(np.nanmax(np.linalg.norm(after - at, axis=1), initial=0.0))
-            for at in (before, unbent)
-        )
+        moved_px, bent_px = _moved_px(stated, refined, stack.px)
         if bent_px > max(np.abs(moves).max(), _LEAST_MOVE_PX):
             names = ", ".join(intrinsics_names(stated)[4:])
             moved = f"the distortion, {names}, moved corners by up to {figure(bent_px)} px; {moved}"
@@ -102,18 +98,39 @@ def _of_camera(fitted: Fit, camera: str) -> Iterator[Finding]:
             allowed = "within what is stated, or by less than images show"
             yield Finding(NOTE, f"The given intrinsics were refined {allowed}: {moved}")
     if not moving.all():
-        at = columns[fitted.unknowns.values_of(lens) < 4]
-        moves = fitted.shift[at]
-        squared = float(moves @ np.linalg.solve(fitted.by_noise[np.ix_(at, at)], moves))
-        if np.abs(moves).max() > _LEAST_MOVE_PX and squared > chi2_limit(FALSE_ALARM, len(at)):
+        held = problem.scene.camera
+        moves = np.zeros(len(intrinsics(held)))
+        moves[fitted.unknowns.values_of(lens)] = fitted.shift[columns]
+        information = np.linalg.inv(fitted.by_noise[np.ix_(columns, columns)])
+        squared = float(fitted.shift[columns] @ information @ fitted.shift[columns])
+        free = with_intrinsics(held, intrinsics(held) + moves)
+        moved_px, bent_px = _moved_px(held, free, stack.px)
+        if moved_px > _LEAST_MOVE_PX and squared > chi2_limit(FALSE_ALARM, len(columns)):
+            would = f"fx, fy, cx, cy would move by {_px(moves[:4])} px"
+            if bent_px > np.abs(moves[:4]).max():
+                names = ", ".join(intrinsics_names(held)[4:])
+                would = f"the distortion, {names}, would move corners by up to {figure(bent_px)} px"
             yield Finding(
                 "lens",
-                "The given intrinsics do not fit these images: free, fx, fy, cx, cy would move by "
-                f'{_px(moves)} px. But intrinsics = "hold" keeps them; what this does to the '
-                "result counts in its sigmas.",
-                _NEW_LENS,
+                f"The given intrinsics do not fit these images: free, {would}. But intrinsics = "
+                '"hold" keeps them; what this does to the result counts in its sigmas.',
+                _FREE_LENS,
                 mahalanobis_sq=squared,
             )
+
+
+def _moved_px(stated: Camera, other: Camera, px: FloatArray) -> tuple[float, float]:
+    """Most that corners move from one lens to another, in all and by its distortion [px]."""
+    rays = normalise(stated, px)
+    rays = np.column_stack([rays, np.ones(len(rays))])
+    # By the matrix alone, the rest is the distortion's.
+    unbent = replace(other, distortion=stated.distortion)
+    after = project(other, rays)
+    moved_px, bent_px = (
+        float(np.nanmax(np.linalg.norm(after - project(at, rays), axis=1), initial=0.0))
+        for at in (stated, unbent)
+    )
+    return moved_px, bent_px
 
 
 def has_changed(fitted: Fit, columns: IntArray) -> bool:
