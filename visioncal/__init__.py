@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from visioncal.interchange.batch import Batch, batch
     from visioncal.interchange.exports import export
     from visioncal.interchange.formats import convert
+    from visioncal.live.capture.from_python import record
+    from visioncal.live.drivers.protocols import ArmState
     from visioncal.live.planning.plan import make_plan
     from visioncal.present.report.page import write_report
     from visioncal.results import Calibration, Verdict
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from visioncal.vision.targets import load_target
 
 _HOMES = {
+    "ArmState": "visioncal.live.drivers.protocols",
     "Batch": "visioncal.interchange.batch",
     "CalibratedArm": "visioncal.results.compensation",
     "Calibration": "visioncal.results",
@@ -83,6 +86,7 @@ _HOMES = {
     "locate_views": "visioncal.frames.session_observations",
     "make_plan": "visioncal.live.planning.plan",
     "place_seen": "visioncal.frames.target_pose",
+    "record": "visioncal.live.capture.from_python",
     "seen_frame": "visioncal.frames.frame_from_images",
     "simulate": "visioncal.simulation",
     "touched_fixture": "visioncal.frames.fixture",
@@ -93,6 +97,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "ArmState",
     "Batch",
     "CalibratedArm",
     "Calibration",
@@ -128,6 +133,7 @@ __all__ = [
     "locate_views",
     "make_plan",
     "place_seen",
+    "record",
     "seen_frame",
     "simulate",
     "touched_fixture",

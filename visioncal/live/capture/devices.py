@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from operator import attrgetter
 from typing import TYPE_CHECKING, TypeVar
 
 from visioncal.core.errors import DataError
@@ -98,9 +99,15 @@ def _socket(address: str, *, form: str | None, **__: object) -> Arm:
 
 def _driver(name: str) -> Callable[[str, DeviceSetup], CameraDevice]:
     """Opener of a camera by its driver, `module.Class` of an address and what is requested."""
-    module, _, kind = f"visioncal.live.drivers.{name}".rpartition(".")
-    # The import waits for the call.
-    return lambda address, requested: getattr(import_module(module), kind)(address, requested)  # noqa: PLW0108
+    module, _, kind = name.partition(".")
+
+    def opened(address: str, requested: DeviceSetup) -> CameraDevice:
+        # The import waits for the call.
+        opener = attrgetter(kind)(import_module(f"visioncal.live.drivers.{module}"))
+        camera: CameraDevice = opener(address, requested)
+        return camera
+
+    return opened
 
 
 ARMS: Mapping[str, Callable[..., Arm]] = {"ur": _ur, "manual": _manual, "socket": _socket}
@@ -113,4 +120,5 @@ CAMERAS: Mapping[str, Callable[[str, DeviceSetup], CameraDevice]] = {
     "basler": _driver("basler.BaslerCamera"),
     "realsense": _driver("realsense.RealsenseCamera"),
     "folder": _driver("folder.FolderCamera"),
+    "python": _driver("function.FunctionCamera.of_file"),
 }
