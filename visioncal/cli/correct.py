@@ -1,6 +1,8 @@
 """`visioncal correct`."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from difflib import unified_diff
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,13 @@ from visioncal.cli.parsing import numbers_in
 from visioncal.cli.result_options import CorrectOptions
 from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, write_atomically
+from visioncal.core.files import check_free, read_bytes, write_atomically
 from visioncal.core.number_format import did_you_mean, figure, mm_and_deg
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats import PoseImportOptions
 from visioncal.interchange.formats.touches import read_typed
+from visioncal.interchange.programs import Dialect, correct_program, dialect_of
 from visioncal.interchange.result_files import load_calibration
 from visioncal.results import Calibration
 from visioncal.results.compensation.correction import (
@@ -53,6 +56,13 @@ def correct_command(
         DataError: Something cannot be read or written, or targets are out of reach.
         VerdictError: The calibration, or the tool, is bad.
     """
+    if (dialect := dialect_of(options.targets.suffix)) is not None and moved is None:
+        _correct_program(options, dialect)
+    else:
+        _correct_table(options, moved)
+
+
+def _correct_table(options: CorrectOptions, moved: tuple[FloatArray, FloatArray] | None) -> None:
     # None where the table is printed.
     file = None if options.out == Path("-") else options.out
     needs = EYE if options.tool is not None and options.tool.removeprefix(_TOOLS) == "cam" else ARM
@@ -127,6 +137,64 @@ def correct_command(
     _report(columns, rows, unreachable, warnings, is_answer=file is not None)
     if file is not None:
         say(f"wrote {file}")
+
+
+def _program_frame(calibration: Calibration, tool: str | None, name: str) -> FloatArray | None:
+    """A tool or a base of the calibration by its name in a program; the stated one without."""
+    kind, _, label = name.partition(" ")
+    if kind == "tool" and tool is not None and not label:
+        return np.eye(4) if tool == "none" else _tool(calibration, tool)
+    parent = _TOOLS if kind == "tool" else "base_from_"
+    placed = {key.lower(): edge.matrix for key, edge in calibration.placed.items()}
+    return placed.get(f"{parent}{label.lower()}")
+
+
+def _correct_program(options: CorrectOptions, dialect: Dialect) -> None:
+    """Corrects a program's literal targets into a folder, and prints what changes as a diff."""
+    if options.out is None or options.out == Path("-"):
+        raise DataError(
+            f"{options.targets.name} is a program ({dialect.name}), and -o FOLDER is missing for "
+            "the corrected one.",
+            culprits=["-o"],
+        )
+    folder, calibration = options.out, load_calibration(options.calibration, options.choice, ARM)
+    bad = check_usable(calibration.verdict, "the calibration", force=options.force)
+    calibration = _at_temperatures(calibration, options.temperatures)
+    arm = CalibratedArm.of(calibration)
+    others = options.targets.parent.glob(f"{options.targets.stem}.*")
+    files = [options.targets, *(at for at in others if at.suffix.lower() == dialect.companion)]
+    texts = {file.name: read_bytes(file).decode("latin-1") for file in files}
+    for name in texts:
+        check_free(folder / name, force=options.force)
+
+    nothing = np.full((1, arm.real.joint_count), np.nan)
+    seed = _seeds(nothing, options.seed_joints)[0]
+    load = (options.payload_kg, options.payload_m)
+    frames = partial(_program_frame, calibration, options.tool)
+    done = correct_program(dialect, texts, arm, frames, loads=load, seed=seed)
+    diff = [
+        line
+        for name, text in texts.items()
+        for line in unified_diff(
+            text.splitlines(), done.texts[name].splitlines(), name, name, n=0, lineterm=""
+        )
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in done.texts.items():
+        write_atomically(folder / name, text.encode("latin-1"))
+    if options.as_json:
+        print_json({"changed": list(done.changed), "left": list(done.left), "diff": diff})
+        return
+    for line in diff:
+        typer.echo(line)
+    most = f", by up to {figure(float(done.moved_mm.max()))} mm" if len(done.moved_mm) else ""
+    say(f"{len(done.changed)} targets corrected{most}; {len(done.left)} motions stay")
+    for words in dict.fromkeys(done.left):
+        say(words, "left as it is: ", "bold yellow")
+    for words in bad:
+        warn(words)
+    for name in texts:
+        say(f"wrote {folder / name}")
 
 
 def _at_temperatures(calibration: Calibration, words: str | None) -> Calibration:
