@@ -14,13 +14,15 @@ from support.bags import FORMS, BagOptions, write_bag
 from support.lerobot import KEY, write_dataset
 from support.refusals import raised
 
-from visioncal import calibrate
+from visioncal import calibrate, simulation
 from visioncal.calibration.stages.motion import motion_of
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import pose_difference
 from visioncal.interchange.formats import ImportOptions, PoseImportOptions, bags, convert, lerobot
 from visioncal.interchange.formats.lerobot import FrameImages
 from visioncal.session import Session
+from visioncal.session.depth import read_depth
+from visioncal.simulation import CAMERAS, CellOptions, DepthOptions
 
 BOARD = ImportOptions(target="charuco_9x6_30mm")
 LENS = {"matrix": [914.2, 913.6, 645.3, 396.8], "distortion": [-0.1, 0.06, 0.0, 0.0, 0.0]}
@@ -105,6 +107,43 @@ def test_depth_is_no_picture(source, rendered, tmp_path):
     change = setting("CompressedImage", "format", "16UC1; png compressed ")
     path = bag(tmp_path / "c", source, rendered, change=change, is_compressed=True)
     raised(DataError, "no topic has images", convert, path, tmp_path / "out", requested=BOARD)
+
+
+@pytest.fixture(scope="module")
+def with_depth(tmp_path_factory):
+    """A folder of a session with depth of 0.1 mm."""
+    folder = tmp_path_factory.mktemp("depth") / "cell"
+    small = replace(CAMERAS["wide"], resolution=(320, 200), matrix=CAMERAS["wide"].matrix / 4)
+    cell = simulation.simulate(CellOptions(camera=small, views=6))
+    simulation.write_session(cell, folder, depth=DepthOptions())
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["16UC1", "32FC1", "compressed", "cloud"])
+@pytest.mark.parametrize("form", ["ros1", "mcap"])
+def test_depth_of_a_bag_is_that_of_its_views(kind, form, with_depth, tmp_path):
+    source = Session.load(with_depth)
+    path = tmp_path / ("b.bag" if form == "ros1" else "b")
+    bag(path, source, with_depth, form=form, depth=kind, frames_s=0.4)
+    session = convert(path, tmp_path / "out", requested=BOARD)
+    assert any("6 of 6 images have depth" in note for note in session.warnings)
+    for view, meant in zip(session.views, source.views, strict=True):
+        data = [one.images.read(at.depth) for one, at in ((session, view), (source, meant))]
+        depth = read_depth(data[0], view.depth, (320, 200))
+        meant_m = read_depth(data[1], meant.depth, (320, 200), 1e-4)
+        # Whole millimetres, or floats of four bytes.
+        limit = 0.51e-3 if kind in ("16UC1", "compressed") else 1e-6
+        assert np.allclose(depth, meant_m, 0.0, limit, equal_nan=True)
+
+
+def test_depth_of_another_frame_is_named_and_left_out(with_depth, tmp_path):
+    source = Session.load(with_depth)
+    path = bag(tmp_path / "b", source, with_depth, depth="16UC1", depth_frame="other", frames_s=0.4)
+    session = convert(path, tmp_path / "out", requested=BOARD)
+    assert not any(view.depth for view in session.views)
+    (said,) = (note for note in session.warnings if "no depth is aligned" in note)
+    assert "/camera/aligned_depth_to_color/image_raw (other, (320, 200))" in said
+    assert "align_depth.enable" in said
 
 
 PACKED = [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "MESSAGE"), ("mcap", "STORAGE")]

@@ -36,6 +36,8 @@ class BagOptions:
     period_s: float = 0.02  # Of the robot's poses, whose times err by up to a fifth of it.
     compression: str = ""  # A format of ROS 1, or a mode of ROS 2, that packs with zstd.
     image_kind: str = "png"  # What compressed images are.
+    depth: str = ""  # Of the views: 16UC1, 32FC1, compressed or cloud.
+    depth_frame: str = ""  # Its frame, where it is not that of the images.
     names: tuple[str, ...] = ("",)  # Namespaces of the cameras, all of which see the same.
     # Changes a message in place, by its type and its number among those of the topic.
     change: Callable[[str, int, Any], object] = lambda *_: None
@@ -123,6 +125,48 @@ class _Bag:
             message = self.of[kind](header, height, width, "mono8", 0, width, pixels.ravel())
         self.add(topic, f"sensor_msgs/msg/{kind}", message, at_s)
 
+    def add_depth(self, space, frame, at_s, session, view):
+        header = self.header(at_s + 0.003, self.options.depth_frame or frame)
+        raw = cv2.imdecode(np.frombuffer(session.images.read(view.depth), np.uint8), -1)
+        unit_m = session.declaration.camera.depth_unit_m
+        mm, kind = np.round(raw * unit_m * 1e3).astype("u2"), "Image"
+        (height, width), topic = raw.shape, f"{space}/aligned_depth_to_color/image_raw"
+        if self.options.depth == "16UC1":
+            message = self.of[kind](
+                header, height, width, "16UC1", 0, 2 * width, mm.view("u1").ravel()
+            )
+        elif self.options.depth == "32FC1":
+            metres = np.where(raw > 0, raw * unit_m, np.nan).astype("f4")
+            message = self.of[kind](
+                header, height, width, "32FC1", 0, 4 * width, metres.view("u1").ravel()
+            )
+        elif self.options.depth == "compressed":
+            kind, topic = "CompressedImage", f"{topic}/compressedDepth"
+            data = np.concatenate([np.zeros(12, "u1"), cv2.imencode(".png", mm)[1].ravel()])
+            message = self.of[kind](header, "16UC1; compressedDepth png", data)
+        else:
+            kind, topic = "PointCloud2", f"{space}/depth/color/points"
+            v, u = np.mgrid[:height, :width]
+            z = np.where(raw > 0, raw * unit_m, np.nan)
+            table = np.zeros((height, width), "f4,f4,f4,u4,f4")
+            for name, values in zip(
+                ("f0", "f1", "f2"), ((u - width / 2) * z, (v - height / 2) * z, z), strict=True
+            ):
+                table[name] = values
+            fields = [self.of["PointField"](axis, 4 * at, 7, 1) for at, axis in enumerate("xyz")]
+            message = self.of[kind](
+                header,
+                height,
+                width,
+                fields,
+                False,
+                20,
+                20 * width,
+                table.view("u1").ravel(),
+                False,
+            )
+        self.add(topic, f"sensor_msgs/msg/{kind}", message, at_s + 0.003)
+
     def add_lens(self, space, frame, at_s, lens):
         fx, fy, cx, cy = lens.matrix
         k = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
@@ -172,6 +216,8 @@ def write_bag(path: Path, session: Session, folder: Path, options: BagOptions) -
             pixels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
             for seen_s in np.arange(0.05, REST_S + WAY_S - 0.05, options.frames_s):
                 bag.add_image(space, frame, begin_s + seen_s, file, pixels)
+                if options.depth:
+                    bag.add_depth(space, frame, begin_s + seen_s, session, view)
         if session.camera is not None:
             bag.add_lens(space, frame, stamps_s[0], session.camera)
     bag.write(path)

@@ -1,9 +1,9 @@
 """Bags of ROS 1 and ROS 2 (sqlite3 and MCAP), read without ROS by rosbags (extra `ros`).
 
-Images, CameraInfo, JointState, TF, PoseStamped and /robot_description are read by their types. The
-robot's motion becomes a stream on its own clock; where the arm stood, one frame a stop becomes a
-view, else frames of the whole sweep. Images are read from the bag when they are stored, one by one:
-memory does not grow with the bag.
+Images, depth (of images and of organised clouds), CameraInfo, JointState, TF, PoseStamped and
+/robot_description are read by their types. The robot's motion becomes a stream on its own clock;
+where the arm stood, one frame a stop becomes a view, else frames of the whole sweep. Images are
+read from the bag when they are stored, one by one: memory does not grow with the bag.
 """
 
 from array import array
@@ -42,6 +42,7 @@ from visioncal.interchange.formats.foreign import (
 )
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 from visioncal.robot import Robot
+from visioncal.session.depth import npy_of
 from visioncal.session.images import ListedImages
 from visioncal.vision.boards.imaging import image_size
 
@@ -65,8 +66,9 @@ _COLOURS: Mapping[str, int | None] = {
     "yuv422": cv2.COLOR_YUV2BGR_UYVY,
     "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2,
 }
-# Encodings of depth, which is no picture.
-_DEPTHS = ("16UC1", "32FC1")
+# Encodings of depth, with the endings of its files, and types of PointCloud2's fields.
+_DEPTHS: Mapping[str, str] = {"16UC1": "png", "32FC1": "tiff"}
+_FIELDS: Mapping[int, str] = {7: "f4", 8: "f8"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +87,7 @@ class _Contents:
     """What a bag holds of one cell, by topic; of images their timestamps alone."""
 
     images: dict[str, _Images] = field(default_factory=dict)
+    depths: dict[str, _Images] = field(default_factory=dict)
     lenses: dict[str, Any] = field(default_factory=dict)  # The first CameraInfo.
     # Times, and positions by the joints' names.
     joints: dict[str, dict[tuple[str, ...], "array[float]"]] = field(default_factory=dict)
@@ -123,7 +126,7 @@ class BagImages(ListedImages[tuple[str, int]]):
         return stack.enter_context(_opened(self.source))
 
     def load(self, place: tuple[str, int]) -> bytes:
-        """Reads one image: as it was compressed, or as a PNG."""
+        """Reads one image: as it was compressed, or as a PNG; depth as a TIFF or a .npy, too."""
         topic, at_ns = place
         with self._lock, _bag_errors(self.source):
             reader = self._reader
@@ -131,7 +134,11 @@ class BagImages(ListedImages[tuple[str, int]]):
             rows = reader.messages(connections=connections, start=at_ns, stop=at_ns + 1)
             connection, _, raw = next(iter(rows))
             message = reader.deserialize(raw, connection.msgtype)
-            return _png(message, topic) if hasattr(message, "encoding") else bytes(message.data)
+            if hasattr(message, "fields"):
+                return _cloud(message, topic)
+            if hasattr(message, "encoding"):
+                return _png(message, topic)
+            return bytes(message.data)[_start(message.format) :]
 
 
 @contextmanager
@@ -187,15 +194,16 @@ def _bag_errors(source: Path) -> Iterator[None]:
 
 
 def _png(message: Message, topic: str) -> bytes:
-    """A raw image as a PNG."""
-    if message.encoding not in _COLOURS:
+    """A raw image as a PNG, one of floats as a TIFF."""
+    ending, code = _DEPTHS.get(message.encoding, "png"), _COLOURS.get(message.encoding)
+    if message.encoding not in (*_COLOURS, *_DEPTHS):
         raise DataError(
             f"topic {topic}: its images are of encoding {message.encoding!r}; known are "
             f"{', '.join(_COLOURS)}.",
             culprits=[topic],
             next_step="Record the topic of its rectified or compressed images.",
         )
-    is_wide, data = message.encoding == "mono16", bytes(message.data)
+    data, size = bytes(message.data), {"mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
     if not 0 < message.width <= message.step or len(data) != message.height * message.step:
         raise DataError(
             f"topic {topic}: an image of {message.width} x {message.height} px with rows of "
@@ -203,14 +211,43 @@ def _png(message: Message, topic: str) -> bytes:
             culprits=[topic],
             next_step="Record it anew, or name another topic with --image-key.",
         )
-    kind = np.dtype("u2" if is_wide else "u1").newbyteorder(">" if message.is_bigendian else "<")
+    kind = np.dtype(size.get(message.encoding, "u1"))
+    sent = kind.newbyteorder(">" if message.is_bigendian else "<")
     lines = np.frombuffer(data, "u1").reshape(message.height, message.step)
     used = lines[:, : message.step - message.step % message.width]
-    pixels = np.ascontiguousarray(used).view(kind).reshape(message.height, message.width, -1)
-    pixels = pixels.astype("u2" if is_wide else "u1")
-    code = _COLOURS[message.encoding]
+    pixels = np.ascontiguousarray(used).view(sent).reshape(message.height, message.width, -1)
+    pixels = pixels.astype(kind)
     image = pixels if code is None else cv2.cvtColor(pixels, code)
-    return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+    return cv2.imencode(f".{ending}", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+
+
+def _start(form: str) -> int:
+    """Where the PNG begins in a compressed image: that of depth has a header."""
+    return 12 if "compressedDepth" in form else 0
+
+
+def _cloud(message: Message, topic: str) -> bytes:
+    """An organised cloud as a .npy of (h, w, 3)."""
+    at = {each.name: each for each in message.fields}
+    kinds = [_FIELDS.get(at[axis].datatype if axis in at else 0) for axis in "xyz"]
+    count = message.width * message.height
+    if None in kinds or message.row_step != message.width * message.point_step:
+        raise DataError(
+            f"topic {topic}: its clouds have no x, y and z of floats in whole rows.",
+            culprits=[topic],
+            next_step="Record the sensor's own organised cloud.",
+        )
+    order = ">" if message.is_bigendian else "<"
+    row = np.dtype(
+        {
+            "names": [*"xyz"],
+            "formats": [f"{order}{kind}" for kind in kinds],
+            "offsets": [at[axis].offset for axis in "xyz"],
+            "itemsize": message.point_step,
+        }
+    )
+    table = np.frombuffer(bytes(message.data), row, count).reshape(message.height, message.width)
+    return npy_of(np.stack([table[axis].astype("f4") for axis in "xyz"], axis=-1))
 
 
 def _is_bag(path: Path) -> bool:
@@ -233,6 +270,8 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     at_s, poses = stream.stamps_s, stream.poses.poses()
     flange = Trajectory(at_s[np.isfinite(poses[:, 0, 0])], poses[np.isfinite(poses[:, 0, 0])])
     rows, places = list[tuple[str, float, str]](), dict[str, tuple[str, int]]()
+    # Depth of images: its path and place.
+    depths = dict[str, tuple[str, tuple[str, int]]]()
     how = "--robot-key BASE,TIP or a topic names another."
     notes = [f"The robot's motion: {words}. {how}{_refused(contents)}"]
     for topic, camera in cameras.items():
@@ -243,7 +282,13 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
             path = f"images/{camera}{'_' if camera else ''}{at:06d}.{images.ending}"
             places[path] = topic, images.received_ns[at]
             rows.append((camera, images.stamps_s[at], path))
+        own = [row[1:] for row in rows[len(rows) - len(chosen) :]]
+        depths |= _depths(contents, topic, own, notes)
     rows.sort(key=lambda row: row[1])
+    columns = {} if len(cameras) == 1 else {"camera": tuple(camera for camera, _, _ in rows)}
+    if depths:
+        columns["depth"] = tuple(depths.get(path, ("",))[0] for _, _, path in rows)
+        places |= dict(depths.values())
     lenses = {camera: _lens(contents, topic, notes) for topic, camera in cameras.items()}
     labels = tuple(f"{name}, {path}" for _, _, path in rows)
     one = next(iter(lenses.values())) if len(lenses) == 1 else None
@@ -257,7 +302,7 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
         lens=one,
         lenses={} if one is not None else lenses,
         robot_document=None if robot is None else robot.document,
-        columns={} if one is not None else {"camera": tuple(camera for camera, _, _ in rows)},
+        columns=columns,
         stream=stream,
         notes=tuple(notes),
     )
@@ -296,16 +341,30 @@ def _seven(contents: _Contents, name: str, place: Message, rotation: Message) ->
 
 
 def _add_image(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
-    images = contents.images.get(topic)
+    images = contents.images.get(topic) or contents.depths.get(topic)
     if images is None:
         is_raw = hasattr(message, "encoding")
         data, kind = (b"", message.encoding) if is_raw else (bytes(message.data), message.format)
-        size = (message.width, message.height) if is_raw else image_size(data)
-        if "depth" in topic.lower() or kind.startswith(_DEPTHS) or size is None:
-            return
+        size = (message.width, message.height) if is_raw else image_size(data[_start(kind) :])
         ending = "jpg" if data[:2] == b"\xff\xd8" else "png"
+        depth = _DEPTHS.get(kind[:5], "") if is_raw or ending == "png" else ""
+        # Pictures that show depth by colours, and floats that were compressed, are neither.
+        if (
+            size is None
+            or (not depth and "depth" in topic.lower())
+            or (depth == "tiff" and not is_raw)
+        ):
+            return
+        group = contents.depths if depth else contents.images
         frame = message.header.frame_id.strip("/")
-        images = contents.images[topic] = _Images(ending, frame, size)
+        images = group[topic] = _Images(depth or ending, frame, size)
+    images.stamps_s.append(_stamp_s(message, received_ns))
+    images.received_ns.append(received_ns)
+
+
+def _add_cloud(contents: _Contents, topic: str, message: Message, received_ns: int) -> None:
+    size, frame = (message.width, message.height), message.header.frame_id.strip("/")
+    images = contents.depths.setdefault(topic, _Images("npy", frame, size))
     images.stamps_s.append(_stamp_s(message, received_ns))
     images.received_ns.append(received_ns)
 
@@ -346,6 +405,7 @@ def _add_description(contents: _Contents, topic: str, message: Message, _: int) 
 _READERS = {
     "sensor_msgs/msg/Image": _add_image,
     "sensor_msgs/msg/CompressedImage": _add_image,
+    "sensor_msgs/msg/PointCloud2": _add_cloud,
     "sensor_msgs/msg/CameraInfo": lambda contents, topic, message, _: contents.lenses.setdefault(
         topic, message
     ),
@@ -382,6 +442,39 @@ def _cameras(contents: _Contents, requested: ImportOptions) -> dict[str, str]:
         return dict.fromkeys(first.values(), "")
     names = {space: space.replace("/", "_").replace("-", "_") or "cam" for space in first}
     return {topic: names[space] for space, topic in sorted(first.items())}
+
+
+def _depths(
+    contents: _Contents, topic: str, rows: Sequence[tuple[float, str]], notes: list[str]
+) -> dict[str, tuple[str, tuple[str, int]]]:
+    """Paths and places of depth, by the paths of a topic's images with their times [s]."""
+    images, found = contents.images[topic], dict[str, tuple[str, tuple[str, int]]]()
+    aligned = {
+        name: depth
+        for name, depth in contents.depths.items()
+        if (depth.frame, depth.size) == (images.frame, images.size)
+    }
+    if not aligned:
+        others = [f"{name} ({at.frame}, {at.size})" for name, at in contents.depths.items()]
+        if others:
+            notes.append(
+                f"{topic} ({images.frame}, {images.size}): no depth is aligned to it: "
+                f"{some_of(others, 6)}. Record aligned depth (realsense2_camera: "
+                "align_depth.enable:=true)."
+            )
+        return found
+    # Distances come before clouds, which are larger.
+    name = min(aligned, key=lambda name: (aligned[name].ending == "npy", name))
+    depth, stamps_s = aligned[name], np.array(aligned[name].stamps_s)
+    # That of the same picture is nearer than the next one.
+    limit_s = 0.5 * float(np.median(np.abs(np.diff(stamps_s)))) if len(stamps_s) > 1 else 0.05
+    for stamp_s, path in rows:
+        nearest = int(np.argmin(np.abs(stamps_s - stamp_s)))
+        if abs(stamps_s[nearest] - stamp_s) <= limit_s:
+            own = str(Path(path.replace("images/", "depth/", 1)).with_suffix(f".{depth.ending}"))
+            found[path] = own, (name, depth.received_ns[nearest])
+    notes.append(f"{topic}: {len(found)} of {len(rows)} images have depth by {name}.")
+    return found
 
 
 def _no_topic(name: str, names: Sequence[str], option: str) -> DataError:
