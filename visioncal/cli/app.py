@@ -54,7 +54,7 @@ class _Commands(LazyGroup):
         "Start": ("demo", "target", "record", "convert", "simulate"),
         "Calibrate": ("doctor", "calibrate", "show", "plan"),
         "Use the result": ("export", "touch-test", "locate", "tcp", "fixture", "correct"),
-        "Keep it valid": ("verify", "guard", "recover", "diff", "history"),
+        "Keep it valid": ("verify", "guard", "audit", "recover", "diff", "history"),
         "More": ("batch", "dynamics"),
     }
 

@@ -195,6 +195,33 @@ class GuardOptions(PartOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class AuditOptions:
+    """Find where a camera moved in the episodes of a data set, by the standing scene.
+
+    DATASET is one of LeRobot, or a folder with a video or a folder of pictures an episode, in their
+    order. Its robot and parts may move in the images; the rest must stand still. Exit status 0: the
+    camera stood; 3: it moved, and each move is named by episode and frame; 2: that cannot be
+    decided.
+    """
+
+    first: ClassVar = "image_key mask as_json"
+    dataset: Path = argument("The data set's folder.", metavar="DATASET", file_okay=False)
+    image_key: str | None = option(
+        "Of several cameras: its key, or a part of the paths of its videos or pictures."
+    )
+    mask: Path | None = option("An image, white where things stand still.")
+    against: Path | None = option("A calibration of the camera, for its lens.")
+    looks: int = option("Frames an episode that are compared.", default=4, min=2, max=1000)
+    steady_px: float = option(
+        "How far images move from look to look without a fault (sigma, px).",
+        default=0.1,
+        min=0.01,
+        max=10.0,
+    )
+    as_json: bool = json_flag()
+
+
+@dataclass(frozen=True, kw_only=True)
 class LoadOptions:
     """What the arm carries at targets, and how warm it is."""
 

@@ -5,8 +5,9 @@ view; of a motion without stops, frames evenly. Videos are read when the session
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -165,15 +166,7 @@ def _numbers(cells: Sequence[object], name: str) -> FloatArray:
 def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads a data set; of several cameras the one that `--image-key` names."""
     info = _Info.of(source)
-    features = info.features
-    cameras = [name for name in features if name.startswith(_IMAGES)]
-    key = requested.image or next(iter(cameras), "")
-    if key not in cameras:
-        raise DataError(
-            f"{source}: no images {key!r}; it has {some_of(cameras, 20) or 'none'}.",
-            culprits=[key],
-            next_step=did_you_mean(key, cameras) or "Name one with --image-key.",
-        )
+    features, key = info.features, _camera_of(source, info, requested.image)
     state = (*requested.joints, _STATE)[0]
     is_video = features[key].get("dtype") == "video"
     columns = [state, "timestamp", "frame_index", "episode_index"]
@@ -246,6 +239,57 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
         arm=None if arm is None else {"model": arm},
         notes=tuple(notes),
     )
+
+
+def _camera_of(source: Path, info: _Info, key: str | None) -> str:
+    """The key of the images that are wanted, by default the first; raises DataError."""
+    cameras = [name for name in info.features if name.startswith(_IMAGES)]
+    key = key or next(iter(cameras), "")
+    if key not in cameras:
+        raise DataError(
+            f"{source}: no images {key!r}; it has {some_of(cameras, 20) or 'none'}.",
+            culprits=[key],
+            next_step=did_you_mean(key, cameras) or "Name one with --image-key.",
+        )
+    return key
+
+
+def episode_frames(
+    source: Path, key: str | None
+) -> dict[int, tuple[int, Callable[[int], bytes], float]]:
+    """Of each episode of a data set: the number of frames, the file of each, and frames a second.
+
+    Raises:
+        DataError: The data set cannot be read, or has no such images.
+    """
+    info = _Info.of(source)
+    key = _camera_of(source, info, key)
+    numbers: list[IntArray] = []
+    files = sorted((source / "data").glob("chunk-*/*.parquet"))
+    for file in files:
+        cells = _parquet(file, ["episode_index"])["episode_index"]
+        numbers.append(_numbers(cells, "episode_index").astype(int).ravel())
+    episodes = np.unique(np.concatenate([*numbers, np.zeros(0, int)])).tolist()
+    is_video = info.features[key].get("dtype") == "video"
+    starts = _starts(source, info, key, episodes) if is_video else {}
+
+    def frame_of(episode: int, rows: Sequence[tuple[int, int]], at: int) -> bytes:
+        if is_video:
+            file, first = starts[episode]
+            return FrameImages({}).load((file, first + at))
+        number, row = rows[at]
+        (cell,) = _parquet(files[number], [key], np.array([row]))[key]
+        return _image_in(source, mapping(cell, f"a cell of {key}"))
+
+    found: dict[int, tuple[int, Callable[[int], bytes], float]] = {}
+    for episode in episodes:
+        rows = [
+            (number, row)
+            for number, column in enumerate(numbers)
+            for row in np.flatnonzero(column == episode).tolist()
+        ]
+        found[episode] = len(rows), partial(frame_of, episode, rows), info.fps
+    return found
 
 
 def _image_in(source: Path, cell: Mapping[str, Any]) -> bytes:
