@@ -86,6 +86,8 @@ def plan_command(options: PlanOptions, session: Path | None = None) -> str:
     kept = (limits, boxes_of(options))
     purpose_of(options.purpose or _USUAL, "--for")
     start, words = chosen_part(find_source(options.source), options)
+    if options.standard is not None:
+        return _plan_cube(options, start, limits)
     # Few plans are for instruments.
     from visioncal.cli import plan_instrument
 
@@ -121,6 +123,37 @@ def plan_command(options: PlanOptions, session: Path | None = None) -> str:
         print_json(document)
     else:
         _report(plan)
+    report_written(written, quiet=options.as_json)
+    return ""
+
+
+def _plan_cube(options: PlanOptions, source: Source, limits: Limits) -> str:
+    """Plans the cycles of ISO 9283 for an arm, and writes their table."""
+    # Few plans are by the standard.
+    from visioncal.live.planning.cube import largest_cube
+
+    found = source.calibration
+    robot = source.robot if found is None else found.calibrated_robot
+    robot = robot if options.robot is None else load_robot(options.robot)
+    if robot is None:
+        raise DataError(
+            f"{source.words} names no robot, and its cube cannot be found without one.",
+            culprits=["robot"],
+            next_step="Name it with --robot.",
+        )
+    cube, cycles = largest_cube(robot, limits), options.stops or 30
+    mount = options.mount or (found and found.mount) or "instrument"
+    written = write_stops(options.out, cube.table(cycles, mount=mount), {})
+    if options.as_json:
+        print_json(
+            {"centre_m": cube.centre_m.tolist(), "side_m": cube.side_m, "q": cube.q.tolist()}
+        )
+    else:
+        place = ", ".join(f"{1e3 * number:.0f}" for number in cube.centre_m)
+        answer(
+            f"ISO 9283: a cube of {1e3 * cube.side_m:.0f} mm about ({place}) mm in the base, five "
+            f"poses in {cycles} cycles; look at the way between them before you drive it"
+        )
     report_written(written, quiet=options.as_json)
     return ""
 

@@ -33,7 +33,15 @@ from visioncal.cli.options import (
 )
 from visioncal.cli.parsing import FORMS, POSE, serial_in, views_in
 from visioncal.cli.session_options import RobotPoseOptions
-from visioncal.core.choices import SITE_FILE, UNITS_M, WIDEST_RAD, ActKind, Convention, SolverName
+from visioncal.core.choices import (
+    SITE_FILE,
+    UNITS_M,
+    WIDEST_RAD,
+    ActKind,
+    Convention,
+    SolverName,
+    Standard,
+)
 from visioncal.core.limits import RecoveryLimits
 from visioncal.interchange.outputs import REPORT, VERIFY
 
@@ -144,6 +152,9 @@ class VerifyOptions(PartOptions, PageOptions, ActOptions):
     first: ClassVar = "against page output as_json"
     session: Path = argument("Five stops or more of the same cell: a folder or an .rrd.")
     against: Path = against_option()
+    standard: Standard | None = option(
+        "Cycles of five poses instead: accuracy and repeatability by the standard."
+    )
     board_moved: bool = flag("The board was put elsewhere on purpose.")
     collision: bool = flag("A collision was reported since.")
     output: Path | None = out_folder(f"A folder for {REPORT} and {VERIFY}.", "-o", "--output")

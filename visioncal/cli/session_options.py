@@ -31,6 +31,7 @@ from visioncal.core.choices import (
     CameraMount,
     Criterion,
     Mount,
+    Standard,
 )
 from visioncal.live.capture.devices import CAMERAS
 from visioncal.live.capture.options import Stillness
@@ -240,6 +241,7 @@ class PlanOptions(ClearanceOptions):
     start_joints: str | None = _what(
         "The arm's present joints [rad], for the way to the first.", metavar="Q1,Q2,..."
     )
+    standard: Standard | None = _what("Instead, 30 cycles of the five poses of its cube.")
     criterion: Criterion | None = _what(
         "Least mean variance of positions (I), for an instrument determinant of the covariance (D)."
     )

@@ -10,9 +10,11 @@ import typer
 from visioncal.cli.console import say
 from visioncal.cli.parsing import refuse_given
 from visioncal.cli.result_options import ShowOptions
+from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.errors import DataError
+from visioncal.core.files import read_text
 from visioncal.core.number_format import some_of
-from visioncal.interchange.outputs import PREVIEW, RECORDING
+from visioncal.interchange.outputs import PERFORMANCE, PREVIEW, RECORDING
 from visioncal.interchange.result_files import load_result, load_stored
 from visioncal.results.views import worst_view
 
@@ -28,7 +30,9 @@ def show_command(options: ShowOptions) -> None:
             out = options.out or folder / "certificate.html"
             signed = {"operator": options.operator} if options.operator else {}
             signed |= dict(options.serial or ())
-            write_certificate(out, stored.calibration, stored.session, signed)
+            measured = folder / PERFORMANCE
+            tested = parse_stored(read_text(measured), str(measured)) if measured.exists() else None
+            write_certificate(out, stored.calibration, stored.session, signed, tested)
         else:
             out = options.out or Path("report.html")
             write_report(

@@ -11,7 +11,12 @@ from visioncal.cli.history import enter
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.summary import print_steps
-from visioncal.interchange.outputs import Written, refuse_calibration, write_check
+from visioncal.interchange.outputs import (
+    Written,
+    refuse_calibration,
+    write_check,
+    write_performance,
+)
 from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
 from visioncal.results.history import entry_of_check
@@ -33,6 +38,9 @@ def verify_command(options: VerifyOptions) -> None:
         from visioncal.cli.page import verify_on_page
 
         verify_on_page(options)
+        return
+    if options.standard is not None:
+        _verify_performance(options)
         return
     if options.output is not None:
         refuse_calibration(options.output)
@@ -79,3 +87,23 @@ def verify_command(options: VerifyOptions) -> None:
             if words:
                 answer(words, begin, style)
     report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)
+
+
+def _verify_performance(options: VerifyOptions) -> None:
+    """Measures the arm's performance by ISO 9283; without a need it neither passes nor fails."""
+    # Few checks are by the standard.
+    from visioncal.calibration.verification.iso9283 import performance
+
+    loaded, calibration = select_matching(
+        Session.load(options.session), load_result(options.against), options.choice
+    )
+    with shown_progress(quiet=options.as_json):
+        tested = performance(loaded, calibration)
+    if options.as_json:
+        typer.echo(json.dumps(tested.document(), indent=2))
+    else:
+        for line in tested.sentences():
+            answer(line)
+    if options.output is not None:
+        written = write_performance(options.output, tested, loaded.name, calibration.session_name)
+        report_written(written, quiet=options.as_json)

@@ -22,6 +22,8 @@ MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
 # What planned stops minimise: the mean variance of positions, or the determinant of the covariance.
 Criterion: TypeAlias = Literal["I", "D"]
+# Standards by which an arm is tested.
+Standard: TypeAlias = Literal["iso9283"]
 # Simulated arms, and built-in descriptions of whole cells.
 SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
 SIMULATED_CELLS = ("camera-and-tracker", "two-arms", "two-cameras")

@@ -15,6 +15,7 @@ from visioncal.core.files import json_text, write_atomically, write_generation
 if TYPE_CHECKING:
     from visioncal.calibration.run import Run as Calibrated
     from visioncal.calibration.verification import Check, Trigger
+    from visioncal.calibration.verification.iso9283 import Performance
     from visioncal.core.choices import ImagesKept
     from visioncal.core.verdict import Verdict
     from visioncal.dynamics.plan_files import MotionPlan
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from visioncal.session import Session
 
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
-VERIFY = "verify.json"
+VERIFY, PERFORMANCE = "verify.json", "iso9283.json"
 STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
 BOARD = "board.toml"
 
@@ -119,6 +120,19 @@ def write_check(
         write_atomically(path, render_check(check, triggers, verdict))
 
     return _write(folder, {VERIFY: _text(document)}, {REPORT: page})
+
+
+def write_performance(folder: Path, tested: "Performance", name: str, against: str) -> Written:
+    """Writes an arm's performance by ISO 9283, and its page; see `write_outputs`."""
+    document = tested.document()
+
+    def page(path: Path) -> None:
+        from visioncal.present.report.performance import render_performance
+
+        write_atomically(path, render_performance(name, against, document, tested.sentences()))
+
+    text = {PERFORMANCE: _text(json_text(document))}
+    return _write(folder, text, {Path(PERFORMANCE).with_suffix(".html").name: page})
 
 
 def refuse_calibration(folder: Path) -> None:

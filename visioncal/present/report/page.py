@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from visioncal.present import advice, facts, result_parts
 from visioncal.present.advice import named
 from visioncal.present.coverage import image_coverage
 from visioncal.present.report import content, network
+from visioncal.present.report.performance import performance_table
 from visioncal.present.report.templates import template
 from visioncal.present.report.thumbnails import Thumbnail, thumbnail
 from visioncal.results import Calibration, ViewResult
@@ -74,7 +76,11 @@ def render(
 
 
 def write_certificate(
-    path: Path, calibration: Calibration, session: Session | None, signed: Mapping[str, str]
+    path: Path,
+    calibration: Calibration,
+    session: Session | None,
+    signed: Mapping[str, str],
+    performance: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes a selection of the report that fits one sheet of A4, with room to sign.
 
@@ -83,12 +89,17 @@ def write_certificate(
         calibration: Calibration to certify.
         session: Session of the calibration; None if it is not at hand.
         signed: What a person adds to it, by label, as the operator and serial numbers.
+        performance: Content of iso9283.json; None where it was not measured.
 
     Raises:
         DataError: The file cannot be written.
     """
     head = _head("Certificate of calibration", calibration, session)
-    page = template("certificate.html.j2").render(**head, notes=(), steps=(), signed=signed)
+    measured = None if performance is None else performance_table(performance)
+    stated = {} if performance is None else performance["stated"]
+    page = template("certificate.html.j2").render(
+        **head, notes=(), steps=(), signed={**stated, **signed}, performance=measured
+    )
     write_atomically(path, page)
 
 
