@@ -1,0 +1,231 @@
+"""Every entry of a registry is found where a user and a contributor look for it.
+
+An entry is one file and one line of a registry. Help, the pages' tables, printed commands and the
+tests' own readers follow from it, or are named here as what is left out.
+"""
+
+import ast
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+from support.commands import visioncal
+from support.makers import MAKERS
+from support.readers import FIXTURE_READERS, READERS, TOOL_READERS
+
+from visioncal.calibration.suspects.registry import SUSPECTS
+from visioncal.cli.app import app
+from visioncal.core.choices import POSE_FORMS
+from visioncal.estimation.effects import RANDOM_EFFECTS
+from visioncal.interchange.exports import EXPORT_FORMATS
+from visioncal.interchange.formats.registry import FOREIGN_FORMATS
+from visioncal.live.capture.devices import ARMS, CAMERAS
+from visioncal.vision.boards import KINDS
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "visioncal"
+
+
+@cache
+def page(path):
+    return (ROOT / path).read_text(encoding="utf-8")
+
+
+@cache
+def help_of(*command):
+    done = visioncal(*command, "--help")
+    assert done.status == 0
+    # A line ends within a name at its hyphens and bars.
+    return re.sub(r"\s*\n\s*", " ", done.out), re.sub(r"\s*\n\s*", "", done.out)
+
+
+def in_help(name, *command):
+    return any(
+        re.search(rf"(?<![\w-]){re.escape(name)}(?![\w-])", text) for text in help_of(*command)
+    )
+
+
+def cells(path):
+    """Names in quotes of code in the first cell of a page's tables."""
+    rows = re.findall(r"^\| (`.*?) \|", page(path), re.MULTILINE)
+    return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
+
+
+def export_faults(formats):
+    """Exports that a page, the listing or the tests leave out."""
+    listing = visioncal("export", "--list").out
+    table = cells("visioncal/interchange/README.md")
+    read = {*READERS, *TOOL_READERS, *FIXTURE_READERS}
+    for form in formats:
+        if form.name not in table:
+            yield f"{form.name}: no row in the table of visioncal/interchange/README.md"
+        if not re.search(rf"^ *{re.escape(form.name)}\s", listing, re.MULTILINE):
+            yield f"{form.name}: not in visioncal export --list"
+        is_read = form.name in read or re.search(
+            rf"\"{form.name}\"",
+            page("tests/interchange/test_exports.py") + page("tests/support/readers.py"),
+        )
+        if not is_read:
+            yield f"{form.name}: no test reads it as its program would"
+
+
+def maker_faults(forms):
+    """Makers whose form is left out by help, pages, exports, or a printed command."""
+    exports = {form.name for form in EXPORT_FORMATS}
+    for form in forms:
+        if not in_help(form.name, "convert"):
+            yield f"{form.name}: not in visioncal convert --help"
+        if form.name not in cells("visioncal/results/README.md"):
+            yield f"{form.name}: no row in the table of visioncal/results/README.md"
+        if f"`{form.name}`" not in page("visioncal/interchange/README.md"):
+            yield f"{form.name}: not among the forms of visioncal/interchange/README.md"
+        if not form.models:
+            continue
+        if form.name not in MAKERS:
+            yield f"{form.name}: not in tests/support/makers.py, from its manual"
+        if form.name not in exports:
+            yield f"{form.name}: the verdict prints export --to {form.name}, which is refused"
+
+
+def device_faults(arms, cameras):
+    """Devices that help or the page of recording leave out."""
+    text = page("visioncal/live/README.md")
+    for option, names in (("arm", arms), ("camera", cameras)):
+        for name in names:
+            if not in_help(name, "record"):
+                yield f"--{option} {name}: not in visioncal record --help"
+            if not re.search(rf"`(?:--{option} )?{name}[:`]|--{option} {name}\b", text):
+                yield f"--{option} {name}: not in visioncal/live/README.md"
+
+
+def kind_faults(kinds):
+    """Kinds of boards that `target make` or the page of boards leave out."""
+    for name in kinds:
+        if f'"{name}"' not in page("visioncal/vision/README.md"):
+            yield f"{name}: not among the kinds of visioncal/vision/README.md"
+        file = "points" if name == "points" else name
+        if not list((PACKAGE / "vision/boards").glob(f"{file}.py")):
+            yield f"{name}: no file visioncal/vision/boards/{file}.py"
+
+
+@cache
+def commands():
+    """Names of all commands: `export`, `target make`."""
+    group = app.info.cls
+    names = [name for listed in group.listed.values() for name in listed]
+    inner = {name: group.groups[name].info.cls.listed for name in names if name in group.groups}
+    return [
+        *(name for name in names if name not in inner),
+        *(
+            f"{name} {each}"
+            for name, listed in inner.items()
+            for row in listed.values()
+            for each in row
+        ),
+    ]
+
+
+def command_faults(names):
+    """Commands that no page shows."""
+    pages = "\n".join(page(path.relative_to(ROOT)) for path in PACKAGE.glob("*/README.md"))
+    for name in names:
+        if not re.search(rf"visioncal {name}\b", pages + page("README.md")):
+            yield f"visioncal {name}: on no page of a package, and not in README.md"
+
+
+@cache
+def raised_kinds():
+    """Kinds of findings by the literal first argument of `Finding(...)`, with their places."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding":
+                kind = node.args[0] if node.args else None
+                if isinstance(kind, ast.Constant):
+                    found.setdefault(kind.value, path.relative_to(PACKAGE).as_posix())
+    return found
+
+
+# Findings that no contest ranks: of other verdicts, and of what is compared after a calibration's.
+OF_OTHERS = (
+    *("calibration/verification/", "calibration/recovery.py", "calibration/loaded.py", "frames/"),
+    *("calibration/pipeline/checkup.py", "calibration/stages/depth.py", "dynamics/"),
+)
+
+
+def finding_faults(kinds):
+    """Kinds that a calibration raises, and no registry has: ranking them is a KeyError."""
+    for kind, place in kinds.items():
+        if kind not in SUSPECTS and not place.startswith(OF_OTHERS):
+            yield f"{kind}: raised in {place}, not in calibration/suspects/registry.py"
+
+
+def effect_faults(effects):
+    """Effects whose kind is no suspect, or that no page names."""
+    for effect in effects:
+        if effect.kind not in SUSPECTS:
+            yield f"{effect.kind}: no suspect has its kind"
+        if not list((PACKAGE / "estimation/effects").glob(f"{effect.kind}.py")):
+            yield f"{effect.kind}: no file estimation/effects/{effect.kind}.py"
+
+
+def import_faults(formats):
+    """Formats that can be asked for by `--from`, and are not listed there."""
+    for form in formats:
+        if not in_help(form.name, "convert") and f"`{form.name}`" not in page(
+            "visioncal/interchange/README.md"
+        ):
+            yield f"{form.name}: neither in convert --help nor in visioncal/interchange/README.md"
+
+
+def contributing_faults(text):
+    """Rows of CONTRIBUTING's table whose file, folder or registry is not there."""
+    rows = re.findall(r"^\| (an? .*?) \| (.*?) \| (.*?) \|$", text, re.MULTILINE)
+    assert len(rows) >= 9
+    for what, place, entry in rows:
+        for name in re.findall(r"`([^`]+)`", place):
+            if not (PACKAGE / name).exists():
+                yield f"{what}: {name} is not there"
+        names = re.findall(r"`([^`]+)`", entry)
+        files = [PACKAGE / name for name in names if "/" in name]
+        for file in files:
+            if not file.exists():
+                yield f"{what}: {file} is not there"
+        folder = PACKAGE / re.findall(r"`([^`]+)`", place)[0]
+        searched = files or [folder / "__init__.py" if folder.is_dir() else folder]
+        for name in names:
+            texts = [file.read_text(encoding="utf-8") for file in searched if file.exists()]
+            if "/" not in name and not any(
+                re.search(rf"^{name}\b", text, re.MULTILINE) for text in texts
+            ):
+                yield f"{what}: no {name} in {searched}"
+
+
+def test_every_entry_is_where_a_user_looks():
+    faults = [
+        *export_faults(EXPORT_FORMATS),
+        *maker_faults(POSE_FORMS.values()),
+        *device_faults(ARMS, CAMERAS),
+        *kind_faults(KINDS),
+        *command_faults(commands()),
+        *finding_faults(raised_kinds()),
+        *effect_faults(RANDOM_EFFECTS),
+        *import_faults(FOREIGN_FORMATS),
+        *contributing_faults(page(".github/CONTRIBUTING.md")),
+    ]
+    assert not faults, "\n".join(faults)
+
+
+def test_an_entry_that_is_left_out_is_found():
+    export, maker = EXPORT_FORMATS[0], POSE_FORMS["xarm"]
+    assert len([*export_faults([replace(export, name="acme")])]) == 3
+    # Form, pages, manual: a maker's export follows from its form.
+    assert len([*maker_faults([replace(maker, name="acme")])]) == 5
+    assert len([*device_faults(["acme"], ["acme-cam"])]) == 4
+    assert len([*kind_faults(["acme"])]) == 2
+    assert len([*command_faults(["acme"])]) == 1
+    assert len([*finding_faults({"acme": "calibration/stages/acme.py"})]) == 1
+    assert len([*import_faults([replace(FOREIGN_FORMATS[0], name="acme")])]) == 1
+    text = page(".github/CONTRIBUTING.md").replace("`STAGES`", "`STEPS`")
+    assert len([*contributing_faults(text)]) == 1
