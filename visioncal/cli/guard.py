@@ -44,17 +44,23 @@ def guard_command(options: GuardOptions) -> None:
     if sys.stdin.isatty():
         say("Looks are read from the keyboard, a JSON line each; Ctrl-D ends them.")
     holds, is_refused, count = guard.holds, False, 0
+    answers: list[dict[str, Any]] = []
     try:
         for count, answer in enumerate(_answers(guard), 1):
             typer.echo(json.dumps(answer, allow_nan=False))
             sys.stdout.flush()
             is_refused = is_refused or "error" in answer
+            answers += [answer] * (options.recording is not None)
             # A program that is killed loses fewer than 50 looks of what it has learned.
             if count % 50 == 0 or guard.holds != holds:
                 holds = guard.holds
                 _keep(guard, options.state)
     finally:
         _keep(guard, options.state)
+        if options.recording is not None and answers:
+            from visioncal.present.recording.timeline import record_looks
+
+            record_looks(options.recording, answers, f"guard of {calibration.session_name}")
     if not count:
         raise DataError(
             "no look came on stdin, so that nothing was judged.",

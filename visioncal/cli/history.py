@@ -88,8 +88,8 @@ def history_command(options: HistoryOptions) -> None:
         known = sorted({entry.cell for entry in history.entries()})
         known_name("cell", options.cell, known, "--cell")
     entries = history.entries(options.cell, options.kind, begin=options.show or "")
-    if options.out is not None:
-        _write(options.out, entries, history.path, force=options.force)
+    if (out := options.recording or options.out) is not None:
+        _write(out, entries, history.path, force=options.force)
     elif options.as_json:
         print_json([{"id": entry.id} | write(Entry, entry) for entry in entries])
     elif options.show is None:
@@ -119,12 +119,19 @@ def history_command(options: HistoryOptions) -> None:
 
 def _write(out: Path, entries: Sequence[Entry], source: Path, *, force: bool) -> None:
     check_free(out, force=force)
+    site = source.absolute().parent.name
+    if out.suffix.lower() == ".rrd":
+        from visioncal.present.recording.timeline import record_years
+
+        record_years(out, entries, site)
+        say(f"wrote {out}")
+        return
     if out.suffix.lower() == ".csv":
         text = table_of(entries)
     elif out.suffix.lower() == ".html":
         from visioncal.present.report.fleet import page_of_history
 
-        text = page_of_history(entries, source.absolute().parent.name, datetime.now(UTC))
+        text = page_of_history(entries, site, datetime.now(UTC))
     else:
         raise DataError(
             f"{out} is neither a page (.html) nor a table (.csv).",

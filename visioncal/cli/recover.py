@@ -42,6 +42,7 @@ from visioncal.core.files import read_bytes, write_json
 from visioncal.core.verdict import Verdict
 from visioncal.interchange.outputs import STOPS, write_outputs
 from visioncal.interchange.result_files import load_result
+from visioncal.present.recording.timeline import record_check
 from visioncal.results import Calibration, select_matching
 from visioncal.results.history import entries_of
 from visioncal.session import Session
@@ -134,6 +135,7 @@ def recover_command(options: RecoverOptions) -> None:
             for words in check.predicted.warnings:
                 warn(words)
             verdict = verdict_of(check).with_paths(path, options.against, _again())
+            record_check(options.folder / "check.rrd", check, verdict)
             if check.passed and not stated:
                 answer(f"nothing has changed: {options.against} holds. {verdict.top[0]}")
                 raise typer.Exit

@@ -157,7 +157,9 @@ class VerifyOptions(PartOptions, PageOptions, ActOptions):
     )
     board_moved: bool = flag("The board was put elsewhere on purpose.")
     collision: bool = flag("A collision was reported since.")
-    output: Path | None = out_folder(f"A folder for {REPORT} and {VERIFY}.", "-o", "--output")
+    output: Path | None = out_folder(
+        f"A folder for {REPORT}, {VERIFY} and a recording.", "-o", "--output"
+    )
     as_json: bool = json_flag()
 
 
@@ -184,6 +186,7 @@ class GuardOptions(PartOptions):
         max=10.0,
     )
     state: Path | None = option("A file that keeps what was learned, for the next start.")
+    recording: Path | None = option("Also record the looks, for visioncal show --viewer.")
     scene: Path | None = option(
         "A session or .rrd whose images show the standing scene; no board is needed."
     )
@@ -500,6 +503,7 @@ class HistoryOptions:
         metavar="OUT",
     )
     out: Path | None = option("The page (.html) or the table (.csv) to write.", "-o", "--out")
+    recording: Path | None = option("Record the years, for visioncal show --viewer.")
     force: bool = force_flag()
     as_json: bool = json_flag()
     _example: bool = example_flag("history")

@@ -112,14 +112,19 @@ def write_outputs(
 def write_check(
     folder: Path, check: "Check", triggers: "Sequence[Trigger]", verdict: "Verdict", document: str
 ) -> Written:
-    """Writes a check's page and JSON into a folder; see `write_outputs`."""
+    """Writes a check's page, recording and JSON into a folder; see `write_outputs`."""
 
     def page(path: Path) -> None:
         from visioncal.present.report.check import render_check
 
         write_atomically(path, render_check(check, triggers, verdict))
 
-    return _write(folder, {VERIFY: _text(document)}, {REPORT: page})
+    def record(path: Path) -> None:
+        from visioncal.present.recording.timeline import record_check
+
+        record_check(path, check, verdict)
+
+    return _write(folder, {VERIFY: _text(document)}, {REPORT: page, RECORDING: record})
 
 
 def write_performance(folder: Path, tested: "Performance", name: str, against: str) -> Written:
