@@ -14,6 +14,7 @@ from support.depth_cells import SMALL, TRUE, calibrated, picks
 
 from visioncal import simulation
 from visioncal.calibration.stages.depth import with_depth
+from visioncal.calibration.verification import verdict_of, verify
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages
 from visioncal.session.depth import npy_of, read_cloud
@@ -36,18 +37,23 @@ def without(calibration):
     )
 
 
-def again(change, **document):
-    """The findings and the depth of the same calibration with changed depth pictures."""
-    session, made_run = made()
+def changed(change, **document):
+    """The session with changed depth pictures."""
+    session, _ = made()
     files = {view.image: session.images.read(view.image) for view in session.views}
     for view in session.views:
         raw = cv2.imdecode(np.frombuffer(session.images.read(view.depth), np.uint8), -1)
         name = view.depth
         files[name] = cv2.imencode(".png", change(raw, view.number))[1].tobytes()
     camera = {**session.document["camera"], **document}
-    other = session.with_content(
+    return session.with_content(
         images=MemoryImages(files), document={**session.document, "camera": camera}
     )
+
+
+def again(change, **document):
+    """The findings and the depth of the same calibration with changed depth pictures."""
+    made_run, other = made()[1], changed(change, **document)
     result, _ = with_depth(without(made_run.calibration), made_run.evidence, other)
     findings = {}
     for found in result.verdict.findings:
@@ -143,6 +149,27 @@ def test_distances_along_the_ray_and_clouds_give_the_same():
     other = session.with_content(images=MemoryImages(files), cells=cells)
     found, _ = with_depth(without(result.calibration), result.evidence, other)
     assert found.camera.depth.values == pytest.approx(depth.values, abs=1e-9)
+
+
+def test_verify_says_whether_depth_is_what_it_was():
+    session, result = made()
+    same = verify(session, result.calibration)
+    assert same.passed
+    assert "depth is what it was" in " ".join(verdict_of(same).reasons)
+    # A millimetre and a half at half a metre, of a model that is known to a third of one.
+    other = verify(
+        changed(lambda raw, _: np.rint(1.003 * raw).astype(np.uint16)), result.calibration
+    )
+    assert not other.named
+    assert not other.passed
+    verdict = verdict_of(other)
+    assert verdict.status == "bad"
+    (found,) = (one for one in verdict.findings if one.kind == "depth_changed")
+    assert "not what it was" in found.words
+    # The share of the change, at the middle of the distances.
+    metres, mm = map(float, re.search(r"at ([\d.]+) m it reads ([+\d.]+) mm", found.words).groups())
+    assert mm == pytest.approx(1e3 * 0.003 * metres, abs=0.15)
+    assert verify(changed(lambda raw, _: np.zeros_like(raw)), result.calibration).passed
 
 
 def test_without_depth_nothing_of_it_is_loaded():

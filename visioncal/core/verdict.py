@@ -29,6 +29,8 @@ _HEADLINES = {
 }
 # Kinds of what is no doubt: praise, remarks, and that a bad result's accuracy is unknown.
 AGREEMENT, NOTE, NO_ACCURACY = "agreement", "note", "no_accuracy"
+# Kind of what verify finds where depth is not what it was.
+DEPTH_CHANGED = "depth_changed"
 # Commands of remedies.
 CALIBRATE, ADD_VIEWS = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add"
 PLAN = f"{ADD_VIEWS} 5"

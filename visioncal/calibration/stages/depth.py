@@ -16,11 +16,12 @@ import numpy as np
 from scipy.optimize import minimize, nnls
 
 from visioncal.core.errors import DataError
+from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import counted, figure, some_of
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import adjoint, apply, invert
 from visioncal.core.types import Camera, FloatArray, Image, Mask
-from visioncal.core.verdict import NOTE, Finding, Remedy
+from visioncal.core.verdict import DEPTH_CHANGED, NOTE, Finding, Remedy
 from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult
 from visioncal.results.depth import DepthResult, bending
@@ -34,7 +35,7 @@ from visioncal.vision.targets import corner_positions
 
 # Cells along the board's longer side in the image, and the fewest pixels of one.
 _CELLS, _LEAST = 12, 12
-# Fewest cells of a view, and views.
+# Fewest cells of a view.
 _FEWEST = 6
 # Pixels of a view that are looked at: more make the median of a cell no better than its view.
 _PIXELS = 60_000
@@ -295,9 +296,10 @@ def with_depth(
         # Of several boards, the one that is seen most.
         board = max((key for key in views if key[0] == camera), key=lambda key: len(views[key]))[1]
         try:
-            result, cells, said = _depth_of(
-                calibration, session, camera, board, views[camera, board], seen
-            )
+            pair = calibration.chosen(Choice(camera or None, None, board or None))
+            of_board = views[camera, board]
+            flanges = {view.number: seen[view.number].base_from_flange for view in of_board}
+            result, cells, said = _depth_of(pair, session, camera, board, of_board, flanges)
         except DataError as error:
             findings.append(Finding("depth_unread", f"Depth was not compared: {error}").of(camera))
             continue
@@ -322,16 +324,40 @@ def with_depth(
     return calibration, tuple(seen[view.view] for view in evidence)
 
 
+def depth_now(
+    calibration: Calibration, session: Session, flanges: Mapping[int, FloatArray | None]
+) -> tuple[Finding, ...]:
+    """Whether the depth of one camera, robot and board still is what it was.
+
+    Args:
+        calibration: Theirs, with the depth.
+        session: New views.
+        flanges: (4, 4) the flange's pose at each by the calibrated arm.
+    """
+    views = [view for view in session.views if view.depth]
+    if not views or calibration.camera is None or calibration.camera.depth is None:
+        return ()
+    camera, board = next(iter(session.cameras), ""), next(iter(session.boards), "")
+    try:
+        before = calibration.camera.depth
+        return tuple(_depth_of(calibration, session, camera, board, views, flanges, before)[2])
+    except DataError as error:
+        return (Finding("depth_unread", f"Depth was not compared: {error}"),)
+
+
 def _depth_of(
-    calibration: Calibration,
+    pair: Calibration,
     session: Session,
     camera: str,
     board: str,
     views: Sequence[View],
-    seen: Mapping[int, ViewEvidence],
+    flanges: Mapping[int, FloatArray | None],
+    before: DepthResult | None = None,
 ) -> tuple[DepthResult | None, list[Cells], list[Finding]]:
-    """The depth of one camera, the cells that it is from, and what is to be said of it."""
-    pair = calibration.chosen(Choice(camera or None, None, board or None))
+    """The depth of one camera, the cells that it is from, and what is to be said of it.
+
+    Where it was something else before, whether it still is.
+    """
     table, target = session.cameras[camera], session.boards[board]
     corners = corner_positions(target)
     if pair.camera is None or np.ptp(corners[:, 2]) > 0.0:
@@ -342,8 +368,7 @@ def _depth_of(
     )
     found, lost = list[Cells](), dict[str, list[int]]()
     for view in views:
-        flange = seen[view.number].base_from_flange
-        if flange is None:
+        if (flange := flanges.get(view.number)) is None:
             continue
         try:
             found.append(sensor.cells(view, plane_at(pair, flange)))
@@ -355,9 +380,10 @@ def _depth_of(
         )
         for words, of in lost.items()
     ]
-    if len(found) < _FEWEST:
+    if len(found) < CheckLimits.stops:
         words = f"Depth was not compared: it is of {counted(len(found), 'view')} of the board; "
-        return None, found, [*said, Finding("depth_unread", f"{words}{_FEWEST} are needed.")]
+        words += f"{CheckLimits.stops} are needed."
+        return None, found, [*said, Finding("depth_unread", words)]
     ratios = np.array([np.median(at.excess_m / at.true_m) for at in found])
     ratio = 1.0 + float(np.median(ratios))
     if not 0.67 < ratio < 1.5:
@@ -373,7 +399,7 @@ def _depth_of(
     stamps = {view.number: view.stamp_s for view in views}
     result, further = estimated(found, sensor.lens.resolution, stamps, sensor.root)
     result = replace(result, of=table.depth_of, unit_m=table.depth_unit_m)
-    return result, found, [*said, _judged(result, found, sensor.lens.resolution, further)]
+    return result, found, [*said, _judged(result, found, sensor.lens.resolution, further, before)]
 
 
 def agreeing(found: Sequence[Cells], size: tuple[int, int]) -> tuple[Mask, FloatArray]:
@@ -478,12 +504,19 @@ def _another_unit(ratio: float, unit_m: float | None) -> Finding:
 
 
 def _judged(
-    result: DepthResult, found: Sequence[Cells], size: tuple[int, int], further: str
+    result: DepthResult,
+    found: Sequence[Cells],
+    size: tuple[int, int],
+    further: str,
+    before: DepthResult | None,
 ) -> Finding:
-    """What is to be said of a depth: whether it is true, in mm at the distances of the views."""
+    """Whether a depth is true, or what it was before, in mm at the distances of the views."""
     true = np.concatenate([cells.true_m for cells in found])
-    away = result.values - [1.0, 0.0, 0.0, 0.0, 0.0]
-    statistic = float(away @ np.linalg.solve(result.covariance, away))
+    known, covariance = np.array([1.0, 0.0, 0.0, 0.0, 0.0]), result.covariance
+    if before is not None:
+        known, covariance = before.values, covariance + before.covariance
+    away = result.values - known
+    statistic = float(away @ np.linalg.solve(covariance, away))
     middle, sigma = float(np.median(true)), np.sqrt(np.diag(result.covariance))
     px = np.concatenate([cells.px for cells in found])
     off = 1e3 * np.column_stack([true, bending(px, size)]) @ away
@@ -494,6 +527,14 @@ def _judged(
         f"{1e3 * sigma[1]:.2f} mm, bowl {1e3 * result.bowl_m:.2f} +- {1e3 * sigma[4]:.2f} mm"
     )
     ink = f" Black reads {1e3 * result.ink_m:.1f} mm deeper than white." if result.ink_m else ""
+    if before is not None:
+        words = (
+            f"The camera's depth is {'' if is_true else 'not '}what it was: at {middle:.2f} m it "
+            f"reads {centre:+.1f} mm in the image's middle, and {off.min():+.1f} to "
+            f"{off.max():+.1f} mm over the board, beside what it did; {figures}.{ink}{further}"
+        )
+        step = "Look at the sensor's window, warmth and settings, or calibrate again."
+        return Finding(NOTE, words) if is_true else Finding(DEPTH_CHANGED, words, Remedy(step))
     if is_true:
         words = f"The camera's depth is true at {middle:.2f} m: {figures}.{ink}{further}"
         return Finding(NOTE, words)

@@ -21,6 +21,7 @@ from visioncal.core.quantiles import f_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import log, mean_transform
 from visioncal.core.types import FloatArray, Progress
+from visioncal.core.verdict import DEPTH_CHANGED, Finding
 from visioncal.estimation.model_evidence import (
     ChangeHypothesis,
     HypothesisEvidence,
@@ -69,6 +70,7 @@ class Check:
     # nothing has changed.
     named: tuple[PossibleChange, ...]
     explained: bool  # Whether the likeliest change leaves no more residuals than noise.
+    depth: tuple[Finding, ...] = ()  # Whether depth still is what it was, where there is some.
 
     @property
     def calibration(self) -> Calibration:
@@ -77,8 +79,8 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the stops agree with the calibration."""
-        return not self.named
+        """Whether the stops agree with the calibration, and their depth."""
+        return not self.named and all(found.kind != DEPTH_CHANGED for found in self.depth)
 
     @property
     def camera_sigma(self) -> FloatArray:
@@ -124,7 +126,18 @@ def verify(
     without = {view.view: view.reason for view in calibration.views if is_its_own and not view.used}
     prior = CalibrationPrior.of(calibration)
     predicted = predict_stops(session, prior, progress, without)
-    return check(predicted, prior, board_placed_anew=board_placed_anew, with_repeats=not is_its_own)
+    found = check(
+        predicted, prior, board_placed_anew=board_placed_anew, with_repeats=not is_its_own
+    )
+    # Depth is compared with the board, where it stands still.
+    if found.named or board_placed_anew or not any(view.depth for view in session.views):
+        return found
+    # Few sessions have depth.
+    from visioncal.calibration.stages.depth import depth_now
+
+    return replace(
+        found, depth=depth_now(calibration, session, predicted.observed.base_from_flange)
+    )
 
 
 def check(

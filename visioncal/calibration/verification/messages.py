@@ -23,7 +23,16 @@ from visioncal.core.limits import CONTRADICTION, CheckLimits
 from visioncal.core.number_format import counted, figure, listed
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import AGAIN, AGREEMENT, CALIBRATE_ANEW, PLAN, Finding, Remedy, Verdict
+from visioncal.core.verdict import (
+    AGAIN,
+    AGREEMENT,
+    CALIBRATE_ANEW,
+    DEPTH_CHANGED,
+    PLAN,
+    Finding,
+    Remedy,
+    Verdict,
+)
 from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
@@ -108,8 +117,12 @@ def verdict_of(check: Check) -> Verdict:
         words = f"{_stops(check)} can hardly tell one change from another."
         step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
         few.append(Finding("few_stops", words, step))
-    if check.passed:
-        findings = (Finding(AGREEMENT, _agreement(check)), *bad, *few)
+    if not check.named:
+        findings = (Finding(AGREEMENT, _agreement(check)), *check.depth, *bad, *few)
+        if not check.passed:
+            # What changed comes first.
+            order = sorted(findings, key=lambda found: found.kind != DEPTH_CHANGED)
+            return Verdict("bad", tuple(order))
         return Verdict("check" if bad or few else "good", findings)
     likeliest, *others = check.named
     kind, words = likeliest.cause.kind, _sentence(change_words(check, likeliest))
