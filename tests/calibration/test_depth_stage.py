@@ -9,16 +9,21 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.depth_cells import SMALL, TRUE, calibrated, picks
 
 from visioncal import simulation
 from visioncal.calibration.stages.depth import with_depth
 from visioncal.calibration.verification import verdict_of, verify
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, exp, invert
+from visioncal.frames.locate import cloud_in_base
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages
 from visioncal.session.depth import npy_of, read_cloud
 from visioncal.simulation import DepthOptions
+from visioncal.vision.camera import project
 
 FALSE = DepthOptions(boxed=0.5)
 
@@ -149,6 +154,93 @@ def test_distances_along_the_ray_and_clouds_give_the_same():
     other = session.with_content(images=MemoryImages(files), cells=cells)
     found, _ = with_depth(without(result.calibration), result.evidence, other)
     assert found.camera.depth.values == pytest.approx(depth.values, abs=1e-9)
+
+
+def by_another_camera(session):
+    """The session with the same plane's distances by a depth camera of another lens, beside."""
+    lens = replace(SMALL, resolution=(424, 240), matrix=np.array([300.0, 300.0, 211.5, 119.5]),
+                   distortion=np.zeros(5))  # fmt: skip
+    beside = compose(
+        exp(np.array([0.01, -0.03, 0.005, 0, 0, 0]))[:3, :3], np.array([0.05, 0.004, -0.01])
+    )
+    cell = calibrated(1, "eye-in-hand", FALSE, 12)[0]
+    px = np.stack(np.meshgrid(np.arange(424), np.arange(240)), axis=-1).astype(float)
+    rays = np.dstack([(px - lens.matrix[2:]) / lens.matrix[:2], np.ones(px.shape[:2])])
+    u, v = np.moveaxis((2 * px + 1) / lens.resolution - 1, -1, 0)
+    rng, files = np.random.default_rng(0), {}
+    for sight in cell.sights:
+        pose = np.linalg.inv(beside) @ sight.cam_from_target
+        z = (pose[:3, 2] @ pose[:3, 3]) / (rays @ pose[:3, 2])
+        measured = FALSE.scale * z + FALSE.offset_m + FALSE.bowl_m * (u**2 + (v * 240 / 424) ** 2)
+        measured += 0.8e-3 * z**2 * rng.standard_normal(z.shape)
+        raw = np.clip(np.rint(measured / 1e-4), 0, 65535).astype(np.uint16)
+        view = next(view for view in session.views if view.number == sight.view)
+        files[view.depth] = cv2.imencode(".png", raw)[1].tobytes()
+        files[view.image] = session.images.read(view.image)
+    turn = Rotation.from_matrix(beside[:3, :3]).as_quat().tolist()
+    x, y, z = beside[:3, 3].tolist()
+    document = {
+        **session.document,
+        "cameras": {
+            "depth": {
+                "resolution": [424, 240], "matrix": lens.matrix.tolist(),
+                "distortion": [0.0] * 5, "depth_unit_m": 1e-4,
+            }
+        },
+        "prior": {
+            "cam_from_depth": {
+                "x_m": x, "y_m": y, "z_m": z, "sigma_m": 1e-5, "quaternion_xyzw": turn,
+                "sigma_rad": 1e-5,
+            }
+        },
+    }  # fmt: skip
+    return cell, beside, session.with_content(images=MemoryImages(files), document=document)
+
+
+def test_a_depth_camera_beside_has_its_own_lens_and_place(tmp_path):
+    session, result = made()
+    cell, beside, other = by_another_camera(session)
+    assert not [words for words in other.warnings if "depth" in words]
+    found, evidence = with_depth(without(result.calibration), result.evidence, other)
+    depth = found.camera.depth
+    error = depth.values - [FALSE.scale, FALSE.offset_m, 0.0, 0.0, FALSE.bowl_m]
+    # Chi-square of five exceeds this in one case of a thousand.
+    assert error @ np.linalg.solve(depth.covariance, error) < 20.5
+    stored = Calibration.from_json(found.text, "stored")
+    assert stored.camera.depth.by.cam_from_depth == pytest.approx(beside)
+    # Cells are shown where the image has them, on the board.
+    cells = next(view.depth for view in evidence if view.depth is not None)
+    assert np.abs(cells[:, 4]).mean() < 0.2 * np.abs(cells[:, 3]).mean()
+    # A point of a board by the picture of the depth camera, and the picture as a cloud.
+    sight = cell.sights[3]
+    other.save(tmp_path / "bin")
+    (tmp_path / "out").mkdir()
+    found.save(tmp_path / "out" / "calibration.json")
+    corner = sight.cam_from_target @ [0.1, 0.07, 0.0, 1.0]
+    (u, v) = project(SMALL, corner[None, :3])[0]
+    words = ("locate", tmp_path / "bin", "-c", tmp_path / "out", "--view", sight.view)
+    (place,) = json.loads(visioncal(*words, "--pixel", f"{u:.2f},{v:.2f}", "--json").good().out)
+    true = cell.mountings["target"] @ [0.1, 0.07, 0.0, 1.0]
+    assert np.linalg.norm(np.subtract(place["p_base_m"], true[:3])) < 2e-3 * place["radius95_mm"]
+    rows, columns = np.mgrid[100:140, 180:240]
+    rays = np.dstack([(columns - 211.5) / 300, (rows - 119.5) / 300, np.ones(rows.shape)])
+    raw = cv2.imdecode(
+        np.frombuffer(other.images.read(f"depth/{sight.view:03d}.png"), np.uint8), -1
+    )
+    points = rays * (raw[100:140, 180:240, None] * 1e-4)
+    flange = cell.robot.base_from_flange[3]
+    placed = invert(cell.mountings["target"])[:3] @ np.concatenate(
+        [cloud_in_base(found, points.reshape(-1, 3), flange).T, np.ones((1, points[..., 0].size))]
+    )
+    # On the board's plane, where noise of a fifth of a millimetre is averaged.
+    assert abs(placed[2].mean()) < 3e-4
+
+
+def test_a_depth_camera_beside_needs_lens_and_place():
+    session, _ = made()
+    document = {**session.document, "cameras": {"depth": {"resolution": [424, 240]}}}
+    with pytest.raises(DataError, match=r"cameras.depth has no.*prior.cam_from_depth is not"):
+        session.with_content(document=document)
 
 
 def test_verify_says_whether_depth_is_what_it_was():

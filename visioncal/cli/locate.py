@@ -25,6 +25,7 @@ from visioncal.frames.locate import (
     locate,
     locate_by_depth,
     locate_target,
+    seen_distances,
 )
 from visioncal.interchange.result_files import load_result
 from visioncal.results import Calibration, Edge
@@ -144,9 +145,11 @@ def _measured(
         if session is None or not views[0].depth:
             return None
         data, name = session.images.read(views[0].depth), views[0].depth
-    depth = read_depth(data, name, camera.resolution, _unit_m(calibration))
-    u, v = np.clip(np.rint(px), 0, np.array(camera.resolution) - 1).astype(int).T
-    lost = np.flatnonzero(np.isnan(depth[v, u]))
+    model = None if calibration.camera is None else calibration.camera.depth
+    size = camera.resolution if model is None or model.by is None else model.by.resolution
+    depth = read_depth(data, name, size, None if model is None else model.unit_m)
+    found = seen_distances(calibration, depth, px)
+    lost = np.flatnonzero(np.isnan(found))
     if len(lost):
         at = f"({px[lost[0], 0]:g}, {px[lost[0], 1]:g})"
         raise DataError(
@@ -154,12 +157,7 @@ def _measured(
             culprits=[f"pixel {at}"],
             next_step="Give a pixel beside it, or the plane that it lies in (--plane).",
         )
-    return np.asarray(depth[v, u])
-
-
-def _unit_m(calibration: Calibration) -> float | None:
-    depth = None if calibration.camera is None else calibration.camera.depth
-    return None if depth is None else depth.unit_m
+    return found
 
 
 def _write_cloud(

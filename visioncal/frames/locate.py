@@ -11,6 +11,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import f_limit
+from visioncal.core.transforms import apply, invert
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.frames.camera_chain import (
@@ -23,7 +24,7 @@ from visioncal.frames.camera_chain import (
 )
 from visioncal.results import Calibration
 from visioncal.session.selecting import EYE, Choice
-from visioncal.vision.camera import normalise
+from visioncal.vision.camera import normalise, project
 from visioncal.vision.targets import load_target
 
 # Factor beyond the distances of the views that is named: a board of a third of the image reaches
@@ -169,10 +170,19 @@ def locate_by_depth(
         if model is not None:
             warnings = []
             along = float(np.linalg.norm(ray)) if model.of == "ray" else 1.0
-            (true,) = model.true_m(metres[None], at[None], eye.camera.resolution)
-            depth = true / along
+            size, where = eye.camera.resolution, at[None]
+            if model.by is None:
+                (true,) = model.true_m(metres[None], where, size)
+                depth = true / along
+            else:
+                # What is measured was seen by the other camera, in whose pixels the model is.
+                size, beside = model.by.resolution, model.by.cam_from_depth
+                point = apply(invert(beside), (metres / along * ray)[None])
+                placed, where = model.corrected(point, model.by.camera)
+                (depth,) = apply(beside, placed)[:, 2]
+                true = depth * along
             noise_m = model.noise_at(true) / along
-            by_depth = -model.by_values(true[None], at[None], eye.camera.resolution).T / along
+            by_depth = -model.by_values(true[None], where, size).T / along
             covariance = model.covariance
             if model.with_calibration is not None:
                 # Between the camera's edge and the lens is the board's.
@@ -196,6 +206,43 @@ def locate_by_depth(
     return tuple(found)
 
 
+def seen_distances(calibration: Calibration, depth_m: FloatArray, px: FloatArray) -> FloatArray:
+    """Distances at pixels of the image by the picture of a depth camera, NaN where there are none.
+
+    That of a camera beside is interpolated between the nearest of its points that are seen there.
+
+    Args:
+        calibration: The camera's.
+        depth_m: (h, w) as measured [m].
+        px: (n, 2) pixels of the image.
+
+    Returns:
+        (n,) along the image's z, or along its rays where the measured ones are [m].
+    """
+    eye = CalibratedCamera.of(calibration)
+    model = eye.lens.depth
+    if model is None or model.by is None:
+        u, v = np.clip(np.rint(px), 0, np.array(eye.camera.resolution) - 1).astype(int).T
+        return np.asarray(depth_m[v, u])
+    rows, columns = np.nonzero(np.isfinite(depth_m))
+    own = normalise(model.by.camera, np.column_stack([columns, rows]).astype(float))
+    rays = np.column_stack([own, np.ones(len(own))])
+    lengths = np.linalg.norm(rays, axis=1, keepdims=True) if model.of == "ray" else 1.0
+    points = apply(model.by.cam_from_depth, rays * depth_m[rows, columns][:, None] / lengths)
+    distances = np.linalg.norm(points, axis=1) if model.of == "ray" else points[:, 2]
+    seen, found = project(eye.camera, points), np.full(len(px), np.nan)
+    # One and a half pixels of the depth picture.
+    reach_px = 1.5 * float(np.max(eye.camera.matrix[:2] / model.by.matrix[:2]))
+    for at, place in enumerate(px):
+        near = np.linalg.norm(seen - place, axis=1) < reach_px
+        # What is nearer hides the rest.
+        near &= distances < 1.02 * np.min(distances[near], initial=np.inf)
+        if np.sum(near) > 2:
+            plane = np.column_stack([np.ones(near.sum()), seen[near] - place])
+            found[at] = np.linalg.lstsq(plane, distances[near])[0][0]
+    return found
+
+
 def cloud_in_base(
     calibration: Calibration,
     points_cam: FloatArray,
@@ -207,7 +254,8 @@ def cloud_in_base(
 
     Args:
         calibration: The camera's.
-        points_cam: (..., 3) in the camera's frame, NaN where there are none [m].
+        points_cam: (..., 3) in the frame of the camera, or of that which measures depth beside it;
+            NaN where there are none [m].
         base_from_flange: As in `locate`.
         joints_rad: As in `locate`.
 
@@ -217,13 +265,9 @@ def cloud_in_base(
     eye = CalibratedCamera.of(calibration)
     pose, model = eye.at(base_from_flange, joints_rad).base_from_cam, eye.lens.depth
     if model is not None:
-        flat = points_cam.reshape(-1, 3)
-        z, focal, centre = flat[:, 2], eye.camera.matrix[:2], eye.camera.matrix[2:]
-        # Tilt and bowl change so slowly that distortion moves no pixel far enough to matter.
-        px = flat[:, :2] / z[:, None] * focal + centre
-        measured = np.linalg.norm(flat, axis=1) if model.of == "ray" else z
-        share = model.true_m(measured, px, eye.camera.resolution) / measured
-        points_cam = (flat * share[:, None]).reshape(points_cam.shape)
+        by = eye.camera if model.by is None else model.by.camera
+        points_cam = model.corrected(points_cam.reshape(-1, 3), by)[0].reshape(points_cam.shape)
+        pose = pose if model.by is None else pose @ model.by.cam_from_depth
     return np.asarray(points_cam @ pose[:3, :3].T + pose[:3, 3])
 
 

@@ -5,8 +5,24 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from visioncal.core.codec import Array, Matrix
-from visioncal.core.types import FloatArray
+from visioncal.core.codec import Array, Matrix, Vector
+from visioncal.core.types import Camera, CameraKind, FloatArray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DepthCamera:
+    """A depth camera beside the camera of the images, as the session states it."""
+
+    model: CameraKind  # `brown` or `fisheye`.
+    resolution: tuple[int, int]  # Width and height [px].
+    matrix: Annotated[FloatArray, Array((4,))]  # fx, fy, cx, cy [px].
+    distortion: Vector  # The coefficients in OpenCV's order.
+    cam_from_depth: Annotated[FloatArray, Array((4, 4))]  # Its pose in the camera's frame [m].
+
+    @property
+    def camera(self) -> Camera:
+        """Its intrinsics."""
+        return Camera(self.model, self.resolution, self.matrix, self.distortion)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,11 +49,27 @@ class DepthResult:
     distances_m: tuple[float, float]  # Least and greatest true distance of what it is from [m].
     of: Literal["z", "ray"] = "z"  # Whether distances are along z or along the ray.
     unit_m: float | None = None  # Unit of depth pictures, where stated [m].
+    # The camera that u and v are of; None where depth is aligned to the image.
+    by: DepthCamera | None = None
 
     def true_m(self, measured_m: FloatArray, px: FloatArray, size: tuple[int, int]) -> FloatArray:
         """(n,) true distances of (n,) measured ones at (n, 2) pixels of an image of a size [m]."""
         bent = bending(px, size) @ self.values[1:]
         return np.asarray((measured_m - bent) / self.scale)
+
+    def corrected(self, points_m: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
+        """(n, 3) points by true distances, and (n, 2) their pixels.
+
+        Args:
+            points_m: (n, 3) as measured, in the frame of the camera that measures depth [m].
+            camera: It.
+        """
+        z = points_m[:, 2]
+        # Tilt and bowl change so slowly that distortion moves no pixel far enough to matter.
+        px = points_m[:, :2] / z[:, None] * camera.matrix[:2] + camera.matrix[2:]
+        measured = np.linalg.norm(points_m, axis=1) if self.of == "ray" else z
+        share = self.true_m(measured, px, camera.resolution) / measured
+        return points_m * share[:, None], px
 
     def by_values(self, true_m: FloatArray, px: FloatArray, size: tuple[int, int]) -> FloatArray:
         """(n, 5) change of measured distances, in true ones, by the model's values."""

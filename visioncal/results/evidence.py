@@ -19,7 +19,8 @@ class ViewEvidence:
     # (4, 4) as reported by the controller, or by the calibrated arm where there is one.
     base_from_flange: FloatArray | None = None
     cam_from_target: FloatArray | None = None  # (4, 4) as estimated from this view alone.
-    # (n, 4) cells of its depth: their pixels [px], predicted distance, and measured minus that [m].
+    # (n, 5) cells of its depth: their pixels in the image [px], predicted distance, measured minus
+    # that, and the same after correction [m].
     depth: FloatArray | None = None
 
 

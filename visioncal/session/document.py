@@ -15,12 +15,14 @@ from pydantic import (
     ValidationError,
     model_validator,
 )
+from scipy.spatial.transform import Rotation
 
 from visioncal.core.choices import POSE_FORMS
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import did_you_mean
-from visioncal.core.types import Camera, CameraKind, CameraMount, Need
+from visioncal.core.transforms import compose
+from visioncal.core.types import Camera, CameraKind, CameraMount, FloatArray, Need
 
 # Limit that keeps squares and products from overflowing.
 _LARGEST = 1e15
@@ -208,6 +210,14 @@ class PriorTable(TableModel):
     quaternion_xyzw: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
     sigma_rad: MeasuredSigma | None = None
 
+    @property
+    def pose(self) -> FloatArray | None:
+        """(4, 4) all that is stated; None where a component is not."""
+        if None in (self.x_m, self.y_m, self.z_m, self.quaternion_xyzw):
+            return None
+        turn = Rotation.from_quat(self.quaternion_xyzw or [])
+        return compose(turn.as_matrix(), np.array([self.x_m, self.y_m, self.z_m], float))
+
     @model_validator(mode="after")
     def _is_one(self) -> Self:
         turn, is_placed = self.quaternion_xyzw, {self.x_m, self.y_m, self.z_m} != {None}
@@ -259,6 +269,8 @@ class Declaration(TableModel):
     targets: dict[str, Annotated[TargetTable, _short("target")]] = Field(default_factory=dict)
     camera: CameraTable | None = None
     cameras: dict[str, CameraTable] = Field(default_factory=dict)
+    # The camera of depth pictures: `[cameras.depth]` beside `[camera]`.
+    depth: CameraTable | None = None
     robot: RobotTable | None = None
     robots: dict[str, Annotated[RobotTable, _short("model")]] = Field(default_factory=dict)
     instrument: InstrumentTable | None = None
@@ -269,6 +281,13 @@ class Declaration(TableModel):
     prior: dict[str, PriorTable] = Field(default_factory=dict)
     need: NeedTable | None = None
     corrected: list[str] = Field(default_factory=list)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _depth_apart(cls, content: dict[str, Any]) -> dict[str, Any]:
+        if "camera" not in content or content.get("cameras", {}).keys() != {"depth"}:
+            return content
+        return {**content, "cameras": {}, "depth": content["cameras"]["depth"]}
 
     def named(self, kind: Kind) -> dict[str, TableModel]:
         """Tables of a kind by name, which is empty for the singular table."""
@@ -366,7 +385,19 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
     for name in declaration.clocks:
         if name not in declaration.cameras:
             yield f"clocks.{name}", "is of no camera: [clocks.NAME] is for [cameras.NAME]"
+    yield from _depth_problems(declaration)
     yield from _far_priors(declaration)
+
+
+def _depth_problems(declaration: Declaration) -> Iterator[tuple[str, str]]:
+    if declaration.depth is None:
+        return
+    if declaration.depth.stated is None:
+        yield "cameras.depth", "has no resolution, matrix and distortion: the lens is needed"
+    prior = declaration.prior.get("cam_from_depth")
+    if prior is None or prior.pose is None:
+        words = "is not stated whole: x_m, y_m, z_m, quaternion_xyzw and sigmas are needed"
+        yield "prior.cam_from_depth", words
 
 
 def _far_priors(declaration: Declaration) -> Iterator[tuple[str, str]]:
@@ -385,6 +416,7 @@ def declaration_warnings(declaration: Declaration) -> Iterator[str]:
     """Warnings: unknown keys, unknown priors, a principal point outside the image."""
     yield from _unknown_keys(declaration, "")
     edges = [*_EDGES, *(f"{edge}_{name}" for edge in _EDGES for name in declaration.targets)]
+    edges += ["cam_from_depth"] * (declaration.depth is not None)
     for edge in declaration.prior:
         if not declaration.has_names and edge not in edges:
             hint = did_you_mean(edge, edges)

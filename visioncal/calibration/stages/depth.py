@@ -24,7 +24,7 @@ from visioncal.core.types import Camera, FloatArray, Image, Mask
 from visioncal.core.verdict import DEPTH_CHANGED, NOTE, Finding, Remedy
 from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult
-from visioncal.results.depth import DepthResult, bending
+from visioncal.results.depth import DepthCamera, DepthResult, bending
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session, View
 from visioncal.session.depth import read_depth
@@ -107,6 +107,7 @@ class Sensor:
     corners_m: FloatArray  # (c, 3) the board's corners in its frame [m].
     lens: Camera  # The lens of the depth pictures.
     cam_from_depth: FloatArray  # (4, 4); the identity where they are aligned to the image.
+    place: FloatArray  # (6,) its standard deviations [rad, m].
     unit_m: float | None  # Their unit, where stated [m].
     is_ray: bool  # Whether distances are along the ray.
 
@@ -177,9 +178,11 @@ class Sensor:
         )
         by_robot = by_pose @ plane.by_flange * flange_sigmas(self.calibration)
         lengths = length[:, None]
+        by_place = -by_pose @ adjoint(invert(pose)) * self.place
+        by_common = np.hstack([by_errors @ self.root, by_place])
         cells = Cells(
             *(view.number, px, true * length, table[:, 2], table[:, 3], (ahead - behind).T),
-            *(lengths * (by_errors @ self.root), lengths * by_robot, np.array(inks)),
+            *(lengths * by_common, lengths * by_robot, np.array(inks)),
         )
         return cells.take(on_board(cells, size))
 
@@ -307,7 +310,7 @@ def with_depth(
         if result is not None:
             found[camera] = result
         for part in cells:
-            table = np.column_stack([part.px, part.true_m, part.excess_m])
+            table = _shown(part, result, pair)
             seen[part.view] = replace(seen[part.view], depth=table)
     verdict = calibration.verdict
     verdict = replace(verdict, findings=(*verdict.findings[:1], *findings, *verdict.findings[1:]))
@@ -322,6 +325,19 @@ def with_depth(
         camera_result = replace(calibration.camera, depth=next(iter(found.values())))
         calibration = replace(calibration, camera=camera_result)
     return calibration, tuple(seen[view.view] for view in evidence)
+
+
+def _shown(cells: Cells, result: DepthResult | None, pair: Calibration) -> FloatArray:
+    """(n, 5) a view's cells, as its evidence has them."""
+    px, left, true = cells.px, cells.excess_m, cells.true_m
+    if result is not None and pair.camera is not None:
+        camera = pair.camera.camera
+        size = camera.resolution if result.by is None else result.by.resolution
+        left = result.true_m(true + left, px, size) - true
+        if result.by is not None:
+            rays = np.column_stack([normalise(result.by.camera, px), np.ones(len(px))])
+            px = project(camera, apply(result.by.cam_from_depth, true[:, None] * rays))
+    return np.column_stack([px, true, cells.excess_m, left])
 
 
 def depth_now(
@@ -362,8 +378,15 @@ def _depth_of(
     corners = corner_positions(target)
     if pair.camera is None or np.ptp(corners[:, 2]) > 0.0:
         raise DataError("it needs a camera and a flat board.")
+    lens, own, beside, place = pair.camera.camera, session.declaration.depth, np.eye(4), np.zeros(6)
+    by = None
+    if own is not None and (stated := own.stated) is not None:
+        prior, lens, table = session.declaration.prior["cam_from_depth"], stated, own
+        beside = np.eye(4) if prior.pose is None else prior.pose
+        place = np.repeat([prior.sigma_rad or 0.0, prior.sigma_m or 0.0], 3)
+        by = DepthCamera(**vars(lens), cam_from_depth=beside)
     sensor = Sensor(
-        *(pair, pair.camera, session, corners, pair.camera.camera, np.eye(4)),
+        *(pair, pair.camera, session, corners, lens, beside, place),
         *(table.depth_unit_m, table.depth_of == "ray"),
     )
     found, lost = list[Cells](), dict[str, list[int]]()
@@ -398,7 +421,7 @@ def _depth_of(
     found = [cells for cells, is_kept in zip(found, kept, strict=True) if is_kept]
     stamps = {view.number: view.stamp_s for view in views}
     result, further = estimated(found, sensor.lens.resolution, stamps, sensor.root)
-    result = replace(result, of=table.depth_of, unit_m=table.depth_unit_m)
+    result = replace(result, of=table.depth_of, unit_m=table.depth_unit_m, by=by)
     return result, found, [*said, _judged(result, found, sensor.lens.resolution, further, before)]
 
 

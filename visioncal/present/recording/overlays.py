@@ -87,13 +87,13 @@ class Overlay:
 
     def _log_depth(self, stream: rr.RecordingStream, depths: Sequence[FloatArray | None]) -> None:
         """Logs the deviations of depth, in radii by their size."""
-        cells = [np.zeros((0, 4)) if part is None else part for part in depths]
-        every = np.vstack(cells) if cells else np.zeros((0, 4))
+        cells = [np.zeros((0, 5)) if part is None else part for part in depths]
+        every = np.vstack(cells) if cells else np.zeros((0, 5))
         if not len(every):
             return
         most_m = max(float(np.quantile(np.abs(every[:, 3]), 0.98)), 1e-6)
         radii = 1.5 * _DOT * self.width * np.clip(np.abs(every[:, 3]) / most_m, 0.1, 1.0)
-        colour = np.where(every[:, 3:] > 0.0, colours.REJECTED, colours.USED)
+        colour = np.where(every[:, 3:4] > 0.0, colours.REJECTED, colours.USED)
         columns = rr.Points2D.columns(positions=every[:, :2] + _CENTRE, colors=colour, radii=radii)
         self._send(
             stream, paths.DEPTH, rr.Points2D.from_fields(colors=colours.USED), columns, cells

@@ -18,7 +18,6 @@ from visioncal.present.advice import contradicts
 from visioncal.present.cell_poses import CellPoses
 from visioncal.present.coverage import coverage_charts
 from visioncal.results import Calibration, ViewResult
-from visioncal.results.depth import DepthResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.views import rms_of
 from visioncal.session import Session, frame_name
@@ -222,20 +221,21 @@ def coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Mark
 def depth_cells(
     evidence: Sequence[ViewEvidence], calibration: Calibration, camera: str
 ) -> FloatArray | None:
-    """(n, 4) the cells of depth of a camera in all views; None without any."""
+    """(n, 5) the cells of depth of a camera in all views; None without any."""
     seer = frame_name("camera", camera)
     mine = {view.view for view in calibration.views if not camera or view.seer == seer}
     parts = [view.depth for view in evidence if view.depth is not None and view.view in mine]
     return np.concatenate(parts) if parts else None
 
 
-def depth_deviations(depth: DepthResult, camera: Camera, cells: FloatArray) -> Markup:
-    """Deviations of (n, 4) cells of depth over the image, as measured and as corrected."""
+def depth_deviations(camera: Camera, cells: FloatArray) -> Markup:
+    """Deviations of (n, 5) cells of depth over the image, as measured and as corrected."""
     drawing, (width, height) = Drawing(), camera.resolution
     scale = 0.42 * WIDTH / width
-    px, true_m, excess_m = cells[:, :2], cells[:, 2], cells[:, 3]
-    left_m = depth.true_m(true_m + excess_m, px, camera.resolution) - true_m
-    for index, (words, away_m) in enumerate((("measured", excess_m), ("corrected", left_m))):
+    px = cells[:, :2]
+    for index, (words, away_m) in enumerate(
+        zip(("measured", "corrected"), cells.T[3:], strict=True)
+    ):
         most_m = max(float(np.quantile(np.abs(away_m), 0.98)), 1e-6)
         x, y = scale * px.T[0] + (0.04 + 0.5 * index) * WIDTH, scale * px.T[1] + 24.0
         most = f"the largest dots are off by {significant(1e3 * most_m)} mm"
