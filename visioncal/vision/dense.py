@@ -127,11 +127,11 @@ def _pixels(image: Image, target: Target) -> Iterator[tuple[IntArray, FloatArray
 
 
 @lru_cache(maxsize=8)
-def drawn_print(target: Target) -> Print:
-    """A board's print, each texel by the share of its area that is light, with paper around it."""
+def drawn_print(target: Target, texels: int = _TEXELS) -> Print:
+    """A board's print with paper around it, of so many texels a square, by their area's light."""
     low, high = extent_m(target)
     low, high = low - _PAPER * target.square_m, high + _PAPER * target.square_m
-    texel_m = min(target.square_m, float(pdist(corner_positions(target)).min())) / _TEXELS
+    texel_m = min(target.square_m, float(pdist(corner_positions(target)).min())) / texels
     size = np.ceil((high - low) / texel_m).astype(int).tolist()
     light = np.ones(size[::-1])
     for cells in kind_of(target).cells(target):

@@ -9,6 +9,7 @@ surroundings, and Cauchy's weights hold down single ones. The covariance is the 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -28,17 +29,29 @@ class Look:
     """One rendering beside the image, with the light that fits it best."""
 
     level: Level
+    flat: Print
     seen: Seen
     drawn: Rendered
     terms: Pixels  # (19, n) columns of the light.
     gain: Pixels  # (n,) derivative of the image by the print's light.
     residuals: Pixels  # (n,) image less model.
-    inside: Pixels  # (n,) 1 where a pixel sees nothing but the print, through all blur.
     weights: Pixels  # (n,).
     noise: float  # Robust standard deviation of a pixel.
     # (p,) information that is known before on pose, blur, twist and lens, and what it is on.
     prior: FloatArray
     changes: FloatArray
+
+    @cached_property
+    def inside(self) -> Pixels:
+        """(n,) 1 where a pixel sees nothing but the print, through all blur."""
+        seen, camera = self.seen, self.level.camera
+        blur_px = 3 * seen.gauss_px + seen.disc_px + 0.8 * self.level.factor
+        blur_px += moved_px(camera, self.flat, seen) / 2
+        pixel_m = self.flat.middle_at(seen.cam_from_target)[2] / camera.matrix[:2].mean()
+        rim = min(blur_px * pixel_m, 0.12 * self.flat.size_m.min())
+        at = self.drawn.places_m - self.flat.corner_m[:, None, None]
+        inside = ((at > rim) & (at < (self.flat.size_m - rim)[:, None, None])).all(axis=0)
+        return np.asarray(inside & self.level.is_sound, np.float32).ravel()
 
     @property
     def cost(self) -> float:
@@ -50,15 +63,15 @@ class Look:
         """Normal matrix (p + 19)^2 and right side by parameters and light, and weighted columns."""
         slopes = self.drawn.slopes.reshape(len(self.drawn.slopes), -1)
         jacobian = np.concatenate([slopes * self.gain, self.terms])
-        weighed = jacobian * self.weights
-        normal, goal = (
-            (weighed @ jacobian.T).astype(float),
-            (weighed @ self.residuals).astype(float),
-        )
+        root = np.sqrt(self.weights)
+        jacobian *= root
+        normal = (jacobian @ jacobian.T).astype(float)
+        jacobian *= root
+        goal = (jacobian @ self.residuals).astype(float)
         known = np.arange(len(self.prior))
         normal[known, known] += self.noise**2 * self.prior
         goal[known] -= self.noise**2 * self.prior * self.changes
-        return normal, goal, weighed
+        return normal, goal, jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +118,9 @@ def register(
     seen, look, is_blurred = replace(start, lens=np.zeros(len(lens_sigma))), None, rough
     for factor in factors:
         blur_px = max(seen.gauss_px, seen.disc_px / 2, moved_px(camera, flat, seen) / 4)
-        # Blur leaves nothing finer.
-        if look is not None and blur_px > 2.5 * look.level.factor:
+        texel_px = flat.texel_m * camera.matrix[:2].mean() / flat.middle_at(seen.cam_from_target)[2]
+        # Blur, or the print's own texels, leave nothing finer.
+        if look is not None and (blur_px > 2.5 * look.level.factor or factor < 0.7 * texel_px):
             break
         level = Level.of(image, factor, flat, camera, seen, len(lens_sigma))
         if level is None:
@@ -140,34 +154,27 @@ class Fitter:
 
     def look(self, seen: Seen, weights: Pixels | None = None, noise: float = _LEAST_NOISE) -> Look:
         """Renders the print and fits the light; by all pixels inside where weights are None."""
-        drawn = self.level.rendered(self.flat, seen, moving=self.moving)
-        light, image = drawn.light.reshape(1, -1), self.level.image.ravel()
-        terms = np.concatenate([self.level.nodes * light, self.level.nodes, light**2])
-        inside = self._inside(drawn, seen)
-        weights = inside if weights is None else weights
-        weighed = terms * weights
-        normal = (weighed @ terms.T).astype(float)
-        normal += 1e-6 * (float(np.trace(normal)) / len(normal) + 1e-3) * np.eye(len(normal))
-        solved = np.linalg.solve(normal, (weighed @ image).astype(float)).astype(np.float32)
-        gain = solved[:9] @ self.level.nodes + 2 * solved[18] * light[0]
+        level = self.level
+        drawn = level.rendered(self.flat, seen, moving=self.moving)
+        light, image = drawn.light.ravel(), level.image.ravel()
+        terms = np.concatenate([level.nodes * light, level.nodes, light[None] ** 2])
         # A print moves by no more than a fifth of itself, nor turns by as much.
         still = np.repeat([1 / (0.2 * self.flat.size_m.max()), 1 / 0.2], 3) ** 2
         known = [np.zeros(7 + (seen.disc_px > 0)), still[: 6 * self.moving], self.lens_sigma**-2.0]
         changes = [known[0], seen.twist[: 6 * self.moving], seen.lens]
-        return Look(
-            self.level, seen, drawn, terms, gain, image - solved @ terms, inside, weights, noise,
+        blank = Look(
+            level, self.flat, seen, drawn, terms, light, image, light, noise,
             np.concatenate(known), np.concatenate(changes),
         )  # fmt: skip
-
-    def _inside(self, drawn: Rendered, seen: Seen) -> Pixels:
-        camera = self.level.camera
-        blur_px = 3 * seen.gauss_px + seen.disc_px + 0.8 * self.level.factor
-        blur_px += moved_px(camera, self.flat, seen) / 2
-        pixel_m = self.flat.middle_at(seen.cam_from_target)[2] / camera.matrix[:2].mean()
-        rim = min(blur_px * pixel_m, 0.12 * self.flat.size_m.min())
-        at = drawn.places_m - self.flat.corner_m[:, None, None]
-        inside = ((at > rim) & (at < (self.flat.size_m - rim)[:, None, None])).all(axis=0)
-        return np.asarray(inside & self.level.is_sound, np.float32).ravel()
+        weights = blank.inside if weights is None else weights
+        root = np.sqrt(weights)
+        rooted = terms * root
+        normal = (rooted @ rooted.T).astype(float)
+        normal += 1e-6 * (float(np.trace(normal)) / len(normal) + 1e-3) * np.eye(len(normal))
+        goal = (rooted @ (root * image)).astype(float)
+        solved = np.linalg.solve(normal, goal).astype(np.float32)
+        gain = solved[:9] @ level.nodes + 2 * solved[18] * light
+        return replace(blank, gain=gain, residuals=image - solved @ terms, weights=weights)
 
     def weighed(self, look: Look, slack_px: float) -> Look:
         """With weights by the residuals: of what covers the print, and of single pixels.
@@ -211,18 +218,21 @@ class Fitter:
                 return None
             normal, goal, _ = look.normal()
             scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * normal.max()))
-            before, scaled = look, normal / np.outer(scale, scale)
+            scaled = normal / np.outer(scale, scale)
             for _ in range(4):
                 step = np.linalg.solve(scaled + damping * np.eye(len(scale)), goal / scale) / scale
+                # Less is below what noise moves.
+                if goal @ step < 0.1 * look.noise**2 + 1e-6 * look.cost:
+                    return look
                 seen = look.seen.moved(step[: len(look.prior)], self.moving)
                 tried = self.look(seen, look.weights, look.noise)
-                if tried.cost <= look.cost:
+                # Interpolation in steps of 1/32 px makes costs uneven, and derivatives less so.
+                if tried.cost <= 1.001 * look.cost:
                     look, damping = tried, damping / 10
                     break
                 damping *= 10
-            # Less is below what noise moves.
-            if before.cost - look.cost < 1e-2 * look.noise**2 + 1e-6 * look.cost:
-                break
+            else:
+                return look
         return look
 
     def rough(self, seen: Seen) -> Look | None:

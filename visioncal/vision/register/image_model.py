@@ -41,7 +41,7 @@ class Print:
     grey: Pixels  # (h, w).
     texel_m: float
     corner_m: FloatArray  # (2,) outer corner of the first texel in the target's frame [m].
-    _reduced: dict[int, tuple[Pixels, int]] = field(default_factory=dict, repr=False)
+    _reduced: dict[int, tuple[Pixels, Pixels, int, float]] = field(default_factory=dict, repr=False)
 
     @property
     def size_m(self) -> FloatArray:
@@ -59,17 +59,27 @@ class Print:
             self.corner_m + self.size_m * [[0, 0], [1, 0], [1, 1], [0, 1]], ((0, 0), (0, 1))
         )
 
-    def blurred(self, sigma_m: float) -> tuple[Pixels, int]:
-        """(h, w, 3) grey and its slopes [1/m], blurred, and by how much it is reduced."""
+    def blurred(self, sigma_m: float) -> tuple[Pixels, Pixels, int, float]:
+        """The print through a Gaussian.
+
+        Returns:
+            (h, w, 3) grey and its slopes [1/m], (h, w, 3) halves of its second derivatives xx, yy
+            and xy twice [1/m^2], by how much both are reduced, and the Gaussian's sigma [m].
+        """
         step = round(4 * np.log2(max(sigma_m / self.texel_m, 0.5)))
         if step not in self._reduced:
             sigma = 2.0 ** (step / 4)
             by = max(1, int(sigma / 1.3))
             smooth = np.asarray(cv2.GaussianBlur(self.grey, (0, 0), sigma, borderType=_EDGE))
-            grey = smooth[by // 2 :: by, by // 2 :: by]
-            wide = cv2.copyMakeBorder(grey, 1, 1, 1, 1, _EDGE) / (2 * by * self.texel_m)
-            slopes = wide[1:-1, 2:] - wide[1:-1, :-2], wide[2:, 1:-1] - wide[:-2, 1:-1]
-            self._reduced[step] = np.dstack([grey, *slopes]).astype(np.float32), by
+            grey, pitch_m = smooth[by // 2 :: by, by // 2 :: by], by * self.texel_m
+            wide = cv2.copyMakeBorder(grey, 1, 1, 1, 1, _EDGE) / pitch_m
+            gx, gy = (wide[1:-1, 2:] - wide[1:-1, :-2]) / 2, (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2
+            middle = 2 * wide[1:-1, 1:-1]
+            xx = (wide[1:-1, 2:] + wide[1:-1, :-2] - middle) / (2 * pitch_m)
+            yy = (wide[2:, 1:-1] + wide[:-2, 1:-1] - middle) / (2 * pitch_m)
+            first = np.dstack([grey, gx, gy]).astype(np.float32)
+            second = np.dstack([xx, yy, np.gradient(gx, pitch_m, axis=0)]).astype(np.float32)
+            self._reduced[step] = first, second, by, sigma * self.texel_m
         return self._reduced[step]
 
 
@@ -195,11 +205,30 @@ class Level:
         pixel_m = self.factor * float(middle[2] / self.camera.matrix[:2].mean())
         # A slanted pixel sees more of the print along one direction.
         slant = abs(float(pose[:3, 2] @ middle)) / float(np.linalg.norm(middle))
-        table, by = flat.blurred(_SAMPLED_PX * pixel_m / max(slant, 0.2) ** 0.5)
+        first, second, by, sigma_m = flat.blurred(_SAMPLED_PX * pixel_m / max(slant, 0.2) ** 0.5)
         count = 1 + 2 * moving * int(
             np.clip(moved_px(self.camera, flat, seen) / self.factor / 3, 2, 6)
         )
         x, y = self.rays + np.tensordot(_pixels(seen.lens), self.bends, 1)
+        ray, n, along = (
+            np.stack([x, y, np.ones_like(x)]),
+            _pixels(pose[:3, 2]),
+            _pixels(pose[:3, :2]),
+        )
+        across = 1 / sum(n[i] * ray[i] for i in range(3))
+        depth = np.float32(n @ pose[:3, 3]) * across
+        # What each pixel sees of the print beside one Gaussian for all, by the heat equation, and
+        # how that is shifted, as slopes of perspective change within a pixel.
+        side = np.float32(_SAMPLED_PX * pixel_m / middle[2])
+        (xx, xy), (yx, yy) = (
+            [
+                side * depth * (along[i, k] - n[i] * across * sum(along[:, k, None, None] * ray))
+                for i in range(2)
+            ]
+            for k in range(2)
+        )
+        spread = xx**2 + xy**2 - sigma_m**2, yx**2 + yy**2 - sigma_m**2, xx * yx + xy * yy
+        shift = [-side * across * (n[0] * px + n[1] * py) for px, py in ((xx, xy), (yx, yy))]
         layers = np.zeros((5 if moving else 3, *x.shape), np.float32)
         place = np.zeros((2, *x.shape), np.float32)
         for k in range(count):
@@ -207,11 +236,16 @@ class Level:
             own = _exp(at * seen.twist) @ pose
             # From rays to the plane of the print.
             rows = _pixels(np.linalg.inv(np.c_[own[:3, :2], own[:3, 3]]))
-            gx, gy, depth = (row[0] * x + row[1] * y + row[2] for row in rows)
-            on = np.stack([gx / depth, gy / depth])
+            gx, gy, scale = (row[0] * x + row[1] * y + row[2] for row in rows)
+            on = np.stack([gx / scale, gy / scale])
             corner = _pixels(flat.corner_m)[:, None, None]
             texels = _pixels(((on - corner) / np.float32(flat.texel_m) - 0.5 - by // 2) / by)
-            drawn = cv2.remap(table, texels[0], texels[1], cv2.INTER_LINEAR, None, _EDGE)
+            drawn, bent = (
+                cv2.remap(table, texels[0], texels[1], cv2.INTER_LINEAR, None, _EDGE)
+                for table in (first, second)
+            )
+            layers[0] += sum(spread[i] * bent[..., i] for i in range(3))
+            layers[0] += shift[0] * drawn[..., 1] + shift[1] * drawn[..., 2]
             layers[:3] += np.moveaxis(_pixels(drawn), -1, 0)
             if moving:
                 layers[3:] += np.float32(at) * np.moveaxis(_pixels(drawn), -1, 0)[1:]
@@ -224,9 +258,6 @@ class Level:
             wider = _through(sharp, _disc(1.02 * radius)) - layers[0]
             by_disc = [_gauss(wider, sigma) / np.float32(0.02 * seen.disc_px)]
         layers = np.stack([_gauss(layer, sigma) for layer in layers])
-        ray, n, along = (x, y, np.ones_like(x)), _pixels(pose[:3, 2]), _pixels(pose[:3, :2])
-        across = 1 / sum(n[i] * ray[i] for i in range(3))
-        depth = np.float32(n @ pose[:3, 3]) * across
         point = [depth * one for one in ray]
 
         def by_point(gx: Pixels, gy: Pixels) -> list[Pixels]:

@@ -1,0 +1,338 @@
+"""Poses of flat prints by all pixels, beside corners and OpenCV's `findTransformECC`.
+
+The images come from `tests/support/printed.py`: rays of 3 x 3 sub-pixels through OpenCV's lens,
+true sub-poses of a motion, covers, light and noise; boards are drawn by OpenCV. Nothing of that is
+shared with what registers them. Errors are of the print's middle and of its turn.
+
+    PYTHONPATH=tests python tests/benchmarks/register.py [VIEWS]
+"""
+
+import base64
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from results import few, wished, write_section
+from scipy.spatial.transform import Rotation
+from support.printed import PICTURES, Look, photographed, pose_at
+
+from visioncal.core.types import Camera, FloatArray, Image, Target
+from visioncal.simulation import CAMERAS
+from visioncal.vision.boards import DetectedCorners, find_target
+from visioncal.vision.dense import drawn_print
+from visioncal.vision.register.fit import Registered, register
+from visioncal.vision.register.image_model import Print, Seen
+from visioncal.vision.targets import corner_positions, target_from_document
+
+# 1.3 MP.
+CAMERA = replace(
+    CAMERAS["wide"], resolution=(1280, 1024), matrix=CAMERAS["wide"].matrix + np.eye(4)[3] * 112
+)
+# What a calibration of few views leaves: of the focal length, the centre [px] and k1.
+LENS_SIGMA = np.array([0.4, 0.5, 0.5, 0.002])
+MOTION = (1.0, 0.4, 0.1, 0.06, 0.05, 0.5)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A print and how it is photographed; so many mm and deg is the start off."""
+
+    words: str
+    kind: str  # `charuco` or one of `PICTURES`.
+    width_m: float
+    distance_m: tuple[float, float]
+    look: Look
+    columns: int = 0
+    motion_px: float = 0.0
+    off: tuple[float, float] = (0.3, 0.05)
+    # Half and whole sizes; motions and wide blurs have nothing finer than the half.
+    factors: tuple[int, ...] = (2, 1)
+
+
+ROWS = (
+    Row("ChArUco 300 mm", "charuco", 0.3, (0.40, 0.52), Look(covered=0.15), 9),
+    Row("ChArUco 100 mm", "charuco", 0.1, (0.28, 0.34), Look(covered=0.15), 6),
+    Row("ChArUco 25 mm", "charuco", 0.025, (0.11, 0.14), Look(covered=0.15), 6, off=(0.1, 0.05)),
+    *(
+        Row(
+            f"ChArUco 300 mm, motion {px} px", "charuco", 0.3, (0.40, 0.52), Look(covered=0.15), 9,
+            px, (1.0, 0.1), (4, 2, 1),
+        )
+        for px in (5, 10, 14)
+    ),
+    *(
+        Row(
+            f"ChArUco 300 mm, defocus {radius / 2} px", "charuco", 0.3, (0.40, 0.52),
+            Look(covered=0.15, disc_px=radius), 9, 0.0, (1.0, 0.1), (4, 2, 1),
+        )
+        for radius in (4.0, 9.0)
+    ),
+    *(
+        Row(kind, kind, 0.3, (0.38, 0.56), Look(covered=0.15), factors=(4, 2, 1))
+        for kind in PICTURES
+    ),
+)  # fmt: skip
+
+
+@dataclass
+class Ways:
+    """Errors of the ways to a pose, over the views of a row."""
+
+    mm: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    deg: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    squared: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+    def add(self, way: str, pose: FloatArray, truth: FloatArray, middle: FloatArray) -> None:
+        """Keeps a pose's error."""
+        off = np.linalg.inv(pose) @ truth
+        turn = Rotation.from_matrix(off[:3, :3]).magnitude()
+        self.deg[way].append(float(np.rad2deg(turn)))
+        self.mm[way].append(1e3 * float(np.linalg.norm(((pose - truth) @ middle)[:3])))
+
+    def told(self, way: str, views: int) -> str:
+        """Medians, and in how many views it gave nothing."""
+        found = self.mm[way]
+        if not found:
+            return "none"
+        missing = f" ({len(found)} of {views})" if len(found) < views else ""
+        return f"{np.median(found):.4f} / {np.median(self.deg[way]):.4f}{missing}"
+
+
+@lru_cache(maxsize=64)
+def made(row: Row, seed: int) -> tuple[Image, Target, Print]:
+    """A print's picture, its target and what is registered."""
+    if row.kind != "charuco":
+        picture = PICTURES[row.kind](seed)
+        told = {
+            "kind": "picture",
+            "width_m": row.width_m,
+            "image": base64.b64encode(cv2.imencode(".png", picture)[1].tobytes()).decode(),
+        }
+        flat = Print(
+            np.asarray(picture / 255, np.float32), row.width_m / picture.shape[1], np.zeros(2)
+        )
+        return picture, target_from_document(told, row.kind), flat
+    square_m = row.width_m / row.columns
+    rows = {9: 6, 6: 4}[row.columns]
+    marker_m = 0.75 * square_m
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    board = cv2.aruco.CharucoBoard((row.columns, rows), square_m, marker_m, words)
+    # White paper around it, half a square wide; a marker's cell is 30 whole pixels.
+    picture = np.pad(board.generateImage((280 * row.columns, 280 * rows)), 140, constant_values=255)
+    target = Target("board", "charuco", row.columns, rows, square_m, 1e-6, marker_m=marker_m,
+                    dictionary="DICT_5X5_100")  # fmt: skip
+    return picture, target, drawn_print(target, 160)
+
+
+def paper(row: Row) -> tuple[float, float]:
+    """Width of what is printed with the paper around it, and of that paper on a side [m]."""
+    side_m = row.width_m / row.columns / 2 if row.columns else 0.0
+    return row.width_m + 2 * side_m, side_m
+
+
+def view(row: Row, seed: int) -> tuple[Image, Target, Print, FloatArray, FloatArray, FloatArray]:
+    """An image, its target and print, the true pose, a start (4, 4), and the middle (4,) [m]."""
+    rng = np.random.default_rng([seed, 3])
+    picture, target, flat = made(row, seed if row.kind != "charuco" else 0)
+    width_m, paper_m = paper(row)
+    size_m = width_m * np.array([1.0, picture.shape[0] / picture.shape[1]])
+    middle = np.array([*(size_m / 2 - paper_m), 0, 1])
+    pose = pose_at(rng.uniform(*row.distance_m), rng.uniform(0, 35), middle[:3], rng)
+    look = row.look
+    if row.motion_px:
+        turn = rng.uniform(0, 2 * np.pi)
+        z = float((pose @ middle)[2])
+        along = row.motion_px * z / CAMERA.matrix[0]
+        spin = rng.normal(0, 0.2, 3) * along / row.width_m
+        way = along * np.array([np.cos(turn), np.sin(turn), rng.normal(0, 0.3)])
+        # A turn about the middle of the print.
+        way = way - np.cross(spin, (pose @ middle)[:3])
+        look = replace(look, twist=(*way.tolist(), *spin.tolist()))
+    image = photographed(picture, width_m, CAMERA, pose, look, seed, (-paper_m, -paper_m))
+    away = rng.normal(0, 1, (2, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    start = pose.copy()
+    start[:3, :3] = (
+        Rotation.from_rotvec(np.deg2rad(row.off[1]) * away[0]).as_matrix() @ pose[:3, :3]
+    )
+    start[:3, 3] = (pose @ middle)[:3] + 1e-3 * row.off[0] * away[1] - start[:3, :3] @ middle[:3]
+    return image, target, flat, pose, start, middle
+
+
+def by_points(places: FloatArray, px: FloatArray, camera: Camera) -> FloatArray | None:
+    """(4, 4) pose by OpenCV, with one round of rejection."""
+    matrix = np.diag([*camera.matrix[:2], 1.0])
+    matrix[:2, 2] = camera.matrix[2:]
+    for _ in range(2):
+        if len(places) < 6:
+            return None
+        _, turn, place = cv2.solvePnP(places, px, matrix, camera.distortion)
+        off = np.linalg.norm(
+            cv2.projectPoints(places, turn, place, matrix, camera.distortion)[0][:, 0] - px, axis=1
+        )
+        near = off < max(4 * float(np.median(off)), 0.02)
+        places, px = places[near], px[near]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], place[:, 0]
+    return pose
+
+
+def opencv_points(
+    image: Image, target: Target, picture: Image
+) -> tuple[FloatArray, FloatArray] | None:
+    """Places and pixels of OpenCV's own: corners of a board, or features of a picture (SIFT)."""
+    if target.kind == "charuco":
+        words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+        size = (target.columns, target.rows)
+        board = cv2.aruco.CharucoBoard(size, target.square_m, target.marker_m, words)
+        px, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
+        if ids is None or len(ids) < 6:
+            return None
+        return board.getChessboardCorners()[ids[:, 0]].astype(float), px[:, 0].astype(float)
+    sift = cv2.SIFT.create(3000)
+    (kept, known), (seen, described) = (
+        sift.detectAndCompute(grey, None) for grey in (picture, image)
+    )
+    pairs = cv2.BFMatcher().knnMatch(described, known, k=2)
+    good = [one for one, other in pairs if one.distance < 0.8 * other.distance]
+    texel = target.square_m / picture.shape[1]
+    places = texel * (np.array([kept[m.trainIdx].pt for m in good]) + 0.5)
+    px = np.array([seen[m.queryIdx].pt for m in good])
+    _, inside = cv2.findHomography(places, px, cv2.USAC_MAGSAC, 3.0)
+    taken = inside[:, 0] > 0
+    return np.pad(places[taken], ((0, 0), (0, 1))), px[taken]
+
+
+def by_ecc(
+    image: Image, row: Row, picture: Image, flat_m: tuple[float, float], start: FloatArray
+) -> FloatArray | None:
+    """(4, 4) pose by OpenCV's registration of the undistorted image by a homography."""
+    matrix = np.diag([*CAMERA.matrix[:2], 1.0])
+    matrix[:2, 2] = CAMERA.matrix[2:]
+    straight = cv2.undistort(image, matrix, CAMERA.distortion)
+    small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    texel, low = flat_m[0] / small.shape[1], -flat_m[1]
+    to_m = np.array([[texel, 0, texel / 2 + low], [0, texel, texel / 2 + low], [0, 0, 1]])
+    warp = matrix @ start[:3, [0, 1, 3]] @ to_m
+    ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-7)
+    try:
+        _, warp = cv2.findTransformECC(
+            small, straight, (warp / warp[2, 2]).astype(np.float32), cv2.MOTION_HOMOGRAPHY, ends,
+            None, 3,
+        )  # fmt: skip
+    except cv2.error:
+        return None
+    grid = np.stack(
+        np.meshgrid(np.linspace(0, row.width_m, 9), np.linspace(0, 0.6 * row.width_m, 6)), -1
+    )
+    places = np.pad(grid.reshape(-1, 2), ((0, 0), (0, 1)))
+    px = cv2.perspectiveTransform(places[None, :, :2], warp.astype(float) @ np.linalg.inv(to_m))[0]
+    return by_points(places, px, replace(CAMERA, distortion=np.zeros(5)))
+
+
+def squared(found: Registered, truth: FloatArray) -> float:
+    """Squared error over covariance, per component of the pose."""
+    off = np.linalg.inv(found.seen.cam_from_target) @ truth
+    error = np.concatenate([Rotation.from_matrix(off[:3, :3]).as_rotvec(), off[:3, 3]])
+    return float(error @ np.linalg.solve(found.covariance[:6, :6], error)) / 6
+
+
+def measured(row: Row, views: int) -> Ways:
+    """All ways on the views of a row."""
+    ways = Ways()
+    is_rough = bool(row.motion_px or row.look.disc_px)
+    for seed in range(views):
+        # Half of the prints are covered.
+        seen = replace(row, look=replace(row.look, covered=row.look.covered * (seed % 2)))
+        seen = row if row.kind == "charuco" else seen
+        image, target, flat, truth, start, middle = view(seen, seed)
+        picture = made(row, seed if row.kind != "charuco" else 0)[0]
+        rng = np.random.default_rng([seed, 9])
+        draw = LENS_SIGMA * rng.normal(size=4)
+        wrong = replace(
+            CAMERA, matrix=CAMERA.matrix + draw[[0, 0, 1, 2]],
+            distortion=CAMERA.distortion + draw[3] * np.eye(5)[0],
+        )  # fmt: skip
+        points = opencv_points(image, target, picture)
+        if points is not None:
+            pose = by_points(*points, CAMERA)
+            if pose is not None:
+                ways.add("opencv", pose, truth, middle)
+        begun = time.thread_time()
+        own = find_target(image, target)
+        ways.seconds["find"].append(time.thread_time() - begun)
+        if isinstance(own, DetectedCorners):
+            places = corner_positions(target)[own.ids]
+            for way, camera in (("own", CAMERA), ("own, lens off", wrong)):
+                pose = by_points(places, own.px, camera)
+                if pose is not None:
+                    ways.add(way, pose, truth, middle)
+        pose = by_ecc(image, row, picture, paper(row), start)
+        if pose is not None:
+            ways.add("ecc", pose, truth, middle)
+        for way, camera, sigma in (
+            ("registered", CAMERA, None), ("registered, lens off", wrong, LENS_SIGMA),
+        ):  # fmt: skip
+            begun = time.thread_time()
+            found = register(
+                image, flat, camera, Seen(start), lens_sigma=sigma, moving=row.motion_px > 0,
+                factors=row.factors, rough=is_rough,
+            )  # fmt: skip
+            ways.seconds[way].append(time.thread_time() - begun)
+            if found is not None:
+                ways.add(way, found.seen.cam_from_target, truth, middle)
+                ways.squared[way].append(squared(found, truth))
+    return ways
+
+
+def lines(rows: tuple[Row, ...], views: int) -> Iterator[str]:
+    """The table, row by row."""
+    head = "| print | OpenCV | visioncal's corners | ECC | registered | sq. error / cov. "
+    yield f"{head}| corners, lens off | registered, lens off | sq. error / cov. | s |"
+    yield "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
+    for row in rows:
+        ways = measured(row, views)
+        told = [ways.told(way, views) for way in ("opencv", "own", "ecc", "registered")]
+        ratios = []
+        for way in ("registered", "registered, lens off"):
+            values = ways.squared[way] or [np.nan]
+            ratios.append(f"{np.mean(values):.2f}, {np.median(values):.2f}")
+        off = [ways.told(way, views) for way in ("own, lens off", "registered, lens off")]
+        took = [f"{np.median(ways.seconds[way]):.2f}" for way in ("find", "registered")]
+        yield (
+            f"| {row.words} | "
+            + " | ".join([*told, ratios[0], *off, ratios[1], ", ".join(took)])
+            + " |"
+        )
+
+
+def main() -> None:
+    """Prints the table and keeps it."""
+    cv2.setNumThreads(1)
+    views = wished(16)
+    kept = []
+    for line in lines(few(ROWS, ROWS[1:2]), views):
+        print(line, flush=True)
+        kept.append(line)
+    text = (
+        f"{views} views a row of {CAMERA.resolution[0]} x {CAMERA.resolution[1]} px, boards 15 % "
+        "covered, of pictures every second one. Medians of the views in which a way gave a pose, "
+        "mm / deg of the print's middle and turn. OpenCV: its ChArUco detector, or SIFT and "
+        "MAGSAC, and solvePnP, with the true lens. Where the lens is off, a focal "
+        "length by 0.4 px, a centre by "
+        "0.5 px and k1 by 0.002, drawn view by view, registration estimates it with these sigmas. "
+        "Squared errors over covariances are per component: mean, median. Seconds are "
+        "medians of a thread.\n\n" + "\n".join(kept)
+    )  # fmt: skip
+    write_section(
+        "Flat prints by all pixels", "PYTHONPATH=tests python tests/benchmarks/register.py", text
+    )
+
+
+if __name__ == "__main__":
+    main()
