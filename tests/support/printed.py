@@ -5,11 +5,15 @@ there; covers, the optics (Gaussian, disc), sub-poses of a motion, light, the se
 noise follow as in a camera.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from visioncal import Session
+from visioncal.simulation import CAMERAS, CellOptions, simulate
+from visioncal.vision.targets import load_target
 
 SAMPLES = 3
 
@@ -217,3 +221,22 @@ def _inside(points, polygon):
     off = points[:, None] - polygon[None]
     cross = sides[:, 0] * off[..., 1] - sides[:, 1] * off[..., 0]
     return (cross >= 0).all(axis=1) | (cross <= 0).all(axis=1)
+
+
+def photographed_cell(picture, described, views, seed=6, covered=0.0, **cell):
+    """A simulated cell's session whose board is a picture with its .toml, and the cell."""
+    wide = CAMERAS["wide"]
+    # A quarter of the pixels.
+    camera = replace(wide, resolution=(640, 400), matrix=wide.matrix / 2)
+    target = load_target(described)
+    options = CellOptions(views=views, seed=seed, target=target, camera=camera, **cell)
+    simulated = simulate(options)
+    images = [
+        photographed(
+            picture, target.square_m, camera, pose, Look(covered=covered * (at % 2)), at
+        )
+        for at, pose in enumerate(simulated.cam_from_target)
+    ]  # fmt: skip
+    flanges = simulated.robot.base_from_flange
+    told = {"resolution": list(camera.resolution)}
+    return Session.from_arrays(images, flanges, target, camera=told), simulated

@@ -17,7 +17,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable, read_bytes
-from visioncal.core.types import FloatArray, Image, Target
+from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.boards.kind import (
     BoardKind,
@@ -27,6 +27,7 @@ from visioncal.vision.boards.kind import (
     sigma_of,
     size_of,
 )
+from visioncal.vision.hard_matches import Features, hard_matches, is_installed
 
 if TYPE_CHECKING:
     from visioncal.vision.register.image_model import Print
@@ -200,47 +201,64 @@ class _Known:
     """A picture with its features."""
 
     print_: "Print"
-    px: FloatArray  # (n, 2) features [px of the picture].
-    described: FloatArray  # (n, 128).
+    features: Features
     unfit: str  # Why no pose is known by it; empty where it is.
 
     def matched(self, image: Image) -> tuple[FloatArray, FloatArray, FloatArray] | str:
         """(3, 3) from the print [m] to an image, (n, 3) features and (n, 2) pixels; or why not."""
-        shrink = min(1.0, _SEARCHED_PX / max(image.shape))
-        px, described = _features(_shrunk(image, shrink))
-        if len(px) < _FEWEST:
+        seen = features_of(image)
+        if len(seen.px) < _FEWEST:
             return "the picture is not seen: the image is plain"
         # From the image's: a picture has more, and several of them would share one of few.
-        pairs = cv2.BFMatcher().knnMatch(described, self.described, k=2)
-        good = [one for one, other in pairs if one.distance < 0.8 * other.distance]
-        if len(good) >= _FEWEST:
-            places = self.print_.texel_m * (self.px[[match.trainIdx for match in good]] + 0.5)
-            seen = (px[[match.queryIdx for match in good]] + 0.5) / shrink - 0.5
-            flat, inside = cv2.findHomography(places, seen, cv2.USAC_MAGSAC, 3.0 / shrink)
-            if flat is not None and inside.sum() >= max(_FEWEST, 0.15 * len(good)):
-                outline = self.print_.outline_m[None, :, :2].astype(np.float32)
-                ends = cv2.perspectiveTransform(outline, flat)
-                # Seen from its front: the outline keeps its sense.
-                is_front = cv2.contourArea(ends, True) * cv2.contourArea(outline, True) > 0.0
-                if cv2.isContourConvex(ends) and is_front:
-                    off = cv2.perspectiveTransform(places[None], flat)[0] - seen
-                    # So far a lens bends what is straight.
-                    near = np.linalg.norm(off, axis=1) < 0.03 * max(image.shape)
-                    return (
-                        np.asarray(flat, float),
-                        np.pad(places, ((0, 0), (0, 1)))[near],
-                        seen[near],
-                    )
-        return f"the picture is not seen: {len(good)} features are like its own, and do not agree"
+        pairs = cv2.BFMatcher().knnMatch(seen.described, self.features.described, k=2)
+        good = [
+            (one.queryIdx, one.trainIdx) for one, two in pairs if one.distance < 0.8 * two.distance
+        ]
+        found = self._agreeing(seen, np.array(good).reshape(-1, 2))
+        if found is None and is_installed():
+            tries = (self._agreeing(seen, match) for match in hard_matches(seen, self.features))
+            found = next((one for one in tries if one is not None), None)
+        lack = f"the picture is not seen: {len(good)} features are like its own, and do not agree"
+        if found is None and len(good) >= _FEWEST and not is_installed():
+            lack += " (more views that are tilted or covered are found with visioncal[kornia])"
+        return lack if found is None else found
+
+    def _agreeing(
+        self, seen: Features, pairs: IntArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """What `matched` gives, by (m, 2) indices of features; None where they do not agree."""
+        if len(pairs) < _FEWEST:
+            return None
+        places = self.print_.texel_m * (self.features.px[pairs[:, 1]] + 0.5)
+        px, longest = seen.px[pairs[:, 0]], max(seen.shape)
+        tolerance_px = 3.0 * max(longest / _SEARCHED_PX, 1.0)
+        flat, inside = cv2.findHomography(places, px, cv2.USAC_MAGSAC, tolerance_px)
+        if flat is None or inside.sum() < max(_FEWEST, 0.15 * len(pairs)):
+            return None
+        outline = self.print_.outline_m[None, :, :2].astype(np.float32)
+        ends = cv2.perspectiveTransform(outline, flat)
+        # Seen from its front: the outline keeps its sense.
+        is_front = cv2.contourArea(ends, True) * cv2.contourArea(outline, True) > 0.0
+        if not (cv2.isContourConvex(ends) and is_front):
+            return None
+        off = cv2.perspectiveTransform(places[None], flat)[0] - px
+        # So far a lens bends what is straight.
+        near = np.linalg.norm(off, axis=1) < 0.03 * longest
+        return np.asarray(flat, float), np.pad(places, ((0, 0), (0, 1)))[near], px[near]
 
 
-def _features(grey: Image) -> tuple[FloatArray, FloatArray]:
-    """(n, 2) places of features and (n, 128) their descriptions."""
-    points, described = cv2.SIFT.create(nfeatures=_FEATURES).detectAndCompute(grey, None)
-    if not points:
-        return np.zeros((0, 2)), np.zeros((0, 128))
+def features_of(grey: Image) -> Features:
+    """Features of a (h, w) image, found in a reduced copy where it is large."""
+    shrink = min(1.0, _SEARCHED_PX / max(grey.shape))
+    points, described = cv2.SIFT.create(nfeatures=_FEATURES).detectAndCompute(
+        _shrunk(grey, shrink), None
+    )
+    described = np.zeros((0, 128)) if described is None else described
     root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
-    return np.array([point.pt for point in points]), np.asarray(root, np.float32)
+    circles = np.array([(*one.pt, one.size, one.angle) for one in points]).reshape(-1, 4)
+    px = (circles[:, :2] + 0.5) / shrink - 0.5
+    diameters, angles = circles[:, 2] / shrink, circles[:, 3]
+    return Features(px, diameters, angles, np.asarray(root, np.float32), grey.shape)
 
 
 @lru_cache(maxsize=8)
@@ -250,14 +268,13 @@ def _known(target: PictureTarget) -> _Known:
     grey = Picture().picture(target)
     assert grey is not None
     print_ = Print(np.asarray(grey / 255, np.float32), target.square_m / grey.shape[1], np.zeros(2))
-    shrink = min(1.0, _SEARCHED_PX / max(grey.shape))
-    px, described = _features(_shrunk(grey, shrink))
-    return _Known(print_, (px + 0.5) / shrink - 0.5, described, unfit(grey, len(px)))
+    features = features_of(grey)
+    return _Known(print_, features, unfit(grey, len(features.px)))
 
 
 def unfit(grey: Image, features: int | None = None) -> str:
     """Why no pose is known by a picture (h, w), as a part of a sentence; empty where one is."""
-    if grey.std() < _PLAIN or (len(_features(grey)[0]) if features is None else features) < 60:
+    if grey.std() < _PLAIN or (len(features_of(grey).px) if features is None else features) < 60:
         return "is too plain: it has too few features to be found by"
     small = _shrunk(grey, 48 / max(grey.shape)).astype(float)
     if _alike(small, small[::-1, ::-1]):

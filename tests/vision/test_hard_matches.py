@@ -1,0 +1,111 @@
+"""Matches by kornia, where it is installed; and what stands without it."""
+
+import subprocess
+import sys
+from unittest.mock import Mock
+
+import cv2
+import numpy as np
+import pytest
+from support.printed import poster
+
+from visioncal.vision.boards import picture
+from visioncal.vision.boards.picture import features_of
+from visioncal.vision.hard_matches import hard_matches, is_installed, light_glue
+from visioncal.vision.register.image_model import Print
+
+needs_kornia = pytest.mark.skipif(not is_installed(), reason="kornia is not installed")
+# Its modules warn of what they will leave out.
+quiet = pytest.mark.filterwarnings("default")
+
+
+def turned(grey):
+    """A picture seen from aside, and where (n, 2) of its pixels are then."""
+    height, width = grey.shape
+    ends = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    seen = np.array([[80, 60], [420, 140], [400, 330], [60, 420]], np.float32)
+    flat = cv2.getPerspectiveTransform(ends, seen)
+    image = cv2.warpPerspective(grey, flat, (640, 480), flags=cv2.INTER_AREA, borderValue=110)
+    return image, lambda px: cv2.perspectiveTransform(px[None], flat)[0]
+
+
+@needs_kornia
+@quiet
+def test_matches_by_neighbours_are_right():
+    grey = poster()
+    image, where = turned(grey)
+    seen, known = features_of(image), features_of(grey)
+    pairs = next(hard_matches(seen, known))
+    off = np.linalg.norm(where(known.px[pairs[:, 1]]) - seen.px[pairs[:, 0]], axis=1)
+    assert len(pairs) > 30
+    # A feature is found to a pixel or two.
+    assert np.mean(off < 5.0) > 0.8
+
+
+@needs_kornia
+@quiet
+def test_weights_in_the_cache_are_used_and_others_refused(tmp_path, monkeypatch):
+    import torch
+    from kornia.feature import LightGlue
+
+    torch.manual_seed(0)
+    sizes = {"input_dim": 128, "descriptor_dim": 64, "n_layers": 2, "add_scale_ori": True}
+    network = LightGlue(None, **sizes)
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    file = folder / "sift_lightglue.pth"
+    # Under the authors' older names.
+    state = {
+        ".".join([name.split(".")[2], name.split(".")[1], *name.split(".")[3:]])
+        if name.startswith("transformers.")
+        else name: value
+        for name, value in network.state_dict().items()
+    }
+    torch.save(state, file)
+    loaded = light_glue(file)
+    assert not loaded.training
+    for name, value in network.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value), name
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    grey = poster(size=(400, 300))
+    ways = list(hard_matches(features_of(grey), features_of(grey)))
+    assert [way.shape[1] for way in ways] == [2, 2]
+    torch.save({"transformers.0.self_attn.Wqkv.weight": torch.zeros(3, 3)}, file)
+    with pytest.raises((ValueError, RuntimeError)):
+        light_glue(file)
+
+
+def test_a_picture_is_found_by_other_matches_where_its_own_fail(monkeypatch):
+    grey = poster()
+    image, where = turned(grey)
+    seen, known = features_of(image), features_of(grey)
+    nearest = np.array([
+        (at, np.argmin(np.linalg.norm(where(known.px) - px, axis=1)))
+        for at, px in enumerate(seen.px)
+    ])  # fmt: skip
+    near = np.linalg.norm(where(known.px[nearest[:, 1]]) - seen.px, axis=1) < 2.0
+    matched = picture._Known(flat_print(grey), known, "")
+    # A ratio test that nothing passes.
+    monkeypatch.setattr(cv2, "BFMatcher", lambda: Mock(knnMatch=lambda *_, **__: []))
+    monkeypatch.setattr(picture, "is_installed", lambda: False)
+    assert "not seen" in matched.matched(image)
+    monkeypatch.setattr(picture, "is_installed", lambda: True)
+    monkeypatch.setattr(picture, "hard_matches", lambda *_: iter([nearest[near]]))
+    flat, places, px = matched.matched(image)
+    off = cv2.perspectiveTransform(places[None, :, :2], flat)[0] - px
+    assert np.median(np.linalg.norm(off, axis=1)) < 2.0
+
+
+def test_nothing_of_it_is_imported_without_a_picture():
+    code = (
+        "import sys, visioncal.calibration.run, visioncal.vision.boards; "
+        "heavy = ('torch', 'kornia', 'visioncal.vision.register', 'visioncal.vision.patches', "
+        "'visioncal.vision.dense'); "
+        "print([name for name in sys.modules if name.startswith(heavy)])"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
+
+
+def flat_print(grey):
+    return Print(grey.astype(np.float32) / 255, 0.3 / grey.shape[1], np.zeros(2))
