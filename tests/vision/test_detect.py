@@ -18,7 +18,7 @@ from support.commands import visioncal
 from support.marks import slow
 from support.refusals import raised
 
-from visioncal.calibration.stages.detect import detect
+from visioncal.calibration.stages.detect import detect, unshown_rows
 from visioncal.cli.target import to_toml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
@@ -174,6 +174,22 @@ def test_another_layout_than_declared_is_named(charuco, declared, correction):
     words = "another board than declared: ChArUco board of 9 x 6"
     caught = raised(DataError, words, detect, session)
     assert caught.next_step.startswith(correction)
+
+
+@pytest.mark.parametrize(
+    ("described", "kind"), [(4, "aprilgrid"), (6, "aprilgrid"), (8, "charuco")]
+)
+def test_an_aprilgrid_with_more_rows_than_printed_is_named(described, kind):
+    cell, images = images_of(CellOptions(views=6, target=BOARDS[kind], cut_views=0.0, seed=3), 6)
+    files = {f"{at}.png": encoded(image) for at, image in enumerate(images)}
+    session = session_of(files, replace(cell.options.target, rows=described))
+    found = [*unshown_rows(session, detect(session))]
+    # A ChArUco board's frame begins at its first marker, whatever rows follow.
+    assert len(found) == (described == 6)
+    for finding in found:
+        assert "the upper 2 of the 6 rows" in finding.words
+        assert "begins 83.2 mm above" in finding.words
+        assert "write rows = 4 in" in finding.do.words
 
 
 def seen_by_a_fisheye(target, turn, depth_m, resolution, *matrix):

@@ -7,7 +7,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.calibration.stages.detect import Detections, detect, image_of, other_sizes
+from visioncal.calibration.stages.detect import (
+    Detections,
+    detect,
+    image_of,
+    other_sizes,
+    unshown_rows,
+)
 from visioncal.calibration.stages.error_sizes import solve_session
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
@@ -67,7 +73,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                     pictures=seen.pictures,
                 )
             seen = replace(seen, searches={**seen.searches, **found.searches})
-            seen = seen.noting((), other_sizes(found))
+            seen = seen.noting((), (*other_sizes(found), *unshown_rows(session, found)))
             if seen.dense is not None:
                 seen, found = _with_dense(seen, views, found)
             corners, resolution = found.corners, found.resolution

@@ -11,11 +11,14 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import cv2
+import numpy as np
 
 from visioncal.calibration.stages.corner_numbers import lack_of_corners, usable_corners
 from visioncal.calibration.stages.other_board import (
+    LOOKED_AT,
     MEND_IMAGES,
     OtherBoardError,
+    board_correction,
     other_board,
     spread,
 )
@@ -189,6 +192,50 @@ def other_sizes(detections: Detections) -> Iterator[Finding]:
             f"{width} x {height} px, and the camera's are {usual[0]} x {usual[1]}.",
             Remedy("Write a copy of the session in which all are alike.", MEND_IMAGES),
             tuple(odd),
+        )
+
+
+def unshown_rows(session: Session, detections: Detections) -> Iterator[Finding]:
+    """Findings on rows that a board may lack, where its frame would begin at another place.
+
+    An AprilGrid's tags count from the lower left, and its frame begins at the upper left: with more
+    rows described than printed, all of its tags are where they should be, and the frame is not.
+    """
+    for name, target in session.boards.items():
+        views = [view.number for view in session.views if session.board_of(view) == name]
+        searches = (detections.searches[view] for view in views if view in detections.searches)
+        seen = [at.found for at in searches if isinstance(at.found, Corners)]
+        places = corner_positions(target)
+        last = max((int(at.ids.max()) for at in seen), default=len(places) - 1)
+        lacking = target.rows - -(-(last + 1) * target.rows // len(places))
+        beyond = places[len(places) - lacking * len(places) // max(target.rows, 1) :, :2]
+        if not lacking or beyond[:, 1].max() > places[: last + 1, 1].min():
+            continue
+        # The next row, with the squares around it.
+        low, high = beyond.min(axis=0), beyond.max(axis=0)
+        gap_m = target.spacing * target.square_m
+        low[1] = high[1] - target.square_m
+        (left, up), (right, down) = low - gap_m, high + gap_m
+        outline = np.array([[[left, up], [right, up], [right, down], [left, down]]])
+        in_view = []
+        for at in seen:
+            px_from_board = np.asarray(cv2.findHomography(places[at.ids, :2], at.px)[0], float)
+            if px_from_board.shape != (3, 3):
+                continue
+            px = cv2.perspectiveTransform(outline, px_from_board)[0]
+            if np.all((px > 0) & (px < np.array(detections.resolution) - 1.0)):
+                in_view.append(at.view)
+        if len(in_view) < LOOKED_AT:
+            continue
+        write, command = board_correction(session, name, f"rows = {target.rows - lacking}")
+        up_mm = 1e3 * lacking * (target.square_m + gap_m)
+        yield Finding(
+            "unshown_rows",
+            f"No image shows the upper {lacking} of the {target.rows} rows of {target.name}, which "
+            f"would lie within view {ranges(in_view)}: it may have {target.rows - lacking}, and "
+            f"its frame begins {up_mm:.4g} mm above these.",
+            Remedy(f"Count the rows, and {write}; where they are covered, uncover them.", command),
+            tuple(in_view),
         )
 
 

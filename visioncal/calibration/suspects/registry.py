@@ -101,6 +101,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("corner_numbers", chance=FACT),
     Suspect("other_board", _unseen, FACT, hides=("lost_views",)),
     Suspect("mirrored_images", chance=FACT, hides=("lost_views",)),
+    Suspect("unshown_rows", chance=FACT),
     Suspect("image_sizes", chance=FACT, hides=("lost_views",)),
     Suspect("other_lens", chance=FACT),
     Suspect("lost_views", chance=REMARK),
