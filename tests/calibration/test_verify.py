@@ -133,6 +133,13 @@ def test_triggers_fire_by_their_limits_and_say_what_is_not_known():
     }
     assert "12 K (limit 10)" in told["ambient_change_k"].words
     assert told["age_days"].value == 200.0
+    own = {"ambient_change_k": 15.0, "age_days": 180.0, "payload_change_kg": None}
+    other = triggers_of(replace(session, views=warm), calibration, limits=own, **also)
+    assert {trigger.quantity for trigger in other if trigger.state == "fired"} == {
+        "collision",
+        "age_days",
+    }
+    assert "200 days (limit 180)" in next(at.words for at in other if at.quantity == "age_days")
 
 
 @pytest.fixture(scope="module")

@@ -464,6 +464,19 @@ def off_mm(document):
 # --- What it finds.
 
 
+def test_a_frame_is_taken_out_again(tmp_path):
+    file, touches = tmp_path / "frames.json", tmp_path / "touches.csv"
+    touches.write_text(visioncal("tcp", "--example").out)
+    for name in ("gripper", "probe"):
+        assert visioncal("tcp", touches, "-o", file, "--name", name).status == 0
+    visioncal("tcp", "-o", file, "--remove").refused("has no flange_from_tool", "probe")
+    visioncal("tcp", touches, "-o", file, "--name", "probe", "--remove").refused("places nothing")
+    done = visioncal("tcp", "-o", file, "--name", "probe", "--remove")
+    assert "flange_from_probe is no longer in" in done.out
+    assert [*FrameFile.load(file).frames] == ["flange_from_gripper"]
+    visioncal("tcp", "--name", "gripper", "--remove").refused("Name where it is with -c or -o")
+
+
 def test_five_real_touches(real_data):
     done = visioncal("tcp", real_data / "tcp_pivot_rvbust/poses.csv", "--json")
     tool = found(done)

@@ -254,6 +254,34 @@ def test_another_page_is_named(change, words):
     assert re.search(words, found.reason), found.reason
 
 
+def test_kalibrs_own_file_describes_a_board(tmp_path):
+    """Its form is that of the wiki of Kalibr, "Calibration targets"."""
+    grid = tmp_path / "april_6x4.yaml"
+    grid.write_text(
+        "target_type: 'aprilgrid' #gridtype\ntagCols: 6  #number of apriltags\ntagRows: 4\n"
+        "tagSize: 0.032 #[m]\ntagSpacing: 0.3\ncodeOffset: 0\n"
+    )
+    read, shipped = load_target(grid), load_target("aprilgrid_6x4_32mm")
+    assert replace(read, name=shipped.name, square_sigma_m=shipped.square_sigma_m) == shipped
+    squares = tmp_path / "board.yml"
+    text = "target_type: checkerboard\ntargetCols: 6\ntargetRows: 7\nrowSpacingMeters: {}\n"
+    text += "colSpacingMeters: 0.06\n"
+    squares.write_text(text.format(0.06))
+    board = load_target(squares)
+    assert (board.kind, board.columns, board.rows, board.square_m) == ("checkerboard", 6, 7, 0.06)
+    squares.write_text(text.format(0.05))
+    raised(DataError, "rowSpacingMeters is 0.05; as much as colSpacing", load_target, squares)
+    squares.write_text("target_type: circlegrid\n")
+    raised(DataError, "target_type is 'circlegrid'", load_target, squares)
+    # What is written of a session has a description of our own.
+    document = {"schema": 1, "name": "a", "mount": "eye-in-hand", "target": grid.name}
+    document["camera"] = {"resolution": [640, 480]}
+    (tmp_path / "session.toml").write_text(tomli_w.dumps(document))
+    (tmp_path / "views.csv").write_text("view,image\n0,a.png\n")
+    Session.load(tmp_path).save(tmp_path / "copy")
+    assert Session.load(tmp_path / "copy").target == replace(read, name="april_6x4")
+
+
 def test_the_grid_of_a_kalibr_target_in_one_word():
     expected = {"kind": "aprilgrid", "columns": 6, "rows": 5, "size_m": 0.088, "spacing": 0.3}
     assert read_target_description("aprilgrid_6x5_88mm_0.3") == expected

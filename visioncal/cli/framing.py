@@ -158,6 +158,10 @@ def place_frame(
             each other.
     """
     source = request.touches
+    if request.remove:
+        refuse_given({"TOUCHES": source}, "--remove places nothing")
+        _remove(request, kind)
+        return
     if source is None:
         command = "tcp" if kind == "tool" else "fixture"
         raise DataError(
@@ -196,6 +200,25 @@ def place_frame(
         with shown_progress(quiet=request.as_json) as progress:
             frame = seen_frame(session, place.calibration, kind, point_m, progress=progress)
     _keep_and_report(place, frame, source, request)
+
+
+def _remove(request: FrameOptions, kind: FrameKind) -> None:
+    """Takes a tool or a fixture out of its calibration or file; raises DataError."""
+    place = _place(replace(request, force=True), kind, Choice(robot=request.robot), ARM)
+    destination = place.file or place.folder
+    left = {name: frame for name, frame in place.frames.items() if name != place.name}
+    if destination is None or len(left) == len(place.frames):
+        kept = f"It has {listed([*left])}." if left else "Name where it is with -c or -o."
+        raise DataError(
+            f"{destination or 'Nothing that was named'} has no {place.name}.",
+            culprits=[place.name],
+            next_step=f"{kept} --name is the part after _from_.",
+        )
+    if place.file is not None:
+        FrameFile(left).save(place.file)
+    elif place.folder is not None and place.result is not None:
+        report_written(rewrite_result(place.folder, replace(place.result, frames=left)), quiet=True)
+    answer(f"{place.name} is no longer in {destination}")
 
 
 def _check_paths(request: FrameOptions, cad: Path | None, needs_tool: bool) -> None:

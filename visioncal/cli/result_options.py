@@ -157,6 +157,11 @@ class VerifyOptions(PartOptions, PageOptions, ActOptions):
     )
     board_moved: bool = flag("The board was put elsewhere on purpose.")
     collision: bool = flag("A collision was reported since.")
+    most_days: float | None = option("Age beyond which to calibrate again; else 365.", min=0.0)
+    most_kelvin: float | None = option(
+        "Change of the ambient temperature beyond which to; else 10 K.", min=0.0
+    )
+    most_kg: float | None = option("Change of the payload beyond which to; else 5 kg.", min=0.0)
     output: Path | None = out_folder(
         f"A folder for {REPORT}, {VERIFY} and a recording.", "-o", "--output"
     )
@@ -360,6 +365,7 @@ class FrameOptions(RobotPoseOptions, PartOptions, ActOptions):
     out: Path | None = option("A file of frames (.json) to put it into, instead.", "-o", "--out")
     name: str | None = option("Name of the frame: gripper, jig_2.")
     force: bool = force_flag()
+    remove: bool = flag("Take the frame of this name out of there again, without touches.")
     touch_noise: float | None = option(
         "Sigma of touches, per axis.", "--touch-noise-mm", min=1e-4, max=1e3
     )

@@ -52,7 +52,15 @@ def verify_command(options: VerifyOptions) -> None:
             loaded, calibration, board_placed_anew=options.board_moved, progress=progress
         )
     triggers = triggers_of(
-        loaded, calibration, failed=not check.passed, collision=options.collision
+        loaded,
+        calibration,
+        failed=not check.passed,
+        collision=options.collision,
+        limits={
+            "ambient_change_k": options.most_kelvin,
+            "payload_change_kg": options.most_kg,
+            "age_days": options.most_days,
+        },
     )
     verdict = verdict_of(check).with_paths(options.session, against, ["visioncal", *sys.argv[1:]])
     content = to_document(check, triggers, verdict)

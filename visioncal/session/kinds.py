@@ -158,7 +158,7 @@ def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None
 
 def is_file(name: object) -> bool:
     """Whether the name of a target or a robot is a path, not a built-in name."""
-    return isinstance(name, str) and name.lower().endswith(ROBOT_SUFFIXES)
+    return isinstance(name, str) and name.lower().endswith((*ROBOT_SUFFIXES, ".yaml", ".yml"))
 
 
 def outside_notes(declaration: Declaration, folder: Path | None) -> Iterator[str]:

@@ -89,7 +89,8 @@ def _placed_files(session: "Session") -> tuple[dict[str, Any], dict[str, str | b
             if described is None or not is_file(stated):
                 continue
             if kind == "target":
-                path = _place_inside(stated, f"target_{name}.toml" if name else "target.toml")
+                toml = f"{stated.rpartition('.')[0]}.toml"
+                path = _place_inside(toml, f"target_{name}.toml" if name else "target.toml")
                 content, tables = stored_target(described, Path(path).stem)
                 text = tomli_w.dumps(content)
             else:

@@ -79,12 +79,35 @@ def read_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[st
         DataError: There is no such target, or its description is wrong.
     """
     path = find_described(
-        name_or_path, what="target", shipped=_shipped(), suffixes=(".toml",), folder=folder
+        name_or_path,
+        what="target",
+        shipped=_shipped(),
+        suffixes=(".toml", ".yaml", ".yml"),
+        folder=folder,
     )
-    document = read_toml(path, path.name)
+    document = read_toml(path, path.name) if path.suffix == ".toml" else _of_kalibr(path)
     if document.get("kind") in KINDS:
         document = KINDS[document["kind"]].loaded(document, path.parent)
     return target_from_document(document, path.stem), document
+
+
+def _of_kalibr(path: Path) -> dict[str, Any]:
+    """The content of a `.toml` by Kalibr's target `.yaml` (its wiki, "Calibration targets")."""
+    # Imported here, as few boards are described so.
+    from visioncal.core.documents.structured import read_yaml
+
+    stated = read_yaml(path)
+    table = DocumentTable(stated if isinstance(stated, Mapping) else {}, str(path))
+    kind = table.choice("target_type", ("aprilgrid", "checkerboard"))
+    if kind == "aprilgrid":
+        keys = {"columns": "tagCols", "rows": "tagRows", "size_m": "tagSize"}
+        keys["spacing"] = "tagSpacing"
+    else:
+        keys = {"columns": "targetCols", "rows": "targetRows", "square_m": "colSpacingMeters"}
+        if table.number("rowSpacingMeters") != table.number("colSpacingMeters"):
+            row, needed = table.number("rowSpacingMeters"), "as much as colSpacingMeters"
+            raise table.refuse("rowSpacingMeters", row, needed)
+    return {"kind": kind, **{own: table.content.get(key) for own, key in keys.items()}}
 
 
 def misspelt_keys(document: Mapping[str, Any]) -> Iterator[str]:

@@ -1,7 +1,9 @@
 """Triggers of a recalibration: a failed check, a collision, other conditions, age."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
+from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -11,7 +13,7 @@ from visioncal.session import Session
 
 State: TypeAlias = Literal["fired", "quiet", "unknown"]
 
-# Quantities in words, with limit, unit and the column of the sessions that has it.
+# Quantities in words, with usual limit, unit and the column of the sessions that has it.
 _LIMITS = {
     "ambient_change_k": ("the ambient temperature's change", 10.0, "K", "ambient_c"),
     "payload_change_kg": ("the payload's change", 5.0, "kg", "payload_kg"),
@@ -41,6 +43,7 @@ def triggers_of(
     *,
     failed: bool,
     collision: bool,
+    limits: Mapping[str, float | None] = MappingProxyType({}),
     now: datetime | None = None,
 ) -> tuple[Trigger, ...]:
     """Evaluates each trigger.
@@ -50,13 +53,15 @@ def triggers_of(
         calibration: The checked calibration, with the mean conditions of its views.
         failed: Whether the check failed.
         collision: Whether a collision was reported.
+        limits: Other limits than the usual ones by quantity; None where the usual one holds.
         now: The time; that of the clock where None.
     """
     triggers = [
         Trigger("failed_check", "fired" if failed else "quiet", "a failed check"),
         Trigger("collision", "fired" if collision else "quiet", "a collision"),
     ]
-    for quantity, (label, limit, unit, column) in _LIMITS.items():
+    for quantity, (label, usual, unit, column) in _LIMITS.items():
+        limit = usual if (own := limits.get(quantity)) is None else own
         found = (
             _change(session, calibration, column)
             if column
