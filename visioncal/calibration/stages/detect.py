@@ -207,9 +207,9 @@ def unshown_rows(session: Session, detections: Detections) -> Iterator[Finding]:
         seen = [at.found for at in searches if isinstance(at.found, Corners)]
         places = corner_positions(target)
         last = max((int(at.ids.max()) for at in seen), default=len(places) - 1)
-        lacking = target.rows - -(-(last + 1) * target.rows // len(places))
-        beyond = places[len(places) - lacking * len(places) // max(target.rows, 1) :, :2]
-        if not lacking or beyond[:, 1].max() > places[: last + 1, 1].min():
+        missing = target.rows - -(-(last + 1) * target.rows // len(places))
+        beyond = places[len(places) - missing * len(places) // max(target.rows, 1) :, :2]
+        if not missing or beyond[:, 1].max() > places[: last + 1, 1].min():
             continue
         # The next row, with the squares around it.
         low, high = beyond.min(axis=0), beyond.max(axis=0)
@@ -227,12 +227,12 @@ def unshown_rows(session: Session, detections: Detections) -> Iterator[Finding]:
                 in_view.append(at.view)
         if len(in_view) < LOOKED_AT:
             continue
-        write, command = board_correction(session, name, f"rows = {target.rows - lacking}")
-        up_mm = 1e3 * lacking * (target.square_m + gap_m)
+        write, command = board_correction(session, name, f"rows = {target.rows - missing}")
+        up_mm = 1e3 * missing * (target.square_m + gap_m)
         yield Finding(
             "unshown_rows",
-            f"No image shows the upper {lacking} of the {target.rows} rows of {target.name}, which "
-            f"would lie within view {ranges(in_view)}: it may have {target.rows - lacking}, and "
+            f"No image shows the upper {missing} of the {target.rows} rows of {target.name}, which "
+            f"would lie within view {ranges(in_view)}: it may have {target.rows - missing}, and "
             f"its frame begins {up_mm:.4g} mm above these.",
             Remedy(f"Count the rows, and {write}; where they are covered, uncover them.", command),
             tuple(in_view),
