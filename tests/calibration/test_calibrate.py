@@ -1,6 +1,7 @@
 """The whole way: a folder goes in, and a result comes out, or what is wrong and what to type."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -276,6 +277,15 @@ def test_nothing_is_wrong_with_a_sound_session(sound):
     done = command("doctor", sound)
     assert (done.status, done.err) == (0, "")
     assert f"visioncal calibrate {sound} -o out" in done.out
+    assert re.search(r"in 15 images, over [5-9]\d % of their width and [5-9]\d % of", str(found))
+
+
+def test_stops_that_are_too_few_to_check_a_result_are_counted(sound):
+    views = Session.load(sound).only(range(6))
+    (found,) = visioncal.doctor(views).findings
+    assert found.kind == "few_stops"
+    assert found.words == "6 stops can be used; 10 or more are needed to check a result."
+    assert "Add 5 views or more" in found.do.words
 
 
 def first_of_blurred(shown, sigma_px):

@@ -174,9 +174,20 @@ def _motion(run: RunState) -> Iterator[Finding]:
             ),
             views,
         )
+    limits, used = CalibrationLimits(), np.flatnonzero(inliers.used).tolist()
+    poses = (run.base_from_flange.get(cell.rows[at].view) for at in used)
+    stops, needed = len({pose.tobytes() for pose in poses if pose is not None}), limits.stops[0]
+    if 0 < stops < needed:
+        yield Finding(
+            "few_stops",
+            f"{counted(stops, 'stop')} can be used; {needed} or more are needed to check a result.",
+            Remedy(
+                f"Add {max(5, needed - stops)} views or more, tilted by 20 to 40 degrees about "
+                "different axes; with another corner of the image filled in each."
+            ),
+        )
     repeats_mm, _ = REPEATABILITY if run.robot is None else run.robot.repeatability
     rad, metres = inliers.fit.noise.robots[0].tolist()
-    limits = CalibrationLimits()
     too_few_digits = rounded(run, next(iter(run.session.robots)), 1e3 * metres, np.rad2deg(rad))
     if too_few_digits is not None:
         yield too_few_digits
@@ -199,7 +210,12 @@ def _contents(run: RunState) -> Iterator[str]:
         there = sum(session.images.exists(image) for image in images)
         yield f"{there} of {counted(len(images), 'image')}"
     for look in run.cameras.values():
-        yield f"the board in {counted(len(look.corners), 'image' if images else 'view')}"
+        seen = f"the board in {counted(len(look.corners), 'image' if images else 'view')}"
+        px = np.vstack([np.zeros((0, 2)), *(at.px for at in look.corners.values())])
+        if len(px) and look.resolution is not None:
+            wide, high = 100.0 * np.ptp(px, axis=0) / look.resolution
+            seen += f", over {wide:.0f} % of their width and {high:.0f} % of their height"
+        yield seen
     for robot, reported in run.robots.items():
         # Rows of one stop share a pose.
         if poses := {pose.tobytes() for pose in reported.base_from_flange.values()}:
