@@ -217,6 +217,46 @@ def test_of_long_sessions_every_row_is_named():
     assert len(found.found.views) == 107
 
 
+def test_views_that_a_symmetric_board_lets_read_turned_are_said_and_turned_back(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    robot, boards = poses_of(MOUNTS[0])
+    size, matrix = (1280, 960), np.array([[1100.0, 0.0, 640.0], [0.0, 1100.0, 480.0], [0, 0, 1.0]])
+    empty = [(np.arange(0), np.zeros((0, 2)))] * len(robot)
+    # Half a turn maps its pattern onto itself.
+    name = str(tmp_path / "board.toml")
+    Path(name).write_text('kind = "checkerboard"\ncolumns = 8\nrows = 6\nsquare_m = 0.028\n')
+    points = corner_positions(
+        next(iter(Session.from_corners(empty, robot, name, size).boards.values()))
+    )
+    # The middle of the board before the camera.
+    boards = boards @ compose(np.eye(3), -points.mean(axis=0))
+    rng, seen, read_turned = np.random.default_rng(2), [], (3, 4, 11)
+    x, z = exp(np.array([0.1, -0.2, 0.3, 0.05, 0.02, 0.1])), exp(np.array([0, 0, 0.4, 0.7, 0, 0]))
+    robot = z @ invert(boards) @ invert(x)
+    for view, pose in enumerate(boards):
+        px = cv2.projectPoints(points, *split(pose), matrix, None)[0][:, 0]
+        ids = np.arange(len(points))
+        seen.append((ids[::-1] if view in read_turned else ids, px + rng.normal(0, 0.1, px.shape)))
+    Session.from_corners(seen, robot, name, size).save(tmp_path / "cell")
+    found = visioncal.calibrate(tmp_path / "cell")
+    # The fit had turned them back: nothing is doubted.
+    assert found.verdict.status == "good"
+    (said,) = (note for note in found.verdict.findings if note.kind == "turned_views")
+    assert said.views == read_turned
+    assert "as if it was turned by 180 deg" in said.words
+    written = said.do.command.partition("--turned ")[2].split(" ")[0]
+    assert written.startswith("3-4,11:180,")
+    done = typed("convert", "cell", "cell-fixed", "--turned", written)
+    assert done.status == 0, done.said
+    again = visioncal.calibrate(tmp_path / "cell-fixed")
+    assert "turned_views" not in {note.kind for note in again.verdict.findings}
+    for edge_name, edge in found.edges.items():
+        # The same corners under the same numbers.
+        np.testing.assert_allclose(again.edges[edge_name].matrix, edge.matrix, atol=1e-6)
+
+
 def test_corners_are_numbered_back_and_views_without_partner_go():
     px = np.random.default_rng(0).uniform(0, 600, (4, 20, 2))
     # The 8 x 5 inner corners of the board, the first of which is one square from both edges.

@@ -1,6 +1,7 @@
 """Verdicts: each doubt with its sentence, what a task needs, and causes by their probability."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -314,7 +315,12 @@ def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():
     cause = calibrate(session_of(cell, flange)).verdict.causes[0]
     assert cause.kind == "something_moved"
     # Of the two parts the larger one is kept.
-    assert "from view 12 on, the camera, the target or a frame of the controller" in cause.words
+    assert "from view 12 on, the camera or the controller's tool was another one" in cause.words
+    # What the controller's table of tools has to be compared with.
+    x, y, z = re.search(r"tool by \(([^)]*)\) mm and 49 deg", cause.words)[1].split(", ")
+    np.testing.assert_allclose(
+        [float(x), float(y), float(z)], 1e3 * switched[:3, 3], atol=0.5, rtol=0.01
+    )
 
 
 def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:

@@ -80,9 +80,11 @@ def _degrees(poses: Poses, rng: np.random.Generator) -> Poses:
     return replace(told, robot=numbers(told.robot.poses()))
 
 
-def _wrapped(poses: Poses, _: np.random.Generator) -> Poses:
-    """Degrees taken for radians that were made into quaternions, and lost their whole turns."""
+def _wrapped(poses: Poses, rng: np.random.Generator) -> Poses:
+    """Degrees taken for radians, or vectors for angles, that were made into quaternions."""
     told = _told(poses, "rotation-vector-deg", "m", Reading("rotation-vector"))
+    if rng.integers(2):
+        told = _told(poses, "rotation-vector", "m", Reading("euler-xyz-rad"))
     return replace(told, robot=numbers(told.robot.poses()))
 
 

@@ -46,7 +46,8 @@ class SideReading(Reading):
     @property
     def has_lost_turns(self) -> bool:
         """Whether whole turns about the tool's last axis are lost, which a camera cannot show."""
-        return bool(self.by_place) and self.rotation.startswith("euler")
+        is_of_degrees = self.rotation.startswith("euler") and self.rotation.endswith("deg")
+        return bool(self.by_place) and is_of_degrees
 
     def rotations(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 3, 3) rotations as they are written; NaN where the numbers give none."""

@@ -204,7 +204,7 @@ def search(recording: Recording) -> list[Candidate]:
 
 
 def _unwrapped(recording: Recording) -> Iterator[Change]:
-    """The reading of rotations whose degrees were taken for radians."""
+    """The reading of rotations whose numbers were taken for others and lost whole turns."""
     rows, declared = recording.common_rows, recording.declared
     numbers = recording.robot.rows(rows)
     poses = declared.robot.poses(numbers)
@@ -213,10 +213,12 @@ def _unwrapped(recording: Recording) -> Iterator[Change]:
     found = unwrapped(poses[there, :3, :3], poses[there, :3, 3], seen[there], recording.mount)
     if found is None:
         return
-    form, rotations = found
+    (taken, form), rotations = found
     places = (numbers.places[at] for at in np.flatnonzero(there))
     by_place = zip(places, map(tuple, rotations.reshape(-1, 9).tolist()), strict=True)
-    words = f"the robot's rotations as {ROTATION_FORMS[form].words}, which were taken for radians"
+    was, other = ROTATION_FORMS[form].words, ROTATION_FORMS[taken].words
+    other = "radians" if form.endswith("deg") else other
+    words = f"the robot's rotations as {was}, which were taken for {other}"
     yield Change(words, "robot", {"rotation": form, "by_place": tuple(by_place)}, 2)
 
 

@@ -1,4 +1,4 @@
-"""Rotations whose angles in degrees were taken for radians, which lost whole turns.
+"""Rotations whose numbers were taken for others, as degrees for radians, and lost whole turns.
 
 The robot's positions, which are right, place both edges but for a rotation of the tool. The
 recorded rotation of one view gives it for each number of turns that its angles may have lost; the
@@ -22,19 +22,22 @@ _TURN = 2.0 * np.pi
 _ALIKE_RAD, _CHECKED, _WRONG = 0.5, 8, 2
 
 
-def _forms() -> Iterator[str]:
-    """Names, without unit, of rotations that robot makers write in degrees."""
+def _forms() -> Iterator[tuple[str, str]]:
+    """Names of forms that robots write, after those which they are taken for."""
     orders = {form.rotation.split("-")[1] for form in POSE_FORMS.values() if "eul" in form.rotation}
     # Angles about fixed axes are those about moving ones in reverse order.
     moving = {order if order.isupper() else order[::-1].upper() for order in orders}
+    yield "rotation-vector", "rotation-vector-deg"
+    for angles in ("euler-xyz-rad", "euler-ZYX-rad", "euler-XYZ-rad"):
+        yield from ((angles, "rotation-vector"), ("rotation-vector", angles))
     # Roll, pitch and yaw first: they are the most common.
-    yield from ("rotation-vector", *(f"euler-{order}" for order in sorted(moving, reverse=True)))
+    yield from ((f"euler-{order}-rad", f"euler-{order}-deg") for order in sorted(moving)[::-1])
 
 
 def unwrapped(
     recorded: FloatArray, positions: FloatArray, camera: FloatArray, mount: Mount
-) -> tuple[str, FloatArray] | None:
-    """Rotations before their degrees were taken for radians, after the name of their form.
+) -> tuple[tuple[str, str], FloatArray] | None:
+    """Rotations before their numbers were taken for others, after the names of both forms.
 
     Args:
         recorded: (n, 3, 3) rotations of the flange as recorded.
@@ -45,10 +48,10 @@ def unwrapped(
     if len(camera) <= _CHECKED:
         return None
     turned = _turned_as_seen(positions, invert(camera) if mount == "eye-in-hand" else camera)
-    for form, first in product(_forms() if len(turned) else (), range(_WRONG + 1)):
-        rotations = _with_turns(recorded, turned, first, form)
+    for forms, first in product(_forms() if len(turned) else (), range(_WRONG + 1)):
+        rotations = _with_turns(recorded, turned, first, forms)
         if rotations is not None:
-            return f"{form}-deg", rotations
+            return forms, rotations
     return None
 
 
@@ -81,51 +84,55 @@ def _turned_as_seen(positions: FloatArray, seen: FloatArray) -> FloatArray:
 
 
 def _with_turns(
-    recorded: FloatArray, turned: FloatArray, first: int, form: str
+    recorded: FloatArray, turned: FloatArray, first: int, forms: tuple[str, str]
 ) -> FloatArray | None:
     """(n, 3, 3) rotations with their whole turns; None where the views show none that fit."""
-    rad = ROTATION_FORMS["rotation-vector" if form == "rotation-vector" else f"{form}-rad"]
-    deg = ROTATION_FORMS[f"{form}-deg"]
-    tools = turned[first].T @ deg.read(_rivals(rad.write(recorded[[first]])[0], form))
+    taken, written = (ROTATION_FORMS[form] for form in forms)
+    tools = turned[first].T @ written.read(_rivals(taken.write(recorded[[first]])[0], *forms))
     wrong = 0
     for view in [at for at in range(len(recorded)) if at != first][:_CHECKED]:
-        again = rad.read(deg.write(turned[view] @ tools))
+        again = taken.read(written.write(turned[view] @ tools))
         near = rotation_angle(np.swapaxes(again, 1, 2) @ recorded[view]) < _ALIKE_RAD
         tools, wrong = (tools[near], wrong) if near.any() else (tools, wrong + 1)
     if wrong > _WRONG:
         return None
-    expected = deg.write(turned @ tools[0])
-    rivals = np.array([_solutions(angles, form) for angles in rad.write(recorded)])
-    if form == "rotation-vector":
-        angle = np.linalg.norm(rivals, axis=2, keepdims=True)
+    expected = written.write(turned @ tools[0])
+    rivals = np.array([_solutions(angles, forms[0]) for angles in taken.write(recorded)])
+    if forms[0] == "rotation-vector":
+        angle = np.maximum(np.linalg.norm(rivals, axis=2, keepdims=True), 1e-9)
         along = np.sum(rivals * expected[:, None], axis=2, keepdims=True) / angle
         rivals = rivals / angle * (angle + _TURN * np.round((along - angle) / _TURN))
     else:
         rivals = rivals + _TURN * np.round((expected[:, None] - rivals) / _TURN)
     nearest = np.linalg.norm(rivals - expected[:, None], axis=2).argmin(axis=1)
-    return deg.read(rivals[np.arange(len(rivals)), nearest])
+    return written.read(rivals[np.arange(len(rivals)), nearest])
 
 
-def _solutions(angles: FloatArray, form: str) -> FloatArray:
+def _solutions(angles: FloatArray, taken: str) -> FloatArray:
     """(s, 3) numbers [rad] of the same rotation, but for whole turns."""
-    order = form.split("-")[1]
+    order = taken.split("-")[1]
     if order == "vector":
         return angles[None]
     middle = -angles[1] if order[0] == order[2] else np.pi - angles[1]
     return np.array([angles, [angles[0] + np.pi, middle, angles[2] + np.pi]])
 
 
-def _rivals(angles: FloatArray, form: str) -> FloatArray:
-    """(k, 3) numbers in degrees that are the same rotation as (3,) numbers in radians."""
-    turns = _TURN * np.arange(-29, 30)
-    if form == "rotation-vector":
+def _rivals(angles: FloatArray, taken: str, written: str) -> FloatArray:
+    """(k, 3) numbers as they may have been written that are taken for the same as some [rad]."""
+    half = 180.0 if written.endswith("deg") else np.pi
+    turns = _TURN * np.arange(-int(half / _TURN) - 1, int(half / _TURN) + 2)
+    if taken == "rotation-vector":
         size = max(float(np.linalg.norm(angles)), 1e-9)
-        return np.asarray(np.outer(size + turns, angles / size))
-    grids = [
-        np.stack(np.meshgrid(*(angle + turns for angle in each), indexing="ij"), -1).reshape(-1, 3)
-        for each in _solutions(angles, form)
-    ]
-    every = np.concatenate(grids)
-    low, high = (0.0, 180.0) if form[6] == form[8] else (-90.0, 90.0)
-    is_one = (np.abs(every[:, ::2]) <= 180.0).all(axis=1)
+        every = np.outer(size + turns, angles / size)
+    else:
+        grids = [
+            np.stack(np.meshgrid(*(angle + turns for angle in each), indexing="ij"), axis=-1)
+            for each in _solutions(angles, taken)
+        ]
+        every = np.concatenate(grids).reshape(-1, 3)
+    if written.startswith("rotation-vector"):
+        return np.asarray(every[np.linalg.norm(every, axis=1) < 1.01 * half])
+    order = written.split("-")[1]
+    low, high = (0.0, half) if order[0] == order[2] else (-half / 2.0, half / 2.0)
+    is_one = (np.abs(every[:, ::2]) <= half).all(axis=1)
     return np.asarray(every[is_one & (low <= every[:, 1]) & (every[:, 1] <= high)])

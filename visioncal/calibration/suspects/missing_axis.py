@@ -4,20 +4,25 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import CLOSING_SCORE, distance_rows, robust_fits
+from visioncal.calibration.guess.fit import distance_rows, robust_fits
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.conventions import UNITS_M
-from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.core.verdict import Finding, Remedy, mending
 from visioncal.estimation.chain import robot_part
+from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 
 # Steps by which the direction is found, and what a direction differs by from an axis of the base
 # [rad]: as a rail is mounted.
 _STEPS, _ALONG_RAD = 20, 0.03
+# Share of the views that have the axis in common; the others may be wrong.
+_MOST = 0.7
 # A column is the axis where its factor is that of a unit but for this share.
 _UNIT = 0.03
+# Columns that number, time or place a view, and are no axis.
+_KNOWN = {"view", "stop", "stamp_s", *POSE, *MEASURED_CAM_POSE}
 
 
 def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[Finding]:
@@ -33,9 +38,13 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
     """
     if run.mount is None or len(views) <= FEWEST_COMPARED:
         return
-    direction, motion, away_m = _line(both, run.mount)
-    distance_m = float(np.median(np.linalg.norm(both[:, 1, :3, 3], axis=1)))
-    if away_m > CLOSING_SCORE * distance_m or np.ptp(motion) < CLEAR_RATIO * away_m:
+    direction, motion, away_m, angles = _line(both, run.mount)
+    # Across it, no more is left than an arm errs by; along it, more moved than one thing once, or
+    # than a few views.
+    limits, moved_m = CalibrationLimits().arm_errors, float(np.ptp(motion))
+    is_right = away_m < 1e-3 * limits[0] and np.quantile(angles, _MOST) < np.deg2rad(limits[1])
+    many_m = np.quantile(np.abs(motion - np.median(motion)), _MOST)
+    if not is_right or min(_left_by_step(motion), many_m) < CLEAR_RATIO * away_m:
         return
     axis = int(np.abs(direction).argmax())
     is_axis = np.arccos(min(abs(direction[axis]), 1.0)) < _ALONG_RAD
@@ -43,7 +52,7 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
     words = (
         f"The robot's positions lack a motion along {name} of its base: across it, robot and "
         f"camera agree to {figure(1e3 * away_m)} mm, and along it they differ by up to "
-        f"{figure(1e3 * float(np.ptp(motion)))} mm, as where a rail, a gantry or another external "
+        f"{figure(1e3 * moved_m)} mm, as where a rail, a gantry or another external "
         "axis moved that is in no pose."
     )
     do = Remedy(
@@ -65,12 +74,24 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
     yield Finding("misread_poses", words, do)
 
 
-def _line(both: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float]:
-    """Direction (3,) in the base, (m,) motion along it [m], and rms by axis across it [m]."""
+def _left_by_step(motion: FloatArray) -> float:
+    """Least rms [m] of a motion (m,) beside one step."""
+    parts = ((motion[:at], motion[at:]) for at in range(1, len(motion)))
+    squares = (sum(float(np.sum((part - part.mean()) ** 2)) for part in each) for each in parts)
+    return float(np.sqrt(min(squares) / len(motion)))
+
+
+def _line(both: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float, FloatArray]:
+    """A line in the base that leaves the least across it.
+
+    Returns:
+        Its direction (3,), the motion along it (m,) [m], the rms by axis across it [m], and how far
+        the rotations are from agreeing (m,) [rad].
+    """
     flanges, camera = both[:, 0], both[:, 1]
     robot = robot_part(flanges, mount)
-    x = robust_fits(robot[None], camera[None])[0].x
-    by_edges, seen = distance_rows(robot, camera, x)
+    (fit,) = robust_fits(robot[None], camera[None])
+    by_edges, seen = distance_rows(robot, camera, fit.x)
     rows, places = by_edges[..., :6], seen + by_edges[..., 6]
     if mount == "eye-to-hand":
         # In the axes of the base, in which a rail lies still.
@@ -92,14 +113,15 @@ def _line(both: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float
         if away < best[2]:
             direction = direction * np.sign(direction[np.abs(direction).argmax()])
             best = direction, -left @ direction, away
-    return best
+    return *best, fit.angle
 
 
 def _columns(run: RunState, motion: dict[int, float], away_m: float) -> Iterator[tuple[str, float]]:
     """Columns that have this motion [m], with their factors."""
     rows = {view.number: view for view in run.session.views if view.number in motion}
     along = np.array([motion[view] for view in rows])
-    for column in run.session.columns:
+    # Those that no stage reads.
+    for column in (name for name in run.session.columns if name not in _KNOWN):
         try:
             values = np.array([float(view.cell(column)) for view in rows.values()])
         except ValueError:

@@ -14,7 +14,7 @@ from visioncal.calibration.suspects.suspect import EXCHANGED
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg, some_of, view_words
 from visioncal.core.transforms import invert, log, mean_transform, pose_difference
-from visioncal.core.types import IntArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import TWIST_UNITS
 from visioncal.estimation.outliers import InlierFit
@@ -127,8 +127,9 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
     used = np.flatnonzero(inliers.used[order])
     before, after = order[: used[0]], order[used[-1] + 1 :]
     run = max(before, after, key=len)
-    if len(run) < FEWEST_VIEWS or not _agree(inliers, run):
+    if len(run) < FEWEST_VIEWS or (change := _common_change(inliers, run)) is None:
         return
+    what, how = _changed_words(cell_fit, *change)
     when = f"from view {rows[int(run[0])].view} on"
     if run is before:
         last = rows[int(run[-1])].station
@@ -136,32 +137,47 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         when = f"before view {following.view}"
     outliers = np.sort(run).tolist()
     do = or_alone(
-        "Fasten camera and target, keep one board, and one tool and base frame in the controller; "
-        "or calibrate the views before and after it apart.",
+        "Fasten camera and target, keep one board, and one tool and base frame in the controller, "
+        "and record again. The result is that of the other views; calibrate these alone, too.",
         tuple(rows[row].view for row in outliers),
     )
-    words = (
-        f"{{views}} were left out: {when}, the camera, the target or a frame of the controller was "
-        "another one."
-    )
+    words = f"{{views}} were left out: {when}, {what} was another one{how}."
     yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
 
 
-def _agree(inliers: InlierFit, rows: IntArray) -> bool:
-    """Whether a step of one frame, or another size of the target, explains most of some outliers.
+def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str, str]:
+    """What was another one from some view on, and by how much, in words."""
+    if not frame:
+        return "the camera, the target or a frame of the controller", ""
+    thing, edge = ("camera" if frame.startswith("cam") else "target"), cell_fit.fit.frames[frame]
+    on_flange = (cell_fit.cell.mount == "eye-in-hand") == (thing == "camera")
+    of_robot = f"controller's {'tool' if on_flange else 'base frame'}"
+    # Poses of another tool, or in another frame, make the edge another one.
+    other = edge @ invert(step) @ invert(edge)
+    x, y, z = (figure(1e3 * part) for part in other[:3, 3].tolist())
+    turn = f"{figure(pose_difference(np.eye(4), other)[1])} deg"
+    moved = mm_and_deg(*pose_difference(np.eye(4), step))
+    how = f": the {thing} by {moved}, or the {of_robot} by ({x}, {y}, {z}) mm and {turn}"
+    return f"the {thing} or the {of_robot}", how
 
-    Rows with other poses, or of other images, have none in common.
+
+def _common_change(inliers: InlierFit, rows: IntArray) -> tuple[str, FloatArray] | None:
+    """The frame whose step explains most of some outliers, and the step; None where none does.
+
+    Its name is empty where another size of the target does, or steps of several frames alike. Rows
+    with other poses, or of other images, have none in common.
     """
     some, state = np.isin(np.arange(len(inliers.problem)), rows), inliers.fit.state
     part = inliers.problem.subset(some)
     if not part.observations.has_rotation.all():
-        return False
+        return None
     measured, predicted = (
         poses[:, :3, 3] for poses in (part.measured(state), part.predicted(state))
     )
     sizes = np.sum(measured * (predicted - measured), axis=1) / np.sum(measured**2, axis=1)
     if CLEAR_RATIO * np.ptp(sizes) < abs(float(np.median(sizes))):
-        return True
+        return "", np.eye(4)
+    found = list[tuple[float, str, FloatArray]]()
     for frame in filter(lambda name: part.observations.involves(name).all(), part.unknown):
         changes = part.change_of(frame, state)
         step = mean_transform(changes)
@@ -169,9 +185,12 @@ def _agree(inliers: InlierFit, rows: IntArray) -> bool:
             np.linalg.norm(log(change) / TWIST_UNITS, axis=-1)
             for change in (invert(step) @ changes, step)
         )
-        if CLEAR_RATIO * np.median(left) < size:
-            return True
-    return False
+        found.append((float(np.median(left) / size), frame, step))
+    ratio, frame, step = min(found, default=(np.inf, "", np.eye(4)), key=lambda item: item[0])
+    if CLEAR_RATIO * ratio >= 1.0:
+        return None
+    is_alone = all(CLEAR_RATIO * ratio < rival for rival, other, _ in found if other != frame)
+    return (frame if is_alone else ""), step
 
 
 def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:

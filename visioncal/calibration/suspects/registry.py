@@ -17,6 +17,7 @@ from visioncal.calibration.suspects import (
     misread_poses,
     rounded_poses,
     steps,
+    turned_views,
 )
 from visioncal.calibration.suspects.outliers import moved_finding
 from visioncal.calibration.suspects.suspect import (
@@ -90,6 +91,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     *growing.GROWING,
     mirrored_cell.MIRRORED_CELL,
     rounded_poses.ROUNDED_POSES,
+    turned_views.TURNED_VIEWS,
     late_poses.LATE_POSES,
     Suspect("carried_away", is_doubt=False),
     Suspect("untied", _unconnected, FACT),

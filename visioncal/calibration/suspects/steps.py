@@ -72,7 +72,12 @@ def _words(step: Step, run: RunState) -> str:
             "Residuals drift with time: from the first stop to the last, base or target moved by "
             f"{moved}"
         )
-    return f"{thing} moved at once: {when}, it is {moved} from where it was"
+    words = f"{thing} moved at once: {when}, it is {moved} from where it was"
+    mount, far_mm = run.mount, pose_difference(np.eye(4), exp(step.value))[0]
+    if mount is not None and far_mm > _LIMITS.arm_errors[0]:
+        on_flange = (mount == "eye-in-hand") == step.of.startswith("cam")
+        words += f", or the controller's {'tool' if on_flange else 'base frame'} is another one"
+    return words
 
 
 # Motion along a camera's axis looks like changes of its focus, which are random in the fit; a
