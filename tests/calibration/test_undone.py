@@ -22,6 +22,7 @@ from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.verdict import GUESS_AND_CALIBRATE
 from visioncal.interchange.formats.rereading import shift_views, turn_boards
 from visioncal.session import Session
 from visioncal.simulation import simulate
@@ -121,6 +122,29 @@ def test_positions_that_lost_a_sign_get_it_back_by_the_printed_command(
     for name, edge in sound.edges.items():
         # A few views with the sign of a position near zero are within the noise.
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("kind", ["sign", "unit", "inverse"])
+def test_poses_that_are_misread_and_rows_apart_are_mended_one_after_the_other(
+    tmp_path, monkeypatch, mount, kind
+):
+    monkeypatch.chdir(tmp_path)
+    sound = visioncal.calibrate(pairs_session(mount, *poses_of(mount)))
+    robot, boards = shifted(*poses_of(mount))
+    if kind == "inverse":
+        robot = invert(robot)
+    robot[:, :3, 3] *= {"sign": [1.0, -1.0, 1.0], "unit": 39.3701, "inverse": 1.0}[kind]
+    pairs_session(mount, robot, boards).save(tmp_path / "cell")
+    cause = visioncal.calibrate(tmp_path / "cell").verdict.causes[0]
+    assert cause.kind == "misread_poses"
+    assert cause.do.command == GUESS_AND_CALIBRATE
+    last = follow("calibrate", "cell", "-o", "out").last
+    assert last.status == 0, last.said
+    found = visioncal.calibrate(tmp_path / "cell-fixed-fixed")
+    for name, edge in sound.edges.items():
+        # A view or two without partner are missing.
+        np.testing.assert_allclose(found.edges[name].matrix, edge.matrix, atol=2e-3)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

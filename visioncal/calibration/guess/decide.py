@@ -21,6 +21,7 @@ from visioncal.calibration.guess.search import (
     chains,
     fitted,
     search,
+    search_by_half,
     thinned,
 )
 from visioncal.core.conventions import PoseNumbers
@@ -94,6 +95,9 @@ def guess_reading(
         )
     with one_blas_thread():
         found = [_likeliest(search(recording)) for recording in recordings]
+        if mount is not None and not found[0][1].fit.closes:
+            tried, best = _likeliest(search_by_half(recordings[0]))
+            found = [(tried, best)] if best is not tried[0] and best.fit.closes else found
         if mount is None:
             # A reading of another mount is that mount's, as it is declared there.
             own = [item for item in found if item[1].hypothesis.mount == item[1].recording.mount]
@@ -133,7 +137,7 @@ def _by_other_rows(best: Candidate) -> float:
         order = rng.permutation(len(robot))
         mixed[2 * at, :, :3, 3] = robot[order, :3, 3]
         mixed[2 * at + 1, :, :3, :3] = robot[order, :3, :3]
-    fits = robust_fits(mixed, np.broadcast_to(camera, mixed.shape), STARTS)
+    fits = robust_fits(mixed, np.broadcast_to(camera, mixed.shape), STARTS, best.fit.share)
     return max(replace(fit, lost=best.fit.lost).log_likelihood for fit in fits)
 
 

@@ -7,7 +7,7 @@ The likelihood is by which readings are compared: a view is gaussian, with the s
 of its own fit, or one of a few outliers, with a broad tail.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,9 +23,9 @@ from visioncal.estimation.closed_form import SOLVERS
 CLOSING_SCORE = 0.05
 # Random small subsets from which a fit starts where views may be wrong.
 STARTS = 12
-# Share of the views that is fitted: two rows exchanged among eight are a quarter; fewer than the
-# second would agree with any reading.
-_KEPT_SHARE = 0.7
+# Shares of the views that are fitted: two rows exchanged among eight are a quarter, and half are
+# rows apart beside another mistake, which the second is for; fewer would agree with any reading.
+KEPT_SHARE, HALF_SHARE = 0.7, 0.45
 _SUBSET = 4
 # Starts that are followed.
 _FOLLOWED = 3
@@ -48,6 +48,7 @@ class Fit:
     angle: FloatArray  # (n,) its rotation relative to Z [rad].
     lever: float  # Typical distance between camera and target, in the poses' units.
     lost: int = 0  # Views that have no residual under this reading, and are outliers.
+    share: float = KEPT_SHARE  # Share of the views that must agree.
 
     @cached_property
     def residuals(self) -> FloatArray:
@@ -57,7 +58,9 @@ class Fit:
     @cached_property
     def kept(self) -> IntArray:
         """The rows with the smallest residuals, smallest first."""
-        return np.argsort(self.residuals, kind="stable")[: _kept_count(len(self.residuals))]
+        return np.argsort(self.residuals, kind="stable")[
+            : _kept_count(len(self.residuals), self.share)
+        ]
 
     @cached_property
     def score(self) -> float:
@@ -148,7 +151,7 @@ def is_about_one_axis(rotations: FloatArray) -> bool:
 
 
 def robust_fits(
-    robot: FloatArray, camera: FloatArray, starts: int = 0, share: float = _KEPT_SHARE
+    robot: FloatArray, camera: FloatArray, starts: int = 0, share: float = KEPT_SHARE
 ) -> list[Fit]:
     """Solves `robot * x * camera = z` for k readings by the views that agree best.
 
@@ -191,10 +194,11 @@ def robust_fits(
         if not falls.any():
             break
         edges[falls], sums[falls], nearest[falls] = trial[falls], lower[falls], rows[falls]
-    return [
+    found = (
         distances(robot[at], camera[at], float(lever[at]), tuple(edges[at, start]))
         for at, start in enumerate(sums.argmin(axis=1))
-    ]
+    )
+    return [replace(fit, share=share) for fit in found]
 
 
 def _away(
@@ -214,7 +218,7 @@ def distances(
     return Fit(*edges, *_away(robot, camera, edges), lever)
 
 
-def _kept_count(rows: int, share: float = _KEPT_SHARE) -> int:
+def _kept_count(rows: int, share: float = KEPT_SHARE) -> int:
     """Number of rows that a fit of this many keeps."""
     return max(int(np.ceil(share * rows)), min(rows, FEWEST_COMPARED))
 

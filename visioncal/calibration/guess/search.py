@@ -14,7 +14,15 @@ from itertools import combinations, product
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import CLOSING_SCORE, STARTS, Fit, distance_rows, robust_fits
+from visioncal.calibration.guess.fit import (
+    CLOSING_SCORE,
+    HALF_SHARE,
+    KEPT_SHARE,
+    STARTS,
+    Fit,
+    distance_rows,
+    robust_fits,
+)
 from visioncal.calibration.guess.readings import (
     ROW_ORDERS,
     Change,
@@ -136,7 +144,11 @@ def chains(
 
 
 def fitted(
-    recording: Recording, tried: Iterable[Hypothesis], rows: IntArray, starts: int
+    recording: Recording,
+    tried: Iterable[Hypothesis],
+    rows: IntArray,
+    starts: int,
+    share: float = KEPT_SHARE,
 ) -> list[Candidate]:
     """Fits both edges under each of some readings, by the rows that are readable under it."""
     tried = [*tried]
@@ -152,7 +164,7 @@ def fitted(
             fits = [Fit(np.eye(4), np.eye(4), away, away, lever=1.0)] * len(members)
         else:
             part = np.ix_(members, np.flatnonzero(mask))
-            fits = robust_fits(robot[part], camera[part], starts)
+            fits = robust_fits(robot[part], camera[part], starts, share)
         for member, fit in zip(members.tolist(), fits, strict=True):
             of_all = replace(fit, lost=len(rows) - count)
             found[member] = Candidate(tried[member], recording, of_all, rows[mask])
@@ -163,6 +175,19 @@ def thinned(rows: IntArray) -> IntArray:
     """At most as many rows as are fitted, evenly spread."""
     spread = np.linspace(0, len(rows) - 1, _FITTED_ROWS).round().astype(int)
     return rows if len(rows) <= _FITTED_ROWS else np.asarray(rows[spread])
+
+
+def search_by_half(recording: Recording) -> list[Candidate]:
+    """Finds single readings that close the chain of half of the rows, as `search`.
+
+    The others may be rows apart, or wrong for another reason.
+    """
+    rows, declared = thinned(recording.common_rows), recording.declared
+    single = _undone(declared, product((None,), changes(declared, recording.is_measured, 0)))
+    tried = [declared, *filter(recording.is_likely, single)]
+    first, *others = fitted(recording, tried, rows, 3 * STARTS, HALF_SHARE)
+    others.sort(key=lambda item: -item.log_posterior)
+    return [first, *others]
 
 
 def search(recording: Recording) -> list[Candidate]:
