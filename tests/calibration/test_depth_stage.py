@@ -103,6 +103,24 @@ def test_pictures_in_another_unit_are_named():
     assert "depth_unit_m = 0.0001" in str(findings["depth_unit"].do)
 
 
+def test_floats_in_millimetres_are_named_with_their_unit():
+    session, result = made()
+    files = {view.image: session.images.read(view.image) for view in session.views}
+    cells = []
+    for view in session.views:
+        raw = cv2.imdecode(np.frombuffer(session.images.read(view.depth), np.uint8), -1)
+        path = view.depth.replace(".png", ".npy")
+        files[path] = npy_of(raw.astype(np.float32) / 10)
+        cells.append([path if name == "depth" else view.cell(name) for name in session.columns])
+    camera = {k: v for k, v in session.document["camera"].items() if k != "depth_unit_m"}
+    other = session.with_content(
+        images=MemoryImages(files), cells=cells, document={**session.document, "camera": camera}
+    )
+    found, _ = with_depth(without(result.calibration), result.evidence, other)
+    (said,) = (one for one in found.verdict.findings if one.kind == "depth_unit")
+    assert "depth_unit_m = 0.001" in str(said.do)
+
+
 @pytest.mark.parametrize("px", [12, 30])
 def test_pictures_that_are_not_aligned_are_named_with_their_shift(px):
     findings, depth = again(lambda raw, _: np.roll(raw, px, axis=1))

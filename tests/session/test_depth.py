@@ -100,6 +100,17 @@ def test_pictures_are_in_the_stated_unit_and_have_holes(cloud):
     assert np.allclose(read_depth(tiff(metres), "a.tiff", SIZE), metres, 0, 1e-12, True)
 
 
+def test_pictures_of_numpy_and_the_largest_number_as_a_hole(cloud):
+    metres = cloud[..., 2].astype(np.float32)
+    assert np.allclose(read_depth(npy(metres), "a.npy", SIZE), metres, 0, 1e-12, True)
+    millimetres = np.where(np.isfinite(metres), np.nan_to_num(1e3 * metres), 65535).astype("u2")
+    for name, data in (("a.npy", npy(millimetres)), ("a.png", png(millimetres))):
+        depth = read_depth(data, name, SIZE)
+        assert np.array_equal(np.isnan(depth), np.isnan(metres))
+        # Whole millimetres.
+        assert np.nanmax(np.abs(depth - metres)) < 1.01e-3
+
+
 @pytest.mark.parametrize(
     ("name", "data", "words"),
     [
@@ -108,6 +119,7 @@ def test_pictures_are_in_the_stated_unit_and_have_holes(cloud):
         ("a.png", png(np.ones((30, 40), np.uint8)), "8 bits"),
         ("a.tif", tiff(np.full((30, 40), np.nan, np.float32)), "no distance: all 1200 are 0 or N"),
         ("a.png", b"\x89PNG", "damaged"),
+        ("a.tif", tiff(np.full((30, 40), -0.5, np.float32)), "below 0 or NaN.*z forward"),
         ("a.ply", b"ply\nformat ascii 1.0\n", "no header"),
         ("a.ply", ply(np.ones((5, 5, 3)))[:-9], "no cloud that can be read"),
         ("a.ply", ply(np.ones((5, 5, 3))), "25 points in no order.*organised"),

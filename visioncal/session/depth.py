@@ -7,11 +7,13 @@ camera's frame, organised where it has one for each pixel. Where nothing was mea
 
 import io
 import re
+from contextlib import suppress
 from pathlib import PurePosixPath
 from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
@@ -55,9 +57,9 @@ def read_depth(
                 culprits=[path],
                 next_step="Save the sensor's raw distances, not the picture that shows them.",
             )
-        is_whole = np.issubdtype(raw.dtype, np.integer)
-        unit = (0.001 if is_whole else 1.0) if unit_m is None else unit_m
-        depth = np.asarray(raw, float) * unit
+        depth = _distances(raw, unit_m)
+    elif (raw := _picture_of_npy(data, path)) is not None:
+        depth = _distances(raw, unit_m)
     else:
         cloud = read_cloud(data, path)
         if cloud.ndim == 2 and len(cloud) == size[0] * size[1]:
@@ -81,14 +83,35 @@ def read_depth(
     return _checked(depth, path)
 
 
+def _picture_of_npy(data: bytes, path: str) -> npt.NDArray[Any] | None:
+    """(h, w) a .npy of distances; None of what is none."""
+    if not path.lower().endswith(".npy"):
+        return None
+    with suppress(ValueError, EOFError):
+        raw = np.load(io.BytesIO(data), allow_pickle=False)
+        return raw if raw.ndim == 2 and raw.shape[1] != 3 and raw.dtype.kind in "fiu" else None
+    return None
+
+
+def _distances(raw: npt.NDArray[Any], unit_m: float | None) -> FloatArray:
+    """Distances of a picture [m]; the largest number of its type is a hole, too."""
+    is_whole = np.issubdtype(raw.dtype, np.integer)
+    unit = (0.001 if is_whole else 1.0) if unit_m is None else unit_m
+    holes = raw == np.iinfo(raw.dtype).max if is_whole else np.zeros(raw.shape, dtype=bool)
+    return np.where(holes, np.nan, np.asarray(raw, float) * unit)
+
+
 def _checked(depth: FloatArray, path: str) -> FloatArray:
     valid = np.isfinite(depth) & (depth > 0.0)
     if not valid.any():
+        is_behind = bool((depth < 0.0).any())
         raise DataError(
-            f"{path} holds no distance: all {depth.size} are 0 or NaN.",
+            f"{path} holds no distance: all {depth.size} are {'below ' * is_behind}0 or NaN.",
             culprits=[path],
-            next_step="Look whether the depth stream ran, the projector was on, and the board is "
-            "within the sensor's range.",
+            next_step="Its z points backwards (OpenGL): save it with z forward and y down."
+            if is_behind
+            else "Look whether the depth stream ran, the projector was on, and the board is within "
+            "the sensor's range.",
         )
     return np.where(valid, depth, np.nan)
 

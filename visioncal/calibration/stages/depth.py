@@ -517,8 +517,13 @@ def estimated(
 
 def _another_unit(ratio: float, unit_m: float | None) -> Finding:
     """The finding on depth in another unit than is stated."""
-    unit = (unit_m or 0.001) / ratio
-    nearest = min((1e-4, 1e-3, 2.5e-4, 1e-2, 1.0, 1.25e-4), key=lambda one: abs(np.log(one / unit)))
+    # Left out, it is a millimetre of whole numbers, and a metre of others.
+    taken = (0.001, 1.0) if unit_m is None else (unit_m,)
+    _, nearest = min(
+        (abs(float(np.log(one * ratio / unit))), one)
+        for unit in taken
+        for one in (1e-4, 1e-3, 2.5e-4, 1e-2, 1.0, 1.25e-4)
+    )
     return Finding(
         "depth_unit",
         f"Depth is {figure(ratio)} times what the chain predicts: its unit is another one.",
