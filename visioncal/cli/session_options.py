@@ -133,7 +133,9 @@ class SimulateOptions:
     force_n: list[float] | None = option(
         "With --instrument: pull on the flange, downwards (N); repeated for stops in turn.", min=0.0
     )
-    at: Path | None = option("With --instrument: a plan's folder; each stop under each load.")
+    at: Path | None = option(
+        "With --instrument: a plan's folder or file; each stop under each load."
+    )
     recording: int = option("Number of another recording of the cell.", default=0, min=0)
     camera_moved_mm: float = _size("How far the first camera was knocked (mm).")
     seed: int = seed_option()

@@ -198,7 +198,8 @@ def _option(name: str) -> str:
 
 def _planned(plan: Path, times: int) -> FloatArray:
     """(k times, n) joint angles of a plan's k stops, each several times [rad]."""
-    document = parse_stored(read_text(plan / PLAN), str(plan / PLAN))
+    file = plan / PLAN if plan.is_dir() else plan
+    document = parse_stored(read_text(file), str(file))
     with reading(str(plan), "a plan", "Make one with visioncal plan."):
         return np.repeat(np.array([stop["q"] for stop in document["stops"]]), times, axis=0)
 

@@ -257,7 +257,14 @@ class ElasticResult(Section):
         """The loads of the stops: `0 to 5 kg`, `10 to 50 N`, or both."""
         loads = ((self.payload_kg, "kg"), (self.force_n or (0.0, 0.0), "N"))
         words = [f"{figure(low)} to {figure(most)} {unit}" for (low, most), unit in loads if most]
-        return " and ".join(words) or "0 kg"
+        return " and ".join(words)
+
+    @property
+    def under_words(self) -> str:
+        """What bends the joints at the stops."""
+        return (
+            f"the {self.loads_words} of the stops" if self.loads_words else "the arm's own weight"
+        )
 
     @cached_property
     def compliance(self) -> FloatArray:

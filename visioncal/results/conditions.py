@@ -85,7 +85,7 @@ def _of_arm(arm: ArmSections, verdict: Verdict, robot: str) -> Iterator[Conditio
         yield Condition(
             "load",
             f"{of}The joints bend under load, by up to {figure(arm.elastic.sag_mm.most)} mm at the "
-            f"flange under the {arm.elastic.loads_words} of the stops.",
+            f"flange under {arm.elastic.under_words}.",
             "State the payload with the targets (visioncal correct --payload-kg).",
         )
     if arm.thermal is not None:
