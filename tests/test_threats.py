@@ -26,8 +26,8 @@ from support.fuzz.mutants import PACKAGED, READINGS, sound
 
 from visioncal.core.choices import SITE_FILE
 from visioncal.core.documents.tables import csv_text, is_number
+from visioncal.core.documents.toml import parse_toml
 from visioncal.core.errors import DataError
-from visioncal.core.files import parse_toml
 from visioncal.present.report.plotting import drawn
 from visioncal.results import history
 from visioncal.results.history import History

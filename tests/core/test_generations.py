@@ -17,17 +17,16 @@ from support.samples import made_up
 
 from visioncal.calibration.run import Run
 from visioncal.core import files
+from visioncal.core.documents.toml import find_described, parse_toml
 from visioncal.core.errors import DataError
 from visioncal.core.files import (
     check_free,
     decode_text,
-    find_described,
-    parse_toml,
     read_bytes,
     read_text_inside,
     write_atomically,
-    write_generation,
 )
+from visioncal.core.generations import write_generation
 from visioncal.interchange.outputs import write_outputs
 from visioncal.present import recording
 from visioncal.present.report import page

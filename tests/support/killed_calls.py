@@ -10,7 +10,8 @@ from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
-from visioncal.core.files import write_atomically, write_generation
+from visioncal.core.files import write_atomically
+from visioncal.core.generations import write_generation
 
 NAMES = ("gone.txt", "report.html", "result.json")
 # Generations by their files: one that has all, one without the first, none.

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
-from visioncal.core.files import json_text, write_atomically, write_generation
+from visioncal.core.files import json_text, write_atomically
+from visioncal.core.generations import write_generation
 
 # Imported late, so that writing one kind of result does not import all the others.
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.limits import NORM_TOLERANCE
 from visioncal.core.transforms import LAST_ROW, exp, rigid_fault, skew
 from visioncal.core.types import FloatArray, Mask

@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.robot.conversion import swing

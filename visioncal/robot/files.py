@@ -8,8 +8,9 @@ from typing import Any
 import tomli_w
 
 from visioncal.core.documents.jsons import parse_json
+from visioncal.core.documents.toml import find_described, read_toml
 from visioncal.core.errors import DataError
-from visioncal.core.files import find_described, read_text, read_toml
+from visioncal.core.files import read_text
 from visioncal.robot.model import Robot
 
 # Suffixes of robot files; a .json is a chain, as a calibration writes it.

@@ -12,8 +12,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
 from visioncal.robot.loads import MASS_KEYS, Masses

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import did_you_mean
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
 from visioncal.robot.inertia import Inertias

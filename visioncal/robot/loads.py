@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from visioncal.core.arguments import typed
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import adjoint, exp, invert, skew
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables

@@ -9,8 +9,8 @@ import numpy as np
 
 from visioncal.core.choices import CONVENTIONS, Convention
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.limits import FAR_M
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, Mask

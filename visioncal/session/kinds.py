@@ -13,8 +13,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from visioncal.core.documents.toml import parse_toml
 from visioncal.core.errors import DataError
-from visioncal.core.files import absence, is_inside, parse_toml, read_text
+from visioncal.core.files import absence, is_inside, read_text
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, Target
 from visioncal.robot.files import ROBOT_SUFFIXES, read_robot_document

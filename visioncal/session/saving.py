@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import named_errors, sha256, temporary, write_atomically
+from visioncal.core.files import named_errors, sha256, write_atomically
+from visioncal.core.temporary import temporary
 from visioncal.robot.files import robot_file
 from visioncal.robot.model import LINK_KEYS
 from visioncal.session.corners import FILE as CORNERS

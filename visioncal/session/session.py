@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from visioncal.core.arguments import typed
 from visioncal.core.documents.tables import TextTable
+from visioncal.core.documents.toml import parse_toml
 from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_TOML_BYTES, one_line, parse_toml, read_text_inside
+from visioncal.core.files import MOST_TOML_BYTES, one_line, read_text_inside
 from visioncal.core.summaries import html_card, text_card
 from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, Target
 from visioncal.session import columns as cols

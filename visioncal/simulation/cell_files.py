@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from visioncal.core.codec import read, reading
+from visioncal.core.documents.toml import find_described, parse_toml
 from visioncal.core.errors import DataError
-from visioncal.core.files import find_described, parse_toml, read_text
+from visioncal.core.files import read_text
 from visioncal.core.number_format import did_you_mean
 from visioncal.session.document import NAME
 from visioncal.simulation.arms import Payload

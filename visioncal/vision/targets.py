@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from visioncal.core.arguments import typed
+from visioncal.core.documents.toml import DocumentTable, find_described, read_toml
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, find_described, read_toml
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import apply, compose
 from visioncal.core.types import FloatArray, IntArray, Target

@@ -11,17 +11,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from visioncal.core.documents.toml import MAX_VALUES, check_values, too_deep, too_many
 from visioncal.core.documents.values import read_plain_text, shown
 from visioncal.core.errors import DataError
-from visioncal.core.files import (
-    MAX_VALUES,
-    MOST_BYTES,
-    check_values,
-    decode_text,
-    read_bytes,
-    too_deep,
-    too_many,
-)
+from visioncal.core.files import MOST_BYTES, decode_text, read_bytes
 
 Array: TypeAlias = npt.NDArray[Any]
 

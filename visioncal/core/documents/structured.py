@@ -16,9 +16,10 @@ from defusedxml.ElementTree import DefusedXMLParser
 
 from visioncal.core.documents.jsons import read_json
 from visioncal.core.documents.tables import is_number
+from visioncal.core.documents.toml import MAX_DEPTH, MAX_VALUES, check_values, too_deep, too_many
 from visioncal.core.documents.values import DECIMAL, matrix_from, read_plain_text, shown
 from visioncal.core.errors import DataError
-from visioncal.core.files import MAX_DEPTH, MAX_VALUES, check_values, read_bytes, too_deep, too_many
+from visioncal.core.files import read_bytes
 
 _STANDARD = "tag:yaml.org,2002:"
 _CONSTANTS: dict[str, object] = {"true": True, "yes": True, "on": True}

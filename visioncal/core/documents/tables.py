@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from visioncal.core.documents.toml import MAX_VALUES, too_many
 from visioncal.core.documents.values import DECIMAL, DECIMAL_COMMA, read_plain_text
 from visioncal.core.errors import DataError
-from visioncal.core.files import MAX_VALUES, too_many
 
 _NUMBER = re.compile(rf"{DECIMAL}|[+-]?(nan|inf)", re.I)
 _DECIMAL_COMMA = re.compile(DECIMAL_COMMA)

@@ -17,10 +17,11 @@ import numpy as np
 from visioncal.core.codec import read, reading
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.documents.jsons import parse_json
+from visioncal.core.documents.toml import MAX_VALUES, too_many
 from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
 from visioncal.core.extras import client_library
-from visioncal.core.files import MAX_VALUES, MOST_IMAGE_BYTES, read_bytes, read_text, too_many
+from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes, read_text
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.interchange.formats.file_search import path_inside

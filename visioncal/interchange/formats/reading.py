@@ -25,9 +25,9 @@ from visioncal.core.documents.structured import (
     rows_of_xml,
 )
 from visioncal.core.documents.tables import TextTable, is_number, read_table
+from visioncal.core.documents.toml import check_values
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
-from visioncal.core.files import check_values
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (

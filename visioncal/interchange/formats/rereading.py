@@ -23,8 +23,9 @@ from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
+from visioncal.core.documents.toml import read_toml
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.files import read_text_inside, read_toml
+from visioncal.core.files import read_text_inside
 from visioncal.core.number_format import ranges, some_of
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import MOUNTS, FloatArray, Progress, Searched, evenly

@@ -15,15 +15,10 @@ import numpy as np
 import tomli_w
 
 from visioncal.core.choices import POSE_FORMS
+from visioncal.core.documents.toml import read_toml
 from visioncal.core.errors import DataError
-from visioncal.core.files import (
-    flush_folder,
-    named_errors,
-    read_bytes,
-    read_toml,
-    remove_abandoned,
-    write_atomically,
-)
+from visioncal.core.files import flush_folder, named_errors, read_bytes, write_atomically
+from visioncal.core.temporary import remove_abandoned
 from visioncal.core.types import Camera, Image, Image16, Mount, Target
 from visioncal.core.version import __version__
 from visioncal.live.capture.cell import LiveCell

@@ -11,8 +11,9 @@ from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.codec import Key, Vector, read, reading, write
 from visioncal.core.documents.jsons import parse_stored
 from visioncal.core.documents.tables import csv_text
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, one_line, read_text, sha256
+from visioncal.core.files import one_line, read_text, sha256
 from visioncal.core.version import __version__
 from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.plan import (

@@ -17,8 +17,9 @@ import pyarrow as pa
 import rerun as rr
 import tomli_w
 
+from visioncal.core.documents.toml import parse_toml
 from visioncal.core.errors import DataError
-from visioncal.core.files import parse_toml, sha256
+from visioncal.core.files import sha256
 from visioncal.core.types import Corners, Rejection, Searched
 from visioncal.core.version import __version__
 from visioncal.present.recording import paths

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 
-from visioncal.core.files import DocumentTable
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.checkerboard import measure_squares, square_corners

@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 import cv2
 import numpy as np
 
-from visioncal.core.files import DocumentTable
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.kind import (

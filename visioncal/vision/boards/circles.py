@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from visioncal.core.files import DocumentTable
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target, chosen_rows
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.imaging import shrunk

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.circles import find_blobs

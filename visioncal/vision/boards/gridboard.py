@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from visioncal.core.files import DocumentTable
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.imaging import blur_at_corners
 from visioncal.vision.boards.kind import (

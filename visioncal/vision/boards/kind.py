@@ -10,8 +10,9 @@ from typing import Any, ClassVar, Literal
 import cv2
 import numpy as np
 
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, is_inside
+from visioncal.core.files import is_inside
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.boards.template import Refined, unrefined

@@ -4,7 +4,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from visioncal.core.files import DocumentTable
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.boards.board import DETECTED_WEIGHT
 from visioncal.vision.boards.kind import (

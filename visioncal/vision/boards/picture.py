@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import cv2
 import numpy as np
 
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, read_bytes
+from visioncal.core.files import read_bytes
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.boards.kind import (

@@ -9,8 +9,8 @@ import numpy as np
 
 from visioncal.core.documents.columns import Column, TableReader
 from visioncal.core.documents.tables import read_table
+from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable
 from visioncal.core.limits import FAR_M
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.kind import (

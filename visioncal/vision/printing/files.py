@@ -5,7 +5,8 @@ from pathlib import Path
 import tomli_w
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, named_errors, write_atomically, write_generation
+from visioncal.core.files import check_free, named_errors, write_atomically
+from visioncal.core.generations import write_generation
 from visioncal.core.types import Target
 from visioncal.vision.boards import kind_of
 from visioncal.vision.printing.page import Sheet
