@@ -103,6 +103,74 @@ def test_heavy_libraries_enter_in_one_place():
             assert homes is None or within.startswith(tuple(homes)), (path, name)
 
 
+# Number of the heart's modules that a shelf of satellites imports. Each shall need `calibrate`,
+# `detect` and types alone: its ceiling falls, to 6 for frames and planning, 4 for formats, and 2.
+HEART = ("calibration", "estimation", "model", "fit")
+CEILINGS = {
+    "live.drivers": 0, "live.capture": 2, "live.page": 2, "live.planning": 21, "live.simulated": 0,
+    "present": 6, "interchange.exports": 1, "interchange.formats": 12, "interchange.batch": 2,
+    "simulation": 0, "dynamics": 2, "frames": 24, "calibration.verification": 23,
+    "results.history": 0,
+}  # fmt: skip
+# Modules that import each other in a circle, by circle; circles only go.
+MOST_CIRCLES, MOST_IN_CIRCLES = 5, 43
+
+
+@cache
+def graph() -> dict[str, set[str]]:
+    """Modules of visioncal, and those that each imports."""
+    files = {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in modules()}
+    names = {f"visioncal.{name}".removesuffix(".__init__"): name for name in files}
+    found = {}
+    for name, path in files.items():
+        given = set()
+        for node in nodes(path):
+            if isinstance(node, ast.Import):
+                given |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                inner = {f"{node.module}.{alias.name}" for alias in node.names}
+                given |= inner & names.keys() or {node.module}
+        found[name] = {names[each] for each in given & names.keys()} - {name}
+    return found
+
+
+def shelf(imported: dict[str, set[str]], name: str) -> set[str]:
+    """Modules of the heart that a package's or a module's files import."""
+    files = {each for each in imported if each == name or each.startswith(f"{name}.")}
+    needed = set().union(*(imported[each] for each in files)) - files
+    return {each for each in needed if each.startswith(tuple(f"{part}." for part in HEART))}
+
+
+def circles(imported: dict[str, set[str]]) -> list[set[str]]:
+    """Circles of modules: those that reach each other."""
+    reach = {name: set(direct) for name, direct in imported.items()}
+    for middle in reach:
+        for name in reach:
+            if middle in reach[name]:
+                reach[name] |= reach[middle]
+    found = {
+        frozenset(other for other in reach[name] if name in reach[other])
+        for name in reach
+        if name in reach[name]
+    }
+    return [set(each) for each in found]
+
+
+def test_shelves_import_ever_less_of_the_heart():
+    counts = {name: len(shelf(graph(), name)) for name in CEILINGS}
+    assert {name: count for name, count in counts.items() if count > CEILINGS[name]} == {}
+    found = circles(graph())
+    assert len(found) <= MOST_CIRCLES, found
+    assert sum(map(len, found)) <= MOST_IN_CIRCLES, found
+
+
+def test_another_import_of_the_heart_or_circle_is_found():
+    imported = {"live.drivers.ur": {"fit.solve"}, "fit.solve": {"core.types"}, "core.types": set()}
+    assert shelf(imported, "live.drivers") == {"fit.solve"}
+    assert circles(imported) == []
+    assert circles(imported | {"core.types": {"fit.solve"}}) == [{"fit.solve", "core.types"}]
+
+
 # What is imported one after the other by a process, and what is not loaded by then.
 SMALL = (
     # Every command waits for what is loaded here, `--help` and `--version` too.
