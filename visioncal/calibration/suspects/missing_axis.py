@@ -12,6 +12,7 @@ from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.core.verdict import Finding, Remedy, mending
 from visioncal.estimation.chain import robot_part
+from visioncal.estimation.observability import too_little_motion
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 
 # Steps by which the direction is found, and what a direction differs by from an axis of the base
@@ -37,6 +38,9 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
         both: (m, 2, 4, 4) poses of the robot, and of the target by each image alone.
     """
     if run.mount is None or len(views) <= FEWEST_COMPARED:
+        return
+    # Without turns, positions alone leave a line open that no axis moved along.
+    if too_little_motion(both[:, 0], run.mount)[0]:
         return
     direction, motion, away_m, angles = _line(both, run.mount)
     # Across it, no more is left than an arm errs by; along it, more moved than one thing once, or
