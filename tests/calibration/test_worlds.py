@@ -16,8 +16,8 @@ from support.marks import slow
 from support.misfits import misfit
 
 from visioncal.calibration.run import calibrate
+from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.core.transforms import exp, invert, log
-from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.results import Calibration
 from visioncal.simulation import CAMERAS, CellOptions, SimulatedCell, cell_session, simulate
 from visioncal.vision.camera import project
@@ -29,7 +29,7 @@ WRONG_ARM = replace(FINE, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
 LITTLE_WRONG = replace(FINE, views=30, dh_sigma_m=2e-4, dh_sigma_rad=2e-4)
 # As a user has it who states no lens.
 OPEN = CellOptions(views=18, state_intrinsics=False, pixel_sigma_px=0.1, seed=1)
-GROWING = frozenset(effect.kind for effect in RANDOM_EFFECTS)
+GROWING = frozenset(KINDS)
 
 
 def unchanged(cell: SimulatedCell) -> SimulatedCell:
@@ -399,14 +399,14 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
     ("change", "kind", "true"),
     [
         (tilted, "base_tilts", TILT_RAD_M),
-        (crept, "base_creeps", np.pad(CREEP_M, (3, 0))),
+        (crept, "base_creeps", np.pad(-CREEP_M, (3, 0))),
         (bent_bracket, "bracket_bends", None),
-        (warmed, "lens_grows", np.array([1.5e-3])),
+        (warmed, "lens_grows", np.array([1.5e-3, 0.0, 0.0])),
         (short, "stops_short", None),
     ],
 )
 def test_what_grows_is_named_recovered_and_in_the_budget(change, kind, true):
-    """With reach, time, or gravity."""
+    """With reach, time, or gravity; of time, from the end, at which it is zero."""
     cell = change(simulate(replace(FINE, views=30)))
     known = calibrated(cell, joints=False)
     assert kind in {finding.kind for finding in known.verdict.findings}

@@ -12,6 +12,7 @@ from support.slopes import jacobian
 
 from visioncal.calibration.pipeline.arm_results import misfit_covariance
 from visioncal.calibration.run import calibrate
+from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
@@ -39,7 +40,6 @@ from visioncal.estimation.mixed import (
     level_weight,
     profile_interval,
 )
-from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.poses import determines_pose
 from visioncal.estimation.problem_parts import ROBOT
 from visioncal.estimation.solve import covariance_of, fit_problem

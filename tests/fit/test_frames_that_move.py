@@ -10,16 +10,30 @@ from support.wrong_arms import GOOD
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.fit.candidates import effects_of_frames, scored
-from visioncal.fit.processes import _alone, _boards, _judged, _tried
+from visioncal.fit.processes import _alone, _boards, _tried_of, judged
 from visioncal.fit.score import added_by, of_effect, products
 from visioncal.fit.solve import solve
 from visioncal.model import read_cell
-from visioncal.model.effects import BaseCreeps, BaseTilts, BracketBends, MountCreeps
+from visioncal.model.effects import (
+    BaseCreeps,
+    BaseSteps,
+    BaseTilts,
+    BracketBends,
+    MountCreeps,
+    MountSteps,
+)
 from visioncal.model.effects.posture import twists_of_frames
 from visioncal.simulation import cell_session, simulate
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
-KINDS = {"tilts": BaseTilts, "bends": BracketBends, "creeps": BaseCreeps, "slips": MountCreeps}
+KINDS = {
+    "tilts": BaseTilts,
+    "bends": BracketBends,
+    "creeps": BaseCreeps,
+    "slips": MountCreeps,
+    "steps": BaseSteps,
+    "knocks": MountSteps,
+}
 
 
 def moving(kind, seed, size, stops=24):
@@ -55,7 +69,7 @@ def test_effects_of_posture_move_neither_base_nor_flange_at_the_mean_of_the_stop
 
 def test_effects_of_time_are_zero_at_the_end():
     cell = made(3, 20).cell
-    for effect in (BaseCreeps("flange"), MountCreeps("flange")):
+    for effect in (BaseCreeps("flange"), MountSteps("flange")):
         columns = effect.columns(cell.moments, np.ones(20))
         assert not columns[-1].any()
         assert np.abs(columns[0]).max() > 0.9
@@ -66,9 +80,9 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
     for effect in effects_of_frames(fit, "flange"):
         each = products(fit, added_by(fit, effect), effect.count)
         alone = _alone(fit, "flange", [each])
-        white = next(_tried(fit, "flange", alone, creeps=True))
+        white = next(_tried_of(fit, "flange", alone, creeps=True))
         # With boards held as the fit has them.
-        _, left, _ = _judged(white, [], is_free=False)
+        _, left, _ = judged(white, [], is_free=False)
         score = of_effect(fit, effect)
         scale = np.sqrt(np.diag(score.information)) + 1e-9 * np.abs(score.information).max() ** 0.5
         assert np.abs((left[:-1, :-1] - score.information) / np.outer(scale, scale)).max() < 1e-4
@@ -77,7 +91,11 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
 
 
 @pytest.mark.parametrize(
-    ("kind", "size"), [("tilts", 3e-3), ("bends", 3e-4), ("creeps", 1.5e-3), ("slips", 1.5e-3)]
+    ("kind", "size"),
+    [
+        *(("tilts", 3e-3), ("bends", 3e-4), ("creeps", 1.5e-3), ("slips", 1.5e-3)),
+        *(("steps", 1.5e-3), ("knocks", 1.5e-3)),
+    ],
 )
 def test_what_moves_is_opened_and_its_result_is_fair(kind, size):
     squares, found = [], 0

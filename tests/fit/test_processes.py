@@ -12,10 +12,9 @@ from visioncal.fit.assemble import mixed_model
 from visioncal.fit.processes import (
     _alone,
     _boards,
-    _independent,
-    _judged,
-    _tried,
+    _tried_of,
     consider,
+    judged,
     processes,
 )
 from visioncal.fit.search import Search
@@ -37,7 +36,7 @@ def test_what_stops_say_alone_is_together_what_the_fit_says(cell):
         alone = _alone(fit, flange)
         p = fit.unknowns.count
         total = alone.rest.copy()
-        noise = np.linalg.inv(alone.known + np.diag(alone.levels**2))
+        noise = np.linalg.inv(alone.known + alone.independent)
         total += np.einsum("uia,uij,ujb->ab", alone.rows, noise, alone.rows)
         covariance = np.linalg.inv(total[:p, :p])
         scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
@@ -114,8 +113,8 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     fit = Search.of(cell, fit.unknowns)._sized(state, fit.used, fit)
     alone = _alone(fit, "flange")
     (board,) = _boards(fit)
-    white = next(_tried(fit, "flange", alone, creeps=True))
-    found = [_judged(white, [board], is_free=is_free)[0] for is_free in (False, True)]
+    white = next(_tried_of(fit, "flange", alone, creeps=True))
+    found = [judged(white, [board], is_free=is_free)[0] for is_free in (False, True)]
     values = []
     for sigma in (3e-4, 1e-2):
         member = fit.unknowns["shape", "target"]
@@ -129,7 +128,7 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     assert abs(board.past) == pytest.approx(1e-4, rel=0.1)
     assert found[1] - found[0] == pytest.approx(values[1] - values[0], abs=1e-3)
     # Of any size, it is off by what the whole likelihood says.
-    (square,) = _judged(white, [board], is_free=True)[2]
+    (square,) = judged(white, [board], is_free=True)[2]
     off = best.values[board.column] + board.past
     own = best.covariance[board.column, board.column]
     assert square == pytest.approx(off**2 + own, rel=1e-3)
@@ -170,15 +169,15 @@ def test_what_is_judged_by_combinations_of_many_unknowns_is_the_same():
     assert fit.unknowns.count > 6 * len(alone.stops)
     rows, sizes = alone.rows.reshape(-1, alone.rows.shape[2]), np.eye(fit.unknowns.count)
     found, values = [], []
-    for tried in _tried(fit, "flange", alone, creeps=True):
-        full = _independent(alone, np.arange(8), tried.white)
+    for tried in _tried_of(fit, "flange", alone, creeps=True):
+        full = alone.covariance(np.arange(8), tried.white)
         if tried.process is not None:
             full += tried.size**2 * tried.process.covariance(np.arange(8))
         total = rows.T @ np.linalg.solve(full, rows) + alone.rest
         known = replace(tried, total=total, boards=sizes[:, [one.column for one in boards]])
         for is_free in (False, True):
-            found.append([*_judged(tried, boards, is_free=is_free)[::2]])
-            values.append([*_judged(known, boards, is_free=is_free)[::2]])
+            found.append([*judged(tried, boards, is_free=is_free)[::2]])
+            values.append([*judged(known, boards, is_free=is_free)[::2]])
     levels = np.array([[one[0] - some[0][0] for one in some] for some in (found, values)])
     assert np.ptp(levels[1]) > 3.0
     # Both have a ridge of a billionth; a twentieth in a log-likelihood decides nothing.

@@ -12,7 +12,7 @@ An unknown is named by its kind and by what it is of, as `("lens", "cam_left")`:
     clock        a pair    the camera's clock less the robot's [s]
     rolling shutter        time from an image's first row to its last [s]
 
-and what grows: an unknown of each kind in `effects.RANDOM_EFFECTS`, of a robot or a camera. Cameras
+and what grows: an unknown of each kind in `model.effects.NAMED`, of a robot or a camera. Cameras
 and frames have the names of the tree of frames, robots and targets those of the session; the names
 of only ones may be empty.
 """

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.estimation.effects.lens_grows import TIME_CONSTANTS
+from visioncal.core.types import evenly
 from visioncal.fit import processes
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
@@ -21,21 +21,24 @@ from visioncal.fit.unknowns import (
     random_effect,
 )
 from visioncal.model.effects import (
+    NAMED,
     SIGNIFICANT,
     BaseCreeps,
-    BaseTilts,
-    BracketBends,
+    BaseSteps,
     Breathing,
     Effect,
     FocusJitter,
     Heat,
-    LensGrows,
     MountCreeps,
+    MountSteps,
     Play,
     Springs,
-    StopsShort,
+    Stood,
     Weight,
 )
+
+# Most stops after which a frame may have been moved.
+_STEPS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +131,7 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
     known = {effect.name for effect in fit.unknowns.effects}
     found = list[tuple[Effect, float, float]]()
     for effect in effects:
-        if effect.name not in known:
+        if effect.name not in known and effect.count:
             bounds = effect.size
             # One of very many unknowns is judged by some of them.
             own = of_effect(fit, effect.typical)
@@ -139,11 +142,15 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
         # differs from stop to stop does not last.
         lasting = [one[0] for one in found if one[0].typical is one[0]]
         clear = [one[0] for one in found if one[0] in lasting and 4.0 * one[2] >= SIGNIFICANT]
+        if any(isinstance(one, BaseCreeps | MountCreeps) for one in clear):
+            clear += [one for one in steps(fit, flange) if one.name not in known]
         beside = processes.scored(fit, flange, clear) if clear else []
         others = [one for one in found if one[0] not in (clear if beside else ())]
         found = [*others, *((one, *best) for one, best in zip(clear, beside, strict=False))]
     for effect, size, gain in found:
-        yield Candidate(gain, starting_at(random_effect(effect), size), effect)
+        # When something was moved is a free choice.
+        choices = np.log(_STEPS) if isinstance(effect, BaseSteps | MountSteps) else 0.0
+        yield Candidate(gain - choices, starting_at(random_effect(effect), size), effect)
 
 
 def starting_at(member: Vector, size: float) -> Vector:
@@ -165,7 +172,8 @@ def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
     for camera, lens in fit.unknowns.lenses.items():
         if ("lens", camera) not in fit.unknowns:
             continue
-        yield LensGrows(camera, lens)
+        for kind in NAMED:
+            yield from kind.of_lens(camera, lens)
         if fit.cell.cameras[camera].focus == "auto":
             distances = [gram.distances for gram in fit.grams if gram.pair[0] == camera]
             reference_m = float(np.median(np.concatenate(distances)))
@@ -194,14 +202,17 @@ def effects_of_frames(fit: Fit, flange: str) -> Iterator[Effect]:
     poses = fit.cell.arms[flange].poses
     stood = stops[np.isfinite(poses[stops, 0, 0])]
     if len(stood) >= processes.ENOUGH_STOPS:
-        yield BaseTilts(flange, poses[stood])
-        yield BracketBends(flange, poses[stood])
-        if not any(sweep.flange == flange for sweep in fit.cell.sweeps):
-            yield StopsShort(flange, poses)
-        # Evenly; as what warms up; as what settles in the first stops.
-        for rate in (0.0, TIME_CONSTANTS, 20.0):
-            yield BaseCreeps(flange, rate)
-            yield MountCreeps(flange, rate)
+        is_swept = any(sweep.flange == flange for sweep in fit.cell.sweeps)
+        for kind in NAMED:
+            yield from kind.of_flange(flange, Stood(poses, stood, is_swept))
+
+
+def steps(fit: Fit, flange: str) -> Iterator[Effect]:
+    """Effects of frames of an arm that were moved at once: rivals to those that creep."""
+    progress = fit.cell.moments.progress
+    for at in (evenly(len(progress) - 3, _STEPS) + 1).tolist():
+        yield BaseSteps(flange, float(progress[at]))
+        yield MountSteps(flange, float(progress[at]))
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:

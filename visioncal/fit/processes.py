@@ -10,8 +10,8 @@ further off than that of independent errors: they take a camera's transform for 
 What each stop alone says of its flange follows from the factorisation.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, evenly
-from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
+from visioncal.estimation.arm import LEVER_M, TWIST_UNITS, pose_basis
 from visioncal.fit.fit import Fit
 from visioncal.fit.mixed import body_with, factors_of, inverse
 from visioncal.fit.score import Products, Score, added_by, products
@@ -61,15 +61,16 @@ class Process:
 
     prior: float
     kernel: FloatArray  # (s, s).
-    basis: FloatArray  # (s, 6, r) right perturbations of the flange [rad, m].
+    basis: FloatArray  # (s, d, r) right perturbations of the flange [rad, m]: d is 6.
     is_of_time: bool = False
+    is_creep: bool = False  # Whether base and flange creep evenly: no error of the arm.
 
     def covariance(self, at: IntArray) -> FloatArray:
-        """(6 k, 6 k) at some stops."""
+        """(d k, d k) at some stops."""
         basis = self.basis[at]
         products = np.einsum("iar,jbr->iajb", basis, basis, optimize=True)
         full = self.kernel[at[:, None], at][:, None, :, None] * products
-        return np.asarray(full.reshape(6 * len(at), 6 * len(at)))
+        return np.asarray(full.reshape(len(at) * basis.shape[1], -1))
 
     def through(self, gains: FloatArray) -> FloatArray:
         """(p, p) covariance of sums of the stops' errors with (s, 6, p) gains."""
@@ -80,31 +81,54 @@ class Process:
         return total
 
 
-def processes(poses: FloatArray, levels: FloatArray, *, creeps: bool) -> Iterator[Process]:
+def processes(
+    poses: FloatArray, levels: FloatArray, *, creeps: bool, as_reported: bool = True
+) -> Iterator[Process]:
     """Processes at (s, 4, 4) flanges, in units of the (6,) levels of the noise.
 
-    `creeps` are a base and a flange that creep evenly until the end: beside these as candidates,
-    they are none of what else may last.
+    Args:
+        poses: The flanges.
+        levels: The levels.
+        creeps: Whether a base and a flange may creep evenly until the end: beside these as
+            candidates, they are none of what else may last.
+        as_reported: Whether base and flange are those of which the robot reports, which have what
+            is the same at all postures; else it is an error like the others.
     """
+    beyond = _beyond_mean if as_reported else np.asarray
     count, order = len(poses), np.arange(len(poses))
     size = np.sqrt(np.mean((levels / TWIST_UNITS) ** 2))
     flange = np.broadcast_to(np.diag(levels), (count, 6, 6))
     of_base = size * adjoint(invert(poses)) * TWIST_UNITS
     both = np.concatenate([flange, of_base], axis=2)
     factors = np.concatenate([poses[:, :3, 3] / 0.6, poses[:, :3, 2]], axis=1)
-    yield Process(1 / 4, _beyond_mean(factors @ factors.T), of_base)
-    turns = poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
-    places = np.concatenate([poses[:, :3, 3] / LEVER_M, turns], axis=1)
-    squared = cdist(places, places, "sqeuclidean")
+    if as_reported:
+        yield Process(1 / 4, beyond(factors @ factors.T), of_base)
+    else:
+        yield Process(1 / 4, np.ones((count, count)), size * pose_basis(poses))
+    features = posture_features(poses)
+    squared = cdist(features, features, "sqeuclidean")
     for length in _RANGES:
-        kernel = _beyond_mean(np.exp(-squared / (2.0 * length**2)))
+        kernel = beyond(np.exp(-squared / (2.0 * length**2)))
         yield Process(1 / 4 / len(_RANGES), kernel, both)
     apart = np.abs(order[:, None] - order)
     for memory in _MEMORIES:
         yield Process(1 / 8 / len(_MEMORIES), np.exp(-apart / memory), flange, True)
     if creeps:
         ramp = (order - order[-1]) / order.std()
-        yield Process(1 / 16, np.outer(ramp, ramp), both, True)
+        yield Process(1 / 16, np.outer(ramp, ramp), both, is_of_time=True, is_creep=True)
+
+
+def posture_features(poses: FloatArray) -> FloatArray:
+    """(s, 12) features of (s, 4, 4) postures, whose distance is that of the postures [rad]."""
+    turns = poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
+    return np.concatenate([poses[:, :3, 3] / LEVER_M, turns], axis=1)
+
+
+def posture_correlation(poses: FloatArray) -> FloatArray:
+    """(s, s) correlation of the errors at (s, 4, 4) postures, of the shortest range considered."""
+    features = posture_features(poses)
+    squared = cdist(features, features, "sqeuclidean")
+    return np.asarray(np.exp(-squared / (2.0 * _RANGES[0] ** 2)))
 
 
 def _beyond_mean(kernel: FloatArray) -> FloatArray:
@@ -120,15 +144,24 @@ def _beyond_mean(kernel: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Alone:
+class StopErrors:
     """What each stop alone says of one flange's errors, as rows in the common unknowns."""
 
     stops: IntArray  # (s,)
-    levels: FloatArray  # (6,) of its noise.
-    known: FloatArray  # (s, 6, 6) covariance.
-    # (s, 6, p + c + 1) by the unknowns, by c more columns, and the error itself.
+    known: FloatArray  # (s, d, d) covariance of what it says.
+    independent: FloatArray  # (s, d, d) covariance of errors that do not last, as found alone.
+    # (s, d, p + c + 1) by the unknowns, by c more columns, and the error itself.
     rows: FloatArray
     rest: FloatArray  # (p + c + 1, p + c + 1) information of all else.
+    count: int  # p unknowns.
+
+    def covariance(self, some: IntArray, white: float) -> FloatArray:
+        """(d k, d k) of k stops beside errors that last, with independent ones times `white`."""
+        own = self.known[some] + white**2 * self.independent[some]
+        count, width = own.shape[:2]
+        covariance = np.zeros((count, width, count, width))
+        covariance[np.arange(count), :, np.arange(count)] = own
+        return covariance.reshape(count * width, -1)
 
 
 def consider(fit: Fit, flange: str) -> Considered | None:
@@ -136,12 +169,12 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     alone = _alone(fit, flange)
     if alone is None:
         return None
-    stops, levels, p = len(alone.stops), alone.levels, fit.unknowns.count
+    stops, p = len(alone.stops), fit.unknowns.count
     boards, logs, free, kinds = _boards(fit), list[float](), list[float](), []
     off = list[FloatArray]()
-    for tried in _tried(fit, flange, alone, creeps=True):
+    for tried in _tried_of(fit, flange, alone, creeps=True):
         ways = (False, True) if boards else (False,)
-        found = [_judged(tried, boards, is_free=is_free) for is_free in ways]
+        found = [judged(tried, boards, is_free=is_free) for is_free in ways]
         logs.append(tried.prior + found[0][0])
         free.append(tried.prior + found[-1][0])
         off.append(found[-1][2])
@@ -151,8 +184,8 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     mean_squares = np.exp(free - np.logaddexp.reduce(free)) @ np.array(off)
     shares = np.exp(logs - np.logaddexp.reduce(logs))[len(_WHITE) :]
     # The estimate's response to an error at each stop, which it takes for independent.
-    gains = np.linalg.inv(alone.known + np.diag(levels**2)) @ alone.rows[:, :, :p]
-    independent = np.einsum("uia,i,uib->ab", gains, levels**2, gains, optimize=True)
+    gains = np.linalg.inv(alone.known + alone.independent) @ alone.rows[:, :, :p]
+    independent = np.einsum("uia,uij,ujb->ab", gains, alone.independent, gains, optimize=True)
     known, excess, shift = fit.estimate.covariance, np.zeros((p, p)), np.zeros(p)
     added = np.zeros((p, p))
     moved = list[tuple[float, FloatArray]]()
@@ -181,7 +214,7 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     return Considered(shift, excess - np.outer(shift, shift), odds, by_board)
 
 
-def _of_frames(fit: Fit, flange: str, alone: _Alone, gains: FloatArray) -> FloatArray:
+def _of_frames(fit: Fit, flange: str, alone: StopErrors, gains: FloatArray) -> FloatArray:
     """(p, p) covariance by the postures of the stops, to whose mean effects of posture refer."""
     p, frames = fit.unknowns.count, np.zeros((12, 12))
     for effect in fit.unknowns.effects:
@@ -209,9 +242,9 @@ def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float
         return []
     sizes, logs = np.geomspace(1e-6, 0.1, 31), list[float]()
     gains = list[list[FloatArray]]()
-    for tried in _tried(fit, flange, alone, creeps=False):
+    for tried in _tried_of(fit, flange, alone, creeps=False):
         for is_free in (False, True) if boards else (False,):
-            value, left, _ = _judged(tried, boards, is_free=is_free)
+            value, left, _ = judged(tried, boards, is_free=is_free)
             # One board of twenty is of another size.
             logs.append(tried.prior + value + np.log(0.05 if is_free else 0.95))
             of_each = (Score(left[a:b, -1], left[a:b, a:b], np.inf) for a, b in pairwise(counts))
@@ -229,7 +262,7 @@ def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float
 
 
 @dataclass(frozen=True, eq=False)
-class _Tried:
+class Tried:
     """A process of some size beside independent errors of some level; None beside the first."""
 
     prior: float  # Its logarithm.
@@ -242,10 +275,23 @@ class _Tried:
     white: float = 1.0
 
 
-def _tried(fit: Fit, flange: str, alone: _Alone, *, creeps: bool) -> Iterator[_Tried]:
-    poses, some = fit.cell.arms[flange].poses[alone.stops], evenly(len(alone.stops), _MOST)
-    independent_at = {white: _independent(alone, some, white) for white in _WHITE}
-    rows, rest, by_boards = _combined(fit, alone.rows[some], alone.rest, independent_at[1.0])
+def _tried_of(fit: Fit, flange: str, alone: StopErrors, *, creeps: bool) -> Iterator[Tried]:
+    levels, poses = fit.flange_sigmas(flange), fit.cell.arms[flange].poses[alone.stops]
+    boards = np.eye(fit.unknowns.count)[:, [board.column for board in _boards(fit)]]
+    return tried(alone, processes(poses, levels, creeps=creeps), boards)
+
+
+def tried(alone: StopErrors, kinds: Iterable[Process], boards: FloatArray) -> Iterator[Tried]:
+    """Processes over the stops, each of all sizes; independent errors of all levels first.
+
+    Args:
+        alone: What the stops say.
+        kinds: The processes.
+        boards: (p, b) the sizes of boards that are held, by the unknowns.
+    """
+    some = evenly(len(alone.stops), _MOST)
+    independent_at = {white: alone.covariance(some, white) for white in _WHITE}
+    rows, rest, by_boards = _combined(alone, some, independent_at[1.0], boards)
 
     def under(covariance: FloatArray) -> tuple[FloatArray, float, FloatArray]:
         root = np.linalg.cholesky(covariance)
@@ -254,20 +300,90 @@ def _tried(fit: Fit, flange: str, alone: _Alone, *, creeps: bool) -> Iterator[_T
 
     for white in _WHITE:
         weight = 1 / 4 if white == 1.0 else 1 / 4 / len(_WHITE)
-        yield _Tried(float(np.log(weight)), *under(independent_at[white]), white=white)
-    for process in processes(poses, alone.levels, creeps=creeps):
+        yield Tried(float(np.log(weight)), *under(independent_at[white]), white=white)
+    for process in kinds:
         covariance = process.covariance(some)
         weight = float(np.log(process.prior / len(_SIZES) / len(_WHITE)))
         for size in _SIZES:
             for white in _WHITE:
                 total = independent_at[white] + size**2 * covariance
-                yield _Tried(weight, *under(total), process, size, white)
+                yield Tried(weight, *under(total), process, size, white)
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A process of some size beside independent errors of some level, and its evidence."""
+
+    log: float  # Of prior and restricted likelihood, over that of independent errors alone.
+    process: Process | None
+    size: float
+    white: float
+
+
+def weigh(alone: StopErrors, poses: FloatArray, kinds: Sequence[Process]) -> list[Weighed]:
+    """The evidence of processes over (s, 4, 4) stops, and of independent errors alone.
+
+    Many stops form groups, which are independent beside the common unknowns (Quinonero-Candela and
+    Rasmussen 2005, section 6): those next to each other for what is of time, and those of similar
+    postures else.
+    """
+    stops = np.arange(len(alone.stops))
+    count = -(-len(stops) // _MOST)
+    near = [kind for kind in kinds if kind.is_of_time and not kind.is_creep]
+    in_time = _by_groups(alone, near, np.array_split(stops, count))
+    rest = [kind for kind in kinds if kind not in near]
+    others = _by_groups(alone, rest, _similar(posture_features(poses), count))
+    return [*others, *(one for one in in_time if one.process is not None)]
+
+
+def _similar(features: FloatArray, count: int) -> list[IntArray]:
+    """Groups of (s, f) features that are near each other, by halves along their widest axis."""
+    groups = [np.arange(len(features))]
+    while len(groups) < count:
+        largest = groups.pop(int(np.argmax([len(group) for group in groups])))
+        along = features[largest, int(np.ptp(features[largest], axis=0).argmax())]
+        groups += np.array_split(largest[along.argsort(kind="stable")], 2)
+    return groups
+
+
+def _by_groups(
+    alone: StopErrors, kinds: Sequence[Process], groups: Sequence[IntArray]
+) -> list[Weighed]:
+    """The same by some groups of stops; what a group excludes is not tried on others."""
+    left = [
+        Weighed(float(np.log(1 / 4 if white == 1.0 else 1 / 4 / len(_WHITE))), None, 0.0, white)
+        for white in _WHITE
+    ]
+    # Most arms have next to none.
+    sizes = (0.1, *_SIZES)
+    for kind in kinds:
+        prior = float(np.log(kind.prior / len(sizes) / len(_WHITE)))
+        left += [Weighed(prior, kind, size, white) for size in sizes for white in _WHITE]
+    sums = [Tried(one.log, alone.rest, 0.0, np.zeros((alone.count, 0))) for one in left]
+    logs = np.zeros(len(left))
+    for group in groups:
+        rows = alone.rows[group].reshape(-1, alone.count + 1)
+        independent = {white: alone.covariance(group, white) for white in _WHITE}
+        lasting = {one.process: one.process.covariance(group) for one in left if one.process}
+        for at, one in enumerate(left):
+            covariance = independent[one.white]
+            if one.process is not None:
+                covariance = covariance + one.size**2 * lasting[one.process]
+            root = np.linalg.cholesky(covariance)
+            solved, _ = lapack.dtrtrs(root, rows, lower=1)
+            log_det = sums[at].log_det + 2.0 * float(np.log(np.diag(root)).sum())
+            sums[at] = replace(sums[at], total=sums[at].total + solved.T @ solved, log_det=log_det)
+        logs = np.array([one.prior + judged(one, (), is_free=False)[0] for one in sums])
+        logs -= np.logaddexp.reduce(logs[: len(_WHITE)])
+        kept = np.flatnonzero((logs > np.log(_LITTLE)) | (np.arange(len(logs)) < len(_WHITE)))
+        left, sums, logs = [left[at] for at in kept], [sums[at] for at in kept], logs[kept]
+    return [replace(one, log=log) for one, log in zip(left, logs.tolist(), strict=True)]
 
 
 def _combined(
-    fit: Fit, rows: FloatArray, rest: FloatArray, independent: FloatArray
+    alone: StopErrors, some: IntArray, independent: FloatArray, boards: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows (6 k, r + c + 1), and all else, by those r combinations of p unknowns that they show.
+    """Rows (d k, r + c + 1), and all else, by those r combinations of p unknowns that they show.
 
     Whatever the covariance of k stops' errors, it changes no information of others. Thousands of
     unknowns of lenses are a few hundreds. Where there are less unknowns, they stay as they are.
@@ -275,8 +391,7 @@ def _combined(
     Returns:
         Both, and the (r, b) sizes of boards that are held by these combinations.
     """
-    p, flat = fit.unknowns.count, rows.reshape(-1, rows.shape[2])
-    boards = np.eye(p)[:, [board.column for board in _boards(fit)]]
+    p, rest, flat = alone.count, alone.rest, alone.rows[some].reshape(-1, alone.rows.shape[2])
     if p <= len(flat):
         return flat, rest, boards
     root = np.linalg.cholesky(independent)
@@ -300,11 +415,11 @@ def _combined(
 
 
 def _estimated(
-    alone: _Alone, process: Process, size: float, white: float
+    alone: StopErrors, process: Process, size: float, white: float
 ) -> tuple[FloatArray, FloatArray]:
     """The (p,) estimate under a process, and its covariance (p, p)."""
     every, p = np.arange(len(alone.stops)), alone.rows.shape[2] - 1
-    covariance = _independent(alone, every, white) + size**2 * process.covariance(every)
+    covariance = alone.covariance(every, white) + size**2 * process.covariance(every)
     root = np.linalg.cholesky(covariance)
     solved = np.linalg.solve(root, alone.rows.reshape(-1, p + 1))
     total = solved.T @ solved + alone.rest
@@ -312,17 +427,7 @@ def _estimated(
     return found @ total[:p, p], found
 
 
-def _independent(alone: _Alone, some: IntArray, white: float) -> FloatArray:
-    """(6 k, 6 k) covariance of what k stops say by themselves and of errors that do not last."""
-    count = len(some)
-    covariance = np.zeros((6 * count, 6 * count))
-    blocks = covariance.reshape(count, 6, count, 6)
-    own = alone.known[some] + np.diag(white**2 * alone.levels**2)
-    blocks[np.arange(count), :, np.arange(count)] = own
-    return covariance
-
-
-def _alone(fit: Fit, flange: str, added: Sequence[Products] = ()) -> _Alone | None:
+def _alone(fit: Fit, flange: str, added: Sequence[Products] = ()) -> StopErrors | None:
     """What each stop alone says; None where too few say anything.
 
     Args:
@@ -368,7 +473,8 @@ def _alone(fit: Fit, flange: str, added: Sequence[Products] = ()) -> _Alone | No
     )
     # From what is reported, not from where it was linearised.
     rows[:, :, p] += past[seen]
-    return _Alone(body.stops[seen], levels, known, rows, rest)
+    independent = np.tile(np.diag(levels**2), (len(seen), 1, 1))
+    return StopErrors(body.stops[seen], known, independent, rows, rest, fit.unknowns.count)
 
 
 def _beside(
@@ -414,8 +520,8 @@ def _boards(fit: Fit) -> list[_Board]:
     return [_Board(column, prior, float(past[column])) for column, prior in each]
 
 
-def _judged(
-    tried: _Tried, boards: Sequence[_Board], *, is_free: bool
+def judged(
+    tried: Tried, boards: Sequence[_Board], *, is_free: bool
 ) -> tuple[float, FloatArray, FloatArray]:
     """The restricted log-likelihood of a process, with boards as stated or of any size.
 

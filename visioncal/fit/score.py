@@ -143,9 +143,12 @@ def added_by(fit: Fit, effect: Effect) -> list[Added]:
         if effect.place == "edge" and effect.frame in gram.by_effects:
             columns = effect.columns(gram.moments, np.ones(len(gram.rows)))
             first, moves = 0, gram.by_effects[effect.frame] @ columns
-        elif effect.place == "lens" and effect.frame == gram.pair[0] and gram.head > 6:
+        elif effect.place == "lens" and effect.frame == gram.pair[0]:
             first, moves = 6, effect.columns(gram.moments, gram.distances)
         else:
+            continue
+        # Poses that were measured depend on no lens.
+        if gram.head < first + moves.shape[1]:
             continue
         rows = slice(first, first + moves.shape[1])
         local = np.swapaxes(moves, 1, 2) @ gram.heads(fit.estimate.logs)[:, rows]

@@ -29,6 +29,7 @@ class Cell:
     moments: Moments  # At all s stops.
     sweeps: tuple[Swept, ...] = ()  # What was seen while robots moved.
     absent: Mapping[int, str] = field(default_factory=dict)  # Why views have no sighting.
+    stations: tuple[int, ...] = ()  # Of the session, at the s stops.
 
     @cached_property
     def pairs(self) -> dict[tuple[str, str], list[int]]:

@@ -94,6 +94,7 @@ def read_cell(
         Moments.of(arms, even_progress(len(stations)), rates, stamps_s),
         tuple(sweeps),
         absent,
+        tuple(stations),
     )
 
 

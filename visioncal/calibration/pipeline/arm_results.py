@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell, robot_key
+from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.calibration.stages.random_effects import random_effect_rms
 from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.thermal import LEVEL
@@ -16,7 +17,6 @@ from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import less_noise
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import expected_levels
-from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.steps import DRIFT, FRAME, SIZE, Step, with_step

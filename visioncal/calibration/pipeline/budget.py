@@ -5,13 +5,13 @@ import numpy as np
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.handeye import closed_form_state
+from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.stages.validate import HeldOutResiduals, needed_frames, pose_residuals
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply_each
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import shape_basis
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
-from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.solve import solve_without
@@ -21,7 +21,7 @@ from visioncal.session import Session, frame_name
 from visioncal.vision.targets import corner_positions
 
 # Sources of a single pair that are not clocks.
-_SOURCES = {"temperature", "arm", *(kind.kind for kind in RANDOM_EFFECTS)}
+_SOURCES = {"temperature", "arm", *KINDS}
 
 # Sources of lenses and boards, in the order of a budget.
 _OPTICAL = {LENS_ERRORS: "lens_field", LENS: "intrinsics", BOARD: "board"}

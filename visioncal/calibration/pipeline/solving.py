@@ -112,11 +112,11 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         cell_fit = _fit_with_inliers(cell_fit, observed)
     corners = cell_fit.linearised_corners
     rows = None if corners is None else cell_fit.all_rows(corners)
-    if found := random_effects(
-        cell_fit.inlier_fit, cell_fit.arms, corners, rows, cell_fit.sizes.growth
-    ):
+    if found := random_effects(cell_fit.inlier_fit, cell_fit.arms, cell_fit.sizes, corners, rows):
+        gains = {effect.name: gain for effect, gain in found.items()}
         effects = (*clock_errors, *found)
-        cell_fit = _fit_with_inliers(replace(cell_fit, other_effects=effects), observed)
+        with_effects = replace(cell_fit, other_effects=effects, gains=gains)
+        cell_fit = _fit_with_inliers(with_effects, observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
     cell_fit, noise = _calibrate_arms(cell_fit, observed, final)

@@ -36,6 +36,8 @@ class CellFit:
     level: str  # The requested calibration level of the arms.
     # Errors of clocks, and those that grow with time, reach or gravity.
     other_effects: tuple[Effect, ...]
+    # Twice the gain in log-likelihood of those that grow, by their names.
+    gains: Mapping[str, float] = field(default_factory=dict)
     sizes: ErrorSizes = field(default_factory=ErrorSizes)  # Of errors of lenses and boards.
     solver: str = "joint"  # The solver of the edges.
 

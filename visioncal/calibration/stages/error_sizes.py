@@ -1,6 +1,6 @@
 """Sizes of the errors of lenses and boards, by the one likelihood of a session; see `fit`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,18 +15,20 @@ from visioncal.fit.held import doubted_boards
 from visioncal.fit.solve import CellFit, solve
 from visioncal.fit.unknowns import Key
 from visioncal.model import Reported, Swept, read_cell
-from visioncal.model.effects import LensGrows
+from visioncal.model.effects import Effect, LensGrows
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import first_corners
 
 
-@dataclass(frozen=True)
-class Growth:
-    """A lens's growth, of which `effects.lens_grows` has the columns."""
+@dataclass(frozen=True, eq=False)
+class FoundEffect:
+    """An effect of a size that chance does not explain."""
 
-    share: float  # Of the focal length.
-    sigma: float
+    effect: Effect
+    columns: FloatArray  # See `Effect.columns`, at the session's stations.
+    values: FloatArray  # (c,) estimates.
+    covariance: FloatArray  # (c, c) of these.
     gain: float  # Twice the gain in log-likelihood.
 
 
@@ -38,7 +40,8 @@ class ErrorSizes:
     # (k, k) covariances of given intrinsics beyond what is stated, by camera.
     lenses: Mapping[str, FloatArray] = field(default_factory=dict)
     boards: Mapping[str, BoardSizes] = field(default_factory=dict)  # By the session's name.
-    growth: Mapping[str, Growth] = field(default_factory=dict)  # Of lenses that grow, by camera.
+    grown: tuple[FoundEffect, ...] = ()  # Lenses that grow.
+    opened: tuple[Effect, ...] = ()  # Of frames that move.
     # Whether boards keep their stated sizes: errors of arms are confounded with them.
     holds_scales: bool = False
 
@@ -52,6 +55,7 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
         return ErrorSizes(holds_scales=True)
     session = observed.timed
     fit, doubted = solved.fit, doubted_boards(solved.doubts)
+    grown = tuple(_grown(fit))
     levels = {name: _levels(fit, name) for name in fit.unknowns.lenses}
     boards, held = dict[str, BoardSizes](), False
     for name, target in session.boards.items():
@@ -71,17 +75,14 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
     given = (name for name in levels if observed.cameras[name].table.stated is not None)
     lenses = {name: _covariance(fit, name, levels[name]) for name in given}
     lenses = {name: covariance for name, covariance in lenses.items() if covariance.any()}
-    growth = {
-        effect.frame: _growth(fit, effect)
-        for effect in fit.unknowns.effects
-        if isinstance(effect, LensGrows) and _size(fit, effect.name)
-    }
-    for name, grown in growth.items():
+    for found in grown:
         # In each view, the lens is another than on average, by a quarter of its growth (rms).
-        own = abs(grown.share) / (4.0 * _noise_px(fit, name))
+        name = found.effect.frame
+        own = abs(float(found.values[0])) / (4.0 * _noise_px(fit, name))
         jitter = float(np.hypot(levels[name].jitter, own))
         levels[name] = replace(levels[name], jitter=jitter)
-    return ErrorSizes(levels, lenses, boards, growth, held)
+    effects = (at for at in fit.unknowns.effects if at.place == "edge" and _size(fit, at.name))
+    return ErrorSizes(levels, lenses, boards, grown, tuple(effects), held)
 
 
 def solve_session(observed: Observed) -> CellFit:
@@ -148,11 +149,19 @@ def _levels(fit: Fit, camera: str) -> LensLevels:
     return LensLevels(field_px, at.length if at else 0.2, breathing, jitter, gains)
 
 
-def _growth(fit: Fit, effect: LensGrows) -> Growth:
-    """The growth of a focal length; its centre moves with it."""
-    key: Key = ("effect", effect.name)
-    share, sigma = fit.state.values[key][0], np.sqrt(fit.covariance(key)[0, 0])
-    return Growth(float(share), float(sigma), _gain(fit, effect.name))
+def _grown(fit: Fit) -> Iterator[FoundEffect]:
+    """Lenses that grow by what they may."""
+    stations, moments = np.array(fit.cell.stations), fit.cell.moments
+    for effect in fit.unknowns.effects:
+        size = _size(fit, effect.name)
+        if not isinstance(effect, LensGrows) or not 0.0 < size <= effect.most:
+            continue
+        known = effect.columns(moments, np.ones(len(moments)))
+        columns = np.zeros((stations.max() + 1, *known.shape[1:]))
+        columns[stations] = np.nan_to_num(known)
+        key: Key = ("effect", effect.name)
+        estimate, covariance = fit.state.values[key], fit.covariance(key)
+        yield FoundEffect(effect, columns, estimate, covariance, _gain(fit, effect.name))
 
 
 def _gain(fit: Fit, name: str) -> float:

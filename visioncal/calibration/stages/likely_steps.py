@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import ArmErrors, stops_of
-from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution
 from visioncal.estimation.steps import (
@@ -66,7 +66,7 @@ def likely_steps(
         likely.append(replace(step, gain=gain - penalty))
     likely.sort(key=lambda step: -step.gain)
     # Which errors of an arm there are is known less well than that there are some.
-    needed = 2.0 * _CLEARLY if any(arm.is_significant for arm in errors.values()) else _CLEARLY
+    needed = 3.0 * _CLEARLY if any(arm.is_significant for arm in errors.values()) else _CLEARLY
     if likely and likely[0].gain > needed:
         least = max(needed, likely[0].gain - _CLEARLY)
         return tuple(step for step in likely if step.gain > least)

@@ -1,116 +1,210 @@
-"""Errors that grow with time, reach or gravity, in the fit of a cell; see `RANDOM_EFFECTS`."""
+"""Errors that grow with time, reach or gravity, in the fit of a cell; see `model.effects.NAMED`.
 
-from collections.abc import Iterator, Mapping, Sequence
+Those of a flange have their sizes by the restricted likelihood of the robots' noise, all together
+and beside errors of the arm by its posture; a lens that grows has its own by its corners.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.calibration.stages.error_sizes import Growth
-from visioncal.core.transforms import adjoint, invert
+from visioncal.calibration.stages.error_sizes import ErrorSizes, FoundEffect
+from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.arm import LEVER_M, stops_of
-from visioncal.estimation.effects import RANDOM_EFFECTS
+from visioncal.estimation.arm import stops_of
 from visioncal.estimation.effects.lenses import LinearisedCorners
-from visioncal.estimation.effects.random_effect import (
-    RandomEffect,
-    Stops,
-    effect_of,
-    find_random_effects,
+from visioncal.estimation.mixed import (
+    LEAST_SIGMA,
+    MOST_SIGMA,
+    MixedEstimate,
+    PriorInformation,
+    level_weight,
 )
-from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
+from visioncal.model import Moments
+from visioncal.model.arm import even_progress
+from visioncal.model.effects import (
+    NAMED,
+    BaseCreeps,
+    BaseSteps,
+    MountCreeps,
+    MountSteps,
+    Named,
+    Stood,
+)
+from visioncal.model.effects import Effect as GrowingEffect
+from visioncal.session.frames import object_name
 
+# Of their findings, and their names in the budget.
+KINDS: Mapping[str, type[Named]] = {effect.kind.replace(" ", "_"): effect for effect in NAMED}
 # With fewer stops, no such error is distinguished from noise.
 _FEWEST_STOPS = 12
-_KINDS = {kind.kind: kind for kind in RANDOM_EFFECTS}
+# Share of sessions that have one such error, and typical size of an arm's errors by its posture
+# [rad].
+_RARE, _ARM = 0.01, 3e-4
+# Log-likelihood that six values gain by chance at one of a dozen stops, of one of two frames.
+_BY_CHANCE = 0.5 * float(chi2_limit(FALSE_ALARM / 24.0, 6))
 
 
 def of_random_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """Those of some effects that are random effects."""
-    return tuple(effect for effect in effects if effect.name.partition(" of ")[0] in _KINDS)
+    return tuple(effect for effect in effects if effect.name.partition(" of ")[0] in KINDS)
 
 
 def random_effects(
     inliers: InlierFit,
     arms: Mapping[str, RobotArm],
+    sizes: ErrorSizes,
     corners: LinearisedCorners | None,
     rows: IntArray | None,
-    growth: Mapping[str, Growth],
-) -> tuple[Effect, ...]:
+) -> dict[Effect, float]:
     """The random effects that the residuals of the inliers show, for all observations.
 
-    `rows` are the (n,) views of the observations, -1 for none, among the cameras' corners, if any;
-    `growth` that of lenses which grow, see `ErrorSizes`.
+    Each comes with twice its gain in log-likelihood.
+
+    Args:
+        inliers: The fit.
+        arms: Its arms.
+        sizes: By the one likelihood of all corners: lenses that grow, frames moved at once.
+        corners: The cameras' corners, if any.
+        rows: (n,) views of the observations among these, -1 for none.
     """
-    problem, found = inliers.problem, list[Effect]()
+    problem, found = inliers.problem, dict[Effect, float]()
     for robot, arm in arms.items():
         stops = stops_of(inliers.part, robot)
         if len(stops) < _FEWEST_STOPS or f"arm of {robot}" in problem.effect_columns:
             continue
-        candidates = [*_of_flange(problem, robot, stops)]
         flat = PriorInformation.flat(arm.basis.shape[2])
         nuisance = Effect.free(f"postures of {robot}", flat, None, {robot: arm.basis})
-        found += find_random_effects(inliers, candidates, [nuisance])
-        if growth and corners is not None and rows is not None and len(arms) == 1:
-            for _, effect in _of_sensors(inliers, robot, stops, corners, rows):
-                known = growth.get(effect.name.partition(" of ")[2])
-                if known is not None:
-                    information = np.eye(1) / known.sigma**2
-                    prior = PriorInformation(information, -information[0] * known.share)
-                    found.append(replace(effect, prior=prior))
-    return tuple(found)
-
-
-def _time(stops: IntArray, count: int) -> FloatArray:
-    """(s,) share of the observed stops that are over, of all stops."""
-    return np.asarray(np.searchsorted(stops, np.arange(count)) / max(len(stops) - 1, 1))
+        opened = [at for at in sizes.opened if object_name(at.frame, "robot") == robot]
+        # Errors that last look as if a mount crept: it is tried where the one likelihood, which
+        # knows these, has it.
+        kinds = [
+            kind
+            for kind in NAMED
+            if kind is not MountCreeps or any(isinstance(at, kind) for at in opened)
+        ]
+        tried = _of_flange(problem, robot, stops, kinds)
+        chosen, value = _with_sizes(inliers, tried, nuisance)
+        step = next((at for at in opened if isinstance(at, BaseSteps | MountSteps)), None)
+        if step is not None:
+            # What moved at once looks as if it crept; the search for steps comes later.
+            kinds = [kind for kind in kinds if not issubclass(kind, BaseCreeps | MountCreeps)]
+            others = _of_flange(problem, robot, stops, kinds, step)
+            instead, least = _with_sizes(inliers, others, nuisance)
+            if value - least > _BY_CHANCE:
+                chosen = {at: instead[at] for at in of_random_effects([*instead])}
+        found |= chosen
+    if corners is not None and rows is not None:
+        found |= {_of_lens(lens, problem, corners, rows): lens.gain for lens in sizes.grown}
+    return found
 
 
 def _of_flange(
-    problem: Problem, robot: str, stops: IntArray
-) -> Iterator[tuple[RandomEffect, Effect]]:
+    problem: Problem,
+    robot: str,
+    stops: IntArray,
+    kinds: Sequence[type[Named]],
+    step: GrowingEffect | None = None,
+) -> dict[Effect, float]:
+    """What may act on a flange, with its largest size."""
     poses = np.where(np.isfinite(problem.poses[robot]), problem.poses[robot], np.eye(4))
-    seen = Stops(poses, _time(stops, len(poses)), np.zeros((0, 6)))
-    for kind in RANDOM_EFFECTS:
-        if not kind.is_of_sensor:
-            effect = effect_of(kind, robot, seen)
-            columns = _without_constants(effect.flange_jacobian[robot], poses, stops)
-            yield kind, replace(effect, flange_jacobian={robot: columns})
+    stood, count = Stood(poses, stops, is_swept=False), len(poses)
+    moments = Moments({robot: poses}, {}, even_progress(count), np.arange(count))
+    tried = [] if step is None else [(replace(step, frame=robot), np.inf)]
+    for kind in kinds:
+        # What fades otherwise is too much alike.
+        tried += [(effect, kind.most) for effect in islice(kind.of_flange(robot, stood), 1)]
+    found = dict[Effect, float]()
+    for effect, most in tried:
+        columns, name = effect.columns(moments, np.ones(count)), effect.kind.replace(" ", "_")
+        flat = PriorInformation.flat(columns.shape[2])
+        found[Effect.free(f"{name} of {robot}", flat, None, {robot: columns})] = most
+    return found
 
 
-def _without_constants(columns: FloatArray, poses: FloatArray, stops: IntArray) -> FloatArray:
-    """Columns (s, 6, k) less what one twist of base and of flange explains at the observed stops.
+def _with_sizes(
+    inliers: InlierFit, candidates: Mapping[Effect, float], nuisance: Effect
+) -> tuple[dict[Effect, float], float]:
+    """Those that the residuals show, with their sizes as priors, and the likelihood with these.
 
-    Base and flange are those of which the robot reports: what is the same at all stops is theirs
-    (Hodges and Reich 2010, on random effects beside fixed ones).
+    Args:
+        inliers: The fit.
+        candidates: What may act, each with its largest size.
+        nuisance: Errors of the arm by posture, of any size.
     """
-    flange = np.broadcast_to(np.eye(6), (len(poses), 6, 6))
-    constant = np.concatenate([flange, adjoint(invert(poses))], axis=2)
-    weights = np.repeat([LEVER_M, 1.0], 3)[:, None]
-    among, target = (
-        (weights * array[stops]).reshape(6 * len(stops), -1) for array in (constant, columns)
+    effects, most = [*candidates, nuisance], np.array([*candidates.values()])
+    problem, fit = inliers.problem, inliers.fit
+    wide = problem.with_effects([*problem.effects, *effects]).subset(inliers.used)
+    values = np.append(fit.state.values, np.zeros(sum(map(len, effects))))
+    likelihood = robot_likelihood(wide, State(fit.state.edges, values), fit.noise)
+    columns = np.full(wide.size, -1)
+    for index, effect in enumerate(effects):
+        columns[wide.effect_columns[effect.name]] = index
+    of_size = columns[likelihood.moving]
+    shares = (of_size[:, None] == np.arange(len(effects))).astype(float)
+    first, prior = likelihood.model.shares.shape[1], likelihood.model.prior
+    model = replace(
+        likelihood.model,
+        shares=np.concatenate([likelihood.model.shares, shares], axis=1),
+        prior=None if prior is None else prior.beside(np.zeros(len(effects)), np.inf),
     )
-    return np.asarray(columns - constant @ np.linalg.lstsq(among, target, rcond=None)[0])
+    levels = np.maximum(fit.noise.robots.ravel(), LEAST_SIGMA)
+    low = np.full(first + len(effects), np.log(LEAST_SIGMA))
+    # The search starts above what is typical.
+    logs = np.log(np.concatenate([levels, np.minimum(most / 5.0, 1e-3), [3.0 * _ARM]]))
+
+    def without(closed: Sequence[int], start: FloatArray) -> MixedEstimate:
+        high = np.full(len(low), np.log(MOST_SIGMA))
+        high[first + np.array(closed, dtype=int)] = np.log(LEAST_SIGMA)
+        return model.maximised(np.minimum(start, high), low, high)
+
+    # Of some that look alike, the weakest goes first.
+    closed, found, chosen = list[int](), without([], logs), dict[Effect, float]()
+    while len(closed) < len(candidates):
+        sizes = np.exp(found.logs[first : first + len(candidates)])
+        left = [index for index in range(len(candidates)) if index not in closed]
+        out = [index for index in left if sizes[index] <= 10.0 * LEAST_SIGMA]
+        if not out:
+            # Two that compensate may both be larger than they can.
+            is_possible = (sizes[left] <= most[left]).all()
+            others = [without([*closed, index], found.logs).value for index in left]
+            weakest = int(np.argmin(others))
+            is_clear = level_weight(2.0 * (others[weakest] - found.value), _RARE) > 0.5
+            if is_clear and is_possible:
+                for index, other in zip(left, others, strict=True):
+                    effect, size = effects[index], float(np.exp(found.logs[first + index]))
+                    known = PriorInformation(np.eye(len(effect)) / size**2, np.zeros(len(effect)))
+                    chosen[replace(effect, prior=known)] = 2.0 * (other - found.value)
+                break
+            out = [left[weakest]]
+        closed += out
+        found = without(closed, found.logs)
+    return chosen, found.value
 
 
-def _of_sensors(
-    inliers: InlierFit, robot: str, stops: IntArray, corners: LinearisedCorners, rows: IntArray
-) -> Iterator[tuple[RandomEffect, Effect]]:
-    problem = inliers.problem
-    time = _time(stops, len(problem.poses[robot]))[problem.observations.stops]
-    optics = corners.camera_parameters
+def _of_lens(
+    found: FoundEffect, problem: Problem, corners: LinearisedCorners, rows: IntArray
+) -> Effect:
+    """A lens that grows, as it moves measured poses."""
+    optics, moved = corners.camera_parameters, np.zeros((len(rows), 6, len(found.values)))
     for name, compressed in zip(optics.problems, corners.compressed, strict=True):
-        views, by_focal = optics.rows(name), np.zeros((len(rows), 6))
-        is_mine = (rows >= views.start) & (rows < views.stop)
-        by_shared = compressed.by_shared[rows[is_mine] - views.start, :, :2]
-        by_focal[is_mine] = by_shared @ optics.camera(name).matrix[:2]
-        seen = Stops(np.zeros((0, 4, 4)), time, by_focal)
-        for kind in RANDOM_EFFECTS:
-            if kind.is_of_sensor and (is_mine & inliers.used).any():
-                yield kind, effect_of(kind, name, seen)
+        views = optics.rows(name)
+        if name == found.effect.frame:
+            own = (rows >= views.start) & (rows < views.stop)
+            lens = found.columns[problem.observations.stops[own]]
+            by_lens = compressed.by_shared[rows[own] - views.start, :, : lens.shape[1]]
+            moved[own] = by_lens @ lens
+    information = np.asarray(np.linalg.inv(found.covariance), dtype=float)
+    prior = PriorInformation(information, -information @ found.values)
+    kind = found.effect.kind.replace(" ", "_")
+    return Effect.free(f"{kind} of {found.effect.frame}", prior, moved)
 
 
 def random_effect_rms(problem: Problem, state: State, robot: str) -> FloatArray:

@@ -13,6 +13,8 @@ import numpy as np
 from visioncal.calibration.pipeline.arm_results import joint_offsets
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.likely_steps import likely_steps
+from visioncal.calibration.stages.pose_errors import find_pose_errors
+from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.suspects.suspect import STEPS
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits, CheckLimits
 from visioncal.core.number_format import mm_and_deg
@@ -20,9 +22,7 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import Finding
 from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.estimation.joint import target_sizes
-from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
@@ -142,6 +142,6 @@ def _of_board(run: RunState, kind: str) -> Trial:
 
 _TRIALS: Mapping[str, Callable[[RunState, str], Trial]] = {
     **dict.fromkeys(STEPS, _of_step),
-    **dict.fromkeys((effect.kind for effect in RANDOM_EFFECTS), _of_growth),
+    **dict.fromkeys(KINDS, _of_growth),
     **dict.fromkeys(("board_size", "board_shape"), _of_board),
 }

@@ -1,4 +1,4 @@
-"""Errors that grow with time, reach or gravity: a suspect for each of `RANDOM_EFFECTS`."""
+"""Errors that grow with time, reach or gravity: a suspect for each of `model.effects.NAMED`."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -6,28 +6,26 @@ from functools import partial
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.suspects.suspect import Suspect
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.effects import RANDOM_EFFECTS
-from visioncal.estimation.effects.random_effect import RandomEffect
+from visioncal.model.effects.effect import LensEffect
 
 
-def _found(effect: RandomEffect, run: RunState) -> Iterator[Finding]:
-    fit = run.assessment.fit
-    for owner in fit.unknowns.of(effect.kind):
-        values = fit.values((effect.kind, owner))
-        covariance = fit.covariance((effect.kind, owner))
+def _found(kind: str, run: RunState) -> Iterator[Finding]:
+    fit, effect, arms = run.assessment.fit, KINDS[kind], run.cell_fit.arms.values()
+    # What arms err by from stop to stop looks like it: there the covariance, which has that, says
+    # what chance explains.
+    is_alone = not any(arm.errors is not None and arm.errors.is_significant for arm in arms)
+    for owner in fit.unknowns.of(kind):
+        values, covariance = fit.values((kind, owner)), fit.covariance((kind, owner))
         squared = float(values @ np.linalg.solve(covariance, values))
-        # Of a lens, all corners are the evidence.
-        if effect.is_of_sensor:
-            squared = max(squared, run.cell_fit.sizes.growth[owner].gain)
+        if is_alone or issubclass(effect, LensEffect):
+            squared = max(squared, run.cell_fit.gains.get(f"{kind} of {owner}", 0.0))
         if squared > chi2_limit(FALSE_ALARM, len(values)):
-            do = Remedy(effect.do)
-            found = Finding(effect.kind, effect.says(values), do, mahalanobis_sq=squared)
+            found = Finding(kind, effect.says(values), Remedy(effect.do), mahalanobis_sq=squared)
             yield found.of(owner if len(fit.noise.robots) > 1 else "")
 
 
-GROWING = tuple(
-    Suspect(effect.kind, partial(_found, effect), 1e-4, True) for effect in RANDOM_EFFECTS
-)
+GROWING = tuple(Suspect(kind, partial(_found, kind), 1e-4, True) for kind in KINDS)

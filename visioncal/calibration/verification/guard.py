@@ -34,9 +34,9 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.model_evidence import TURN_PER_M
-from visioncal.estimation.pose_errors import posture_features
 from visioncal.estimation.poses import determines_pose
 from visioncal.estimation.problem_parts import ROBOT, Effect
+from visioncal.fit.processes import posture_features
 from visioncal.results import Calibration
 from visioncal.vision.targets import first_corners
 

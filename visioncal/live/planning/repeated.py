@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
-from visioncal.core.types import FloatArray
-from visioncal.estimation.pose_errors import spread_postures
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.fit.processes import posture_features
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.session.columns import POSE, pose_row
@@ -58,7 +59,7 @@ def stops_to_repeat(
     poses = exp(stops.poses)
     # Of several boards at one stop, the first.
     first = np.unique(stops.poses, axis=0, return_index=True)[1]
-    rows = first[spread_postures(poses[first], count)].tolist()
+    rows = first[_spread_postures(poses[first], count)].tolist()
     views = tuple(stops.views[row] for row in rows)
     recorded = {} if session is None else {view.number: view for view in session.views}
     angles = [recorded[view].joints_rad for view in views if view in recorded]
@@ -66,3 +67,16 @@ def stops_to_repeat(
     return CalibratedStops(
         views, poses[rows], np.array(known) if len(known) == len(views) else None
     )
+
+
+def _spread_postures(poses: FloatArray, count: int) -> IntArray:
+    """(k,) indices of some of (s, 4, 4) postures, which are far apart.
+
+    They are chosen by farthest-point clustering (Gonzalez 1985).
+    """
+    features = posture_features(poses)
+    distance_sq = cdist(features, features, "sqeuclidean")
+    chosen = [int(np.argmax(distance_sq.sum(axis=1)))]
+    for _ in range(min(count, len(poses)) - 1):
+        chosen.append(int(np.argmax(distance_sq[chosen].min(axis=0))))
+    return np.array(chosen)

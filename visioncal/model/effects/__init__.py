@@ -1,12 +1,19 @@
-"""What moves a frame, or changes a lens, beside noise: one file an effect."""
+"""What moves a frame, or changes a lens, beside noise: one file an effect.
+
+Those that a finding names are in `NAMED`, too.
+"""
 
 from visioncal.model.effects.breathing import Breathing as Breathing
 from visioncal.model.effects.clock import Clock as Clock
 from visioncal.model.effects.creep import BaseCreeps as BaseCreeps
+from visioncal.model.effects.creep import BaseSteps as BaseSteps
 from visioncal.model.effects.creep import MountCreeps as MountCreeps
+from visioncal.model.effects.creep import MountSteps as MountSteps
 from visioncal.model.effects.effect import SIGNIFICANT as SIGNIFICANT
 from visioncal.model.effects.effect import Effect as Effect
+from visioncal.model.effects.effect import Named as Named
 from visioncal.model.effects.effect import Size as Size
+from visioncal.model.effects.effect import Stood as Stood
 from visioncal.model.effects.focus_jitter import FocusJitter as FocusJitter
 from visioncal.model.effects.heat import Heat as Heat
 from visioncal.model.effects.lens_grows import LensGrows as LensGrows
@@ -19,3 +26,13 @@ from visioncal.model.effects.springs import Springs as Springs
 from visioncal.model.effects.springs import Weight as Weight
 from visioncal.model.effects.stops_short import StopsShort as StopsShort
 from visioncal.model.effects.zeros import Zeros as Zeros
+
+# From these follow the trial in every cell, the columns of the fit, covariance, budget and finding.
+NAMED: tuple[type[Named], ...] = (
+    BaseTilts,
+    BaseCreeps,
+    MountCreeps,
+    BracketBends,
+    LensGrows,
+    StopsShort,
+)

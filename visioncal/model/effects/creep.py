@@ -1,40 +1,38 @@
-"""Frames that creep or settle during the session: a base, and what a flange carries."""
+"""Frames that creep, settle or step during the session: a base, and what a flange carries."""
 
+from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
+from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import Effect
+from visioncal.model.effects.effect import Effect, Named, Stood
+from visioncal.model.effects.lens_grows import TIME_CONSTANTS
 
 
 @dataclass(frozen=True, eq=False)
-class Creep(Effect):
+class _Moves(Effect):
     """Motion of a frame over the session [m, of turns at a lever].
 
     The picks come after the session: at its end it is zero.
     """
 
     bounds, count = (1e-2, 1e-7, 0.1), 6
-    rate: float = 0.0  # By which it fades, over the session; zero of an even one.
 
+    @abstractmethod
     def left(self, moments: Moments) -> FloatArray:
         """(k, 1, 1) share of the motion that is still to come."""
-        over = moments.progress[:, None, None] + 1.0
-        if self.rate == 0.0:
-            return np.asarray(1.0 - over)
-        end = np.exp(-self.rate)
-        return np.asarray((np.exp(-self.rate * over) - end) / (1.0 - end))
 
 
 @dataclass(frozen=True, eq=False)
-class BaseCreeps(Creep):
+class _OfBase(_Moves):
     """Motion of a base, or of what stands in it."""
-
-    kind = "base creeps"
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
@@ -44,12 +42,85 @@ class BaseCreeps(Creep):
 
 
 @dataclass(frozen=True, eq=False)
-class MountCreeps(Creep):
+class _OfMount(_Moves):
     """Motion of what the flange carries."""
-
-    kind = "mount creeps"
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
         return np.asarray(self.left(moments) * np.diag(np.repeat([1.0 / LEVER_M, 1.0], 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Creep(_Moves, Named):
+    """Motion all over the session."""
+
+    most = 3e-3
+    what: ClassVar[str]  # That creeps, as a sentence begins.
+    rate: float = 0.0  # By which it fades, over the session; zero of an even one.
+
+    @classmethod
+    def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
+        """Evenly; as what warms up; as what settles in the first stops."""
+        del stood
+        for rate in (0.0, TIME_CONSTANTS, 20.0):
+            yield cls(flange, rate)
+
+    @classmethod
+    def says(cls, values: FloatArray) -> str:
+        """See `Named`."""
+        turn_rad, shift_m = np.linalg.norm(values.reshape(2, 3), axis=1) / (LEVER_M, 1.0)
+        by = mm_and_deg(1e3 * float(shift_m), float(np.rad2deg(turn_rad)))
+        return f"{cls.what} crept by {by} during the session. The result is that of its end."
+
+    def left(self, moments: Moments) -> FloatArray:
+        """See `_Moves`."""
+        over = moments.progress[:, None, None] + 1.0
+        if self.rate == 0.0:
+            return np.asarray(1.0 - over)
+        end = np.exp(-self.rate)
+        return np.asarray((np.exp(-self.rate * over) - end) / (1.0 - end))
+
+
+@dataclass(frozen=True, eq=False)
+class BaseCreeps(_Creep, _OfBase):
+    """A base, or what stands in it, that creeps."""
+
+    kind, what = "base creeps", "The base, or what stands in it,"
+    do = (
+        "Fasten the base, the fixed camera and the fixed target, let the cell warm up, and record "
+        "again."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class MountCreeps(_Creep, _OfMount):
+    """What the flange carries, which creeps."""
+
+    kind, what = "mount creeps", "What the flange carries"
+    do = "Fasten what the flange carries, let the cell warm up, and record again."
+
+
+@dataclass(frozen=True, eq=False)
+class _Step(_Moves):
+    """Motion at once."""
+
+    progress: float = -0.5  # Of the session, up to which the frame is where it was.
+
+    def left(self, moments: Moments) -> FloatArray:
+        """See `_Moves`."""
+        return np.asarray((moments.progress <= self.progress)[:, None, None].astype(float))
+
+
+@dataclass(frozen=True, eq=False)
+class BaseSteps(_Step, _OfBase):
+    """A base, or what stands in it, that was moved at once."""
+
+    kind = "base steps"
+
+
+@dataclass(frozen=True, eq=False)
+class MountSteps(_Step, _OfMount):
+    """What the flange carries, which was moved at once."""
+
+    kind = "mount steps"

@@ -1,12 +1,13 @@
 """An effect: columns that act on an edge or on a lens at each moment, and their common size."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.core.types import Camera, FloatArray
+from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.model.arm import Moments
 from visioncal.vision.camera import intrinsics
 
@@ -87,6 +88,40 @@ class Effect(ABC):
         """Derivatives (k, 6, c) of `twists` at (c,) values: the columns where these are linear."""
         del values
         return self.columns(moments, np.ones(len(moments)))
+
+
+@dataclass(frozen=True, eq=False)
+class Stood:
+    """Where a flange stood."""
+
+    poses: FloatArray  # (s, 4, 4) `base_from_flange` at the cell's stops; NaN where unknown.
+    seen: IntArray  # (k,) stops at which something was seen.
+    is_swept: bool  # Whether it moved meanwhile.
+
+
+class Named(ABC):
+    """An effect that is tried in every cell, and of which a finding says what it means."""
+
+    kind: ClassVar[str]
+    most: ClassVar[float]  # Size beyond which what else looks like it is likelier.
+    do: ClassVar[str]  # Advice.
+
+    @classmethod
+    def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
+        """Those that are tried of a flange: none of effects on a lens."""
+        del flange, stood
+        return iter(())
+
+    @classmethod
+    def of_lens(cls, camera: str, lens: Camera) -> Iterator[Effect]:
+        """Those that are tried of a lens: none of effects on a flange."""
+        del camera, lens
+        return iter(())
+
+    @classmethod
+    @abstractmethod
+    def says(cls, values: FloatArray) -> str:
+        """What (c,) estimated values mean, as a sentence."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,23 +1,43 @@
 """A lens that changes while it warms up: its focal length and its centre."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.types import FloatArray
-from visioncal.estimation.effects.lens_grows import TIME_CONSTANTS
+from visioncal.core.number_format import figure
+from visioncal.core.types import Camera, FloatArray
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import LensEffect
+from visioncal.model.effects.effect import Effect, LensEffect, Named
+
+# Time constants of a camera's warming in one session.
+TIME_CONSTANTS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class LensGrows(LensEffect):
+class LensGrows(LensEffect, Named):
     """Growth of the focal lengths, and shifts of the centre by as many pixels, until the end.
 
     The picks come after the session: there it is zero.
     """
 
-    kind, bounds, count = "lens grows", (1e-2, 1e-7, 0.1), 3
+    kind, bounds, count, most = "lens grows", (1e-2, 1e-7, 0.1), 3, 1e-2
+    do = "Let the camera run for half an hour before it is calibrated and used."
+
+    @classmethod
+    def of_lens(cls, camera: str, lens: Camera) -> Iterator[Effect]:
+        """See `Named`."""
+        yield cls(camera, lens)
+
+    @classmethod
+    def says(cls, values: FloatArray) -> str:
+        """See `Named`."""
+        way = "grew" if values[0] > 0.0 else "shrank"
+        share = figure(100.0 * abs(float(values[0])) * (1.0 - np.exp(-TIME_CONSTANTS)))
+        return (
+            f"The lens's focal length {way} by {share} % during the session, as of a camera that "
+            "warms up. The result is that of its end."
+        )
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""

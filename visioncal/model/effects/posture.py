@@ -1,16 +1,18 @@
 """Errors of an arm's posture: a base that tilts, and what the flange carries that bends."""
 
 from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import Effect
+from visioncal.model.effects.effect import Effect, Named, Stood
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +74,28 @@ def twists_of_frames(poses: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class BaseTilts(PostureEffect):
-    """Tilts of the base about its x and y [rad/m], in proportion to the horizontal reach."""
+class BaseTilts(PostureEffect, Named):
+    """Tilts of the base about its x and y [rad/m], in proportion to the horizontal reach.
 
-    kind, bounds, count = "base tilts", (1e-2, 1e-7, 0.1), 2
+    Its stand, or the floor, gives way.
+    """
+
+    kind, bounds, count, most = "base tilts", (1e-2, 1e-7, 0.1), 2, 5e-3
+    do = "Tighten the base's screws, and stiffen what it stands on, or keep to one reach."
+
+    @classmethod
+    def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
+        """See `Named`."""
+        yield cls(flange, stood.poses[stood.seen])
+
+    @classmethod
+    def says(cls, values: FloatArray) -> str:
+        """See `Named`."""
+        size = figure(1e3 * float(np.linalg.norm(values)))
+        return (
+            f"The base tilts as the arm reaches out, by {size} mrad for each metre. The result "
+            "counts it; the robot's own poses do not."
+        )
 
     def raw(self, poses: FloatArray) -> FloatArray:
         """See `PostureEffect`."""
@@ -84,13 +104,29 @@ class BaseTilts(PostureEffect):
 
 
 @dataclass(frozen=True, eq=False)
-class BracketBends(PostureEffect):
+class BracketBends(PostureEffect, Named):
     """Bends of what the flange carries [m], linear in gravity's direction along its axes.
 
     Turns are times a length of 0.1 m.
     """
 
-    kind, bounds, count = "bracket bends", (1e-2, 1e-7, 0.1), 18
+    kind, bounds, count, most = "bracket bends", (1e-2, 1e-7, 0.1), 18, 3e-3
+    do = "Stiffen the bracket, or record and work in the same attitudes."
+
+    @classmethod
+    def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
+        """See `Named`."""
+        yield cls(flange, stood.poses[stood.seen])
+
+    @classmethod
+    def says(cls, values: FloatArray) -> str:
+        """See `Named`."""
+        turn, shift = (np.linalg.norm(at, ord=2) for at in values.reshape(2, 3, 3))
+        by = mm_and_deg(1e3 * float(shift), float(np.rad2deg(turn / 0.1)))
+        return (
+            f"What the flange carries bends with its weight, by up to {by}. The result is that of "
+            "the views' mean attitude."
+        )
 
     def raw(self, poses: FloatArray) -> FloatArray:
         """See `PostureEffect`."""
