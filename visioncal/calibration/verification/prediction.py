@@ -248,7 +248,9 @@ def _differences(prior: CalibrationPrior, name: str, target: Target) -> list[str
     """In what a target is printed differently than a calibrated one; its size's sigma may be."""
     ours, theirs = target_document(prior.targets[name]), target_document(target)
     return [
-        f"{field} = {shorten(theirs.get(field))}, not {shorten(ours.get(field))}"
+        "image is of another picture"
+        if field == "image"
+        else f"{field} = {shorten(theirs.get(field))}, not {shorten(ours.get(field))}"
         for field in {**ours, **theirs}
         if ours.get(field) != theirs.get(field) and field != "square_sigma_m"
     ]
