@@ -17,10 +17,10 @@ from support.readers import FIXTURE_READERS, READERS, TOOL_READERS
 from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.cli.app import app
 from visioncal.core.choices import POSE_FORMS
-from visioncal.estimation.effects import RANDOM_EFFECTS
 from visioncal.interchange.exports import EXPORT_FORMATS
 from visioncal.interchange.formats.registry import FOREIGN_FORMATS
 from visioncal.live.capture.devices import ARMS, CAMERAS
+from visioncal.model.effects import NAMED
 from visioncal.vision.boards import KINDS
 
 ROOT = Path(__file__).parents[1]
@@ -164,10 +164,11 @@ def finding_faults(kinds):
 def effect_faults(effects):
     """Effects whose kind is no suspect, or that no page names."""
     for effect in effects:
-        if effect.kind not in SUSPECTS:
-            yield f"{effect.kind}: no suspect has its kind"
-        if not list((PACKAGE / "estimation/effects").glob(f"{effect.kind}.py")):
-            yield f"{effect.kind}: no file estimation/effects/{effect.kind}.py"
+        kind = effect.kind.replace(" ", "_")
+        if kind not in SUSPECTS:
+            yield f"{kind}: no suspect has its kind"
+        if not effect.__module__.startswith("visioncal.model.effects."):
+            yield f"{kind}: no file in model/effects"
 
 
 def import_faults(formats):
@@ -210,7 +211,7 @@ def test_every_entry_is_where_a_user_looks():
         *kind_faults(KINDS),
         *command_faults(commands()),
         *finding_faults(raised_kinds()),
-        *effect_faults(RANDOM_EFFECTS),
+        *effect_faults(NAMED),
         *import_faults(FOREIGN_FORMATS),
         *contributing_faults(page(".github/CONTRIBUTING.md")),
     ]

@@ -1,5 +1,6 @@
 """Several threads calibrate and write at once, and leave the process as it was."""
 
+import concurrent.futures
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -13,7 +14,6 @@ from support.refusals import raised
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from visioncal.calibration.run import calibrate, run
-from visioncal.calibration.stages import detect
 from visioncal.core.errors import DataError
 from visioncal.core.threads import SharedSetting
 from visioncal.dynamics import run as dynamics
@@ -71,7 +71,7 @@ def test_threads_change_no_digit(tmp_path, monkeypatch):
             asked.append(threads)
             super().__init__(threads)
 
-    monkeypatch.setattr(detect, "ThreadPoolExecutor", Pool)
+    monkeypatch.setattr(concurrent.futures, "ThreadPoolExecutor", Pool)
     one, three = (
         replace(calibrate(tmp_path / "cell", threads=name), created=CREATED) for name in (1, 3)
     )

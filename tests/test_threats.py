@@ -44,6 +44,7 @@ PLANTED = (
 TRAP = "import os\nopen(os.environ['VISIONCAL_CAUGHT'], 'a').write(__name__ + '\\n')\n"
 # Commands that read no file: what each is called with, in a folder with planted modules.
 NOT_READING = {
+    "audit": "--help",
     "batch": "SESSION -o fleet --workers 2",
     "demo": "--help",
     "simulate": "cell --no-images",

@@ -30,6 +30,7 @@ WORDS = {
     "information": "compute the information of each stop",
     "choice": "choose the stops",
     "path": "find a clear path",
+    "audit": "look at the episodes",
     "excitation": "search for the motion",
 }
 # Least interval of lines without a terminal [s].

@@ -135,6 +135,7 @@ def recover_command(options: RecoverOptions) -> None:
             for words in check.predicted.warnings:
                 warn(words)
             verdict = verdict_of(check).with_paths(path, options.against, _again())
+            options.folder.mkdir(parents=True, exist_ok=True)
             record_check(options.folder / "check.rrd", check, verdict)
             if check.passed and not stated:
                 answer(f"nothing has changed: {options.against} holds. {verdict.top[0]}")

@@ -18,6 +18,7 @@ _PACKAGES = {
     "basler": "pypylon>=26.9",
     "realsense": "pyrealsense2>=2.59,<3",
     "cluster": "distributed>=2025.1",
+    "kornia": "kornia>=0.8,<1",
     "page": "nicegui>=3.18,<4",
     "ros": "rosbags>=0.11,<0.12",
     "lerobot": "pyarrow>=18",

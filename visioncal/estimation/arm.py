@@ -28,6 +28,8 @@ TWIST_UNITS: FloatArray = np.repeat([1.0, LEVER_M], 3)
 # Limits of twice the gain in log-likelihood that noise exceeds in one session of ten thousand, and
 # of twenty.
 SIGNIFICANT, _LIKELY = map(float, chi2_limit([FALSE_ALARM, 0.05], 1))
+# The shortest range of errors by posture [rad].
+POSTURE_RANGE_RAD = 0.15
 # Smaller sizes count as zero [rad].
 _NOTHING = 1e-6
 # Sizes of the errors of links [rad], and their prior: with a probability of a half log-normal about
@@ -117,6 +119,19 @@ def pose_basis(base_from_flange: FloatArray) -> FloatArray:
         of_base * factor[:, None, None] for factor in np.concatenate([position, axis], axis=1).T
     ]
     return np.concatenate([of_flange, of_base, *varying], axis=2)
+
+
+def posture_features(poses: FloatArray) -> FloatArray:
+    """(s, 12) features of (s, 4, 4) postures, whose distance is that of the postures [rad]."""
+    turns = poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
+    return np.concatenate([poses[:, :3, 3] / LEVER_M, turns], axis=1)
+
+
+def posture_correlation(poses: FloatArray) -> FloatArray:
+    """(s, s) correlation of the errors at (s, 4, 4) postures, of the shortest range considered."""
+    features = posture_features(poses)
+    squared = np.sum((features[:, None] - features) ** 2, axis=2)
+    return np.asarray(np.exp(-squared / (2.0 * POSTURE_RANGE_RAD**2)))
 
 
 def find_arm_errors(likelihood: RobotLikelihood, robot: int, basis: FloatArray) -> ArmErrors | None:

@@ -20,7 +20,12 @@ from scipy.spatial.distance import cdist
 
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, evenly
-from visioncal.estimation.arm import LEVER_M, TWIST_UNITS, pose_basis
+from visioncal.estimation.arm import (
+    POSTURE_RANGE_RAD,
+    TWIST_UNITS,
+    pose_basis,
+    posture_features,
+)
 from visioncal.fit.fit import Fit
 from visioncal.fit.mixed import body_with, factors_of, inverse
 from visioncal.fit.score import Products, Score, added_by, products
@@ -29,7 +34,7 @@ from visioncal.model.effects import Effect
 from visioncal.model.effects.posture import PostureEffect, twists_of_frames
 
 # Lengths of processes by posture [rad], with the lever per radian, and by time [stops].
-_RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
+_RANGES, _MEMORIES = (POSTURE_RANGE_RAD, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
 # Sizes of a process, and of what is independent beside it, over the level of the noise.
 _SIZES, _WHITE = (0.3, 0.6, 1.2, 2.5, 5.0), (1.0, 0.7, 0.4, 0.15)
 # Stops that determine errors of an arm's posture; of more than the most, some stand for all in the
@@ -116,19 +121,6 @@ def processes(
     if creeps:
         ramp = (order - order[-1]) / order.std()
         yield Process(1 / 16, np.outer(ramp, ramp), both, is_of_time=True, is_creep=True)
-
-
-def posture_features(poses: FloatArray) -> FloatArray:
-    """(s, 12) features of (s, 4, 4) postures, whose distance is that of the postures [rad]."""
-    turns = poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
-    return np.concatenate([poses[:, :3, 3] / LEVER_M, turns], axis=1)
-
-
-def posture_correlation(poses: FloatArray) -> FloatArray:
-    """(s, s) correlation of the errors at (s, 4, 4) postures, of the shortest range considered."""
-    features = posture_features(poses)
-    squared = cdist(features, features, "sqeuclidean")
-    return np.asarray(np.exp(-squared / (2.0 * _RANGES[0] ** 2)))
 
 
 def _beyond_mean(kernel: FloatArray) -> FloatArray:

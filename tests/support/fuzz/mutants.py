@@ -193,7 +193,7 @@ READINGS = tuple(
     for name in names.split("|")
 )  # fmt: skip
 # What reads no file of the user's, or in processes of its own, or once a device has answered.
-READS_NOTHING = {"batch", "demo", "simulate", "dynamics record"}
+READS_NOTHING = {"audit", "batch", "demo", "simulate", "dynamics record"}
 # What a sound input may be exchanged with.
 _OTHERS = ("pairs", "pairs_out", "arm.toml", "pairs/touches.csv", "foreign/visp")
 _NAMED, _BROKEN = re.compile(r"\[([a-z][\w./]+)\]"), re.compile(r"\{(.+?)\}")

@@ -14,12 +14,12 @@ from visioncal.estimation.appearance import (
     boards_basis,
     stated_board_sigma,
 )
+from visioncal.estimation.arm import posture_correlation
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.model_evidence import CalibrationPosterior, RepeatedStops
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
-from visioncal.fit.processes import posture_correlation
 from visioncal.results import Calibration
 from visioncal.results.arm import FUNCTIONS
 from visioncal.results.sections import FittedArm, JointFit

@@ -29,14 +29,13 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.transforms import invert, rigid_fault
 from visioncal.core.types import Corners, FloatArray
-from visioncal.estimation.arm import ArmErrors, link_basis
+from visioncal.estimation.arm import ArmErrors, link_basis, posture_features
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.model_evidence import TURN_PER_M
 from visioncal.estimation.poses import determines_pose
 from visioncal.estimation.problem_parts import ROBOT, Effect
-from visioncal.fit.processes import posture_features
 from visioncal.results import Calibration
 from visioncal.vision.targets import first_corners
 
