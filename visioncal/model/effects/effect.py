@@ -103,7 +103,8 @@ class Named(ABC):
     """An effect that is tried in every cell, and of which a finding says what it means."""
 
     kind: ClassVar[str]
-    most: ClassVar[float]  # Size beyond which what else looks like it is likelier.
+    # Size, a standard deviation of its values, beyond which what else looks like it is likelier.
+    most: ClassVar[float]
     do: ClassVar[str]  # Advice.
 
     @classmethod
