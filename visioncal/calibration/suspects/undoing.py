@@ -60,16 +60,16 @@ class _Record:
         """The record of a run after the stage `pnp`, of one robot and one camera."""
         seen, views = run.poses_of_one_board, [view.number for view in run.session.views]
         robot = np.full((len(views), 4, 4), np.nan)
-        rows, camera = [], list[FloatArray]()
-        boards = run.session.boards
+        rows, camera, session = [], list[FloatArray](), run.session
+        turns = {name: rotation_transforms(board) for name, board in session.boards.items()}
+        excluded = run.held_back | run.spared.keys()
         for at, view in enumerate(views):
             if view in run.base_from_flange:
                 robot[at] = run.base_from_flange[view]
-            if view in seen and view not in run.held_back | run.spared.keys():
-                board = boards.get(run.session.board_of(run.session.views[at]))
-                turns = np.eye(4)[None] if board is None else rotation_transforms(board)
+            if view in seen and view not in excluded:
+                own = turns.get(session.board_of(session.views[at]), np.eye(4)[None])
                 rows.append(at)
-                camera.append((seen[view].cam_from_target[:, None] @ turns).reshape(-1, 4, 4))
+                camera.append((seen[view].cam_from_target[:, None] @ own).reshape(-1, 4, 4))
         most = max(map(len, camera), default=0)
         padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
         mount: Mount = run.mount or "eye-in-hand"
