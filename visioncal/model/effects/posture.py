@@ -25,6 +25,11 @@ class PostureEffect(Effect):
 
     stops: FloatArray  # (s, 4, 4) the flange at them.
 
+    @classmethod
+    def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
+        """See `Named`."""
+        yield cls(flange, stood.poses[stood.seen])
+
     @abstractmethod
     def raw(self, poses: FloatArray) -> FloatArray:
         """Columns (k, 6, c) at (k, 4, 4) flanges."""
@@ -84,11 +89,6 @@ class BaseTilts(PostureEffect, Named):
     do = "Tighten the base's screws, and stiffen what it stands on, or keep to one reach."
 
     @classmethod
-    def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
-        """See `Named`."""
-        yield cls(flange, stood.poses[stood.seen])
-
-    @classmethod
     def says(cls, values: FloatArray) -> str:
         """See `Named`."""
         size = figure(1e3 * float(np.linalg.norm(values)))
@@ -112,11 +112,6 @@ class BracketBends(PostureEffect, Named):
 
     kind, bounds, count, most = "bracket bends", (1e-2, 1e-7, 0.1), 18, 3e-3
     do = "Stiffen the bracket, or record and work in the same attitudes."
-
-    @classmethod
-    def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
-        """See `Named`."""
-        yield cls(flange, stood.poses[stood.seen])
 
     @classmethod
     def says(cls, values: FloatArray) -> str:
