@@ -13,6 +13,7 @@ What each stop alone says of its flange follows from the factorisation.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 from scipy.linalg import lapack
@@ -266,6 +267,31 @@ class Tried:
     size: float = 0.0
     white: float = 1.0
 
+    def beside(self, rows: FloatArray, shared: "_Shared") -> Self:
+        """The same with rows (d k, r + c + 1) of k more stops."""
+        covariance = shared.independent[self.white]
+        if self.process is not None:
+            covariance = covariance + self.size**2 * shared.lasting[self.process]
+        root = np.linalg.cholesky(covariance)
+        solved, _ = lapack.dtrtrs(root, rows, lower=1)
+        log_det = self.log_det + 2.0 * float(np.log(np.diag(root)).sum())
+        return replace(self, total=solved.T @ solved + self.total, log_det=log_det)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """(d k, d k) covariances of k stops, which all sizes of a process share."""
+
+    independent: Mapping[float, FloatArray]  # By the level of what is independent.
+    lasting: Mapping[Process, FloatArray]  # At a size of one.
+
+    @classmethod
+    def of(cls, alone: StopErrors, some: IntArray, kinds: Iterable[Process]) -> Self:
+        return cls(
+            {white: alone.covariance(some, white) for white in _WHITE},
+            {kind: kind.covariance(some) for kind in kinds},
+        )
+
 
 def _tried_of(fit: Fit, flange: str, alone: StopErrors, *, creeps: bool) -> Iterator[Tried]:
     levels, poses = fit.flange_sigmas(flange), fit.cell.arms[flange].poses[alone.stops]
@@ -281,41 +307,34 @@ def tried(alone: StopErrors, kinds: Iterable[Process], boards: FloatArray) -> It
         kinds: The processes.
         boards: (p, b) the sizes of boards that are held, by the unknowns.
     """
-    some = evenly(len(alone.stops), _MOST)
-    independent_at = {white: alone.covariance(some, white) for white in _WHITE}
-    rows, rest, by_boards = _combined(alone, some, independent_at[1.0], boards)
+    some, kinds = evenly(len(alone.stops), _MOST), tuple(kinds)
+    shared = _Shared.of(alone, some, kinds)
+    rows, rest, by_boards = _combined(alone, some, shared.independent[1.0], boards)
+    for one in _grid(kinds, _SIZES, rest, by_boards):
+        yield one.beside(rows, shared)
 
-    def under(covariance: FloatArray) -> tuple[FloatArray, float, FloatArray]:
-        root = np.linalg.cholesky(covariance)
-        solved, _ = lapack.dtrtrs(root, rows, lower=1)
-        return solved.T @ solved + rest, 2.0 * float(np.log(np.diag(root)).sum()), by_boards
 
+def _grid(
+    kinds: Iterable[Process], sizes: Sequence[float], rest: FloatArray, boards: FloatArray
+) -> Iterator[Tried]:
+    """Yields what is tried before any stop: independent errors first, then processes one by one."""
     for white in _WHITE:
         weight = 1 / 4 if white == 1.0 else 1 / 4 / len(_WHITE)
-        yield Tried(float(np.log(weight)), *under(independent_at[white]), white=white)
+        yield Tried(float(np.log(weight)), rest, 0.0, boards, white=white)
     for process in kinds:
-        covariance = process.covariance(some)
-        weight = float(np.log(process.prior / len(_SIZES) / len(_WHITE)))
-        for size in _SIZES:
+        prior = float(np.log(process.prior / len(sizes) / len(_WHITE)))
+        for size in sizes:
             for white in _WHITE:
-                total = independent_at[white] + size**2 * covariance
-                yield Tried(weight, *under(total), process, size, white)
+                yield Tried(prior, rest, 0.0, boards, process, size, white)
 
 
-@dataclass(frozen=True, eq=False)
-class Weighed:
-    """A process of some size beside independent errors of some level, and its evidence."""
+def weigh(
+    alone: StopErrors, poses: FloatArray, kinds: Sequence[Process]
+) -> list[tuple[Tried, float]]:
+    """Processes over (s, 4, 4) stops, and independent errors alone, with their evidence.
 
-    log: float  # Of prior and restricted likelihood, over that of independent errors alone.
-    process: Process | None
-    size: float
-    white: float
-
-
-def weigh(alone: StopErrors, poses: FloatArray, kinds: Sequence[Process]) -> list[Weighed]:
-    """The evidence of processes over (s, 4, 4) stops, and of independent errors alone.
-
-    Many stops form groups, which are independent beside the common unknowns (Quinonero-Candela and
+    It is the logarithm of prior and restricted likelihood, over that of independent errors. Many
+    stops form groups, which are independent beside the common unknowns (Quinonero-Candela and
     Rasmussen 2005, section 6): those next to each other for what is of time, and those of similar
     postures else.
     """
@@ -325,7 +344,7 @@ def weigh(alone: StopErrors, poses: FloatArray, kinds: Sequence[Process]) -> lis
     in_time = _by_groups(alone, near, np.array_split(stops, count))
     rest = [kind for kind in kinds if kind not in near]
     others = _by_groups(alone, rest, _similar(posture_features(poses), count))
-    return [*others, *(one for one in in_time if one.process is not None)]
+    return [*others, *(pair for pair in in_time if pair[0].process is not None)]
 
 
 def _similar(features: FloatArray, count: int) -> list[IntArray]:
@@ -340,36 +359,20 @@ def _similar(features: FloatArray, count: int) -> list[IntArray]:
 
 def _by_groups(
     alone: StopErrors, kinds: Sequence[Process], groups: Sequence[IntArray]
-) -> list[Weighed]:
+) -> list[tuple[Tried, float]]:
     """The same by some groups of stops; what a group excludes is not tried on others."""
-    left = [
-        Weighed(float(np.log(1 / 4 if white == 1.0 else 1 / 4 / len(_WHITE))), None, 0.0, white)
-        for white in _WHITE
-    ]
     # Most arms have next to none.
-    sizes = (0.1, *_SIZES)
-    for kind in kinds:
-        prior = float(np.log(kind.prior / len(sizes) / len(_WHITE)))
-        left += [Weighed(prior, kind, size, white) for size in sizes for white in _WHITE]
-    sums = [Tried(one.log, alone.rest, 0.0, np.zeros((alone.count, 0))) for one in left]
+    left = [*_grid(kinds, (0.1, *_SIZES), alone.rest, np.zeros((alone.count, 0)))]
     logs = np.zeros(len(left))
     for group in groups:
         rows = alone.rows[group].reshape(-1, alone.count + 1)
-        independent = {white: alone.covariance(group, white) for white in _WHITE}
-        lasting = {one.process: one.process.covariance(group) for one in left if one.process}
-        for at, one in enumerate(left):
-            covariance = independent[one.white]
-            if one.process is not None:
-                covariance = covariance + one.size**2 * lasting[one.process]
-            root = np.linalg.cholesky(covariance)
-            solved, _ = lapack.dtrtrs(root, rows, lower=1)
-            log_det = sums[at].log_det + 2.0 * float(np.log(np.diag(root)).sum())
-            sums[at] = replace(sums[at], total=sums[at].total + solved.T @ solved, log_det=log_det)
-        logs = np.array([one.prior + judged(one, (), is_free=False)[0] for one in sums])
+        shared = _Shared.of(alone, group, {one.process for one in left if one.process})
+        left = [one.beside(rows, shared) for one in left]
+        logs = np.array([one.prior + judged(one, (), is_free=False)[0] for one in left])
         logs -= np.logaddexp.reduce(logs[: len(_WHITE)])
         kept = np.flatnonzero((logs > np.log(_LITTLE)) | (np.arange(len(logs)) < len(_WHITE)))
-        left, sums, logs = [left[at] for at in kept], [sums[at] for at in kept], logs[kept]
-    return [replace(one, log=log) for one, log in zip(left, logs.tolist(), strict=True)]
+        left, logs = [left[at] for at in kept], logs[kept]
+    return [*zip(left, logs.tolist(), strict=True)]
 
 
 def _combined(

@@ -54,10 +54,10 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
         for kind in kinds
     }
     try:
-        models = weigh(alone, flanges[at], [*seen])
+        models, logs_of = zip(*weigh(alone, flanges[at], [*seen]), strict=True)
     except np.linalg.LinAlgError:
         return None
-    logs = np.array([one.log for one in models])
+    logs = np.array(logs_of)
     shares = np.exp(logs - np.logaddexp.reduce(logs))
     shares[shares < _NO_SHARE] = 0.0
     shares /= shares.sum()
