@@ -127,20 +127,30 @@ def plan_command(options: PlanOptions, session: Path | None = None) -> str:
     return ""
 
 
+def robot_of(options: PlanOptions, source: Source, found: Calibration | None, lost: str) -> Robot:
+    """The robot that is asked for, as calibrated, or as stated; raises DataError."""
+    if options.robot is not None:
+        return load_robot(options.robot)
+    if found is not None and found.calibrated_robot is not None:
+        return found.calibrated_robot
+    if source.robot is not None:
+        return source.robot
+    if source.session is not None and source.session.robot_document is not None:
+        return Robot.from_document(source.session.robot_document)
+    raise DataError(
+        f"{source.words} names no robot, and its {lost} without one.",
+        culprits=["robot"],
+        next_step="Name it with --robot.",
+    )
+
+
 def _plan_cube(options: PlanOptions, source: Source, limits: Limits) -> str:
     """Plans the cycles of ISO 9283 for an arm, and writes their table."""
     # Few plans are by the standard.
     from visioncal.live.planning.cube import largest_cube
 
     found = source.calibration
-    robot = source.robot if found is None else found.calibrated_robot
-    robot = robot if options.robot is None else load_robot(options.robot)
-    if robot is None:
-        raise DataError(
-            f"{source.words} names no robot, and its cube cannot be found without one.",
-            culprits=["robot"],
-            next_step="Name it with --robot.",
-        )
+    robot = robot_of(options, source, found, "cube cannot be found")
     cube, cycles = largest_cube(robot, limits), options.stops or 30
     mount = options.mount or (found and found.mount) or "instrument"
     written = write_stops(options.out, cube.table(cycles, mount=mount), {})

@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.run import calibrate
 from visioncal.cli.console import answer, print_json, report_written, say, warn
 from visioncal.cli.parsing import numbers_in, refuse_given
-from visioncal.cli.plan import Kept, Source, pose_of
+from visioncal.cli.plan import Kept, Source, pose_of, robot_of
 from visioncal.cli.session_options import PlanOptions
 from visioncal.core.choices import Criterion
 from visioncal.core.documents.tables import csv_text
@@ -28,8 +28,7 @@ from visioncal.live.planning.instrument import (
 from visioncal.live.planning.plan import Stop
 from visioncal.live.planning.plan_file import ur_program
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.results import Calibration
-from visioncal.robot import Robot, load_robot
+from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION
 from visioncal.session.document import InstrumentTable
@@ -148,7 +147,7 @@ def _cell(
                 next_step="Give both roughly, by --cam and --board: what was recorded counts all "
                 "the same.",
             ) from error
-    robot = _robot(options, source, found)
+    robot = robot_of(options, source, found, "stops cannot be planned")
     if found is not None:
         x, z = (found.edges[name].matrix for name in ("base_from_instrument", "flange_from_probe"))
         noise = replace(
@@ -183,22 +182,6 @@ def _cell(
 def _placed(words: str, option: str) -> FloatArray:
     """A rough pose as `pose_of` reads it; three numbers are a place alone, which is not turned."""
     return pose_of(words + " 0 0 0" * (len(words.replace(",", " ").split()) == 3), option)
-
-
-def _robot(options: PlanOptions, source: Source, found: Calibration | None) -> Robot:
-    if options.robot is not None:
-        return load_robot(options.robot)
-    if found is not None and found.calibrated_robot is not None:
-        return found.calibrated_robot
-    if source.robot is not None:
-        return source.robot
-    if source.session is not None and source.session.robot_document is not None:
-        return Robot.from_document(source.session.robot_document)
-    raise DataError(
-        f"{source.words} names no robot, and its stops cannot be planned without one.",
-        culprits=["robot"],
-        next_step="Name it with --robot.",
-    )
 
 
 def _instrument(options: PlanOptions, session: Session | None) -> tuple[Instrument | None, bool]:

@@ -85,6 +85,20 @@ class Dialect:
     decimals: tuple[int, int]  # Least decimals of positions, and of rotations and joints.
 
 
+def by_file(
+    read: Callable[[str, str, Frames, Found], object],
+) -> Callable[[Mapping[str, str], Frames], Found]:
+    """Reads files one after the other, each by its name and text, into what was found."""
+
+    def read_all(code: Mapping[str, str], frames: Frames) -> Found:
+        found = Found()
+        for name, text in code.items():
+            read(name, text, frames, found)
+        return found
+
+    return read_all
+
+
 def number_spans(text: str, start: int, end: int) -> tuple[tuple[int, int], ...]:
     """Places of the numbers in a part of a text."""
     return tuple(found.span() for found in NUMBER.finditer(text, start, end))

@@ -5,7 +5,6 @@ ABB, "RAPID Instructions, Functions and Data types": robtarget is [[x, y, z], [q
 """
 
 import re
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from visioncal.interchange.programs.program import (
     Frame,
     Frames,
     Literal,
+    by_file,
     line_of,
     number_spans,
     numbers_at,
@@ -116,19 +116,12 @@ class _Reader:
         self._found.add(place, literal, base, self._frame("tool", arguments[-1]))
 
 
-def _read(code: Mapping[str, str], frames: Frames) -> Found:
-    found = Found()
-    for name, text in code.items():
-        _Reader(name, text, frames, found)
-    return found
-
-
 RAPID = Dialect(
     "RAPID",
     (".mod", ".modx", ".prg", ".sys"),
     "",
     r"![^\r\n]*|\"[^\"\r\n]*\"",
-    _read,
+    by_file(_Reader),
     _READING,
     np.pi / 180,
     (3, 7),

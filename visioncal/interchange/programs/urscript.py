@@ -5,7 +5,6 @@ base, of the tool that set_tcp states.
 """
 
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +16,7 @@ from visioncal.interchange.programs.program import (
     Frame,
     Frames,
     Literal,
+    by_file,
     line_of,
     number_spans,
     numbers_at,
@@ -97,19 +97,12 @@ class _Reader:
             self._found.add(place, literal, np.eye(4), self._tool)
 
 
-def _read(code: Mapping[str, str], frames: Frames) -> Found:
-    found = Found()
-    for name, text in code.items():
-        _Reader(name, text, frames, found)
-    return found
-
-
 URSCRIPT = Dialect(
     "URScript",
     (".script", ".urscript"),
     "",
     r"#[^\r\n]*|\"[^\"\r\n]*\"",
-    _read,
+    by_file(_Reader),
     _READING,
     1.0,
     (6, 6),
