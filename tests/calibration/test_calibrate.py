@@ -284,7 +284,7 @@ def test_stops_that_are_too_few_to_check_a_result_are_counted(sound):
     views = Session.load(sound).only(range(6))
     (found,) = visioncal.doctor(views).findings
     assert found.kind == "few_stops"
-    assert found.words == "6 stops can be used; 10 or more are needed to check a result."
+    assert found.words == "6 stops can be used, but checking a result takes 10 or more."
     assert "Add 5 views or more" in found.do.words
 
 

@@ -244,7 +244,7 @@ def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
     for changed, words in (
         ({"time_s": 1.0}, "earlier than the last, at 18000 s"),
         ({"joints_rad": None}, "no joints_rad"),
-        ({"joints_rad": np.zeros(3)}, "6 are needed"),
+        ({"joints_rad": np.zeros(3)}, "must be 6"),
         ({"joints_rad": np.rad2deg(look.joints_rad)}, "in degrees by its size"),
         ({"corners": bad}, "its 3 corners do not determine"),
         ({"corners": afar}, r"at \(1e\+200, .*\) px lies far outside the calibrated"),
@@ -260,9 +260,9 @@ def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
         ({"corners": None}, "one of both"),
         ({"corners": None, "cam_from_target": far}, "millimetres"),
         ({"base_from_flange": np.eye(3)}, "its shape is"),
-        ({"time_s": np.nan}, "its time_s is nan; seconds"),
+        ({"time_s": np.nan}, "time_s is nan, but must be seconds"),
         # Nanoseconds: after them all looks in seconds would be too early.
-        ({"time_s": 1.8e18}, "its time_s is 1.8e"),
+        ({"time_s": 1.8e18}, "time_s is 1.8e"),
     ):
         raised(DataError, words, lambda c=changed: replace(look, **c))
     assert guard.document == before
@@ -306,7 +306,7 @@ def test_of_the_command_line(tmp_path, monkeypatch):
         '{"time_s": 1}': "cam_from_target or",
         '{"when": 2}': "'when'",
         '{"acknowledge": false}': "or acknowledge alone, true",
-        "null": "line 7: the look is null; a JSON object",
+        "null": "line 7: the look is null, but must be a JSON object",
         "[" * 9999: "nested deeper",
         '{"time_s": null}': "no time_s",
         '{"time_s": [1]}': "time_s is [1]; it has to be a number of seconds",

@@ -284,7 +284,7 @@ def test_one_image_of_two_targets_is_two_views_and_rows_name_their_targets(tmp_p
     assert np.all(np.abs(between[3:]) < 4.0 * np.linalg.norm(sigmas[3:]))
     session.save(tmp_path / "copy")
     assert Session.load(tmp_path / "copy").digest() == session.digest()
-    words = "'wall'; one of board, same is needed"
+    words = "'wall', but must be one of board, same"
     changed(folder, "corners.csv", ",board\n", ",wall\n")
     raised(DataError, words, Session.load, folder)
     changed(folder, "corners.csv", ",wall\n", ",board\n")

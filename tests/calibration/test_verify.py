@@ -481,11 +481,11 @@ def cell(tmp_path_factory):
 
 # Of what recover.json holds, and what is said of it; a text that is no act at all.
 EDITED_ACTS = (
-    ({"minutes": "x"}, "minutes is 'x'; a table"), ({"minutes": {"plan": np.nan}}, "minutes.plan"),
-    ({"minutes": {"plan": "1"}}, "a number is needed"), ({"stated": None}, "stated is None"),
-    ({"stated": "camera"}, "a list is needed"), ({"against": 3}, "against is 3"),
-    ({"record": "visioncal record; rm -rf x"}, "a visioncal record is needed"),
-    ({"record": "rm -rf x"}, "a visioncal record is needed"), ({"schema": 9}, "schema is 9"),
+    ({"minutes": "x"}, "but must be a table"), ({"minutes": {"plan": np.nan}}, "minutes.plan"),
+    ({"minutes": {"plan": "1"}}, "must be a number"), ({"stated": None}, "stated is None"),
+    ({"stated": "camera"}, "must be a list"), ({"against": 3}, "against is 3"),
+    ({"record": "visioncal record; rm -rf x"}, "must be a visioncal record"),
+    ({"record": "rm -rf x"}, "must be a visioncal record"), ({"schema": 9}, "schema is 9"),
     ({}, "{"), ({}, "null"), ({}, "{}"), ({}, ""),
 )  # fmt: skip
 

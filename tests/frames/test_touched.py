@@ -323,7 +323,7 @@ LINE = np.outer(np.arange(8), [50, 0, 0])
     [
         ({"points_mm": MIRRORED}, "cad.csv is a mirror image of the part"),
         ({"points_mm": LINE[:6], "names": NAMES[:6]}, "the points do not fit the drawing"),
-        ({"points_mm": CAD_MM[:2], "names": NAMES[:2]}, "at least 3 are needed"),
+        ({"points_mm": CAD_MM[:2], "names": NAMES[:2]}, "takes at least 3"),
         ({"scale": 1000.0}, "these look like millimetres. "),
         ({"scale": 0.001}, "metres read as millimetres"),
         ({"names": NAMES[::-1]}, "the points do not fit the drawing"),
@@ -345,7 +345,7 @@ def test_features_need_their_kinds(tmp_path, tool_file):
         return visioncal("fixture", touches, "--tool", tool_file, *more)
 
     run(KINDS).good()
-    run(("",) * 7).refused("there is no kind; one of origin, x, xy is needed", "--cad")
+    run(("",) * 7).refused("kind is missing, but must be one of origin, x, xy", "--cad")
     run(("orgin", *KINDS[1:])).refused("line 2: kind is 'orgin'", "Did you mean origin?")
     run(KINDS[:3]).refused("no touch of kind xy")
     on_a_line = 0.1 * np.outer([0.0, 1.0, 3.0], [1.0, 0.0, 0.0])

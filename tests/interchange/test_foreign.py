@@ -275,7 +275,7 @@ def test_intrinsics_of_numpy_and_of_a_fisheye(tmp_path):
     (tmp_path / "fisheye.yaml").write_text(text)
     assert read_intrinsics(tmp_path / "fisheye.yaml")[0]["model"] == "fisheye"
     (tmp_path / "omni.yaml").write_text(text.replace("pinhole", "omni"))
-    raised(DataError, "pinhole is needed", read_intrinsics, tmp_path / "omni.yaml")
+    raised(DataError, "must have the camera matrix of a pinhole", read_intrinsics, tmp_path / "omni.yaml")
 
 
 def test_numbers_or_images_say_which_pose_has_no_image(tmp_path):
@@ -593,8 +593,8 @@ BY_COLUMNS = [525.0, 0, 0, 0, 526, 0, 319.5, 239.5, 1]
         (BY_ROWS, ""),
         (BY_COLUMNS, ""),
         (np.reshape(BY_COLUMNS, (3, 3)).tolist(), ""),
-        ([525, 0, 320, 0, 526, 240, 7, 8, 9], "are needed"),
-        ([525, 0, 320, 0, 526, 240, 0, 0, 0.5], "are needed"),
+        ([525, 0, 320, 0, 526, 240, 7, 8, 9], "must be the nine numbers"),
+        ([525, 0, 320, 0, 526, 240, 0, 0, 0.5], "must be the nine numbers"),
         ([525, 0, 320, 0, -526, 240, 0, 0, 1], "above 0"),
     ],
 )

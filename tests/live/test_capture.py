@@ -243,7 +243,7 @@ def test_a_disk_without_room_is_told_before_on_the_way_and_while_it_is_written(
     free = {"free": 1_000_000}
     monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: usage._replace(**free))
     arm, camera = fake_devices(plan)
-    words = r"1\.5 MB are needed for 5 views"
+    words = r"1\.5 MB must be free for 5 views"
     raised(DataError, words, recorded, tmp_path / "before", plan, arm, camera)
     assert arm.moves == 0
 
@@ -537,7 +537,7 @@ def test_what_cannot_be_is_refused_before_a_device_is_asked(planned, tmp_path, m
 def test_devices_and_pictures_that_do_not_fit_are_named(planned, cell, tmp_path):
     visioncal(
         "record", "-o", tmp_path / "live", "--arm", "fak", *CAMERA, "--plan", planned[0]
-    ).refused("'fak' is no kind of device; fake, manual are. Did you mean fake?")
+    ).refused("--arm: the device is 'fak', but must be one of fake, manual. Did you mean fake?")
     camera = cell[1]
     camera.lens = replace(camera.lens, resolution=(320, 200))
     record(tmp_path / "live", "--plan", planned[0], "--yes").refused(

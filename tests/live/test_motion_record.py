@@ -52,7 +52,7 @@ def test_an_arm_that_never_moves_is_named():
 
 
 def test_other_arms_and_streams_that_are_there_are_refused(tmp_path):
-    run("dynamics", "record", tmp_path / "s", "--arm", "abb:1.2.3.4").refused("ur:HOST is needed")
+    run("dynamics", "record", tmp_path / "s", "--arm", "abb:1.2.3.4").refused("must be ur:HOST")
     (tmp_path / "s" / "streams").mkdir(parents=True)
     (tmp_path / "s" / "streams" / "excite.csv").write_text("stamp_s\n1\n")
     run("dynamics", "record", tmp_path / "s", "--arm", "ur:1.2.3.4").refused("excite.csv exists")

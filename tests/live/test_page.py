@@ -88,7 +88,7 @@ def calibrated(cell, browser) -> Path:
         page.get_by_label(POSE).fill("{X 0.4, Y 0.02, Z 0.3, A 10, B 20, C 30}")
         page.get_by_text("In metres?").wait_for()
         page.get_by_label(POSE).fill("400 20 300 10 20 30")
-        page.get_by_text("one form is needed").wait_for()
+        page.get_by_text("must have one form").wait_for()
         for place, view in enumerate(views[:4], 1):
             typed(page, seen, view, kuka(view.base_from_flange(), comma=place % 2 == 0), place)
         page.get_by_role("button", name="Undo last").click()

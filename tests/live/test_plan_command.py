@@ -132,7 +132,7 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
     ("source", "cell", "more", "words"),
     [
         ("ur55e", {}, (), "Did you mean ur5e"),
-        ("ur5e", {"cam": "1 2 3"}, (), "--cam is '1,2,3'; x,y,z,rx,ry,rz is needed"),
+        ("ur5e", {"cam": "1 2 3"}, (), "--cam is '1,2,3', but must be x,y,z,rx,ry,rz"),
         ("ur5e", {"resolution": "1280"}, (), "--resolution"),
         ("ur5e", {}, ("--box", "cage:500,0,400:900,900,700"), "Look whether the boxes are"),
         ("ur5e", {}, ("--for", "handeye"), "Did you mean hand-eye"),

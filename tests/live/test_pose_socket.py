@@ -310,7 +310,7 @@ def test_a_robot_that_does_not_come_back_ends_the_recording():
     raised(DriverError, "cannot be listened at", SocketArm, "127.0.0.1", arm.port)
     arm.close()
     for words in ("socket:", "socket:127.0.0.1", "socket:70000"):
-        raised(DataError, "is no port", open_arm, words, None, form=None, moves=False)
+        raised(DataError, "needs a port", open_arm, words, None, form=None, moves=False)
 
 
 def test_who_says_nothing_or_garbage_takes_no_robots_place(arm):

@@ -232,13 +232,17 @@ def calibrated(tmp_path_factory):
 @pytest.mark.parametrize(
     ("place", "value", "words"),
     [
-        (("views", 2, "rms_px"), "0.2", r"views\[2\].rms_px is '0.2'; a number is needed"),
-        (("views", 1, "used"), 1, r"views\[1\].used is 1; true or false is needed"),
-        (("noise", "pixel_px"), float("nan"), "noise.pixel_px is nan; a number that a cell has"),
-        (("rms", "mm"), 10**400, "rms.mm is inf; a number that a cell has"),
+        (("views", 2, "rms_px"), "0.2", r"views\[2\].rms_px is '0.2', but must be a number"),
+        (("views", 1, "used"), 1, r"views\[1\].used is 1, but must be true or false"),
+        (
+            ("noise", "pixel_px"),
+            float("nan"),
+            "pixel_px is nan, but must be a number that a cell has",
+        ),
+        (("rms", "mm"), 10**400, "rms.mm is inf, but must be a number that a cell has"),
         (("rms",), {}, "rms.mm is missing"),
         (("verdict", "status"), "perfect", "verdict.status is 'perfect'"),
-        (("kinematics",), "nominal", "kinematics is 'nominal'; a table is needed"),
+        (("kinematics",), "nominal", "kinematics is 'nominal', but must be a table"),
         (("joint_covariance", "matrix", 2, 2), -1e-8, "matrix is no covariance"),
         (("transforms", "flange_from_cam", "matrix", 3, 0), 1.0, "not a rigid transform"),
         (("elastic",), {"joints": [{"compliance_rad_per_nm": {}}]}, r"joints\[0\].compliance"),
@@ -266,8 +270,8 @@ def test_what_a_calibration_does_not_hold_is_named(calibrated, tmp_path, place, 
     [
         ("views", [{"view": 0}], r"views\[0\]\.[a-z]+ is missing"),
         ("noise", {"a": {"translation_mm": "0.1"}}, "noise.a.translation_mm is '0.1'"),
-        ("cameras", [], r"cameras is \[\]; a table is needed"),
-        ("weakest", None, "weakest is None; a text is needed"),
+        ("cameras", [], r"cameras is \[\], but must be a table"),
+        ("weakest", None, "weakest is None, but must be a text"),
     ],
 )
 def test_what_a_cell_s_result_does_not_hold_is_named(tmp_path, key, value, words):

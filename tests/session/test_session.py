@@ -373,7 +373,7 @@ CSV_REFUSALS = [
     (",qw,", ",w,", "the columns x_m, .* lack qw"),
     ("3,,holdout", "3.5,,holdout", r"line 3, column view: '3\.5' is no whole number"),
     ("3,,holdout", "7,,holdout", r"line 3, column view: 7 is already the view of .*line 2"),
-    ("holdout", "test", 'line 3, column role: \'test\' is no role; "fit", "holdout"'),
+    ("holdout", "test", 'line 3, column role: \'test\' must be a role: "fit", "holdout"'),
     ("0.6,0,0.3", '0.6,"0,1",0.3', "line 3, column y_m: '0,1' .*such as -1234.5"),
     (",0.10,", ",1e308,", r"1e\+308 s is no time of a recording"),
     ("0.6,0,0.3", "0.6,,0.3", r"line 3, column x_m \.\.\. qw: some are empty"),

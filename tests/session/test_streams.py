@@ -143,7 +143,7 @@ def test_the_digest_knows_streams_and_is_as_it_was_without():
     ("column", "value", "words"),
     [
         ("stamp_s", "1e308", "no time of a recording; write seconds"),
-        ("x_m", "-1e308", "no place in a robot cell"),
+        ("x_m", "-1e308", "beyond every robot cell"),
         ("q1_rad", "1e300", "no angle of a joint"),
         ("qx", "1e308", "no number that a cell has"),
     ],
@@ -186,7 +186,7 @@ def test_loads_are_read_and_nothing_is_no_load():
         ({"payload_kg": "-2"}, "column payload_kg: -2 kg is no payload"),
         ({"payload_x_m": "0.1"}, "payload_kg, its mass, is missing"),
         ({"force_z_n": "5e7"}, "5e\\+07 N is no force"),
-        ({"approach": "up"}, "column approach: 'up' is no side"),
+        ({"approach": "up"}, "column approach: 'up' must be a side"),
     ],
 )
 def test_what_can_be_no_load_is_refused(cells, words):

@@ -65,7 +65,7 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
         length, radius = (1e-3 * number for number in options.tool)
         if min(length, radius) <= 0.0:
             raise DataError(
-                f"--tool is {options.tool}; a length and a radius above zero [mm] are needed.",
+                f"--tool is {options.tool}, but must be a length and a radius above zero [mm].",
                 culprits=["--tool"],
             )
         flange = arm.chain.placements[-1]
@@ -76,7 +76,7 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
         kg, *centre_mm = options.payload
         if kg < 0.0:
             raise DataError(
-                f"--payload is of {kg:g} kg; a mass of 0 kg or more is needed.",
+                f"--payload is of {kg:g} kg, but must have a mass of 0 kg or more.",
                 culprits=["--payload"],
             )
         # A point mass, in the flange's frame.
@@ -149,7 +149,7 @@ def dynamics_record_command(options: DynamicsRecordOptions) -> None:
     kind, _, host = options.arm.partition(":")
     if kind != "ur" or not host:
         raise DataError(
-            f"--arm is {options.arm!r}; ur:HOST is needed, as ur:192.168.0.10.",
+            f"--arm is {options.arm!r}, but must be ur:HOST, as ur:192.168.0.10.",
             culprits=["--arm"],
             next_step="Other arms' recordings go into streams/NAME.csv of a session.",
         )

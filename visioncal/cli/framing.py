@@ -165,7 +165,7 @@ def place_frame(
     if source is None:
         command = "tcp" if kind == "tool" else "fixture"
         raise DataError(
-            f"{command}: touches of it, or a session that shows it, are needed.",
+            f"{command} needs touches of it, or a session that shows it.",
             culprits=["TOUCHES"],
             next_step=f"Name them: visioncal {command} TOUCHES -c OUT"
             f"{' --cad DRAWING --tool NAME' * (kind != 'tool')}; visioncal {command} --example "
@@ -311,7 +311,7 @@ def _tool(option: str | None, calibration: Calibration | None, robot: str | None
     if frames:
         return Tool.among(frames, "The calibration", option)
     raise DataError(
-        f"--tool {option}: there is no such file, nor a calibration (-c) that has such a tool.",
+        f"--tool {option} must be a file of frames, or a tool of the calibration (-c).",
         culprits=[option],
         next_step=NO_TOOL,
     )

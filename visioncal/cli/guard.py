@@ -111,7 +111,7 @@ def _answers(guard: Guard) -> Iterator[dict[str, Any]]:
         try:
             document = parse_json(line, "the look")
             if not isinstance(document, dict):
-                raise DataError(f"the look is {line.strip()[:60]}; a JSON object is needed.")
+                raise DataError(f"the look is {line.strip()[:60]}, but must be a JSON object.")
             if document == {"acknowledge": True}:
                 guard.acknowledge()
                 yield {"acknowledged": True}

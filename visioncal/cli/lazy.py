@@ -63,7 +63,7 @@ class PlainCommand(TyperCommand):
         ):
             if option in path_options and not value:
                 raise DataError(
-                    f"{option} is empty; a path is needed.",
+                    f"{option} is empty, but must be a path.",
                     culprits=[option],
                     next_step="Write . for the folder where you are; or look whether a variable of "
                     "the shell is set.",

@@ -265,7 +265,7 @@ def _plane_of(
 def _height_m(words: str) -> float:
     if not words.startswith("z="):
         raise DataError(
-            f"--plane ends in {words[:80]!r}; z=5, a height in mm, is needed there.",
+            f"--plane ends in {words[:80]!r}, but must end in a height in mm, such as z=5.",
             culprits=["--plane"],
             next_step=f"A plane is {FORMS}.",
         )

@@ -32,7 +32,7 @@ def numbers_in(words: str, option: str, form: str = "", scale: float = 1.0) -> t
     except ValueError:
         values = ()
     count = len(form.split(",")) if form else max(len(values), 1)
-    needed = f"{form} is needed, numbers" if form else "numbers are needed,"
+    needed = f"{form}, numbers" if form else "numbers"
     are_right = len(values) == count and all(map(math.isfinite, values))
     _check(are_right, words, option, f"{needed} with commas between")
     return tuple(scale * value for value in values)
@@ -41,7 +41,7 @@ def numbers_in(words: str, option: str, form: str = "", scale: float = 1.0) -> t
 def pair_in(words: str, option: str) -> tuple[int, int]:
     """Parses the numbers of two views, written as 8,17."""
     numbers = _whole_numbers(words)
-    needed = "the numbers of two views are needed, as 8,17"
+    needed = "the numbers of two views, as 8,17"
     _check(len(numbers) == 2, words, option, needed)
     return numbers[0], numbers[1]
 
@@ -52,7 +52,7 @@ def views_in(words: str, option: str) -> tuple[int, ...]:
     for part in words.split(","):
         ends = _whole_numbers(part.replace("-", ","))
         is_range = 1 <= len(ends) <= 2 and ends[0] <= ends[-1]
-        _check(is_range, words, option, "numbers of views are needed, as 1-12,14")
+        _check(is_range, words, option, "numbers of views, as 1-12,14")
         found += range(ends[0], ends[-1] + 1)
     return tuple(found)
 
@@ -61,7 +61,7 @@ def shift_in(words: str, option: str) -> tuple[tuple[int, ...], int]:
     """Parses views and the number of rows that they are apart, written as 12-24:2."""
     views, _, by = words.partition(":")
     is_right = by.removeprefix("-").isdecimal() and int(by) != 0
-    _check(is_right, words, option, "views and a number of rows are needed, as 12-24:2")
+    _check(is_right, words, option, "views and a number of rows, as 12-24:2")
     return views_in(views, option), int(by)
 
 
@@ -89,14 +89,14 @@ def places_in(
     is_right = len(parsed) == 3 and all(
         re.fullmatch(f"(?:{_TERM})+", axis) for axis in axes.split(",")
     )
-    _check(is_right, words, option, "views and three axes are needed, as 0,4-6:x,-y,z+rail_m")
+    _check(is_right, words, option, "views and three axes, as 0,4-6:x,-y,z+rail_m")
     return views_in(views, option), parsed
 
 
 def serial_in(words: str, option: str) -> tuple[str, str]:
     """Parses what a serial number is of, and the number, written as camera=1234."""
     what, sign, number = words.partition("=")
-    needed = "what it is of and the number are needed, as camera=1234"
+    needed = "what it is of and the number, as camera=1234"
     _check(bool(sign and what), words, option, needed)
     return f"serial number, {what}", number
 
@@ -104,9 +104,7 @@ def serial_in(words: str, option: str) -> tuple[str, str]:
 def size_in(words: str, option: str = "--resolution") -> tuple[int, int]:
     """Parses the width and height of images [px], written as 1280,800 or 1280x800."""
     numbers = _whole_numbers(words.replace("x", ","))
-    needed = (
-        "width and height of the images are needed [px], two whole numbers above 0, as 1280,800"
-    )
+    needed = "width and height of the images [px], two whole numbers above 0, as 1280,800"
     _check(len(numbers) == 2 and min(numbers) > 0, words, option, needed)
     return numbers[0], numbers[1]
 
@@ -115,7 +113,7 @@ def address_in(words: str, option: str) -> tuple[str, int]:
     """Parses the address of a server, written as 0.0.0.0:8321."""
     host, _, port = words.rpartition(":")
     is_right = bool(host) and port.isdecimal() and 0 < int(port) < 1 << 16
-    _check(is_right, words, option, "a host and a port up to 65535 are needed, as 0.0.0.0:8321")
+    _check(is_right, words, option, "a host and a port up to 65535, as 0.0.0.0:8321")
     return host, int(port)
 
 
@@ -123,14 +121,14 @@ def names_in(words: str, option: str) -> tuple[str, ...]:
     """Parses an option of names separated by commas."""
     names = tuple(part.strip() for part in words.split(","))
     are_names = all(names) and len(set(names)) == len(names)
-    _check(are_names, words, option, "names are needed, each once, with commas between")
+    _check(are_names, words, option, "names, each once, with commas between")
     return names
 
 
 def _check(is_right: bool, words: str, option: str, needed: str) -> None:
     """Refuses a value of an option."""
     if not is_right:
-        raise DataError(f"{option} is {words[:80]!r}; {needed}.", culprits=[option])
+        raise DataError(f"{option} is {words[:80]!r}, but must be {needed}.", culprits=[option])
 
 
 def _whole_numbers(words: str) -> list[int]:

@@ -248,7 +248,7 @@ def boxes_of(kept: ClearanceOptions) -> tuple[Box, ...]:
         parts = words.split(":")
         if len(parts) != 3 or not parts[0].strip():
             raise DataError(
-                f"--box is {words[:80]!r}; NAME:X,Y,Z:SX,SY,SZ is needed, with the centre in the "
+                f"--box is {words[:80]!r}, but must be NAME:X,Y,Z:SX,SY,SZ, with the centre in the "
                 "base and the lengths in mm.",
                 culprits=["--box"],
                 next_step="Such as --box name:500,0,300:400,400,400",

@@ -136,7 +136,7 @@ def recorded_cell(plan: PlanFile | None, described: RecordOptions) -> RecordedCe
         found = plan.cell
     elif target is None:
         raise DataError(
-            "record: --plan or --target is needed to know what to look for.",
+            "record needs --plan or --target to know what to look for.",
             culprits=["--plan", "--target"],
             next_step="Name the board, as --target charuco_9x6_30mm.",
         )

@@ -66,7 +66,7 @@ class _Act:
         words = shlex.split(self.record or "visioncal record")
         # Whoever edited the file has no say in what is typed.
         if words[:2] != ["visioncal", "record"] or self.record not in (None, shlex.join(words)):
-            raise ValueError(f"record is {self.record!r}; a visioncal record is needed")
+            raise ValueError(f"record is {self.record!r}, but must be a visioncal record")
 
 
 def _opened(options: RecoverOptions, old: Calibration) -> _Act:

@@ -193,7 +193,7 @@ class GuardOptions(PartOptions):
     state: Path | None = option("A file that keeps what was learned, for the next start.")
     recording: Path | None = option("Also record the looks, for visioncal show --viewer.")
     scene: Path | None = option(
-        "A session or .rrd whose images show the standing scene; no board is needed."
+        "A session or .rrd whose images show the standing scene, without a board."
     )
     mask: Path | None = option(
         "With --scene: an image, white where things stand still.", needs="scene"

@@ -40,7 +40,7 @@ def target_make_command(options: TargetMakeOptions) -> None:
     kind = options.kind
     if (options.target is None) == (kind is None):
         raise DataError(
-            "Name a board, or describe one by --kind: one of both is needed.",
+            "Name a board, or describe one by --kind.",
             next_step=f"The boards are {', '.join(target_names())}.",
         )
     board = {field.name: getattr(options, field.name) for field in fields(BoardOptions)}

@@ -163,7 +163,7 @@ def _refusal(
         if any(entry["type"] == "literal_error" for entry in worst):
             step = did_you_mean(str(value), re.findall("'(.*?)'", needed))
     at = "".join(f"[{index}]" for index in place)
-    message = f"{owner}: {name}{at} is {seen}; {needed} is needed."
+    message = f"{owner}: {name}{at} is {seen}, but must be {needed}."
     return DataError(message, culprits=[name], next_step=step)
 
 

@@ -297,7 +297,7 @@ def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what J
 def type_error(value: object, needed: str, path: str) -> DataError:
     """Builds the error for a value of another type than needed."""
     place = path or "the document"
-    return DataError(f"{place} is {value!r:.60}; {needed} is needed.", culprits=[place])
+    return DataError(f"{place} is {value!r:.60}, but must be {needed}.", culprits=[place])
 
 
 def _table(value: object, path: str) -> Mapping[str, Any]:

@@ -210,7 +210,7 @@ def rigid_fault(matrix: FloatArray, most: float = RIGID) -> str:
         return "it has entries that are not finite"
     if not np.allclose(matrix[3], LAST_ROW, atol=most):
         row = ", ".join(f"{value:.4g}" for value in matrix[3])
-        return f"its last row is [{row}], and [0, 0, 0, 1] is needed; it may be transposed"
+        return f"its last row is [{row}], but must be [0, 0, 0, 1]; it may be transposed"
     # Squares of the largest numbers overflow.
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(matrix[:3, :3].T @ matrix[:3, :3] - np.eye(3)).max()

@@ -254,13 +254,13 @@ class ExcitationRequest:
             )
         if not FEWEST <= self.harmonics <= MOST:
             raise DataError(
-                f"a motion of {self.harmonics} harmonics is wished; {FEWEST} to {MOST} is needed.",
+                f"--harmonics is {self.harmonics}, but must be {FEWEST} to {MOST}.",
                 culprits=["--harmonics"],
             )
         if not self.seconds >= 0.0 or min(self.starts, self.steps) < 1:
             raise DataError(
                 f"a search of {self.seconds:g} s from {self.starts} starts with {self.steps} steps "
-                "is wished; 0 s or more, a start and a step are needed.",
+                "is asked for, but must have 0 s or more, a start and a step.",
                 culprits=["--starts", "--seconds"],
             )
 

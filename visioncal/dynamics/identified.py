@@ -416,5 +416,5 @@ def _column(rows: Sequence[Mapping[str, Any]], name: str) -> FloatArray:
 def _array(values: object, shape: tuple[int, ...]) -> FloatArray:
     array = np.asarray(values, dtype=float)
     if array.shape != shape:
-        raise ValueError(f"an array of shape {array.shape} stands where {shape} is needed")
+        raise ValueError(f"an array has the shape {array.shape}, but must have {shape}")
     return array

@@ -39,7 +39,7 @@ class MotionMargins:
         ):
             value = getattr(self, name)
             if not low <= value <= high:
-                raise DataError(f"limits: {name} is {value}; {low:g} to {high:g} is needed.")
+                raise DataError(f"limits: {name} is {value}, but must be {low:g} to {high:g}.")
 
 
 @dataclass(frozen=True)

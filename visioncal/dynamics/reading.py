@@ -96,7 +96,7 @@ def read_recorded(
     gains = np.asarray(gains_nm_a if of_currents else np.ones(count), dtype=float)
     if gains.shape != (count,) or not (np.isfinite(gains) & (gains > 0.0)).all():
         raise DataError(
-            f"{label} holds currents and no torques; {count} gains above 0 [N m/A] are needed to "
+            f"{label} holds currents and no torques: it needs {count} gains above 0 [N m/A] to "
             f"turn them into torques, not {list(gains_nm_a)}.",
             culprits=[label],
             next_step="Give them with --gains K1,K2,...: the motor's torque constant times the "

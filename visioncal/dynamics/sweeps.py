@@ -44,7 +44,7 @@ class SweepRequest:
             )
         if not _SHORTEST_HOLD_S <= self.hold_s <= 60.0:
             raise DataError(
-                f"sweeps of {self.hold_s:g} s are wished; {_SHORTEST_HOLD_S} to 60 s are needed.",
+                f"hold_s is {self.hold_s:g}, but must be {_SHORTEST_HOLD_S} to 60.",
                 culprits=["hold_s"],
             )
 

@@ -232,9 +232,9 @@ def refuse_too_few(problem: Problem, mount: Mount) -> None:
     sensor = "instrument" if mount == "instrument" else "camera"
     culprit = f"the {sensor}'s offset from the {_frame(mount)}"
     raise DegenerateError(
-        f"{title(mount)}: {counted(stops, 'usable stop')} of the robot, at least {FEWEST_VIEWS} "
-        f"are needed; {culprit} is not determined: it takes two different axes of rotation between "
-        "views.",
+        f"{title(mount)}: {counted(stops, 'usable stop')} of the robot, but it takes at least "
+        f"{FEWEST_VIEWS}; {culprit} is not determined without two different axes of rotation "
+        "between views.",
         culprits=[culprit],
         next_step=_advice(mount),
     )

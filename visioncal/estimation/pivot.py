@@ -225,8 +225,8 @@ def _check_counts(touches: Touches) -> None:
             f"{n} of {name or 'one point'}" for name, n in zip(touches.names, counts, strict=True)
         )
         raise DataError(
-            f"tcp: {len(tips)} touches of kind point ({counted}): at least {FEWEST_POINTS} of "
-            "one point, or 2 each of two points, are needed.",
+            f"tcp: {len(tips)} touches of kind point ({counted}), but it takes at least "
+            f"{FEWEST_POINTS} of one point, or 2 each of two points.",
             culprits=touches.names,
             next_step=_ADVICE,
         )

@@ -160,8 +160,8 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
     missing = [kind for kind in FEATURE_KINDS if kind not in touches.kinds]
     if missing:
         raise DataError(
-            f"fixture: no touch of kind {some_of(missing)}: at least one of each kind, "
-            f"{some_of(FEATURE_KINDS)}, is needed.",
+            f"fixture: no touch of kind {some_of(missing)}: it takes at least one of each "
+            f"kind, {some_of(FEATURE_KINDS)}.",
             culprits=missing,
             next_step="Touch the fixture's origin, a point on its x axis, and a point in its xy "
             "plane on the side of positive y.",
@@ -207,8 +207,8 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
     names = tuple(dict.fromkeys(pairs.labels))
     if len(names) < FEWEST_POINTS:
         raise DataError(
-            f"fixture: {len(names)} measured points with coordinates in the drawing, at least "
-            f"{FEWEST_POINTS} are needed.",
+            f"fixture: {len(names)} measured points with coordinates in the drawing, but it "
+            f"takes at least {FEWEST_POINTS}.",
             culprits=names,
             next_step="Measure more points, not all on one line.",
         )

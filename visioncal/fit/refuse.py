@@ -40,7 +40,7 @@ def refuse_unjoined(cell: Cell, joined: Cell) -> None:
         return
     stops = len({one.stop for one in cell.sightings if not (one.is_held or one.is_stated)})
     frames = [_named(name) for name in cell.unknown] or ["the camera"]
-    why = f"{counted(stops, 'usable stop')} of the robot, at least {FEWEST_VIEWS} are needed"
+    why = f"{counted(stops, 'usable stop')} of the robot, but it takes at least {FEWEST_VIEWS}"
     if cell.sightings and cell.held.all():
         why = f"all {counted(len(cell.sightings), 'view')} are held out"
     elif stops >= FEWEST_VIEWS:

@@ -153,7 +153,7 @@ class CalibratedCamera:
                 next_step="State the feature's standard deviation in pixels (sigma_px).",
             )
         if not np.isfinite(sigma) or sigma < 0.0:
-            raise DataError(f"locate: sigma_px is {sigma!r}; a standard deviation is needed.")
+            raise DataError(f"locate: sigma_px is {sigma!r}, but must be a standard deviation.")
         return float(sigma)
 
     def at(
@@ -285,7 +285,7 @@ def checked_point(point_target_m: FloatArray | Sequence[float]) -> FloatArray:
     point, name = np.asarray(point_target_m, dtype=float), "point_target_m"
     if point.shape != (3,) or not np.isfinite(point).all():
         seen = f"is {point.tolist()}" if point.shape == (3,) else f"has the shape {point.shape}"
-        raise DataError(f"{name} {seen}; three metres are needed.", culprits=[name])
+        raise DataError(f"{name} {seen}, but must be three numbers [m].", culprits=[name])
     if np.abs(point).max() > FAR_M:
         raise DataError(
             f"{name} is {point.tolist()}, and no arm reaches farther than {FAR_M:g} m.",
@@ -325,7 +325,7 @@ class Plane:
         """
         for name, array in (("normal", normal), ("point", point)):
             if np.shape(array) != (3,):
-                raise DataError(f"plane: the {name} is {array!r}; three numbers are needed.")
+                raise DataError(f"plane: the {name} is {array!r}, but must be three numbers.")
         length = float(np.linalg.norm(normal))
         if not np.isfinite(length) or length < 1e-9:
             raise DataError(
@@ -374,7 +374,7 @@ def _length(value_m: float) -> float:
 def _offset_covariance(sigma_m: float) -> FloatArray:
     if not np.isfinite(sigma_m) or sigma_m < 0.0:
         raise DataError(
-            f"plane: sigma_m is {sigma_m!r}; a standard deviation is needed.",
+            f"plane: sigma_m is {sigma_m!r}, but must be a standard deviation.",
             culprits=["sigma_m"],
             next_step="Give how well its height is known, 0 or more.",
         )

@@ -157,7 +157,7 @@ def locate_by_depth(
     measured = np.broadcast_to(np.asarray(depth_m, dtype=float), len(px))
     if not (measured > 0.0).all():
         raise DataError(
-            f"locate: the distances are {measured.tolist()}; metres above 0 are needed.",
+            f"locate: the distances are {measured.tolist()}, but must be metres above 0.",
             next_step="Take a pixel at which the sensor measured one.",
         )
     model, found = eye.lens.depth, list[Located]()
@@ -275,7 +275,7 @@ def _rays(eye: CalibratedCamera, px: FloatArray) -> tuple[FloatArray, FloatArray
     """(n, 2) checked pixels, and (n, 3) their rays of unit depth; raises DataError."""
     px = np.atleast_2d(np.asarray(px, dtype=float))
     if px.shape[1:] != (2,):
-        raise DataError(f"locate: pixels have the shape {px.shape}; (n, 2) is needed.")
+        raise DataError(f"locate: pixels have the shape {px.shape}, but must have (n, 2).")
     size = np.array(eye.camera.resolution)
     inside = np.all((px >= -0.5) & (px <= size - 0.5), axis=1)
     # Points at unit depth.

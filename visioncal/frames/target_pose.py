@@ -354,7 +354,7 @@ def place_seen(
             needed and missing.
     """
     if not sights:
-        raise DataError("no image shows the target: at least one is needed.")
+        raise DataError("No image shows the target, but at least one must.")
     eye = CalibratedCamera.of(calibration)
     board = target if isinstance(target, Target) else load_target(target)
     looks = [

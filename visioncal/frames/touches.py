@@ -60,7 +60,7 @@ class TouchRows:
             needed += "" if default else some_of(allowed)
             raise DataError(
                 f"{self.places[wrong[0]]}: "
-                f"{f'kind is {seen!r}' if seen else 'there is no kind'}; {needed} is needed.",
+                f"kind is {repr(seen) if seen else 'missing'}, but must be {needed}.",
                 culprits=[self.places[at] for at in wrong],
                 next_step=did_you_mean(seen, allowed) or hint,
             )
@@ -252,7 +252,7 @@ class Tool:
         if name is None or not tools:
             state = f"has {len(tools)} tools: {some_of(list(tools))}" if tools else "has no tool"
             raise DataError(
-                f"{source} {state}; the one that the points were touched with is needed.",
+                f"{source} {state}, but must have the one that the points were touched with.",
                 culprits=list(tools) or [source],
                 next_step=f"Say --tool {next(iter(tools))}, or the like." if tools else NO_TOOL,
             )

@@ -94,13 +94,13 @@ class CameraResult:
         size = 4 + len(self.camera.distortion)
         for array in (self.covariance, self.edge_covariance):
             if array is not None and len(array) != size:
-                raise ValueError(f"a covariance has {len(array)} rows; {size} are needed")
+                raise ValueError(f"a covariance has {len(array)} rows, but must have {size}")
         if self.field is not None:
             count = self.displacements(np.zeros((1, 2))).shape[2]
             for name in ("coefficients", "root", "intrinsics_covariance", "edge_covariance"):
                 rows = len(getattr(self.field, name))
                 if rows != count:
-                    raise ValueError(f"field.{name} has {rows} rows; {count} are needed")
+                    raise ValueError(f"field.{name} has {rows} rows, but must have {count}")
 
     def covariance_with(self, edge: FloatArray) -> FloatArray:
         """Joint covariance of the first edges, lens and field; e + k + m rows and columns.

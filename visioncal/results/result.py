@@ -440,7 +440,7 @@ class Calibration(CalibrationSections):
             file = file / "calibration.json"
         if file.suffix.lower() == ".rrd":
             raise DataError(
-                f"{path} is a recording; a calibration.json, or the folder with one, is needed.",
+                f"{path} is a recording, but must be a calibration.json or the folder with one.",
                 culprits=[str(path)],
                 next_step="Name the output folder of visioncal calibrate. Of a recording alone, "
                 "visioncal.present.recording.read_calibration reads the result.",

@@ -54,7 +54,7 @@ def read_robot_document(
         table = read_toml(path, path.name) if is_toml else parse_json(read_text(path), path.name)
         if not isinstance(table, dict) or not (is_toml or "kind" in table):
             raise DataError(
-                f"{path.name} describes no robot: an object of kind chain is needed.",
+                f"{path.name} describes no robot: it must be an object of kind chain.",
                 culprits=[path.name],
                 next_step="Write one with visioncal export CALIBRATION --to robot-json.",
             )

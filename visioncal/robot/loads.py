@@ -76,14 +76,14 @@ class Loads:
             )
         except ValueError as error:
             raise DataError(
-                f"loads: a payload in kg, its centre (3,) in m and a force (3,) in N are needed, "
+                f"loads must be a payload in kg, its centre (3,) in m and a force (3,) in N, "
                 f"or {count} of each: {error}."
             ) from error
         centre = np.concatenate([loads.payload_kg[:, None], loads.payload_m, loads.force_n], axis=1)
         if not np.isfinite(centre).all() or (loads.payload_kg < 0.0).any():
             raise DataError(
-                f"loads: a payload of {np.min(loads.payload_kg):g} kg; 0 kg or more, and finite "
-                "numbers, are needed.",
+                f"loads: a payload is {np.min(loads.payload_kg):g} kg, but must be 0 kg or more, "
+                "and all numbers finite.",
                 culprits=["payload_kg"],
             )
         return loads

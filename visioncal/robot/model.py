@@ -329,8 +329,8 @@ class Robot:
             chain = replace(chain, functions=chain.functions + added)
             if np.any(chain.functions[chain.prismatic, 2:]):
                 raise DataError(
-                    f"robot {self.name}: a prismatic joint has no eccentricity; sine and cosine of "
-                    "zero are needed.",
+                    f"robot {self.name}: a prismatic joint has no eccentricity: its sine and "
+                    "cosine must be zero.",
                     culprits=[self.name],
                 )
         if harmonics is not None:
@@ -363,8 +363,8 @@ class Robot:
         q = np.asarray(q, dtype=float)
         if q.ndim != 2 or q.shape[1] != self.joint_count:
             raise DataError(
-                f"robot {self.name} has {self.joint_count} joints up to {self.tip}; joint angles "
-                f"of shape (m, {self.joint_count}) are needed, not {q.shape}.",
+                f"robot {self.name} has {self.joint_count} joints up to {self.tip}: joint angles "
+                f"must have the shape (m, {self.joint_count}), not {q.shape}.",
                 culprits=[self.name],
             )
         return self.chain.effective(q)
@@ -373,7 +373,7 @@ class Robot:
         values = np.asarray(values, dtype=float)
         if values.shape != shape or not np.isfinite(values).all():
             raise DataError(
-                f"robot {self.name}: {what} of shape {shape} and finite numbers are needed, not "
+                f"robot {self.name}: {what} must be finite numbers of the shape {shape}, not "
                 f"{values.shape}.",
                 culprits=[self.name],
             )

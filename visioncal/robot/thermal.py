@@ -222,8 +222,8 @@ class ThermalModel:
         links_c = np.asarray(links_c, dtype=float)
         if not links_c.ndim or links_c.shape[-1] != self.joint_count:
             raise DataError(
-                f"robot {self.robot.name}: temperatures of shape {links_c.shape} do not go with "
-                f"its {self.joint_count} joints; one for each joint is needed."
+                f"robot {self.robot.name}: temperatures have the shape {links_c.shape}, but must "
+                f"be {self.joint_count}, one for each joint."
             )
         return np.asarray(links_c - self.reference_c)
 
@@ -272,8 +272,8 @@ class OnlineCompensator:
         signal = np.asarray([] if given is None else given, dtype=float)
         if signal.shape != (count,) or not np.isfinite(signal).all():
             raise DataError(
-                f"thermal: the model was fitted to {heating.kind}; {count} of them are needed in a "
-                f"sample, not {signal.tolist()}."
+                f"thermal: the model was fitted to {heating.kind}: a sample must have {count} of "
+                f"them, not {signal.tolist()}."
             )
         if self._last is not None and stamp_s <= self._last.stamps_s[0]:
             raise DataError(

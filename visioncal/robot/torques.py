@@ -95,8 +95,8 @@ def effective_states(
     wanted = (len(q), robot.joint_count)
     if not q.shape == dq.shape == ddq.shape == wanted:
         raise DataError(
-            f"robot {robot.name}: positions, speeds and accelerations of shape (m, {wanted[1]}) "
-            f"are needed, not {q.shape}, {dq.shape} and {ddq.shape}.",
+            f"robot {robot.name}: positions, speeds and accelerations must have the shape "
+            f"(m, {wanted[1]}), not {q.shape}, {dq.shape} and {ddq.shape}.",
             culprits=[robot.name],
         )
     chain = robot.chain

@@ -131,8 +131,8 @@ def _content(
     q = np.asarray(cell.get("q", np.zeros((count, 0))), dtype=float)
     if q.ndim != 2 or len(q) != count:
         raise DataError(
-            f"q has the shape {q.shape} beside {count} poses; (n, j) is needed, the joint angles "
-            "[rad] of each view.",
+            f"q has the shape {q.shape} beside {count} poses, but must have (n, j), the joint "
+            "angles [rad] of each view.",
             culprits=["q"],
         )
     camera: Camera | Mapping[str, Any] | None = cell.get("camera")

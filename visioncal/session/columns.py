@@ -48,7 +48,7 @@ _TEXTS = frozenset(
 # radians admit poses in micrometres and turns in degrees. Stamps beyond the year 2286 do not
 # resolve microseconds, and are in milliseconds or less.
 _SIZES: Mapping[str, tuple[float, str]] = {
-    "m": (1e7, "{0:g} m is no place in a robot cell; write metres ({0:g} mm?)"),
+    "m": (1e7, "{0:g} m is beyond every robot cell; write metres ({0:g} mm?)"),
     "rad": (1e4, "{0:g} rad is no angle of a joint; write radians"),
     "s": (1e10, "{0:g} s is no time of a recording; write seconds"),
     "rad_s": (1e5, "{0:g} rad/s is no speed of a joint"),
@@ -110,7 +110,7 @@ def check_header(columns: Sequence[str], where: str) -> None:
     has_state = bool(set(POSE) & set(columns) or joint_columns(tuple(columns)))
     if others and (problems or (not has_state and len(others) > len(POSITION))):
         raise DataError(
-            f"{where}: poses are in {','.join(others)}, and {', '.join(POSE)} are needed, in "
+            f"{where}: poses are in {','.join(others)}, but must be in {', '.join(POSE)}, in "
             "metres and as quaternions.",
             culprits=[where],
             next_step=f"The images show their unit and form. {READ_AGAIN}",

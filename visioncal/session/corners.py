@@ -228,7 +228,7 @@ def _target_problems(
         if not names and target not in ("", first):
             words = f"{target!r} beside {first!r}, but session.toml declares one target"
         elif names and (target or named[at]) not in names:
-            words = f"{target!r}; one of {', '.join(names)} is needed, here or in views.csv"
+            words = f"{target!r}, but must be one of {', '.join(names)}, here or in views.csv"
         elif names and target and named[at] not in ("", target):
             words = (
                 f"{target!r}, but views.csv says that view {view} shows {named[at]!r}; a "

@@ -53,7 +53,7 @@ def read_depth(
             is_image = raw is not None
             raise DataError(
                 f"{path} {'is an image of 8 bits or colours' if is_image else 'is damaged'}, no "
-                "depth picture; one channel of 16 bits or of floats is needed.",
+                "depth picture, but must have one channel of 16 bits or of floats.",
                 culprits=[path],
                 next_step="Save the sensor's raw distances, not the picture that shows them.",
             )
@@ -150,7 +150,7 @@ def read_cloud(data: bytes, path: str) -> FloatArray:
 def _of_npy(data: bytes) -> FloatArray:
     points = np.load(io.BytesIO(data), allow_pickle=False)
     if points.ndim not in (2, 3) or points.shape[-1] != 3:
-        raise ValueError(f"its shape is {points.shape}; (h, w, 3) is needed")
+        raise ValueError(f"its shape is {points.shape}, but must be (h, w, 3)")
     return np.array(points, float)
 
 
@@ -191,7 +191,7 @@ def _of_pcd(data: bytes) -> FloatArray:
     if head is None:
         raise ValueError("it has no header of a PCD")
     if head[1] not in (b"ascii", b"binary"):
-        raise ValueError(f"its points are {head[1].decode()}; ascii or binary is needed")
+        raise ValueError(f"its points are {head[1].decode()}, but must be ascii or binary")
     lines = (line.split() for line in head[0].decode("ascii").splitlines() if line.strip())
     fields = {words[0]: words[1:] for words in lines}
     width, height = int(fields["WIDTH"][0]), int(fields["HEIGHT"][0])

@@ -393,10 +393,10 @@ def _depth_problems(declaration: Declaration) -> Iterator[tuple[str, str]]:
     if declaration.depth is None:
         return
     if declaration.depth.stated is None:
-        yield "cameras.depth", "has no resolution, matrix and distortion: the lens is needed"
+        yield "cameras.depth", "has no resolution, matrix and distortion, but must have a lens"
     prior = declaration.prior.get("cam_from_depth")
     if prior is None or prior.pose is None:
-        words = "is not stated whole: x_m, y_m, z_m, quaternion_xyzw and sigmas are needed"
+        words = "is not stated whole, but must have x_m, y_m, z_m, quaternion_xyzw and sigmas"
         yield "prior.cam_from_depth", words
 
 

@@ -133,8 +133,8 @@ def image_path(path: str) -> str:
     inside = inside_path(path)
     if not inside.lower().endswith(IMAGE_ENDINGS):
         raise DataError(
-            f"the image {path!r} is of a kind that is not read; png, jpg, tif, bmp or webp "
-            "is needed.",
+            f"the image {path!r} is of a kind that is not read: it must be png, jpg, tif, bmp "
+            "or webp.",
             culprits=[path],
             next_step="Convert the images without loss, to png.",
         )
@@ -165,8 +165,8 @@ def inside_path(path: str) -> str:
     parts = [part for part in slashed.split("/") if part not in ("", ".")]
     if slashed.startswith("/") or re.match("[A-Za-z]:", slashed) or ".." in parts or not parts:
         raise DataError(
-            f"the path {path!r} leaves the session's folder; a path inside it, relative to it, "
-            "is needed.",
+            f"the path {path!r} leaves the session's folder, but must be inside it, and relative "
+            "to it.",
             culprits=[path],
             next_step="Copy the file into the session's folder, if it is not there, and write its "
             "path in that, as images/000.png.",

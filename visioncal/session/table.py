@@ -240,7 +240,7 @@ def _observation_problem(
 
 def _role(cell: str) -> str:
     if cell not in ("fit", "holdout", "intrinsics"):
-        raise DataError(f'{cell!r} is no role; "fit", "holdout", "intrinsics" or nothing is needed')
+        raise DataError(f'{cell!r} must be a role: "fit", "holdout", "intrinsics" or nothing')
     return cell
 
 
@@ -263,7 +263,7 @@ def _load_problems(view: View) -> Iterator[tuple[str, str]]:
     """Columns of a row with an invalid load or approach, with messages."""
     approach = view.text.get("approach", "").strip()
     if approach not in SIDES:
-        yield "approach", f'{approach!r} is no side; "+", "-" or nothing is needed'
+        yield "approach", f'{approach!r} must be a side: "+", "-" or nothing'
     placed = [name for name in _CENTRE if name in view.numbers]
     if placed and "payload_kg" not in view.numbers:
         yield (

@@ -65,7 +65,7 @@ def read_cell(name_or_path: str) -> NetworkOptions:
             rows = document.get(key, {})
             if not (isinstance(rows, dict) and all(isinstance(row, dict) for row in rows.values())):
                 raise DataError(
-                    f"{key} is {rows!r:.60}; tables [{key}.NAME] are needed.", culprits=[key]
+                    f"{key} is {rows!r:.60}, but must be tables [{key}.NAME].", culprits=[key]
                 )
             for name, row in rows.items():
                 if not NAME.fullmatch(name) or name == CELL:
@@ -79,7 +79,7 @@ def read_cell(name_or_path: str) -> NetworkOptions:
             content["boards" if key == "targets" else key] = named
         if not content["robots"]:
             raise DataError(
-                "robots is missing; a table [robots.NAME] for each robot is needed.",
+                "robots is missing, but must have a table [robots.NAME] for each robot.",
                 culprits=["robots"],
             )
         if content["points"] and not content["instruments"]:
@@ -112,6 +112,6 @@ def _check(kind: type, row: Mapping[str, Any], path: str, tables: tuple[str, ...
             is_number = isinstance(number, int | float)
             if is_number and not (math.isfinite(number) and low <= number <= high):
                 raise DataError(
-                    f"{path}{key} is {value}; a number from {low:g} to {high:g} is needed.",
+                    f"{path}{key} is {value}, but must be a number from {low:g} to {high:g}.",
                     culprits=[f"{path}{key}"],
                 )

@@ -240,7 +240,7 @@ class NetworkOptions(DrawOptions):
 
     def __post_init__(self) -> None:
         if self.stops < 1:
-            raise DataError(f"simulation: stops is {self.stops}, at least 1 is needed.")
+            raise DataError(f"simulation: stops is {self.stops}, but must be at least 1.")
         if any(robot.warms_up for robot in self.robots) and self.pace_s <= 0.0:
             raise DataError("simulation: a robot that warms up needs pace_s, from stop to stop.")
         for robot in self.robots:
@@ -340,7 +340,7 @@ class CellOptions(ArmOptions, CameraOptions, DrawOptions):
     def __post_init__(self) -> None:
         check_fields(self)
         if self.views < 1:
-            raise DataError(f"simulation: views is {self.views}, at least 1 is needed.")
+            raise DataError(f"simulation: views is {self.views}, but must be at least 1.")
         if not 0 <= self.wrong_views <= self.views:
             raise DataError(
                 f"simulation: wrong_views is {self.wrong_views}, 0 to {self.views} are possible."

@@ -164,7 +164,7 @@ def _registered(
         gate = scale * _GATE_PX
         pose, rows, rest = _fitted(camera, points[found], pose, px, covariances, gate, size)
     if len(at) < _FEWEST:
-        words = f"{len(at)} patches, {_FEWEST} are needed"
+        words = f"{len(at)} patches, but needs {_FEWEST}"
         return nothing(size, f"the reference has too little texture: {words}")
     count = int(rows.any(axis=(1, 2)).sum())
     of_pose = _covariance(at[found] / camera.resolution, rows, rest)

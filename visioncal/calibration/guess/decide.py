@@ -90,7 +90,7 @@ def guess_reading(
     if common < FEWEST_ROWS:
         raise DegenerateError(
             f"guess: {counted(common, 'row', ('has', 'have'))} a pose of the robot and one of the "
-            f"camera; {FEWEST_ROWS} or more are needed to distinguish readings.",
+            f"camera, but it takes {FEWEST_ROWS} or more to distinguish readings.",
             next_step="Add views, tilted about different axes.",
         )
     with one_blas_thread():

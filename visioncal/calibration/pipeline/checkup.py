@@ -180,7 +180,7 @@ def _motion(run: RunState) -> Iterator[Finding]:
     if 0 < stops < needed:
         yield Finding(
             "few_stops",
-            f"{counted(stops, 'stop')} can be used; {needed} or more are needed to check a result.",
+            f"{counted(stops, 'stop')} can be used, but checking a result takes {needed} or more.",
             Remedy(
                 f"Add {max(5, needed - stops)} views or more, tilted by 20 to 40 degrees about "
                 "different axes; with another corner of the image filled in each."

@@ -118,7 +118,7 @@ def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOpti
     """Loads the session and checks the options: the state before the first stage."""
     threads, solver = asked.get("threads"), asked.get("solver", "joint")
     if threads is not None and threads < 1:
-        raise DataError(f"threads is {threads}; at least 1 is needed.", culprits=["--threads"])
+        raise DataError(f"threads is {threads}, but must be at least 1.", culprits=["--threads"])
     check_level(asked.get("level", "auto"))
     state = RunState(
         session if isinstance(session, Session) else Session.load(session),

@@ -159,8 +159,8 @@ class Sensor:
                 inks.append(deeper)
         if len(found) < _FEWEST:
             raise DataError(
-                f"{view.depth} has depth in {counted(len(found), 'cell')} of the board; {_FEWEST} "
-                "are needed."
+                f"{view.depth} has depth in {counted(len(found), 'cell')} of the board, but needs "
+                f"{_FEWEST}."
             )
         table = np.array(found)
         px, rays = table[:, :2], self.rays(table[:, :2])
@@ -404,8 +404,8 @@ def _depth_of(
         for words, of in lost.items()
     ]
     if len(found) < CheckLimits.stops:
-        words = f"Depth was not compared: it is of {counted(len(found), 'view')} of the board; "
-        words += f"{CheckLimits.stops} are needed."
+        words = f"Depth was not compared: it is of {counted(len(found), 'view')} of the board, "
+        words += f"but must be of {CheckLimits.stops}."
         return None, found, [*said, Finding("depth_unread", words)]
     ratios = np.array([np.median(at.excess_m / at.true_m) for at in found])
     ratio = 1.0 + float(np.median(ratios))

@@ -91,7 +91,7 @@ def motion_of(session: Session, robot: Robot | None, name: str) -> RobotMotion:
     raise DataError(
         f"streams/{name}.csv: it has {counted(len(reported_s), 'pose')} and "
         f"{counted(len(joints_s), 'row')} of "
-        f"{q.shape[1]} joint angles; two poses or more are needed, or {needed}.",
+        f"{q.shape[1]} joint angles, but must have two poses or more, or {needed}.",
         culprits=[f"streams/{name}.csv"],
         next_step="Fill in x_m to qw, or q1_rad ... and [robot] model.",
     )

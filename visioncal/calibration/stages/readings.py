@@ -149,7 +149,7 @@ def check_readings(observed: Observed, readings: Readings) -> None:
         return
     what = "point on the flange" if points == 1 else f"{points} points on the flange"
     raise DegenerateError(
-        f"instrument: {counted(count, 'usable stop')} of the robot; at least {needed} are needed "
+        f"instrument: {counted(count, 'usable stop')} of the robot, but it takes at least {needed} "
         f"to determine where the instrument stands and where the {what} "
         f"{'is' if points == 1 else 'are'}.",
         culprits=["the instrument's place", f"the {what}"],

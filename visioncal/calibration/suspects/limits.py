@@ -253,8 +253,8 @@ def _few_stops(judged: Findings) -> Iterator[Finding]:
             is_fatal, thing = arm.stops < bad, "view" if arm.stops == used else "stop"
             yield Finding(
                 "too_few_stops" if is_fatal else "few_stops",
-                f"Only {counted(arm.stops, thing, ('is', 'are'))} used; {check} or more are needed "
-                "to check the result.",
+                f"Only {counted(arm.stops, thing, ('is', 'are'))} used, but a check of the "
+                f"result needs {check} or more.",
                 _tilted(judged),
                 is_fatal=is_fatal,
                 until_mm=0.0,

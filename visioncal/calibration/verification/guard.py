@@ -75,7 +75,7 @@ class Look:
             )
         # After one in other units every look in seconds would be too early.
         if not abs(self.time_s) < 1e11:
-            words = f"look: its time_s is {self.time_s:g}; seconds of under 3000 years are needed."
+            words = f"look: time_s is {self.time_s:g}, but must be seconds of under 3000 years."
             raise DataError(words, culprits=["time_s"])
 
 
@@ -304,7 +304,7 @@ class Guard:
             joints, count = look.joints_rad[None], self._arm.robot.joint_count
             if joints.shape != (1, count) or not np.isfinite(joints).all():
                 raise DataError(
-                    f"{label}: joints_rad is {look.joints_rad.tolist()}; {count} are needed.",
+                    f"{label}: joints_rad is {look.joints_rad.tolist()}, but must be {count}.",
                     culprits=["joints_rad"],
                 )
             # Beyond two turns there are few joints, and their degrees are there at once.

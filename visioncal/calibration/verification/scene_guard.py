@@ -189,7 +189,7 @@ def scene_looks(
     if used < 2:
         raise DataError(
             f"guard --scene: {used} images of session {session.name!r} could be compared with an "
-            "earlier one of the same pose of the robot; two are needed.",
+            "earlier one of the same pose of the robot, but must be two or more.",
             next_step="See what is said of each; return to one pose after every job, and take an "
             "image there.",
         )
@@ -214,7 +214,7 @@ def scene_plane(calibration: Calibration, view: View, stated: str) -> FloatArray
     if stated != "board":
         is_number = stated.replace(".", "", 1).isdecimal()
         if not is_number or not 1.0 <= float(stated) < 1e6:
-            raise DataError(f"--plane is {stated!r}; board, or a distance in mm, is needed.")
+            raise DataError(f"--plane is {stated!r}, but must be board, or a distance in mm.")
         return np.array([0.0, 0.0, 1.0, 1e-3 * float(stated)])
     flange, names = view.base_from_flange(), ("flange_from_cam", "base_from_target")
     if flange is None or any(name not in calibration.transforms for name in names):

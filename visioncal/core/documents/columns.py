@@ -161,7 +161,7 @@ class TableReader(NumberChecks):
             except DataError as error:
                 self.report(row, name, error.message.rstrip("."), error.next_step)
             if not cell and needed:
-                self.report(row, name, f"it is empty; {needed} is needed")
+                self.report(row, name, f"it is empty, but must be {needed}")
             values.append(value)
         return values
 

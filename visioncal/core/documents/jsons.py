@@ -105,7 +105,7 @@ def parse_json(text: str, where: str, largest: float | None = None) -> object:
     except UnicodeEncodeError as error:
         half = ascii(error.object[error.start])
         raise DataError(
-            f"{where} holds {half} alone, which is half a letter; text is needed.", culprits=[where]
+            f"{where} must be text, but holds {half} alone, half of a letter.", culprits=[where]
         ) from error
     return value
 
@@ -115,7 +115,7 @@ def _unique(pairs: Sequence[tuple[str, Any]], where: str) -> dict[str, Any]:
     if len(content) < len(pairs):
         ((twice, _),) = Counter(name for name, _ in pairs).most_common(1)
         raise DataError(
-            f"{where}: the key {twice[:60]!r} is there twice; once is needed.", culprits=[where]
+            f"{where}: the key {twice[:60]!r} occurs twice, but must occur once.", culprits=[where]
         )
     return content
 
@@ -130,7 +130,8 @@ def parse_stored(text: bytes | str, label: str) -> dict[str, Any]:
     text = decode_text(text, label) if isinstance(text, bytes) else text
     if Path(label).suffix != ".json" and not (begin := text.lstrip()[:40]).startswith("{"):
         raise DataError(
-            f"{label} begins with {shown(begin)}; a JSON document that visioncal wrote is needed.",
+            f"{label} must be a JSON document that visioncal wrote, but begins with "
+            f"{shown(begin)}.",
             culprits=[label],
             next_step="Name its file, as calibration.json, or its folder; nothing need be changed "
             "in this one.",
@@ -138,5 +139,5 @@ def parse_stored(text: bytes | str, label: str) -> dict[str, Any]:
     # Squares and products of larger numbers may overflow.
     document = parse_json(text, label, 1e60)
     if not isinstance(document, dict):
-        raise DataError(f"{label} is {shown(document)}; a table is needed.", culprits=[label])
+        raise DataError(f"{label} is {shown(document)}, but must be a table.", culprits=[label])
     return document

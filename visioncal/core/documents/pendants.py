@@ -307,7 +307,7 @@ def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:
     makers = ", ".join(written.forms)
     said = "" if stated is None else f", not of {stated!r}"
     raise DataError(
-        f"{where}: it is written as a pose of {makers}{said}; one form is needed.",
+        f"{where}: it is written as a pose of {makers}{said}, but must have one form.",
         culprits=[where],
         next_step=f"Say which of them it is; the forms are {', '.join(POSE_FORMS)}.",
     )

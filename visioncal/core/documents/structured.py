@@ -100,7 +100,7 @@ class _Loader(_BASE):  # type: ignore[misc] # which of two is chosen when import
         """Refuses any other tag; raises DataError."""
         place = _place(self.where, node)
         raise DataError(
-            f"{place}: the tag {node.tag.removeprefix(_STANDARD)[:60]!r}; plain values are needed.",
+            f"{place}: the tag {node.tag.removeprefix(_STANDARD)[:60]!r} must be a plain value.",
             culprits=[place],
         )
 
@@ -142,7 +142,7 @@ def parse_xml(data: bytes, where: str) -> Element:
         root: Element = parser.close()
     except DefusedXmlException as error:
         raise DataError(
-            f"{where}: a document type is declared; plain XML without entities is needed.",
+            f"{where}: a document type is declared, but XML must be plain, without entities.",
             culprits=[where],
             next_step="Remove the <!DOCTYPE ...>.",
         ) from error
@@ -257,5 +257,5 @@ def _numbers(text: str, where: str) -> list[float]:
     """Reads numbers separated by blanks; OpenCV writes `.Nan` and `-.Inf`."""
     words = text.replace(".N", "N").replace(".I", "I").split()
     if not all(is_number(word) for word in words):
-        raise DataError(f"{where}: {text[:60]!r}; numbers are needed.", culprits=[where])
+        raise DataError(f"{where} must be numbers, but is {text[:60]!r}.", culprits=[where])
     return [float(word) for word in words]

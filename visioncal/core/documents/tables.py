@@ -164,7 +164,7 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
         if len(row) != width:
             line = all_lines[at - 1]
             raise DataError(
-                f"{where}, line {at}: {len(row)} cells; {width} are needed, as in the first row.",
+                f"{where}, line {at}: {len(row)} cells, but must be {width}, as in the first row.",
                 culprits=[f"{where}, line {at}"],
                 next_step="Where commas are decimal, separate the columns by semicolons or tabs."
                 if re.search("[0-9],[0-9]", line) and not re.search(r"\.|,(?![0-9])", line)

@@ -97,7 +97,7 @@ def check_values(document: object, label: str, largest: float | None = None) -> 
             )
         elif largest is not None and isinstance(value, float) and not abs(value) <= largest:
             raise DataError(
-                f"{label}: {path} is {value}; a number that a cell has is needed.",
+                f"{label}: {path} is {value}, but must be a number that a cell has.",
                 culprits=[f"{label}: {path}"],
             )
 
@@ -171,7 +171,7 @@ class DocumentTable:
         value = self.content.get(key, default)
         if value is None:
             raise DataError(
-                f"{self.label}: {key} is missing; {needed} is needed.",
+                f"{self.label}: {key} is missing, but must be {needed}.",
                 culprits=[f"{self.label}: {key}"],
             )
         return value
@@ -179,7 +179,7 @@ class DocumentTable:
     def refuse(self, key: str, value: object, needed: str, next_step: str = "") -> DataError:
         """Builds the error for a field with an invalid value."""
         return DataError(
-            f"{self.label}: {key} is {value!r}; {needed} is needed.",
+            f"{self.label}: {key} is {value!r}, but must be {needed}.",
             culprits=[f"{self.label}: {key}"],
             next_step=next_step,
         )

@@ -60,7 +60,7 @@ def as_numbers(value: object, where: str) -> FloatArray:
             return np.array(value, dtype=float)
         except (ValueError, TypeError, OverflowError):
             pass
-    raise DataError(f"{where} is {shown(value)}; numbers are needed.", culprits=[where])
+    raise DataError(f"{where} is {shown(value)}, but must be numbers.", culprits=[where])
 
 
 def number(value: object, where: str) -> float:
@@ -68,7 +68,7 @@ def number(value: object, where: str) -> float:
     numbers = as_numbers(value, where)
     if numbers.size != 1 or not np.isfinite(numbers).all():
         raise DataError(
-            f"{where} is {shown(value)}; one finite number is needed.", culprits=[where]
+            f"{where} is {shown(value)}, but must be one finite number.", culprits=[where]
         )
     return float(numbers.reshape(-1)[0])
 
@@ -77,7 +77,7 @@ def mapping(value: object, where: str) -> Mapping[str, Any]:
     """Checks that a value is a mapping; raises DataError."""
     if not isinstance(value, Mapping):
         raise DataError(
-            f"{where} is {shown(value)}; keys with values are needed.", culprits=[where]
+            f"{where} is {shown(value)}, but must be keys with values.", culprits=[where]
         )
     return value
 

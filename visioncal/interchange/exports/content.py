@@ -69,7 +69,7 @@ class Placements:
         if inverse in self.by_name:
             hint = f"Ask for --edge {inverse} --inverse."
         raise DataError(
-            f"There is no transform {name!r}; {self.words} has {', '.join(self.by_name)}.",
+            f"The transform {name!r} must be one of {self.words}: {', '.join(self.by_name)}.",
             culprits=[name],
             next_step=hint,
         )
@@ -152,7 +152,7 @@ def placements(source: Source, camera: str | None = None) -> Placements:
         frame = next((name for name in (camera, f"cam_{camera}") if name in lenses), None)
         if frame is None:
             raise DataError(
-                f"There is no camera {camera!r}; this cell has {', '.join(lenses) or 'none'}.",
+                f"The camera {camera!r} must be one of this cell: {', '.join(lenses) or 'none'}.",
                 culprits=["--camera"],
                 next_step=did_you_mean(camera, list(lenses)),
             )

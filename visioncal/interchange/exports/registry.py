@@ -136,8 +136,8 @@ def _robot_part(
     if not isinstance(source, Calibration) or source.cell is None:
         if {*names, selection.camera} != {None}:
             raise DataError(
-                "Which camera, robot or target is meant is said of a whole cell alone, and this is "
-                "none.",
+                "Only a whole cell takes --camera, --robot and --target: this is of one camera "
+                "and robot.",
                 culprits=["--camera", "--robot", "--target"],
                 next_step="Leave it out.",
             )
@@ -219,8 +219,8 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
     for frame in (parent, child):
         if not _FRAME.fullmatch(frame):
             raise DataError(
-                f"{frame!r} cannot be a frame's name: letters, digits and _ / - . are needed, the "
-                "first a letter, a digit or _.",
+                f"{frame!r} cannot be a frame's name: it must have letters, digits and _ / - . "
+                "alone, and begin with a letter, a digit or _.",
                 culprits=[frame],
                 next_step="Choose other names with --parent and --child.",
             )

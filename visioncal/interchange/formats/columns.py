@@ -300,7 +300,7 @@ def _image_name(fields: Fields, groups: Sequence[FileGroup], taken: Collection[s
     # Several columns may name the same images.
     if len({*naming.values()}) > 1:
         raise DataError(
-            f"{fields.name}: {some_of([*naming])} name images; one of them is needed.",
+            f"{fields.name}: {some_of([*naming])} all name images: one of them must be chosen.",
             culprits=[*naming],
             next_step=f"Say which with --image-{named_by(fields.places[0]).rstrip('s')}.",
         )
@@ -357,7 +357,7 @@ def with_camera_file(
     if len(robot) != len(camera):
         raise DataError(
             f"There are {len(robot)} poses of the robot and {len(camera)} of the camera, without "
-            "times; as many of both are needed.",
+            "times, but must be as many of both.",
             culprits=[robot.places[-1], camera.places[-1]],
         )
     return ForeignRecording(name=name, robot=robot, camera=camera, notes=notes)

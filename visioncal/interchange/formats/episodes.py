@@ -51,8 +51,8 @@ def read_episodes(source: Path, image_key: str | None = None) -> tuple[Episode, 
         found.append(Episode(name, len(paths), partial(_picture, paths)))
     if not found:
         raise DataError(
-            f"{source} has no episodes{f' of {wanted}' if wanted else ''}: meta/info.json of "
-            f"LeRobot, videos ({some_of(_VIDEOS)}) or folders of pictures are needed.",
+            f"{source} has no episodes{f' of {wanted}' if wanted else ''}: it must hold "
+            f"meta/info.json of LeRobot, videos ({some_of(_VIDEOS)}) or folders of pictures.",
             culprits=[str(source)],
             next_step="Name the folder that holds an episode's video or pictures each.",
         )

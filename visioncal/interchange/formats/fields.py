@@ -74,7 +74,7 @@ class Fields:
             return matches[0]
         if matches:
             raise DataError(
-                f"{self.name}: {name!r} may be {some_of(matches)}; the full name is needed.",
+                f"{self.name}: {name!r} may be {some_of(matches)}: give the full name.",
                 culprits=matches,
             )
         raise DataError(
@@ -93,7 +93,7 @@ class Fields:
             odd = ((place, word) for place, word in cells if word and not is_number(word))
             place, text = next(odd, (self.places[0], ""))
             raise DataError(
-                f"{place}: {full} holds {text[:40]!r}; a number is needed.",
+                f"{place}: {full} must be a number, but is {text[:40]!r}.",
                 culprits=[place],
                 next_step=f"Correct the cell, or delete {place}; or leave the whole pose of that "
                 "row empty.",

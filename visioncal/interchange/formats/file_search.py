@@ -290,8 +290,8 @@ def images_named(
                 path = near if is_inside(near, base) and near.exists() else known or path
         if path is not None and not is_image_name(path.name):
             raise DataError(
-                f"{base}: an image is named {str(name)[:80]!r}; a png, jpg, tif, bmp or "
-                "webp is needed.",
+                f"{base}: an image is named {str(name)[:80]!r}, but must be a png, jpg, tif, "
+                "bmp or webp.",
                 culprits=[str(name)[:80]],
                 next_step="Correct it, or name the column of the images with --image-column.",
             )

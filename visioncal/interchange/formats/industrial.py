@@ -175,7 +175,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> ForeignRecording:
     static = document.get("static_camera")
     if not isinstance(static, bool | None):
         raise DataError(
-            f"{file}: static_camera is {static!r}; true or false is needed.", culprits=[str(file)]
+            f"{file}: static_camera is {static!r}, but must be true or false.", culprits=[str(file)]
         )
     views = tuple(index for name in places if (index := number_in(name)) is not None)
     views = views if len(set(views)) == len(places) else ()
@@ -228,8 +228,8 @@ def _read_kinematics(path: Path, requested: ImportOptions) -> ForeignRecording:
     moving = [name for name in chains if name in fields.numbers and fields.numbers[name].size]
     if len(moving) != 1:
         raise DataError(
-            f"{file}: {' and '.join(moving) or 'no chain'} with joints; one chain with the same "
-            "joints in every row is needed.",
+            f"{file}: {' and '.join(moving) or 'no chain'} with joints, but must be one, with "
+            "the same joints in every row.",
             culprits=[str(file)],
         )
     requested = replace(requested, joints=requested.joints or tuple(moving))

@@ -49,7 +49,7 @@ def read_target_description(words: str) -> Mapping[str, Any]:
     if document is None:
         if not words.lower().endswith(".toml") and words not in target_names():
             raise DataError(
-                f"There is no target {words[:80]!r}; a name is needed "
+                f"There is no target {words[:80]!r}: it must be a name "
                 f"({', '.join(target_names())}), the path of a .toml, or a "
                 f"description: {FORMS}.",
                 culprits=[words[:80]],
@@ -162,7 +162,7 @@ def intrinsics_from(
         )
     if len(matrix) != 4 or content.get("camera_model", "pinhole") != "pinhole":
         raise DataError(
-            f"{where}: the camera matrix of a pinhole is needed; there are "
+            f"{where} must have the camera matrix of a pinhole, but has "
             f"{', '.join(map(str, list(content)[:20]))}.",
             culprits=[where],
             next_step=f"The usual names are {', '.join(_MATRIX_KEYS[:5])}, or fx, fy, cx, cy.",
@@ -200,8 +200,8 @@ def _camera_matrix(numbers: FloatArray, where: str) -> FloatArray:
     # Largest skew relative to the focal length; more is another camera model.
     if not np.array_equal(k[2], last) or k[1, 0] or abs(k[0, 1]) > 1e-6 * abs(k[0, 0]):
         raise DataError(
-            f"{where} is {np.array2string(numbers.reshape(-1)[:9], precision=6)}; the nine numbers "
-            "fx, 0, cx, 0, fy, cy, 0, 0, 1 are needed.",
+            f"{where} is {np.array2string(numbers.reshape(-1)[:9], precision=6)}, but must be the "
+            "nine numbers fx, 0, cx, 0, fy, cy, 0, 0, 1.",
             culprits=[where],
             next_step="Leave it out with --intrinsics estimate.",
         )

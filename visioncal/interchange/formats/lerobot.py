@@ -147,7 +147,7 @@ class _Info:
         # Lists of other files, which FFmpeg would follow out of the folder, have other endings.
         if not self.video_path.endswith(".mp4"):
             words = f"meta/info.json: video_path is {self.video_path[:80]!r}"
-            raise _refusal(f"{words}; a place that ends in .mp4 is needed", "video_path")
+            raise _refusal(f"{words}, but must end in .mp4", "video_path")
         return re.sub(r"\{([^{}:]*)(?::0?([0-9]?)d?)?\}", value, self.video_path)
 
 

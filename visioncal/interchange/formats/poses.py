@@ -574,7 +574,7 @@ def check_radians(
     if not is_degrees and largest[row] <= 2 * np.pi + 0.01:
         return
     size = "in degrees" if is_degrees else "too large for radians"
-    needed = "its form is needed"
+    needed = "it needs its form"
     makers = defaultdict[str, list[str]](list)
     for form in POSE_FORMS.values():
         if form.models and form.rotation.endswith("-deg"):

@@ -282,7 +282,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
         raise
     if len(table.rows) == 4 and len(table.columns) == 4 and not table.has_header:
         raise DataError(
-            f"{path} is one 4 x 4 matrix; a file a view in a folder, or a row a view, is needed.",
+            f"{path} is one 4 x 4 matrix, but must have a row a view, or be a file a view.",
             culprits=[str(path)],
             next_step="Convert the folder.",
         )
@@ -335,8 +335,8 @@ def _halcon(text: str, path: Path) -> dict[str, object]:
     kind, sizes = int(code[0]) & 6, (len(code), len(turns), len(place))
     if sizes != (1, 3, 3) or code[0] not in range(14) or kind == 6:
         fault = f"f is {' '.join(words['f'])}, and r and t have {sizes[1]} and {sizes[2]} numbers"
-        needed = "0 to 5 or 8 to 13, and 3 each, are needed"
-        raise DataError(f"{path}: {fault}; {needed}.", culprits=[str(path)])
+        needed = "must be 0 to 5 or 8 to 13, and have 3 each"
+        raise DataError(f"{path}: {fault}, but {needed}.", culprits=[str(path)])
     turns = -turns if code[0] % 2 else turns
     order = {0: "XYZ", 2: "xyz"}.get(kind)
     # A vector of the tangent is a quaternion but for its length.
@@ -402,7 +402,7 @@ def _declared(text: str, path: Path) -> list[Fields]:
             kinds[kind, len(words)] += [row] * (system != "PULSE")
     if in_pulses and not any(kinds.values()):
         raise DataError(
-            f"{path}: its {in_pulses} positions are in pulses of the motors; poses are needed.",
+            f"{path}: its {in_pulses} positions are in pulses of the motors, but must be poses.",
             culprits=[str(path)],
             next_step="Save the job with positions in the base (///POSTYPE BASE, ///RECTAN).",
         )

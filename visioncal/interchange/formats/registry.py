@@ -217,7 +217,7 @@ def _foreign_format(source: Path, form: str | None, requested: ImportOptions) ->
     if not (source.is_file() or source.is_dir()):
         raise DataError(
             f"{source} {'is no regular file' if source.exists() else 'does not exist'}; a file or "
-            "a folder is needed.",
+            "it must be a folder.",
             culprits=[str(source)],
             next_step="Check the path and its spelling.",
         )

@@ -141,10 +141,10 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
         )
     column = next((name for name in _NAMES if name in fields.texts), None)
     if column is None:
-        also = "" if columns_named(fields, _AXES) else ", and so are x_mm, y_mm, z_mm"
+        also = "" if columns_named(fields, _AXES) else ", and x_mm, y_mm, z_mm"
         raise DataError(
-            f"{fields.name}: a column {some_of(_NAMES)} is needed, with the name of each point"
-            f"{also}; there are {fields.listing()}.",
+            f"{fields.name} must have a column {some_of(_NAMES)}, with the name of each point"
+            f"{also}, but has {fields.listing()}.",
             culprits=[fields.name],
         )
     names = tuple(text.strip() for text in fields.texts[column])
@@ -174,7 +174,7 @@ def _coordinates(
     names = tuple(map(fields.find, given)) or columns_named(fields, _AXES)
     if not names:
         raise DataError(
-            f"{fields.name}: columns x_mm, y_mm, z_mm or x_m, y_m, z_m are needed; there are "
+            f"{fields.name} must have columns x_mm, y_mm, z_mm or x_m, y_m, z_m, but has "
             f"{fields.listing()}.",
             culprits=[fields.name],
         )

@@ -57,7 +57,7 @@ def _opener(words: str, openers: Mapping[str, _Opener], option: str) -> tuple[_O
     kind, _, address = words.partition(":")
     if kind not in openers:
         raise DataError(
-            f"{option}: {kind[:80]!r} is no kind of device; {', '.join(openers)} are.",
+            f"{option}: the device is {kind[:80]!r}, but must be one of {', '.join(openers)}.",
             culprits=[option],
             next_step=did_you_mean(kind, openers),
         )
@@ -89,7 +89,7 @@ def _socket(address: str, *, form: str | None, **__: object) -> Arm:
     host, _, port = address.rpartition(":")
     if not (port.isascii() and port.isdecimal() and len(port) < 6 and int(port) < 1 << 16):
         raise DataError(
-            f"--arm: {address[:80]!r} is no port; socket needs one to listen at.",
+            f"--arm: socket needs a port to listen at, but has {address[:80]!r}.",
             culprits=["--arm"],
             next_step="Give a port, as socket:30100 for programs on this computer, or with the "
             "address of this computer in the robot's network, as socket:192.168.0.2:30100.",

@@ -442,7 +442,7 @@ class Journal:
         free = shutil.disk_usage(self.folder).free
         return DataError(
             f"{self.folder}: too little room: {free / 1e6:.1f} MB are free, and "
-            f"{(needed + _SPARE_BYTES) / 1e6:.1f} MB are needed for {what}.",
+            f"{(needed + _SPARE_BYTES) / 1e6:.1f} MB must be free for {what}.",
             culprits=[str(self.folder)],
             next_step="Make room on that disk.",
         )

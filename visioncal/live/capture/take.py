@@ -56,7 +56,7 @@ class _StillFrame:
         if frame.stamp_s < asked - _EARLY_S or frame.stamp_s > cell.clock.now() + _EARLY_S:
             raise DriverError(
                 f"{cell.camera.name}: its picture is stamped {frame.stamp_s - asked:+.3f} s from "
-                "when it was asked for; a picture exposed after that is needed.",
+                "when it was asked for, but must be exposed after that.",
                 culprits=[cell.camera.name],
                 next_step="The camera hands out old pictures, or its clock is not the host's.",
             )

@@ -65,7 +65,7 @@ class Features:
         """
         sent = self.get("PixelFormat")
         if sent not in _FORMATS and all(self._why_not(name, "PixelFormat") for name in _FORMATS):
-            why = f"sends {sent}; one of {', '.join(_FORMATS)} is needed"
+            why = f"sends {sent}, but must send one of {', '.join(_FORMATS)}"
             raise stream.camera_error(self.name, why, "Set its PixelFormat in its maker's viewer.")
         for name, value in (
             ("AcquisitionMode", "Continuous"),

@@ -220,10 +220,10 @@ def _factory_intrinsics(
     if model == dai.CameraModel.Fisheye:
         return Camera("fisheye", resolution, intrinsics, coefficients[:4]), source
     if model != dai.CameraModel.Perspective:
-        return None, f"not used: its model is {model.name}; Perspective or Fisheye is needed"
+        return None, f"not used: its model is {model.name}, but must be Perspective or Fisheye"
     tail = coefficients[8:]
     if np.any(tail != 0.0):
-        why = f"thin-prism or tilt coefficients up to {np.abs(tail).max():.3g}; zeros are needed"
+        why = f"thin-prism or tilt coefficients up to {np.abs(tail).max():.3g}, but must have zeros"
         return None, f"not used: it has {why}"
     count = 8 if np.any(coefficients[5:8] != 0.0) else 5
     padded = np.pad(coefficients, (0, max(8 - len(coefficients), 0)))

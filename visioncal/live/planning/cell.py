@@ -98,7 +98,7 @@ class Limits:
         for name in ("joint_margin_rad", "edge_px", "clearance_m"):
             value = getattr(self, name)
             if not 0.0 <= value < np.inf:
-                raise DataError(f"limits: {name} is {value}; zero or more is needed.")
+                raise DataError(f"limits: {name} is {value}, but must be zero or more.")
         if not 0.0 < self.tilt_rad <= _STEEPEST_RAD:
             raise DataError(
                 f"limits: tilt_rad is {self.tilt_rad}; above 0 and up to {_STEEPEST_RAD} is "
@@ -108,7 +108,7 @@ class Limits:
             span = getattr(self, name)
             if span is not None and not 0.0 <= span[0] < span[1]:
                 raise DataError(
-                    f"limits: {name} is {span}; an ascending range from zero [m] is needed."
+                    f"limits: {name} is {span}, but must be an ascending range from zero [m]."
                 )
 
 
@@ -151,7 +151,7 @@ class PlanCell:
         for name in ("sigma_rad", "sigma_m"):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise DataError(
-                    f"the guesses: {name} is {getattr(self, name)}; zero or more is needed."
+                    f"the guesses: {name} is {getattr(self, name)}, but must be zero or more."
                 )
 
     def collisions(self) -> Collisions:
@@ -232,7 +232,7 @@ def _check_pose(what: str, pose: FloatArray) -> None:
     # It may be typed with three digits.
     if fault := rigid_fault(np.asarray(pose), 1e-3):
         raise DataError(
-            f"{what}: a 4 x 4 matrix of a rotation and a translation [m] is needed: {fault}.",
+            f"{what} must be a 4 x 4 matrix of a rotation and a translation [m]: {fault}.",
             culprits=[what],
         )
 

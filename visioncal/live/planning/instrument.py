@@ -189,7 +189,7 @@ def _candidates(cell: InstrumentCell, possible: int, least: int, seed: int) -> F
     if len(kept) < least:
         worst = max(lost, key=lambda limit: lost[limit])
         raise DataError(
-            f"plan: {len(kept)} possible stops were found, and {least} are needed; most in the way "
+            f"plan: {len(kept)} possible stops were found, but must be {least}; most in the way "
             f"is {worst}, which kept out {lost[worst]} postures.",
             culprits=[worst],
             next_step="Put the instrument where the arm comes less between it and the probe "

@@ -138,7 +138,7 @@ def order_stops(cell: AnyCell, start_q: FloatArray | None, q: FloatArray, seed: 
         apart_m, needed_m = collisions.distances(start_q)[contact], collisions.needed_m()[contact]
         raise DataError(
             f"plan: where the arm starts, {first_body} and {second_body} are {1e3 * apart_m:.0f} "
-            f"mm apart; {1e3 * needed_m:.0f} mm and a little more are needed.",
+            f"mm apart, but must be {1e3 * needed_m:.0f} mm and a little more.",
             culprits=[first_body, second_body],
             next_step="Drive the arm clear by hand, or begin the plan at its first stop. The "
             f"clearance is {1e3 * cell.limits.clearance_m:.0f} mm.",

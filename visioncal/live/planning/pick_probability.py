@@ -96,7 +96,7 @@ def need_planned(picking: Picking, rows: IntArray, count: int) -> NeedPlanned:
     words = ""
     if probability < least:
         stops = f"{len(rows)} stops predict that {percent(probability)} of picks land within "
-        words = f"{stops}{words_of(picking.need)}; {percent(least)} are needed. "
+        words = f"{stops}{words_of(picking.need)}, but must predict {percent(least)}. "
     if words and best >= least:
         words += f"More than {count} stops are needed: all candidates give {percent(best)}."
     elif words:
@@ -121,7 +121,7 @@ def check_need(need: Need, judged: str) -> None:
     for name, value in (("mm", need.mm), ("deg", need.deg)):
         if value is not None and not 0.0 < value < np.inf:
             raise DataError(
-                f"the need is {value} {name}; a number above zero is needed.",
+                f"the need is {value} {name}, but must be a number above zero.",
                 culprits=[f"need_{name}"],
             )
     if judged != "sight":

@@ -124,4 +124,4 @@ def _check_room(folder: Path) -> None:
     """Raises early: on a full disk, rerun's thread dies and waiting for it hangs."""
     free_bytes = shutil.disk_usage(folder).free
     if free_bytes < _ROOM_BYTES:
-        raise OSError(f"{free_bytes / 1e6:.0f} MB are free, {_ROOM_BYTES / 1e6:.0f} are needed")
+        raise OSError(f"{free_bytes / 1e6:.0f} MB are free, but must be {_ROOM_BYTES / 1e6:.0f}")

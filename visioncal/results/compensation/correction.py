@@ -238,7 +238,9 @@ def _matrices(poses: Poses) -> FloatArray:
     matrices = np.asarray(given, dtype=float)
     matrices = matrices[None] if matrices.ndim == 2 else matrices
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
-        raise DataError(f"correct: targets of shape (m, 4, 4) are needed, not {np.shape(given)}.")
+        raise DataError(
+            f"correct: targets have the shape {np.shape(given)}, but must have (m, 4, 4)."
+        )
     for at, matrix in enumerate(matrices):
         if fault := rigid_fault(matrix):
             raise DataError(

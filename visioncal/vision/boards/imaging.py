@@ -62,7 +62,7 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     except SyntaxError:
         return "unreadable: the file is damaged"
     except (OSError, ValueError):
-        return "unreadable: not an image that can be decoded (png, jpg, tif, bmp or webp is needed)"
+        return "unreadable: must be an image that can be decoded (png, jpg, tif, bmp or webp)"
     flags = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -100,7 +100,7 @@ def check_grey(image: Image, label: str) -> None:
     """Checks that an image is grey; raises DataError."""
     if image.ndim != 2:
         raise DataError(
-            f"{label}: an array of the shape {image.shape}; (h, w) grey levels are needed.",
+            f"{label} has the shape {image.shape}, but must have (h, w), of grey levels.",
             culprits=[label],
             next_step=GREY,
         )
