@@ -39,7 +39,7 @@ from visioncal.live.planning.purposes import PURPOSES
 from visioncal.results import to_document
 from visioncal.results.arm import FUNCTIONS, ArmLevel, ArmResult
 from visioncal.robot import Loads, Robot, load_robot
-from visioncal.robot.loads import WeightFunctions
+from visioncal.robot.elasticity import WeightFunctions
 from visioncal.simulation import CellOptions, Payload, cell_session, simulate
 from visioncal.simulation.arms import forward
 from visioncal.simulation.instrument_session import (

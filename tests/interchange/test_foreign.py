@@ -275,7 +275,12 @@ def test_intrinsics_of_numpy_and_of_a_fisheye(tmp_path):
     (tmp_path / "fisheye.yaml").write_text(text)
     assert read_intrinsics(tmp_path / "fisheye.yaml")[0]["model"] == "fisheye"
     (tmp_path / "omni.yaml").write_text(text.replace("pinhole", "omni"))
-    raised(DataError, "must have the camera matrix of a pinhole", read_intrinsics, tmp_path / "omni.yaml")
+    raised(
+        DataError,
+        "must have the camera matrix of a pinhole",
+        read_intrinsics,
+        tmp_path / "omni.yaml",
+    )
 
 
 def test_numbers_or_images_say_which_pose_has_no_image(tmp_path):

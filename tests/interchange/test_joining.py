@@ -16,8 +16,9 @@ from visioncal.core.errors import DataError
 from visioncal.frames.frame_from_images import SEEN_BY
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import frames_to_keep, load_stored, rewrite_result
-from visioncal.present.recording import read_calibration, read_evidence, read_session
+from visioncal.present.recording import read_calibration, read_evidence
 from visioncal.results import Calibration, FrameFile, to_document
+from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
 
 
@@ -51,7 +52,7 @@ def test_all_files_are_as_before_with_the_frames(sample, folder):
     expected = to_document(sample.calibration) | {"frames": to_document(joined)["frames"]}
     for calibration in (Calibration.load(folder), read_calibration(folder / "recording.rrd")):
         assert to_document(calibration) == expected
-    assert_same(sample.session, read_session(folder / "recording.rrd"))
+    assert_same(sample.session, Session.load(folder / "recording.rrd"))
     assert_same_evidence(sample.evidence, read_evidence(folder / "recording.rrd"))
     assert load_stored(folder).note == ""
     report = (folder / "report.html").read_text(encoding="utf-8")

@@ -24,7 +24,7 @@ from support.recorded import QUICK, REPEATABILITY_M, facts_of, recorded
 from support.refusals import raised
 
 from visioncal.calibration.run import run
-from visioncal.cli import record as record_module
+from visioncal.cli import live_cell
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
 from visioncal.live.capture import devices
@@ -414,7 +414,7 @@ def _use(monkeypatch, arm, camera):
         devices, "ARMS", {"fake": lambda *_, **__: arm, "manual": lambda *_, **__: arm}
     )
     monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
-    monkeypatch.setattr(record_module, "HostClock", lambda: arm.clock)
+    monkeypatch.setattr(live_cell, "HostClock", lambda: arm.clock)
 
 
 def record(out, *more):

@@ -17,7 +17,7 @@ from support.commands import visioncal
 from support.live_cell import fake_devices, fake_plan
 from support.refusals import raised
 
-import visioncal.cli.record as record_module
+from visioncal.cli import live_cell
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import pose_difference
 from visioncal.live.capture import devices
@@ -446,7 +446,7 @@ def cell(monkeypatch):
     plan = fake_plan(12)
     body, camera = fake_devices(plan)
     monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
-    monkeypatch.setattr(record_module, "HostClock", lambda: body.clock)
+    monkeypatch.setattr(live_cell, "HostClock", lambda: body.clock)
     return plan, body
 
 

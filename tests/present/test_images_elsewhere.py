@@ -11,7 +11,7 @@ from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
 from visioncal.interchange.outputs import RECORDING, write_outputs
 from visioncal.interchange.result_files import rewrite_result
-from visioncal.present.recording import read_calibration, read_evidence, read_session
+from visioncal.present.recording import read_calibration, read_evidence
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -34,7 +34,7 @@ def test_the_session_stays_what_it_is_without_its_images(cell, tmp_path, kept):
     write_outputs(tmp_path / "out", session, done, images=kept)
     path = tmp_path / "out" / RECORDING
     assert path.stat().st_size < 0.35 * (tmp_path / "full" / RECORDING).stat().st_size
-    found = read_session(path)
+    found = Session.load(path)
     assert found.digest() == session.digest()
     assert found.warnings == session.warnings
     assert len(read_evidence(path)) == 6
@@ -60,7 +60,7 @@ def test_the_session_stays_what_it_is_without_its_images(cell, tmp_path, kept):
         assert shown is None
     # Written anew, what there is stays what it is.
     rewrite_result(tmp_path / "out", Calibration.load(tmp_path / "out"))
-    rewritten = read_session(path)
+    rewritten = Session.load(path)
     assert (rewritten.digest(), rewritten.images.shown(name)) == (session.digest(), shown)
     assert len(run(rewritten).evidence) == 6
     assert read_calibration(path).session_sha256 == session.digest()
@@ -69,6 +69,6 @@ def test_the_session_stays_what_it_is_without_its_images(cell, tmp_path, kept):
 def test_a_run_without_searches_keeps_all_images(cell, tmp_path):
     session, done = cell
     write_outputs(tmp_path, session, replace(done, searches={}))
-    found = read_session(tmp_path / RECORDING)
+    found = Session.load(tmp_path / RECORDING)
     name = found.views[0].image
     assert found.images.read(name) == session.images.read(name)

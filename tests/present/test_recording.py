@@ -36,12 +36,11 @@ from visioncal.present.recording import (
     paths,
     read_calibration,
     read_evidence,
-    read_session,
     write_recording,
 )
 from visioncal.present.recording.overlays import Overlay
-from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.scene import Scene
+from visioncal.present.recording.stored import chunks
 from visioncal.present.report import plots
 from visioncal.present.viewer import blueprint
 from visioncal.results import Edge, ViewResult, to_document
@@ -100,7 +99,7 @@ def test_real_session_round_trip(name, tmp_path):
     if not folder.is_dir():
         pytest.skip("the shared sessions are not beside this checkout")
     session = Session.load(folder)
-    assert_same(session, read_session(write_session(tmp_path / "real.rrd", session)))
+    assert_same(session, Session.load(write_session(tmp_path / "real.rrd", session)))
 
 
 def test_odd_facts_survive(tmp_path):
@@ -117,13 +116,13 @@ def test_odd_facts_survive(tmp_path):
         ["", "-3", "", "0.1", "0.30000000000000004", "0", "1", "0", "0", "0", "1"],
     ]
     session = Session.assemble(document, columns, cells, MemoryImages({}))
-    assert_same(session, read_session(write_session(tmp_path / "odd.rrd", session)))
+    assert_same(session, Session.load(write_session(tmp_path / "odd.rrd", session)))
 
 
 def test_the_date_of_a_boards_description_is_kept_as_text(sample, tmp_path):
     board = {**sample.session.target_document, "printed": datetime.date(2026, 11, 20)}
     session = replace(sample.session, target_document=board)
-    read = read_session(write_session(tmp_path / "dated.rrd", session))
+    read = Session.load(write_session(tmp_path / "dated.rrd", session))
     assert read.target_document["printed"] == "2026-11-20"
     assert read.digest() == session.digest()
 
@@ -132,7 +131,7 @@ def test_views_without_rows_of_corners_csv_survive(sample, tmp_path):
     table = parse_corners("view,point,u_px,v_px\n0,1,310.5,220\n")
     session = replace(sample.session, corner_table=table).only([1, 2])
     assert len(session.corner_table) == 0
-    assert_same(session, read_session(write_session(tmp_path / "some.rrd", session)))
+    assert_same(session, Session.load(write_session(tmp_path / "some.rrd", session)))
 
 
 @pytest.mark.parametrize(
@@ -143,13 +142,13 @@ def test_another_format_says_what_to_do(step, words, sample, tmp_path, monkeypat
         other.setattr(codec, "FORMAT", codec.FORMAT + step)
         other.setattr(codec, "__version__", "9.1")
         path = write_session(tmp_path / "other.rrd", sample.session)
-    for read in (read_session, read_calibration):
+    for read in (Session.load, read_calibration):
         assert words in raised(DataError, f"format {codec.FORMAT + step}", read, path).next_step
 
 
 def test_images_stay_in_the_recording_until_they_are_read(sample, tmp_path):
     path = write_session(tmp_path / "session.rrd", sample.session)
-    session = read_session(path)
+    session = Session.load(path)
     image = session.views[2].image
     write_session(path, made_up(2).session)
     raised(DataError, r"not there any more|replaced since", session.images.read, image)
@@ -160,7 +159,7 @@ def test_missing_and_shared_images_stay_so(sample, tmp_path):
     first, second, third = sample.session.views[:3]
     views = (first, replace(second, image=first.image), replace(third, image="images/none.png"))
     session = replace(sample.session, views=views)
-    again = read_session(write_session(tmp_path / "few.rrd", session))
+    again = Session.load(write_session(tmp_path / "few.rrd", session))
     assert_same(session, again)
     assert not again.images.exists("images/none.png")
 
@@ -561,7 +560,7 @@ def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path
     files = write_outputs(tmp_path / "out", session, Run(found, ())).files
     assert [file.name for file in files] == ["calibration.json", "report.html", "recording.rrd"]
     recording = tmp_path / "out" / "recording.rrd"
-    assert read_session(recording).digest() == session.digest()
+    assert Session.load(recording).digest() == session.digest()
     assert to_document(read_calibration(recording)) == to_document(found)
     drawn = {chunk.entity_path for chunk in RrdReader(recording).stream()}
     for entity in ("/cameras/top", "/targets/plate/sheet", "/robots/b/links", "/network"):

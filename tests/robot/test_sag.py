@@ -10,7 +10,7 @@ from support.slopes import jacobian
 from visioncal.core.errors import DataError
 from visioncal.robot import Loads, Robot, load_robot
 from visioncal.robot.conversion import table_of, with_base
-from visioncal.robot.loads import deflected_joints
+from visioncal.robot.elasticity import deflected_joints
 from visioncal.robot.tables import table_document
 from visioncal.simulation import Payload, arm_named
 from visioncal.simulation.arms import loaded_joints

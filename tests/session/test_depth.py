@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from visioncal.core.errors import DataError
-from visioncal.present.recording import read_session, write_recording
+from visioncal.present.recording import write_recording
 from visioncal.session import MemoryImages, Session
 from visioncal.session.depth import read_cloud, read_depth
 
@@ -147,7 +147,7 @@ def test_a_session_keeps_depth_in_its_folder_digest_and_recording(tmp_path, clou
     assert session.declaration.camera.depth_of == "ray"
     session.save(tmp_path / "bin")
     write_recording(tmp_path / "bin.rrd", session, None, (), None)
-    for stored in (Session.load(tmp_path / "bin"), read_session(tmp_path / "bin.rrd")):
+    for stored in (Session.load(tmp_path / "bin"), Session.load(tmp_path / "bin.rrd")):
         assert stored.images.read("depth/0.png") == tenths
         assert stored.digest() == session.digest()
     other = MemoryImages(files | {"depth/0.png": png(np.ones(SIZE[::-1], np.uint16))})

@@ -13,8 +13,8 @@ from typing import get_args
 import numpy as np
 
 from visioncal.cli.console import say
+from visioncal.cli.live_cell import check_order, opened, recorded_cell, taking_of
 from visioncal.cli.parsing import refuse_given
-from visioncal.cli.record import check_order, opened, recorded_cell, taking_of
 from visioncal.cli.result_options import VerifyOptions
 from visioncal.cli.session_options import RecordOptions
 from visioncal.core.choices import CameraMount

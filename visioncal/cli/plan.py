@@ -1,28 +1,28 @@
 """`visioncal plan`."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import tomli_w
-from scipy.spatial.transform import Rotation
 
 from visioncal.cli.console import answer, print_json, report_written, say, warn
 from visioncal.cli.parsing import numbers_in, refuse_given
+from visioncal.cli.plan_source import Kept, Source, chosen_part, find_source, pose_of, robot_of
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import MOST_FOR_NEED, ClearanceOptions, PlanOptions
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import listed, percent, some_of
 from visioncal.core.transforms import compose
-from visioncal.core.types import Camera, FloatArray, Need, Progress
+from visioncal.core.types import Camera, Need, Progress
 from visioncal.estimation.problem_parts import Noise
 from visioncal.interchange.formats.intrinsics import read_intrinsics, target_named
-from visioncal.interchange.outputs import BOARD, CALIBRATION, write_plan, write_stops
-from visioncal.interchange.result_files import content_of, load_calibration, load_stored
+from visioncal.interchange.outputs import BOARD, write_plan, write_stops
+from visioncal.interchange.result_files import content_of, load_calibration
 from visioncal.live.planning.cell import (
     TYPICAL_NOISE,
     TYPICAL_PX,
@@ -39,29 +39,16 @@ from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.recorded import SessionStart, calibrate_partially, start_from_session
 from visioncal.live.planning.repeated import stops_to_repeat
 from visioncal.results import Calibration
-from visioncal.robot import Robot, load_robot
+from visioncal.robot import load_robot
 from visioncal.robot.conversion import has_ur_axes
 from visioncal.session import Session
-from visioncal.session.selecting import ANY, LENS, Choice, must_select_one, select
+from visioncal.session.selecting import ANY, LENS
 from visioncal.vision.targets import stored_target, target_from_document
 
 _SHOWN = 12
 _USUAL = "hand-eye"  # What stops of a camera are for.
-_SESSION = "session.toml"
 # Options without which a cell is not known.
 _NEEDED = ("target", "camera", "cam", "board")
-# Limits of the arm and the camera, and obstacles.
-Kept: TypeAlias = tuple[Limits, tuple[Box, ...]]
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """Source of a plan: a robot, a calibration or a session; `words` describes it for people."""
-
-    words: str
-    robot: Robot | None = None
-    calibration: Calibration | None = None
-    session: Session | None = None
 
 
 def plan_command(options: PlanOptions, session: Path | None = None) -> str:
@@ -125,23 +112,6 @@ def plan_command(options: PlanOptions, session: Path | None = None) -> str:
         _report(plan)
     report_written(written, quiet=options.as_json)
     return ""
-
-
-def robot_of(options: PlanOptions, source: Source, found: Calibration | None, lost: str) -> Robot:
-    """The robot that is asked for, as calibrated, or as stated; raises DataError."""
-    if options.robot is not None:
-        return load_robot(options.robot)
-    if found is not None and found.calibrated_robot is not None:
-        return found.calibrated_robot
-    if source.robot is not None:
-        return source.robot
-    if source.session is not None and source.session.robot_document is not None:
-        return Robot.from_document(source.session.robot_document)
-    raise DataError(
-        f"{source.words} names no robot, and its {lost} without one.",
-        culprits=["robot"],
-        next_step="Name it with --robot.",
-    )
 
 
 def _plan_cube(options: PlanOptions, source: Source, limits: Limits) -> str:
@@ -290,49 +260,6 @@ def _report(plan: Plan) -> None:
         )
 
 
-def find_source(name: str) -> Source:
-    """Loads a robot, a session or a calibration, whichever is named; raises DataError."""
-    path = Path(name)
-    if path.is_dir() and (path / _SESSION).is_file() and not (path / CALIBRATION).is_file():
-        return Source(f"session {name}", session=Session.load(path))
-    if path.suffix.lower() == ".rrd":
-        # The codec takes half a second to import, which a robot need not wait for.
-        from visioncal.present.recording import read_calibration
-
-        calibration, session = read_calibration(path), Session.load(path)
-        return Source(f"recording {name}", calibration=calibration, session=session)
-    if (path / CALIBRATION).is_file() or "transforms" in content_of(path):
-        stored = load_stored(path)
-        return Source(f"calibration {name}", calibration=stored.calibration, session=stored.session)
-    try:
-        return Source(f"robot {name}", robot=load_robot(name))
-    except DataError as error:
-        raise DataError(
-            f"{name[:200]} is no session and no calibration, and as a robot: {error.message}",
-            culprits=[name[:200]],
-            next_step=error.next_step,
-        ) from error
-
-
-def chosen_part(source: Source, words: PlanOptions) -> tuple[Source, PlanOptions]:
-    """Extracts one camera, robot and target from a cell's source, as the options name them.
-
-    Raises:
-        DataError: There is no such thing, or the choice is ambiguous.
-    """
-    session, result = source.session, source.calibration
-    is_cell = result is not None and result.cell is not None
-    choice = Choice(words.camera, words.robot, words.target)
-    if not is_cell and (session is None or not must_select_one(session, choice)):
-        return source, words
-    if session is not None and must_select_one(session, choice):
-        session = select(session, choice)
-    if result is not None:
-        result = result.chosen(choice)
-    others = replace(words, camera=None, robot=None, target=None)
-    return replace(source, session=session, calibration=result), others
-
-
 def begun_session(
     source: Source, words: PlanOptions, kept: Kept, progress: Progress
 ) -> SessionStart:
@@ -391,17 +318,6 @@ def cell_of(source: Source, words: PlanOptions, kept: Kept) -> PlanCell:
         *kept,
     )
     return _with_noise(cell, words)
-
-
-def pose_of(words: str, option: str) -> FloatArray:
-    """Parses a rough pose: x, y, z [mm] and angles about the fixed axes x, y, z [deg]; (4, 4) [m].
-
-    Raises:
-        DataError: It is not six numbers.
-    """
-    numbers = numbers_in(",".join(words.replace(",", " ").split()), option, "x,y,z,rx,ry,rz")
-    turn = Rotation.from_euler("xyz", numbers[3:], degrees=True).as_matrix()
-    return compose(turn, 1e-3 * np.array(numbers[:3]))
 
 
 def _calibrated(

@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.run import calibrate
 from visioncal.cli.console import answer, print_json, report_written, say, warn
 from visioncal.cli.parsing import numbers_in, refuse_given
-from visioncal.cli.plan import Kept, Source, pose_of, robot_of
+from visioncal.cli.plan_source import Kept, Source, pose_of, robot_of
 from visioncal.cli.session_options import PlanOptions
 from visioncal.core.choices import Criterion
 from visioncal.core.documents.tables import csv_text

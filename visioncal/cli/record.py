@@ -2,23 +2,21 @@
 
 import math
 import shlex
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from visioncal.cli.console import asked, print_json, say
+from visioncal.cli.live_cell import check_order, opened, recorded_cell, taking_of
 from visioncal.cli.parsing import refuse_given
 from visioncal.cli.session_options import RecordOptions
-from visioncal.core.errors import DataError, DriverError
+from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, figure, listed
 from visioncal.core.threads import signals_as_interrupts
-from visioncal.interchange.formats.intrinsics import target_named
-from visioncal.live.capture.cell import HostClock, LiveCell
-from visioncal.live.capture.devices import REQUESTING, open_arm, open_camera
+from visioncal.live.capture.cell import LiveCell
+from visioncal.live.capture.devices import REQUESTING
 from visioncal.live.capture.gate import Consent
-from visioncal.live.capture.journal import CaptureFacts, Journal, RecordedCell
-from visioncal.live.capture.options import CaptureOptions, Stillness
+from visioncal.live.capture.journal import CaptureFacts, Journal
+from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.recording import (
     Capture,
     CaptureEvent,
@@ -29,10 +27,8 @@ from visioncal.live.capture.recording import (
     motion_summary,
     record,
 )
-from visioncal.live.drivers.protocols import Arm, DeviceSetup, MovingArm, RequestingArm
-from visioncal.live.planning.cell import PlanCell
+from visioncal.live.drivers.protocols import RequestingArm
 from visioncal.live.planning.plan_file import PlanFile, read_plan
-from visioncal.robot import load_robot
 
 
 def record_command(options: RecordOptions) -> None:
@@ -104,55 +100,6 @@ def record_command(options: RecordOptions) -> None:
     _finish(journal, steps, as_json=options.as_json)
 
 
-def taking_of(options: RecordOptions, *, is_driven: bool) -> CaptureOptions:
-    """How views are taken."""
-    return CaptureOptions(
-        speed=options.speed,
-        frames=options.frames,
-        still=Stillness(image_px=options.still_px, quiet_s=options.settle_s),
-        # Where a person sees them, missed views end nothing.
-        missed_in_a_row=CaptureOptions.missed_in_a_row if is_driven else 0,
-    )
-
-
-def check_order(cell: LiveCell, *, is_resumed: bool) -> None:
-    """Refuses what would part a folder's pictures from their poses; raises DataError."""
-    if cell.is_stored and (is_resumed or not isinstance(cell.arm, RequestingArm)):
-        raise DataError(
-            "record: pictures of a folder belong to poses by their order alone, from the first on: "
-            "neither a followed arm, a driven one nor --resume can keep it.",
-            culprits=["--camera", "--resume" if is_resumed else "--arm"],
-            next_step="Record all of it into a new session, with poses that are typed or sent.",
-        )
-
-
-def recorded_cell(plan: PlanFile | None, described: RecordOptions) -> RecordedCell | PlanCell:
-    """What is recorded, by the plan or by options."""
-    target, robot, mount = described.target, described.robot, described.mount
-    found: RecordedCell | PlanCell
-    if plan is not None:
-        given = {"--target": target, "--robot": robot, "--mount": mount}
-        refuse_given(given, "the plan says that already")
-        found = plan.cell
-    elif target is None:
-        raise DataError(
-            "record needs --plan or --target to know what to look for.",
-            culprits=["--plan", "--target"],
-            next_step="Name the board, as --target charuco_9x6_30mm.",
-        )
-    else:
-        arm = None if robot is None else load_robot(robot)
-        found = RecordedCell(mount or "eye-in-hand", target_named(target), arm)
-    if found.target.is_rig and not found.target.point_tags:
-        raise DataError(
-            f"record: target {found.target.name} is a rig of points, which no image is searched "
-            "for.",
-            culprits=["--target"],
-            next_step="Record with a printed board, or write views.csv and corners.csv yourself.",
-        )
-    return found
-
-
 def _guided(capture: Capture, views: int) -> list[CaptureEvent]:
     """Records an arm that a person or its own program moves."""
     arm = capture.cell.arm
@@ -162,28 +109,6 @@ def _guided(capture: Capture, views: int) -> list[CaptureEvent]:
     if arm.invitation:
         say(arm.invitation)
     return ask_and_take(capture, arm, views)
-
-
-@contextmanager
-def opened(
-    options: RecordOptions, *, is_moved: bool, given: Arm | None = None
-) -> Iterator[LiveCell]:
-    """Opens both devices, the arm unless it is given, and closes them at the end of the block."""
-    requested = DeviceSetup(options.resolution, options.exposure_us, options.gain, options.focus)
-    chosen = given or open_arm(
-        *(str(options.arm), asked, options.pose_form),
-        moves=is_moved,
-        answers=sys.stdin.isatty(),
-    )
-    with closing(chosen) as arm:
-        if is_moved and not isinstance(arm, MovingArm):
-            raise DriverError(
-                f"{arm.name} cannot be driven.",
-                culprits=[arm.name],
-                next_step="Guide it by hand: --follow.",
-            )
-        with closing(open_camera(str(options.camera), requested)) as camera:
-            yield LiveCell(arm, camera, HostClock())
 
 
 def say_line(step: CaptureEvent) -> None:

@@ -65,7 +65,7 @@ def show_command(options: ShowOptions) -> None:
 
 def _row(file: Path, view: int | None) -> int | None:
     """Index of the view at which a recording is opened; None for the first."""
-    from visioncal.present.recording import read_session
+    from visioncal.session import Session
 
     if view is None:
         # A plan and an uncalibrated session have no worst view.
@@ -74,7 +74,7 @@ def _row(file: Path, view: int | None) -> int | None:
             view = worst_view(result.views, result.rms)
         if view is None:
             return None
-    numbers = [other.number for other in read_session(file).views]
+    numbers = [other.number for other in Session.load(file).views]
     if view not in numbers:
         raise DataError(
             f"{file} has no view {view}; it has {some_of([*map(str, numbers)])}.",

@@ -12,7 +12,7 @@ from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import TWIST_UNITS, ArmErrors
 from visioncal.robot import Loads, Robot
-from visioncal.robot.loads import WeightFunctions, deflected_joints
+from visioncal.robot.elasticity import WeightFunctions, deflected_joints
 
 # Columns of a joint's function (see `Robot.function_jacobian`) by block.
 _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}

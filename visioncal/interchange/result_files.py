@@ -172,9 +172,9 @@ def load_stored(path: Path) -> Stored:
 
 
 def _with_recording(calibration: Calibration, recording: Path) -> Stored:
-    from visioncal.present.recording import read_evidence, read_session
+    from visioncal.present.recording import read_evidence
 
-    session, evidence = read_session(recording), read_evidence(recording)
+    session, evidence = Session.load(recording), read_evidence(recording)
     return Stored(calibration, session, evidence, review=review_command(recording))
 
 

@@ -35,7 +35,7 @@ from visioncal.results.selecting import selected_fields
 from visioncal.results.tree import FrameTree
 from visioncal.results.views import Rms, Validation, ViewResult
 from visioncal.robot import Loads, Robot
-from visioncal.robot.loads import deflected_joints
+from visioncal.robot.elasticity import deflected_joints
 from visioncal.robot.thermal import ThermalModel
 from visioncal.session.frames import CELL, frames_of_kind, object_name
 from visioncal.session.selecting import PARTS, Choice, Part

@@ -108,9 +108,10 @@ class Session:
         path = Path(path)
         if path.suffix.lower() == ".rrd":
             # Imported here, since recordings depend on sessions.
-            from visioncal.present.recording import read_session
+            from visioncal.present.recording.stored import session_content
 
-            return read_session(path)
+            content, streams = session_content(path)
+            return cls.assemble(**content).with_streams(streams)
         # calibration.json stands for the output folder that contains it.
         folder = path.parent if path.name == "calibration.json" else path
         recording = folder / "recording.rrd"

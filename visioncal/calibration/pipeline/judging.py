@@ -15,8 +15,9 @@ from visioncal.calibration.suspects.contest import contested
 from visioncal.calibration.suspects.judge import judge
 from visioncal.calibration.suspects.judged import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.calibration.suspects.misread_poses import BY_CHAIN, with_misreading
+from visioncal.calibration.suspects.outliers import EXCHANGED
 from visioncal.calibration.suspects.registry import found_in
-from visioncal.calibration.suspects.suspect import EXCHANGED, UNDONE
+from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.core.conventions import controller_form
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg, some_of

@@ -10,7 +10,6 @@ import numpy as np
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
-from visioncal.calibration.suspects.suspect import EXCHANGED
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS
 from visioncal.core.number_format import figure, mm_and_deg, some_of, view_words
 from visioncal.core.transforms import invert, log, mean_transform, pose_difference
@@ -22,6 +21,7 @@ from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
 
+EXCHANGED = "exchanged_views"  # The kind of finding, which others name.
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
 
 

@@ -19,10 +19,9 @@ from visioncal.calibration.suspects import (
     steps,
     turned_views,
 )
-from visioncal.calibration.suspects.outliers import moved_finding
+from visioncal.calibration.suspects.outliers import EXCHANGED, moved_finding
 from visioncal.calibration.suspects.suspect import (
     ARM_ERRORS,
-    EXCHANGED,
     FACT,
     REMARK,
     SOURCES,

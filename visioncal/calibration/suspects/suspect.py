@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from visioncal.calibration.pipeline.run_state import RunState
 
 # Kinds that several modules name.
-ARM_ERRORS, EXCHANGED, UNEXPLAINED = "arm_errors", "exchanged_views", "unexplained"
+ARM_ERRORS, UNEXPLAINED = "arm_errors", "unexplained"
 UNDONE = ("shifted_rows", "turned_board", "flipped_poses", "copied_poses", "lost_sign")
 # All that explains that views disagree, or that the flange is off.
 CHAIN = "chain"

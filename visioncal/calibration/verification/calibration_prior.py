@@ -24,7 +24,7 @@ from visioncal.results import Calibration
 from visioncal.results.arm import FUNCTIONS
 from visioncal.results.sections import FittedArm, JointFit
 from visioncal.robot import Robot
-from visioncal.robot.loads import WeightFunctions
+from visioncal.robot.elasticity import WeightFunctions
 from visioncal.vision.targets import numbered_positions, target_from_document
 
 # Correlation of the arm's errors from which a stop repeats a calibrated one.

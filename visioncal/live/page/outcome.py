@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from visioncal.calibration.suspects.suspect import EXCHANGED
+from visioncal.calibration.suspects.outliers import EXCHANGED
 from visioncal.core.number_format import figure
 from visioncal.session import View
 

@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.model.arm import Moments
 from visioncal.model.effects.joints import JointEffect
-from visioncal.robot.loads import WeightFunctions
+from visioncal.robot.elasticity import WeightFunctions
 
 
 @dataclass(frozen=True, eq=False)

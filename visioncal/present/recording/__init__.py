@@ -4,7 +4,7 @@ The session's data is stored without loss beside its drawing; see `codec`. Chang
 after writing are detected; see `rrd_messages`.
 """
 
-from visioncal.present.recording.reader import read_calibration, read_evidence, read_session
+from visioncal.present.recording.reader import read_calibration, read_evidence
 from visioncal.present.recording.writer import write_recording
 
-__all__ = ["read_calibration", "read_evidence", "read_session", "write_recording"]
+__all__ = ["read_calibration", "read_evidence", "write_recording"]

@@ -15,7 +15,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import pyarrow as pa
 import rerun as rr
-import tomli_w
 
 from visioncal.core.documents.toml import parse_toml
 from visioncal.core.errors import DataError
@@ -24,9 +23,9 @@ from visioncal.core.types import Corners, Rejection, Searched
 from visioncal.core.version import __version__
 from visioncal.present.recording import paths
 from visioncal.results.evidence import ViewEvidence
-from visioncal.session import Session, Stream
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import ImageStore
+from visioncal.session.streams import Stream
 
 # Only recordings of this format are read.
 FORMAT = 7
@@ -90,71 +89,23 @@ def _unpacked(table: dict[str, Any]) -> object:
     return np.frombuffer(b64decode(table["base64"]), table["dtype"]).reshape(table["shape"])
 
 
-def session_record(
-    session: Session,
-    kept: str,
-    digests: Sequence[str],
-    searches: Mapping[tuple[str, str], Searched],
-) -> Record:
-    """The record of a session.
-
-    Args:
-        session: The session.
-        kept: What is stored of its images, as `ImagesKept`.
-        digests: SHA-256 of each view's image; empty without an image.
-        searches: What was found in images, by their names and those of their boards.
-    """
-    corners, table = None, session.corner_table
-    # Of some views alone, a table may have no rows.
-    if table is not None:
-        corners = table.views, table.points, table.px, table.targets, table.sigmas_px
-    return {
-        "session_toml": tomli_w.dumps(session.document),
-        "target": session.target_document,
-        "robot": session.robot_document,
-        "columns": session.columns,
-        "cells": [[view.cell(column) for column in session.columns] for view in session.views],
-        "images": kept,
-        "digests": digests,
-        "depths": {
-            path: np.frombuffer(session.images.read(path), np.uint8)
-            for path in {view.depth: None for view in session.views if view.depth}
-            if session.images.exists(path)
-        },
-        "streams": {
-            name: (samples.columns, samples.values) for name, samples in session.streams.items()
-        },
-        "corners": corners,
-        "searches": [
-            (*key, search.size, search.misfit, _found(search.found))
-            for key, search in searches.items()
-        ],
-    }
-
-
-def _found(found: Corners | Rejection) -> object:
-    if isinstance(found, Rejection):
-        return found.reason
-    return found.ids, found.px, found.blur_px, found.weights, None, found.drawn_m
-
-
-def session_of(record: Record, images: ImageStore) -> Session:
-    """The session of a record."""
+def content_of(record: Record, images: ImageStore) -> tuple[dict[str, Any], dict[str, Stream]]:
+    """Arguments of `Session.assemble`, and the streams, of the session of a record."""
     corners = None
     if record["corners"] is not None:
         views, points, px, targets, sigmas_px = record["corners"]
         corners = CornerTable(views, points, px, tuple(targets), sigmas_px)
-    return Session.assemble(
-        parse_toml(record["session_toml"], "session.toml"),
-        record["columns"],
-        record["cells"],
-        images,
-        target_document=record["target"],
-        robot_document=record["robot"],
-        corners=corners,
-    ).with_streams(
-        {name: Stream(tuple(names), values) for name, (names, values) in record["streams"].items()}
-    )
+    content = {
+        "document": parse_toml(record["session_toml"], "session.toml"),
+        "columns": record["columns"],
+        "cells": record["cells"],
+        "images": images,
+        "target_document": record["target"],
+        "robot_document": record["robot"],
+        "corners": corners,
+    }
+    streams = record["streams"].items()
+    return content, {name: Stream(tuple(names), values) for name, (names, values) in streams}
 
 
 def image_names(record: Record) -> list[str]:
@@ -180,7 +131,7 @@ def result_record(text: str, evidence: Sequence[ViewEvidence]) -> Record:
     """The record of a result: calibration.json, and the views' exact evidence in its order."""
     views = []
     for view in evidence:
-        corners = None if view.corners is None else _found(view.corners)
+        corners = None if view.corners is None else search_result(view.corners)
         poses = view.base_from_flange, view.cam_from_target, view.depth
         views.append((view.view, corners, view.predicted_px, *poses))
     return {"calibration": text, "views": views}
@@ -206,3 +157,10 @@ def image_at(batch: pa.RecordBatch, position: int) -> bytes:
     """Reads the bytes of the image at one position of a chunk."""
     blob = batch.column(_BLOB)[position].values[0]
     return bytes(blob.values.to_numpy().tobytes())
+
+
+def search_result(found: Corners | Rejection) -> object:
+    """Fields of what was found in an image, or why nothing was."""
+    if isinstance(found, Rejection):
+        return found.reason
+    return found.ids, found.px, found.blur_px, found.weights, None, found.drawn_m

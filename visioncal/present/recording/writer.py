@@ -4,7 +4,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
+import numpy as np
 import rerun as rr
+import tomli_w
 from rerun.blueprint import BlueprintLike
 
 from visioncal.core.choices import ImagesKept
@@ -13,9 +15,9 @@ from visioncal.core.files import replacing_file, sha256
 from visioncal.core.types import Searched
 from visioncal.present.recording import codec, notes, paths
 from visioncal.present.recording.overlays import Overlay, log_image_frames
-from visioncal.present.recording.reader import RecordedImages
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import Scene
+from visioncal.present.recording.stored import RecordedImages
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session, View
@@ -45,7 +47,7 @@ def write_recording(
 
     Args:
         path: The `.rrd` to write; it appears whole or not at all.
-        session: The session; `read_session` returns it.
+        session: The session; `Session.load` returns it.
         calibration: Result of the session; None draws the cell as recorded.
         evidence: Evidence of the views, in any order.
         blueprint: Viewer layout, as by `viewer.blueprint`; None for the viewer's own.
@@ -126,7 +128,7 @@ def recording(
             recorder.at(row)
             digests.append(_log_image(recorder.stream, session, view, images, found))
         stored = {} if images == "full" else found
-        record = codec.session_record(session, images, digests, stored)
+        record = session_record(session, images, digests, stored)
         codec.log_record(recorder.stream, paths.SESSION, record)
         recorder.lay_out(blueprint)
         recorder.keep()
@@ -160,3 +162,45 @@ def _log_image(
         media_type = _MEDIA_TYPES.get(PurePosixPath(name).suffix.lower())
         stream.log(paths.IMAGE, rr.EncodedImage(contents=shown, media_type=media_type))
     return digest
+
+
+def session_record(
+    session: Session,
+    kept: str,
+    digests: Sequence[str],
+    searches: Mapping[tuple[str, str], Searched],
+) -> codec.Record:
+    """The record of a session.
+
+    Args:
+        session: The session.
+        kept: What is stored of its images, as `ImagesKept`.
+        digests: SHA-256 of each view's image; empty without an image.
+        searches: What was found in images, by their names and those of their boards.
+    """
+    corners, table = None, session.corner_table
+    # Of some views alone, a table may have no rows.
+    if table is not None:
+        corners = table.views, table.points, table.px, table.targets, table.sigmas_px
+    return {
+        "session_toml": tomli_w.dumps(session.document),
+        "target": session.target_document,
+        "robot": session.robot_document,
+        "columns": session.columns,
+        "cells": [[view.cell(column) for column in session.columns] for view in session.views],
+        "images": kept,
+        "digests": digests,
+        "depths": {
+            path: np.frombuffer(session.images.read(path), np.uint8)
+            for path in {view.depth: None for view in session.views if view.depth}
+            if session.images.exists(path)
+        },
+        "streams": {
+            name: (samples.columns, samples.values) for name, samples in session.streams.items()
+        },
+        "corners": corners,
+        "searches": [
+            (*key, search.size, search.misfit, codec.search_result(search.found))
+            for key, search in searches.items()
+        ],
+    }

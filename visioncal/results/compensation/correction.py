@@ -16,8 +16,8 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.results import Calibration
 from visioncal.results.arm import WorkspacePlace
 from visioncal.robot import Loads, Robot
+from visioncal.robot.elasticity import joint_deflections
 from visioncal.robot.inverse import Inverse, Posture
-from visioncal.robot.loads import joint_deflections
 from visioncal.session.selecting import ARM, Choice
 
 # Transforms, or their (4, 4) or (m, 4, 4) matrices.
