@@ -416,7 +416,7 @@ def test_what_cannot_be_checked_is_said(tmp_path):
     [
         (("--duration", 3), "a motion of 3 s is too short"),
         (("--duration", 60), "60 s is too long"),
-        (("--harmonics", 2), "2 harmonics"),
+        (("--harmonics", 2), "harmonics is 2, but must be"),
         (("--friction", "coulomb,stiction"), "--friction names stiction"),
         (("--payload", "2,0,0"), "--payload is '2,0,0', but must be kg,x,y,z"),
         (("--payload", "-2,0,0,0"), "a mass of 0 kg or more"),

@@ -446,7 +446,7 @@ def test_pixels_are_placed_on_planes(cell):
         ({"source": "part", "point": "1,2"}, "--point-mm is '1,2', but must be x,y,z"),
         ({"source": "part", "point": "0,0,99000"}, "farther than 20 m"),
         ({"source": "part", "target": "charuco"}, "There is no target 'charuco'"),
-        ({"source": "part/views.csv", "target": "charuco_9x6_30mm"}, "not an image"),
+        ({"source": "part/views.csv", "target": "charuco_9x6_30mm"}, "it must be a png"),
         ({"pixel": ["1"], "plane": "z=0"}, "--pixel is '1', but must be u,v"),
         ({"pixel": ["1,2"], "plane": "z=low"}, "--plane z is 'low'"),
         ({"pixel": ["1,2"], "plane": "gig"}, "'gig', .* there are: .*base_from_jig"),
