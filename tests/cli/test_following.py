@@ -6,9 +6,11 @@ import tomllib
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import tomli_w
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from support.commands import Done, visioncal
 from support.edited import rewritten
 from support.following import follow
@@ -88,6 +90,14 @@ def turned_for_viewers(folder: Path, every: int) -> None:
         image.save(path.with_suffix(".jpg"), quality=97, **{"exif": tag} if at % every == 0 else {})
         path.unlink()
     edit(folder, lambda text: text.replace(".png", ".jpg"), "views.csv")
+
+
+def as_axis(_: int, row: dict[str, str], *, whole: bool = False) -> dict[str, str]:
+    """A row whose quaternion is an axis and an angle, or the product of both."""
+    turn = Rotation.from_quat([float(row[name]) for name in POSE[3:]]).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    axis = turn if whole else turn / angle
+    return row | dict(zip(POSE[3:], map(str, [*axis.tolist(), angle]), strict=True))
 
 
 def without_a_lens(folder: Path) -> None:
@@ -242,6 +252,21 @@ DONE_WRONG = {
     "one decimal comma": (
         cells(lambda at, row: row | {"x_m": row["x_m"].replace(".", ",")} if at == 3 else row),
         CELL, 0, "good",
+    ),
+    "thousands or decimals": (
+        cells(lambda at, row: row | {"x_m": "0.5" if at else "1,234"}), CELL, 2, "Write 1.234",
+    ),
+    "one number of a quaternion in thousandths": (
+        cells(lambda _, row: row | {"qw": str(1000.0 * float(row["qw"]))}),
+        CELL, 2, "Divide qw by 1000 in all rows",
+    ),
+    "quaternions in thousandths": (
+        cells(lambda _, row: row | {q: str(1000.0 * float(row[q])) for q in POSE[3:]}),
+        CELL, 2, "Divide qx, qy, qz, qw by 1000 in all rows",
+    ),
+    "an axis, and the angle about it": (cells(as_axis), CELL, 2, "empty column qw in all rows"),
+    "a rotation vector, and nothing": (
+        cells(lambda _, row: {**as_axis(0, row, whole=True), "qw": ""}), CELL, 0, "good",
     ),
     "names of a quaternion exchanged": (
         text("qx,qy,qz,qw", "qw,qx,qy,qz", "views.csv"), CELL, 0, "good",

@@ -192,6 +192,7 @@ TABLES = {
     "comma": "a,b\n1,2\n3,4\n",
     "semicolon with decimal comma": "a;b\n1,0;2,0\n3,0;4,0\n",
     "tab with decimal comma": "a\tb\n1,0\t2,0\n3,0\t4,0\n",
+    "commas with decimal commas in quotes": 'a,b\n"1,0",2\n3,"4,00"\n',
     "separator named, as Excel does": "sep=;\na;b\n1,0;2,0\n3,0;4,0\n",
     "tab": "a\tb\n1\t2\n3\t4\n",
     "blanks": "a  b\n1   2\n 3 4\n",

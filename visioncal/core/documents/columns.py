@@ -9,15 +9,17 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.core.documents.tables import TextTable, is_number
+from visioncal.core.documents.tables import THOUSANDS, TextTable, is_number
 from visioncal.core.errors import DataError
-from visioncal.core.limits import NORM_TOLERANCE
+from visioncal.core.limits import FEWEST_COMPARED, NORM_TOLERANCE
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import READ_AGAIN
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 # Lines of a message at most.
 _SHOWN = 10
+
+_OTHER_FORM = f"Rotation vectors or Euler angles? The images show which. {READ_AGAIN}"
 
 _T = TypeVar("_T")
 
@@ -90,26 +92,29 @@ class NumberChecks:
             is_ragged = (
                 there[:, 1:] > there[:, :-1] if group is first_only else there != there[:, :1]
             )
+            # Three numbers of a rotation stand in the columns of a quaternion.
+            filled = [bool(column.any()) for column in there.T]
+            is_other = names[-1] == "qw" and all(filled[:-1]) and not filled[-1]
             for row in np.flatnonzero(is_ragged.any(axis=1) & ~wrong).tolist():
                 words = "some are empty and others filled; a row fills all of them or none"
-                self.report(row, f"{names[0]} ... {names[-1]}", words)
+                step = _OTHER_FORM if is_other else ""
+                self.report(row, f"{names[0]} ... {names[-1]}", words, step)
 
     def unit(self, names: Sequence[str]) -> None:
         """Checks that quaternions, in four columns, are of unit length."""
         if not all(name in self.values for name in names):
             return
+        numbers = np.array([self.values[name] for name in names])
         # hypot does not overflow.
-        norms = np.hypot.reduce([self.values[name] for name in names])
-        # Beyond, they are taken for another form of rotation.
-        is_far = norms.max(initial=0.0, where=np.isfinite(norms)) > 1.5
-        other = f"Rotation vectors or Euler angles? The images show which. {READ_AGAIN}"
-        for row in np.flatnonzero(np.abs(norms - 1.0) > NORM_TOLERANCE).tolist():
+        norms = np.hypot.reduce(numbers)
+        wrong = np.flatnonzero(np.abs(norms - 1.0) > NORM_TOLERANCE).tolist()
+        for row in wrong:
             self.report(
                 row,
                 f"{names[0]} ... {names[-1]}",
                 f"the quaternion's norm is {norms[row]:.6g}, but must be 1 to within "
                 f"{NORM_TOLERANCE:g}",
-                other if is_far else "",
+                _unit_step(names, numbers, norms),
             )
 
     def check(self, next_step: str = "") -> None:
@@ -183,10 +188,41 @@ class TableReader(NumberChecks):
         )
 
 
+def _unit_step(names: Sequence[str], numbers: FloatArray, norms: FloatArray) -> str:
+    """What mends quaternions (4, n), of some norms (n,), of another unit or form, if anything."""
+    known = np.isfinite(norms)
+    # Squares of the largest numbers overflow, and no unit is so small.
+    squares = np.clip(numbers[:, known], -1e100, 1e100) ** 2
+    choices = [[0, 1, 2, 3], [0], [1], [2], [3]] if known.sum() >= FEWEST_COMPARED else []
+    for chosen in choices:
+        # Those beside it are a part of a quaternion's square.
+        rest = np.maximum(1.0 - np.delete(squares, chosen, axis=0).sum(axis=0), 0.0)
+        mine = squares[chosen].sum(axis=0)
+        factor = float(np.sqrt(mine.sum() / max(rest.sum(), NORM_TOLERANCE)))
+        away = np.abs(mine / max(factor, NORM_TOLERANCE) ** 2 - rest).max()
+        if rest.max() > 10.0 * NORM_TOLERANCE and away < 2.0 * NORM_TOLERANCE:
+            which = ", ".join(names[at] for at in chosen)
+            return f"Divide {which} by {factor:.6g} in all rows: then all norms are 1."
+    # What the camera saw is read in one form alone.
+    if names[3] != "qw" or norms.max(initial=0.0, where=known) <= 1.5:
+        return ""
+    if np.nan_to_num(numbers[3]).any():
+        return (
+            f"Where {', '.join(names[:3])} are a rotation vector or Euler angles, empty column "
+            f"{names[3]} in all rows: convert --guess then finds which."
+        )
+    return _OTHER_FORM
+
+
 def as_number(cell: str) -> float:
     """Reads a finite number; raises DataError."""
     # float() alone also accepts 1_000 and digits of other scripts.
     value = float(cell) if is_number(cell) else math.nan
+    if THOUSANDS.fullmatch(cell):
+        raise DataError(
+            f"{cell!r} may have a decimal comma or separated thousands",
+            next_step=f"Write {cell.replace(',', '.')} or {cell.replace(',', '')}, in all rows.",
+        )
     if not math.isfinite(value):
         raise DataError(f"{cell[:60]!r} is no finite number, such as -1234.5 or 1e-3")
     return value

@@ -18,6 +18,8 @@ from visioncal.core.errors import DataError
 
 _NUMBER = re.compile(rf"{DECIMAL}|[+-]?(nan|inf)", re.I)
 _DECIMAL_COMMA = re.compile(DECIMAL_COMMA)
+# A number with one comma that may separate its thousands.
+THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
 # Excel's declaration of the separator in the first line.
 _SEPARATOR = re.compile(r"sep=([;\t,])\s*", re.I)
 # Characters of an empty row.
@@ -50,13 +52,14 @@ class TextTable:
 def parse_table(text: str, label: str) -> TextTable:
     """Splits a table with a header row; blank lines are skipped. `label` is its name in messages.
 
-    Where the header has semicolons or tabs and no comma, they separate the columns, and decimal
-    commas are read as points, as many spreadsheets write them. Empty columns at the end are
-    dropped. Rows may differ in length; an empty text has no columns. Raises DataError.
+    Where the header has semicolons or tabs and no comma, they separate the columns. Decimal commas
+    are read as points, as many spreadsheets write them, in quotes between commas. Empty columns at
+    the end are dropped. Rows may differ in length; an empty text has no columns. Raises DataError.
     """
     header = text.lstrip().partition("\n")[0]
     separator = next((name for name in ";\t" if name in header and "," not in header), ",")
-    rows = list(_split(enumerate(io.StringIO(text, newline=""), 1), label, separator))
+    split = _split(enumerate(io.StringIO(text, newline=""), 1), label, separator)
+    rows = _with_points(split, separator)
     names, *filled = _without_margin([cells for _, cells in rows]) if rows else [()]
     columns = tuple(name.strip() for name in names)
     return TextTable(label, columns, tuple(filled), [line for line, _ in rows[1:]])
@@ -65,7 +68,7 @@ def parse_table(text: str, label: str) -> TextTable:
 def _split(
     lines: Iterable[tuple[int, str]], label: str, separator: str, *, stripped: bool = False
 ) -> Iterator[tuple[int, tuple[str, ...]]]:
-    """The line in which each filled row begins, and its cells, with decimal points."""
+    """The line in which each filled row begins, and its cells."""
     at: list[int] = []
 
     def texts() -> Iterator[str]:
@@ -78,12 +81,7 @@ def _split(
             texts(), strict=not stripped, delimiter=separator, skipinitialspace=stripped
         ):
             if any(cell.strip() for cell in cells):
-                row = tuple(cell.strip() for cell in cells) if stripped else tuple(cells)
-                if separator != ",":
-                    row = tuple(
-                        c.replace(",", ".") if _DECIMAL_COMMA.fullmatch(c) else c for c in row
-                    )
-                yield at[0], row
+                yield at[0], tuple(cell.strip() for cell in cells) if stripped else tuple(cells)
             at.clear()
     except csv.Error as error:
         place = f"{label}, line {at[0]}"
@@ -92,6 +90,18 @@ def _split(
             culprits=[place],
             next_step='A field that holds a comma or a "quote" is put in quotes, "" inside.',
         ) from error
+
+
+def _with_points(
+    rows: Iterable[tuple[int, tuple[str, ...]]], separator: str
+) -> list[tuple[int, tuple[str, ...]]]:
+    """Rows with decimal points; between commas only where some number shows what its comma is."""
+    split = list(rows)
+    marks = [cell for _, row in split for cell in row if _DECIMAL_COMMA.fullmatch(cell)]
+    if separator == "," and all(map(THOUSANDS.fullmatch, marks)):
+        return split
+    points = {cell: cell.replace(",", ".") for cell in marks}
+    return [(at, tuple(points.get(cell, cell) for cell in row)) for at, row in split]
 
 
 def csv_text(rows: Iterable[Iterable[object]], *, inert: bool = False) -> str:
@@ -122,9 +132,9 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
     `text` is that of the file, where it has been read; None to read it.
 
     Without a header row, a comment right before the first row is the header if it has one word per
-    column after any colon; a first line such as `sep=;` declares the separator. With semicolons or
-    tabs, decimal commas are read as points. Rows may be lists in brackets, with a name before them.
-    Empty rows, empty trailing columns, and titles or a preamble above the header are ignored.
+    column after any colon; a first line such as `sep=;` declares the separator. Decimal commas
+    are read as points, in quotes between commas. Rows may be lists in brackets, with a name before
+    them. Empty rows, empty trailing columns, and titles or a preamble above the header are ignored.
     Raises DataError.
     """
     text, where = read_plain_text(path) if text is None else text, str(path)
@@ -146,7 +156,7 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
     separator = declared[1] if declared else next((mark for mark in ";\t," if mark in usual), " ")
     split = [(at, tuple(line.split())) for at, line in lines]
     if separator != " ":
-        split = list(_split(lines, where, separator, stripped=True))
+        split = _with_points(_split(lines, where, separator, stripped=True), separator)
     if not split or not all(cells for _, cells in split):
         raise DataError(f"{where} has no rows.", culprits=[where])
     split = _below_titles(split)

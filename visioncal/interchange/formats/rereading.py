@@ -374,6 +374,9 @@ def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
     table = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")
     cells = [dict(zip(table.columns, row, strict=False)) for row in table.rows]
     places = tuple(map(table.place, range(len(cells))))
+    if not any(row.get(POSE[-1]) for row in cells):
+        # Three numbers of a rotation may stand in the columns of a quaternion.
+        cells = [row | {POSE[-1]: "0"} if row.get(POSE[0]) else row for row in cells]
     texts = ({k: text for k, text in row.items() if is_number(text)} for row in cells)
     fields = fields_of_records([*texts], places, "views.csv", folder)
     names = pose_names(fields, (), "robot", (), by_shape=False)
