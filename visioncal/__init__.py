@@ -50,51 +50,37 @@ if TYPE_CHECKING:
     from visioncal.vision.boards.identify import identify
     from visioncal.vision.targets import load_target
 
+# Modules, and the names in each.
 _HOMES = {
-    "ArmState": "visioncal.live.drivers.protocols",
-    "Batch": "visioncal.interchange.batch",
-    "CalibratedArm": "visioncal.results.compensation",
-    "Calibration": "visioncal.results",
-    "CellOptions": "visioncal.simulation",
-    "Checkup": "visioncal.calibration.pipeline.checkup",
-    "ConvergenceError": "visioncal.core.errors",
-    "Corrected": "visioncal.results.compensation",
-    "DataError": "visioncal.core.errors",
-    "DegenerateError": "visioncal.core.errors",
-    "DriverError": "visioncal.core.errors",
-    "Guard": "visioncal.calibration.verification",
-    "Loads": "visioncal.robot",
-    "Located": "visioncal.frames.locate",
-    "Look": "visioncal.calibration.verification",
-    "OnlineCompensator": "visioncal.robot.thermal",
-    "Plane": "visioncal.frames.camera_chain",
-    "Session": "visioncal.session",
-    "Sight": "visioncal.frames.target_pose",
-    "Verdict": "visioncal.results",
-    "VisioncalError": "visioncal.core.errors",
-    "batch": "visioncal.interchange.batch",
-    "calibrate": "visioncal.calibration.run",
-    "compare": "visioncal.results.compare",
-    "convert": "visioncal.interchange.formats",
-    "correct": "visioncal.results.compensation",
-    "doctor": "visioncal.calibration.pipeline.checkup",
-    "export": "visioncal.interchange.exports",
-    "identify": "visioncal.vision.boards.identify",
-    "load_target": "visioncal.vision.targets",
-    "locate": "visioncal.frames.locate",
-    "locate_target": "visioncal.frames.locate",
-    "locate_views": "visioncal.frames.session_observations",
-    "make_plan": "visioncal.live.planning.plan",
-    "place_seen": "visioncal.frames.target_pose",
-    "record": "visioncal.live.capture.from_python",
-    "seen_frame": "visioncal.frames.frame_from_images",
-    "simulate": "visioncal.simulation",
-    "touched_fixture": "visioncal.frames.fixture",
-    "touched_tool": "visioncal.frames.tcp",
-    "verify": "visioncal.calibration.verification",
-    "write_report": "visioncal.present.report.page",
-    "write_session": "visioncal.simulation",
+    "calibration.pipeline.checkup": "Checkup doctor",
+    "calibration.run": "calibrate",
+    "calibration.verification": "Guard Look verify",
+    "core.errors": "ConvergenceError DataError DegenerateError DriverError VisioncalError",
+    "frames.camera_chain": "Plane",
+    "frames.fixture": "touched_fixture",
+    "frames.frame_from_images": "seen_frame",
+    "frames.locate": "Located locate locate_target",
+    "frames.session_observations": "locate_views",
+    "frames.target_pose": "Sight place_seen",
+    "frames.tcp": "touched_tool",
+    "interchange.batch": "Batch batch",
+    "interchange.exports": "export",
+    "interchange.formats": "convert",
+    "live.capture.from_python": "record",
+    "live.drivers.protocols": "ArmState",
+    "live.planning.plan": "make_plan",
+    "present.report.page": "write_report",
+    "results": "Calibration Verdict",
+    "results.compare": "compare",
+    "results.compensation": "CalibratedArm Corrected correct",
+    "robot": "Loads",
+    "robot.thermal": "OnlineCompensator",
+    "session": "Session",
+    "simulation": "CellOptions simulate write_session",
+    "vision.boards.identify": "identify",
+    "vision.targets": "load_target",
 }
+_MODULES = {name: module for module, names in _HOMES.items() for name in names.split()}
 
 __all__ = [
     "ArmState",
@@ -145,9 +131,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - the type is given under TYPE_CHECKING
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

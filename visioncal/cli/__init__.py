@@ -1,5 +1,3 @@
 """The command line: one thin file a command."""
 
 from visioncal.cli.app import main
-
-__all__ = ["main"]

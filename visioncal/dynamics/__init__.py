@@ -2,5 +2,3 @@
 
 from visioncal.dynamics.arm import ArmDynamics
 from visioncal.dynamics.identified import Identified
-
-__all__ = ["ArmDynamics", "Identified"]

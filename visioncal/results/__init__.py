@@ -10,29 +10,3 @@ from visioncal.results.parts import NeedMet, Picker, RobotResult, SolverResult
 from visioncal.results.picking import select_matching
 from visioncal.results.result import Calibration
 from visioncal.results.views import HELD_BACK, Rms, Validation, ViewResult
-
-__all__ = [
-    "HELD_BACK",
-    "Calibration",
-    "CameraResult",
-    "CellResult",
-    "Edge",
-    "Finding",
-    "Frame",
-    "FrameFile",
-    "Moved",
-    "NeedMet",
-    "Observation",
-    "Picker",
-    "Remedy",
-    "Rms",
-    "RobotResult",
-    "SolverResult",
-    "UnconnectedFrame",
-    "Validation",
-    "Verdict",
-    "VerdictStatus",
-    "ViewResult",
-    "select_matching",
-    "to_document",
-]

@@ -7,5 +7,3 @@ writes models as files.
 from visioncal.robot.files import load_robot
 from visioncal.robot.loads import Loads
 from visioncal.robot.model import Robot
-
-__all__ = ["Loads", "Robot", "load_robot"]

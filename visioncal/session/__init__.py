@@ -13,20 +13,3 @@ from visioncal.session.streams import FOLDER as STREAMS
 from visioncal.session.streams import Stream, check_stream, save_stream, too_far_apart
 from visioncal.session.table import View
 from visioncal.vision.targets import target_document
-
-__all__ = [
-    "STREAMS",
-    "Declaration",
-    "FolderImages",
-    "ImageStore",
-    "MemoryImages",
-    "Observation",
-    "Session",
-    "Stream",
-    "View",
-    "check_stream",
-    "frame_name",
-    "save_stream",
-    "target_document",
-    "too_far_apart",
-]

@@ -2,5 +2,3 @@
 
 from visioncal.calibration.guess.decide import Guess, guess_reading
 from visioncal.calibration.guess.search import Candidate
-
-__all__ = ["Candidate", "Guess", "guess_reading"]

@@ -4,17 +4,3 @@ from visioncal.calibration.verification.check import Check, PossibleChange, veri
 from visioncal.calibration.verification.guard import Guard, Guarded, Look, PossibleCause
 from visioncal.calibration.verification.messages import to_document, verdict_of
 from visioncal.calibration.verification.triggers import Trigger, triggers_of
-
-__all__ = [
-    "Check",
-    "Guard",
-    "Guarded",
-    "Look",
-    "PossibleCause",
-    "PossibleChange",
-    "Trigger",
-    "to_document",
-    "triggers_of",
-    "verdict_of",
-    "verify",
-]

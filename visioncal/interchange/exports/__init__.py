@@ -2,5 +2,3 @@
 
 from visioncal.interchange.exports.content import Load, Selection
 from visioncal.interchange.exports.registry import EXPORT_FORMATS, Document, document, export
-
-__all__ = ["EXPORT_FORMATS", "Document", "Load", "Selection", "document", "export"]

@@ -23,17 +23,3 @@ from visioncal.interchange.formats.rereading import (
     load_for_rereading,
     reread,
 )
-
-__all__ = [
-    "FOREIGN_FORMATS",
-    "DoubtfulSession",
-    "ForeignRecording",
-    "ImportOptions",
-    "PoseImportOptions",
-    "assemble",
-    "convert",
-    "load_for_rereading",
-    "read_foreign",
-    "reread",
-    "write_session",
-]

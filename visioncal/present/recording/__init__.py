@@ -6,5 +6,3 @@ after writing are detected; see `rrd_messages`.
 
 from visioncal.present.recording.reader import read_calibration, read_evidence
 from visioncal.present.recording.writer import write_recording
-
-__all__ = ["read_calibration", "read_evidence", "write_recording"]

@@ -2,5 +2,3 @@
 
 from visioncal.present.viewer.layout import blueprint
 from visioncal.present.viewer.native import review_native, review_web
-
-__all__ = ["blueprint", "review_native", "review_web"]

@@ -1,5 +1,3 @@
 """Compensation of arm errors: commands for a nominal controller that reach the real targets."""
 
 from visioncal.results.compensation.correction import CalibratedArm, Corrected, correct
-
-__all__ = ["CalibratedArm", "Corrected", "correct"]

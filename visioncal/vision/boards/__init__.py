@@ -17,8 +17,6 @@ from visioncal.vision.boards.marker import MarkerKind
 from visioncal.vision.boards.picture import Picture
 from visioncal.vision.boards.points import Rig
 
-__all__ = ["KINDS", "DetectedCorners", "NotFound", "blur_of", "find_target", "kind_of"]
-
 KINDS: Mapping[str, BoardKind] = {
     kind.name: kind
     for kind in (
