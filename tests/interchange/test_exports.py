@@ -26,7 +26,13 @@ from visioncal.core.types import Camera
 from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document, export
 from visioncal.interchange.result_files import load_calibration, load_result_or_frames
 from visioncal.results import Calibration, CameraResult, Edge, FrameFile, Verdict
-from visioncal.vision.camera import normalise, project_with_jacobian
+from visioncal.vision.camera import (
+    intrinsics,
+    normalise,
+    project,
+    project_with_jacobian,
+    with_intrinsics,
+)
 
 FORMATS = {export_format.name: export_format for export_format in EXPORT_FORMATS}
 FRAME_READERS = TOOL_READERS | FIXTURE_READERS
@@ -328,7 +334,7 @@ def test_lenses_are_written_to_the_last_digit(model, distortion, ros_model, kali
     assert stored.getNode("distortion_model").string() == model
     assert stored.getNode("image_width").real() == 1280
     if not kalibr_model:
-        raised(DataError, r"[14] more.*camera-info", export, source, "kalibr")
+        raised(DataError, r"[14] more.*--lens radtan", export, source, "kalibr")
         return
     assert yaml.safe_load(export(source, "kalibr", Selection(child="left")))["cam0"] == {
         "camera_model": "pinhole",
@@ -388,6 +394,58 @@ def test_halcon_holds_no_rays_beside_the_plane():
     wide = replace(source.camera.camera, matrix=np.array([300.0, 300.0, 640.0, 400.0]))
     source = replace(source, camera=replace(source.camera, camera=wide))
     raised(DataError, r"80 degrees.*camera-info", export, source, "halcon-camera")
+
+
+@pytest.mark.parametrize("name", ["pinhole", "radtan", "plumb_bob"])
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [
+        ("brown", [-0.1, 0.05, 5e-4, -1e-3, 0.0, 0.2, 0.1, 0.05]),
+        ("fisheye", [0.02, -0.01, 0.004, -0.001]),
+    ],
+)
+def test_a_poorer_lens_sees_the_same_rays_as_near_as_it_says(name, model, distortion):
+    camera = Camera(
+        model, (1280, 800), np.array([1400.1, 1402.2, 640.3, 395.2]), np.array(distortion)
+    )
+    source = replace(SAMPLE, camera=CameraResult(camera, estimated=True))
+    written = document(source, "opencv", Selection(lens=name))
+    storage = cv2.FileStorage(written.text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    matrix, flat = (
+        storage.getNode(node).mat() for node in ("camera_matrix", "distortion_coefficients")
+    )
+    numbers = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    found = Camera("brown", camera.resolution, numbers, flat.ravel())
+    # What a model is without is zero.
+    assert np.count_nonzero(found.distortion) == {"pinhole": 0, "radtan": 4, "plumb_bob": 5}[name]
+    axes = (np.linspace(0, side - 1, 31) for side in camera.resolution)
+    px = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    rays = np.column_stack([normalise(camera, px), np.ones(len(px))])
+    off_px = np.linalg.norm(project(found, rays) - px, axis=1)
+    (words,) = (words for words in written.warnings if "--lens" in words)
+    number = r"(?:under )?(\S+) px"
+    rms_px, most_px = map(float, re.search(rf"leaves {number} rms .*, {number} at", words).groups())
+    # As they are printed, by two digits; small ones as a bound.
+    found_px = float(np.sqrt(np.mean(off_px**2)))
+    assert found_px < 1.05 * rms_px
+    assert off_px.max() <= most_px
+    assert "under" in words or (rms_px < 1.05 * found_px and most_px < 1.1 * off_px.max())
+    # No neighbouring lens of this model is nearer.
+    for at, step in enumerate((1.0, 1.0, 1.0, 1.0, *[1e-3] * np.count_nonzero(found.distortion))):
+        for sign in (-step, step):
+            moved = with_intrinsics(found, intrinsics(found) + sign * np.eye(9)[at])
+            assert np.sum((project(moved, rays) - px) ** 2) > np.sum(off_px**2)
+
+
+def test_a_lens_within_a_poorer_model_stays_as_it_is():
+    source = with_lens("brown", [0.1, -0.02, 1e-3, 1e-4, 0.0])
+    written = document(source, "kalibr", Selection(lens="radtan"))
+    found = yaml.safe_load(written.text)["cam0"]
+    np.testing.assert_allclose(found["distortion_coeffs"], [0.1, -0.02, 1e-3, 1e-4], atol=1e-9)
+    raised(
+        DataError, "kuka has no place for --lens", export, SAMPLE, "kuka", Selection(lens="radtan")
+    )
+    raised(DataError, "pinhole", export, source, "kalibr", Selection(lens="pinehole"))
 
 
 def test_a_field_is_told_beside_the_coefficients_that_come_nearest_to_the_lens():

@@ -324,6 +324,10 @@ class ExportOptions(PartOptions):
     cog_mm: tuple[float, float, float] | None = option(
         "Its centre of mass in the flange: X Y Z (mm)."
     )
+    lens: str | None = option(
+        "A poorer model of the lens, refitted; what it leaves is said.",
+        metavar="pinhole|radtan|plumb_bob",
+    )
     convention: str | None = option("Of robot-dh's table.", metavar="|".join(get_args(Convention)))
     calibration_hash: str | None = option("Hash of ur_calibration, for ur-kinematics.", "--hash")
     force: bool = force_both()

@@ -233,6 +233,7 @@ class Selection:
     # Which robot of a cell: its part is exported as of one camera and robot.
     robot: str | None = None
     target: str | None = None  # Which target of a cell; likewise.
+    lens: str | None = None  # A poorer model of the lens, as of `lenses.POORER`.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -245,6 +246,8 @@ class Content(Placement):
     frames: tuple[str, str]  # Our own names of parent and child.
     mount: Mount | None
     lens: CameraResult | None  # The camera, where there is one.
+    camera: Camera | None  # The same as exported, and what a poorer model leaves of it, in words.
+    poorer: str = ""
     # Where a camera's child is not the optical frame, that frame's pose in it, in words.
     optical: str = ""
     number: int | None = None  # Of the controller's tool or base.
@@ -260,8 +263,8 @@ class Content(Placement):
         """What matrix and coefficients leave of a lens's field, in words; empty without one."""
         rms_px, most_px = (0.0, 0.0) if self.lens is None else self.lens.beyond_model_px()
         if rms_px < 0.01:
-            return ""
-        return (
+            return self.poorer
+        return (f"{self.poorer}; " if self.poorer else "") + (
             "the lens departs from its model, and matrix and coefficients are those that come "
             f"nearest to it: they leave {figure(rms_px)} px rms where it was seen, "
             f"{figure(most_px)} px at the most (visioncal locate corrects that)"
@@ -330,14 +333,14 @@ class ExportFormat(Format[Content]):
 
 def camera_of(content: Content) -> Camera:
     """The camera of a format of lenses; raises DataError where there is none."""
-    if content.lens is None:
+    if content.camera is None:
         raise DataError(
             "This calibration has no camera: its session brought measured poses of the target, "
             "and no images. A lens is calibrated with images.",
             culprits=["calibration.json: camera"],
             next_step="Export its transform, as with --to ros.",
         )
-    return content.lens.camera
+    return content.camera
 
 
 def lens_notes(content: Content) -> list[str]:
@@ -353,7 +356,13 @@ def warn_of_field(content: Content) -> list[str]:
     return [f"{content.field_error_words}."] * bool(content.field_error_words)
 
 
-LENS_FORMAT = partial(ExportFormat, holds="lens", frames={"cam": "camera"}, warn=warn_of_field)
+LENS_FORMAT = partial(
+    ExportFormat,
+    holds="lens",
+    frames={"cam": "camera"},
+    takes=frozenset({"lens"}),
+    warn=warn_of_field,
+)
 
 
 def numbers(values: FloatArray) -> list[float]:

@@ -3,10 +3,11 @@
 Its camera frame is ours: z forward, x right, and whole numbers are the centres of pixels.
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
-from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.types import Camera, FloatArray
 from visioncal.interchange.exports.content import (
@@ -19,7 +20,7 @@ from visioncal.interchange.exports.content import (
     numbers,
     warn_of_field,
 )
-from visioncal.vision.camera import normalise
+from visioncal.interchange.exports.lenses import seen_rays
 
 
 def _write_pose(content: Content) -> str:
@@ -33,6 +34,8 @@ def _write_pose(content: Content) -> str:
     )
 
 
+# The file and its warning say what it leaves.
+@lru_cache(maxsize=1)
 def _polynomial(camera: Camera) -> tuple[FloatArray, float]:
     """Coefficients of `area_scan_polynomial`, and what they leave of the lens at most [px].
 
@@ -46,19 +49,8 @@ def _polynomial(camera: Camera) -> tuple[FloatArray, float]:
     Raises:
         DataError: The lens sees rays that no plane image holds.
     """
-    size = np.array(camera.resolution)
-    steps = (np.linspace(0.0, side - 1.0, 31) for side in size.tolist())
-    px = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
+    px, rays = seen_rays(camera, "HALCON's polynomial model")
     focal_px, centre = camera.matrix[:2], camera.matrix[2:]
-    rays = normalise(camera, px)
-    seen = np.isfinite(rays).all(axis=1) & (np.abs(rays).max(axis=1) < np.tan(np.deg2rad(80.0)))
-    if not seen.all():
-        raise DataError(
-            "HALCON's polynomial model holds rays up to 80 degrees from the axis, and "
-            f"{(~seen).mean():.0%} of this image see beyond, or beyond the lens's model.",
-            culprits=["camera.distortion"],
-            next_step="Export the lens with --to camera-info or opencv, and undistort there.",
-        )
     # In focal lengths, so that columns are of one order.
     u, v = x = ((px - centre) / focal_px).T
     r2 = u * u + v * v
@@ -79,7 +71,7 @@ def _write_camera(content: Content) -> str:
     coefficients, left_px = _polynomial(camera)
     # Images determine the ratio of focal length and pixel alone: any width [m] is the same map.
     width = 5e-6
-    coefficients /= (width * fx) ** np.array([2.0, 4.0, 6.0, 1.0, 1.0])
+    coefficients = coefficients / (width * fx) ** np.array([2.0, 4.0, 6.0, 1.0, 1.0])
     reals = {"Focus:foc": width * fx}
     reals |= {f"Poly{at}:poly{at}": value for at, value in enumerate(coefficients.tolist(), 1)}
     reals |= {"Sx:sx": width, "Sy:sy": width * fx / fy, "Cx:cx": cx, "Cy:cy": cy}

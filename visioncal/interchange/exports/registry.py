@@ -31,6 +31,7 @@ from visioncal.interchange.exports.content import (
     worst_of,
 )
 from visioncal.interchange.exports.halcon import HALCON
+from visioncal.interchange.exports.lenses import poorer
 from visioncal.interchange.exports.mujoco import MUJOCO
 from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import FILES, ROS_FORMATS
@@ -232,6 +233,9 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         )
     if available.cell is not None:
         lens = available.lenses.get(frames[1], lens)
+    camera, words = None if lens is None else lens.camera, ""
+    if camera is not None and selection.lens is not None:
+        camera, words = poorer(camera, selection.lens)
     conditions = tuple(
         condition
         for condition in placement.conditions
@@ -245,6 +249,8 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         frames=frames,
         mount=available.mount,
         lens=lens,
+        camera=camera,
+        poorer=words,
         optical=optical,
         number=selection.number,
         load=selection.load,

@@ -18,6 +18,7 @@ from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.types import FloatArray
+from visioncal.core.verdict import AGAIN
 from visioncal.interchange.exports.content import (
     LENS_FORMAT,
     Content,
@@ -73,8 +74,8 @@ def _write_kalibr(content: Content) -> str:
                 f"{len(beyond)} more that are not zero: "
                 f"{', '.join(f'{value:.3g}' for value in beyond)}.",
                 culprits=["camera.distortion"],
-                next_step="Leaving them out would bend the image: export with --to camera-info or "
-                "opencv.",
+                next_step="Leaving them out would bend the image: --lens radtan writes the nearest "
+                f"lens without, and says how far it departs. Run: {AGAIN} --lens radtan",
             )
         coefficients = coefficients[:4]
     document = {
@@ -107,8 +108,7 @@ def _write_opencv(content: Content) -> str:
     storage.write("transform", content.matrix)
     storage.write("R", content.matrix[:3, :3].copy())
     storage.write("t", content.matrix[:3, 3:].copy())
-    if content.lens is not None:
-        camera = content.lens.camera
+    if (camera := content.camera) is not None:
         storage.write("image_width", camera.resolution[0])
         storage.write("image_height", camera.resolution[1])
         storage.write("distortion_model", camera.model)
@@ -134,6 +134,7 @@ FILES = (
         "opencv",
         "OpenCV's FileStorage: transform, R, t and any lens [m]",
         _write_opencv,
+        takes=frozenset({"lens"}),
         warn=warn_of_field,
     ),
     ExportFormat(
