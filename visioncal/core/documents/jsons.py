@@ -130,8 +130,8 @@ def parse_stored(text: bytes | str, label: str) -> dict[str, Any]:
     text = decode_text(text, label) if isinstance(text, bytes) else text
     if Path(label).suffix != ".json" and not (begin := text.lstrip()[:40]).startswith("{"):
         raise DataError(
-            f"{label} must be a JSON document that visioncal wrote, but begins with "
-            f"{shown(begin)}.",
+            f"{label} begins with {shown(begin)}, but must be a JSON document that visioncal "
+            "wrote.",
             culprits=[label],
             next_step="Name its file, as calibration.json, or its folder; nothing need be changed "
             "in this one.",
