@@ -118,6 +118,24 @@ def test_places_follow_their_stated_covariance():
     assert 0.4 < np.mean(surprises) < 2.0
 
 
+def test_views_from_several_sides_tell_how_large_a_target_is():
+    surprises, sigmas = [], []
+    for seed in range(8):
+        cell, calibration = calibrated(IN_HAND, seed % 4)
+        rng = np.random.default_rng(seed)
+        # As unsure as a label that is measured with a ruler.
+        told = replace(BOARD, square_sigma_m=3e-3 * BOARD.square_m)
+        true = replace(told, square_m=BOARD.square_m + told.square_sigma_m * rng.normal())
+        place = place_of(cell, "base", rng)
+        found = place_seen(calibration, sights_of(cell, "base", place, rng, 8, true), told, "base")
+        surprises.append(misfit(found, place) / 6)
+        sigmas.append(found.edge.sigma_mm)
+    # At 0.6 m, the size alone would leave 1.8 mm in an image.
+    assert np.median(sigmas) < 0.2
+    # 48 degrees of freedom: sqrt(2 / 48) = 0.2.
+    assert 0.5 < np.mean(surprises) < 1.6
+
+
 def test_what_images_share_is_no_scatter_and_what_one_has_alone_leaves_it_out():
     cell, calibration = calibrated(IN_HAND, 0)
     rng, name = np.random.default_rng(0), "flange_from_cam"
@@ -372,5 +390,9 @@ def test_doubts_of_calibration_and_sigma_are_told():
     strict = ImageFrameLimits(sigma_mm=(1e-3, 10.0))
     frame = seen_frame(session, calibration, "fixture", options=strict)
     assert frame.verdict.status == "check"
-    # The board's size, known to 0.1 %, is what most of it is from.
+    assert "from other sides" in frame.verdict.reasons[0]
+    # A fixed camera sees a fixture from one side only: the board's size, known to 0.1 %, counts.
+    cell, calibration = calibrated_cell(TO_HAND)
+    session = session_of(cell, rows_of(TO_HAND, "fixture", 3))
+    frame = seen_frame(session, calibration, "fixture", options=strict)
     assert "more images do not" in frame.verdict.reasons[0]

@@ -10,7 +10,8 @@ from support.commands import visioncal
 from support.printed import PICTURES, Look, label, photographed, pose_at, poster
 
 from visioncal.core.errors import DataError
-from visioncal.simulation import CAMERAS
+from visioncal.simulation import CAMERAS, CellOptions, prepare_scene, render, simulate
+from visioncal.simulation import project as simulated_px
 from visioncal.vision.boards import NotFound, find_target
 from visioncal.vision.boards.picture import kept_picture, unfit
 from visioncal.vision.camera import project
@@ -59,6 +60,19 @@ def test_prints_of_many_alike_features_are_found(kind, tmp_path):
     places = corner_positions(target)[found.ids]
     off = found.px - project(CAMERA, places @ pose[:3, :3].T + pose[:3, 3])
     assert np.median(np.abs(off)) < 0.03
+
+
+def test_a_simulated_cell_shows_the_picture(target):
+    cell = simulate(CellOptions(views=2, seed=1, target=target))
+    scene, (width, height) = prepare_scene(cell), cell.camera().camera.resolution
+    for view, pose in enumerate(cell.cam_from_target):
+        image = render(scene, view)
+        assert image.shape == (height, width)
+        found = find_target(image, target)
+        places = corner_positions(target)[found.ids] @ pose[:3, :3].T + pose[:3, 3]
+        # A part of it is beyond the image's end, and a texel of the sheet is nearly a pixel wide.
+        assert len(found.ids) > 40
+        assert np.median(np.abs(found.px - simulated_px(cell.camera().camera, places))) < 0.05
 
 
 def test_other_pictures_are_not_found_and_mirrored_ones_are_named(target):

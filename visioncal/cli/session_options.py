@@ -94,9 +94,11 @@ class SimulateOptions:
     views: int = option("Number of views.", default=20, min=1)
     robot: str = option("The arm.", default="ur10e", metavar="|".join(SIMULATED_ARMS))
     camera: Literal["wide", "fine", "fisheye"] = option("Its size and lens.", default="wide")
-    board: Literal[
-        "charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles", "tags"
-    ] = option("The board's pattern.", default="charuco")
+    board: str = option(
+        "The board's pattern, or the file of a target.",
+        default="charuco",
+        metavar="charuco|checkerboard|aprilgrid|circles|symmetric-circles|tags|FILE",
+    )
     second_board: bool = flag("A second board, a checkerboard, beside it.")
     robot_sigma_mm: float = _size("Repeatability of the robot (mm).", default=0.03)
     robot_sigma_mrad: float = _size("Repeatability of its rotation (mrad).", default=0.05)

@@ -52,6 +52,7 @@ from visioncal.simulation.dynamics import (
     write_exercise,
 )
 from visioncal.simulation.instrument_session import THREE, InstrumentOptions, tracked, write_tracked
+from visioncal.vision.targets import load_target
 
 # Parameters of a cell of one robot, for any kind of recording.
 _SINGLE = frozenset(
@@ -100,7 +101,7 @@ def simulate_command(asked: SimulateOptions) -> None:
         robot=asked.robot,
         mount=asked.mount,
         views=asked.views,
-        target=BOARDS[asked.board],
+        target=BOARDS.get(asked.board) or load_target(asked.board),
         camera=CAMERAS[asked.camera],
         state_intrinsics=asked.with_intrinsics,
         robot_sigma_m=1e-3 * asked.robot_sigma_mm,

@@ -155,7 +155,7 @@ class _CandidateViews:
 
 @dataclass(frozen=True, eq=False)
 class _ImageInliers:
-    """Inlier images of a target, and their mean pose, weighted by independent errors."""
+    """Inlier images of a target, and their mean pose, weighted by all errors."""
 
     matrix: FloatArray  # (4, 4) `parent_from_target`, the mean of the inliers.
     independent: FloatArray  # (6, 6) covariance by the images' independent errors.
@@ -201,10 +201,16 @@ class _ImageSearch:
         chosen = [view[at] for view, at in zip(candidates.views, self.picks, strict=True)]
         matrices = np.array([place.matrix for place in chosen])
         of_images = np.array([candidates.independent(place) for place in chosen])
-        # Weighted by the images' independent errors: common errors do not average out.
+        by_common = np.array([place.by_common for place in chosen])
+        # Least variance by all errors (Aitken 1936): views from several sides tell how large the
+        # target is, and where the camera is.
         weights = np.where(agrees[:, None, None], np.linalg.inv(of_images), 0.0)
-        of_mean = covariance_from(weights.sum(axis=0))
-        gains = of_mean @ weights
+        values, vectors = np.linalg.eigh(candidates.common)
+        rooted = by_common @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+        against = weights @ rooted
+        inner = np.einsum("mij,mik->jk", rooted, against) + np.eye(len(values))
+        own = weights - against.sum(axis=0) @ np.linalg.solve(inner, np.swapaxes(against, 1, 2))
+        gains = covariance_from(own.sum(axis=0)) @ own
         matrix = matrices[int(np.flatnonzero(agrees)[0])]
         # The mean converges in a few steps, since the poses are near each other.
         for _round in range(10):
@@ -213,18 +219,22 @@ class _ImageSearch:
             if np.abs(step).max() < 1e-12:
                 break
         errors = log(invert(matrix) @ matrices)
-        by_common = np.array([place.by_common for place in chosen])
         mean_by_common = np.einsum("mij,mjk->ik", gains, by_common)
         difference = by_common - mean_by_common
         shared = difference @ candidates.common @ np.swapaxes(difference, 1, 2)
-        is_inlier, others = agrees[:, None, None], int(agrees.sum()) - 1
+        carried, others = gains @ of_images, int(agrees.sum()) - 1
+        of_mean = (carried @ np.swapaxes(gains, 1, 2)).sum(axis=0)
         squared = np.einsum(
             "mi,mi->m", errors, np.linalg.solve(of_images + shared, errors[..., None])[..., 0]
         )
-        # Six degrees of freedom for each image beyond the first.
-        variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
-        # The residual of an image that is part of the mean has a smaller covariance.
-        covariance = of_images + shared + np.where(is_inlier, -1.0, 1.0) * of_mean
+        # Six degrees of freedom for each image beyond the first, less what they share.
+        seen = np.einsum("mij,mi->j", against, errors)
+        total = np.einsum("mi,mij,mj", errors, weights, errors) - seen @ np.linalg.solve(
+            inner, seen
+        )
+        variance = max(float(total) / (6.0 * others), 1.0) if others else 1.0
+        # An image's own errors are in the mean, too, where it is a part of that.
+        covariance = of_images + shared + of_mean - carried - np.swapaxes(carried, 1, 2)
         mahalanobis_sq = (
             squared_lengths(errors, covariance, of_images)[0]
             if others
@@ -339,8 +349,8 @@ def place_seen(
 ) -> TargetPose:
     """Estimates the pose of a target on a fixture in the base, or on a tool on the flange.
 
-    The images are averaged, weighted by their independent errors, and outliers are left out and
-    named. Common errors add to the covariance in full.
+    The images are averaged with least variance, those that share errors by these, and outliers are
+    left out and named.
 
     Args:
         calibration: The camera's.

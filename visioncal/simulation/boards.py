@@ -63,11 +63,10 @@ def corners_m(sheet: Sheet) -> FloatArray:
 
 
 def unit_m(target: Target) -> float:
-    """Side of a square, or of the first of free tags, as the unit of a sheet's texture [m]."""
-    if not target.is_rig:
-        return target.square_m
-    first, second = target.points_m[:2]
-    return float(np.linalg.norm(np.subtract(second, first)))
+    """Side of a square, a patch or the first of free tags, as a unit of sheets' textures [m]."""
+    first, second = corner_positions(target)[:2]
+    is_side = target.is_rig or target.kind == "picture"
+    return float(np.linalg.norm(second - first)) if is_side else target.square_m
 
 
 def outline_m(sheet: Sheet, margin_m: float) -> FloatArray:

@@ -1,6 +1,5 @@
 """Textures of a simulated scene: the printed sheet on its plate, and what is behind it."""
 
-import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -10,7 +9,7 @@ import numpy.typing as npt
 
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.simulation.boards import unit_m
-from visioncal.vision.printing.pattern import dark_cells, dark_discs
+from visioncal.vision.printing.pattern import light_of
 from visioncal.vision.targets import extent_m
 
 Float32Array: TypeAlias = npt.NDArray[np.float32]
@@ -50,8 +49,8 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
     grey = np.full((height + 2 * margin, width + 2 * margin), _PLATE, np.uint8)
     paper = margin - round(_PAPER_MARGIN * texels)
     grey[paper:-paper, paper:-paper] = _PAPER
-    dark = _dark_shares(target, (height, width), finest)
-    grey[margin:-margin, margin:-margin] = np.rint(_PAPER + (_INK - _PAPER) * dark)
+    light = light_of(target, low, finest, (height, width))
+    grey[margin:-margin, margin:-margin] = np.rint(_INK + (_PAPER - _INK) * light)
     plate = margin - round(_PLATE_MARGIN * texels)
     # Coverage: 255 on the plate, fading in the shadow around it, which is computed at low
     # resolution, as it is smooth.
@@ -100,37 +99,3 @@ def draw_backdrop(rng: np.random.Generator, size: int, blur: float) -> Image:
         box = cv2.boxPoints((place.tolist(), (2.0 * half).tolist(), float(rng.uniform(0, 180))))
         cv2.fillPoly(canvas, [np.round(box).astype(np.int32)], float(rng.uniform(70.0, 165.0)))
     return np.asarray(cv2.GaussianBlur(canvas, (0, 0), blur), np.uint8)
-
-
-def _dark_shares(target: Target, shape: tuple[int, int], texel_m: float) -> Float32Array:
-    """Dark share of each texel of the print, of `shape` texels down and across."""
-    dark = np.zeros(shape, np.float32)
-    low, _ = extent_m(target)
-    for grid in dark_cells(target):
-        corner = (grid.corner_m - low) / texel_m
-        (top, down), (left, across) = (
-            _overlaps(start, grid.cell_m / texel_m, grid.dark.shape[axis], shape[axis])
-            for axis, start in enumerate(corner[::-1].tolist())
-        )
-        window = dark[top : top + down.shape[1], left : left + across.shape[1]]
-        window += down.T @ grid.dark @ across
-    for disc in (dark_discs(target) - [*low, 0.0]) / texel_m:
-        centre, radius = disc[:2], float(disc[2])
-        # Circles' edges are straight within a texel.
-        start, end = (
-            np.clip(centre + value, 0, shape[::-1]) for value in (-radius - 1, radius + 2)
-        )
-        (left, top), (right, bottom) = start.astype(int), end.astype(int)
-        x, y = np.arange(left, right) + 0.5 - centre[0], np.arange(top, bottom) + 0.5 - centre[1]
-        inside = np.clip(radius - np.hypot(x[None], y[:, None]) + 0.5, 0.0, 1.0)
-        np.maximum(dark[top:bottom, left:right], inside, out=dark[top:bottom, left:right])
-    return dark
-
-
-def _overlaps(start: float, cell: float, count: int, texels: int) -> tuple[int, Float32Array]:
-    """First texel that a row of cells touches, and (cells, texels) overlaps."""
-    edges = start + cell * np.arange(count + 1)
-    first, end = max(math.floor(edges[0]), 0), min(math.ceil(edges[-1]), texels)
-    texel = np.arange(first, end)
-    low, high = (np.clip(texel[None] + side, edges[:-1, None], edges[1:, None]) for side in (0, 1))
-    return first, np.asarray(high - low, np.float32)

@@ -20,6 +20,7 @@ from scipy.spatial.distance import pdist
 from visioncal.core.types import Camera, FloatArray, Image, IntArray, Target
 from visioncal.vision.boards import DetectedCorners, find_target, kind_of
 from visioncal.vision.patches import places_of, started, usual_lens, usual_sigma
+from visioncal.vision.printing.pattern import light_of
 from visioncal.vision.register.fit import Registered, register
 from visioncal.vision.register.image_model import Print, Seen, moved_px
 from visioncal.vision.targets import corner_positions, extent_m
@@ -128,27 +129,12 @@ def _pixels(image: Image, target: Target) -> Iterator[tuple[IntArray, FloatArray
 
 @lru_cache(maxsize=8)
 def drawn_print(target: Target, texels: int = _TEXELS) -> Print:
-    """A board's print with paper around it, of so many texels a square, by their area's light."""
+    """A board's print with paper around it, of so many texels a square, or a picture's own."""
+    picture = kind_of(target).picture(target)
+    if picture is not None:
+        return Print.of_picture(picture, target.square_m)
     low, high = extent_m(target)
     low, high = low - _PAPER * target.square_m, high + _PAPER * target.square_m
     texel_m = min(target.square_m, float(pdist(corner_positions(target)).min())) / texels
     size = np.ceil((high - low) / texel_m).astype(int).tolist()
-    light = np.ones(size[::-1])
-    for cells in kind_of(target).cells(target):
-        counts = np.array(cells.dark.shape[::-1])
-        turned = cells.turn[0, 0] < 0
-        corner = cells.corner_m - turned * cells.cell_m * counts
-        dark = cells.dark[::-1, ::-1] if turned else cells.dark
-        shares = []
-        for axis in (0, 1):
-            edges = (
-                corner[axis] - low[axis] + cells.cell_m * np.arange(counts[axis] + 1)
-            ) / texel_m
-            at = np.arange(size[axis])[:, None]
-            shares.append(np.clip(np.minimum(at + 1, edges[1:]) - np.maximum(at, edges[:-1]), 0, 1))
-        light -= shares[1] @ dark @ shares[0].T
-    x, y = np.meshgrid(*((np.arange(count) + 0.5) * texel_m for count in size))
-    for disc in kind_of(target).discs(target):
-        away = disc[2] - np.hypot(x - disc[0] + low[0], y - disc[1] + low[1])
-        light -= np.clip(0.5 + away / texel_m, 0.0, 1.0)
-    return Print(np.asarray(light, np.float32), texel_m, low)
+    return Print(light_of(target, low, texel_m, (size[1], size[0])), texel_m, low)

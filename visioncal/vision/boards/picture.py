@@ -268,9 +268,8 @@ def _known(target: PictureTarget) -> _Known:
 
     grey = Picture().picture(target)
     assert grey is not None
-    print_ = Print(np.asarray(grey / 255, np.float32), target.square_m / grey.shape[1], np.zeros(2))
     features = features_of(grey)
-    return _Known(print_, features, unfit(grey, len(features.px)))
+    return _Known(Print.of_picture(grey, target.square_m), features, unfit(grey, len(features.px)))
 
 
 def unfit(grey: Image, features: int | None = None) -> str:

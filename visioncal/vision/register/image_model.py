@@ -43,6 +43,11 @@ class Print:
     corner_m: FloatArray  # (2,) outer corner of the first texel in the target's frame [m].
     _reduced: dict[int, tuple[Pixels, Pixels, int, float]] = field(default_factory=dict, repr=False)
 
+    @classmethod
+    def of_picture(cls, picture: Image, width_m: float) -> Self:
+        """A (h, w) picture of a width, with its upper left corner as the origin."""
+        return cls(_pixels(picture / 255), width_m / picture.shape[1], np.zeros(2))
+
     @property
     def size_m(self) -> FloatArray:
         """(2,) width and height [m]."""
