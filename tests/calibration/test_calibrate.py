@@ -280,12 +280,14 @@ def test_nothing_is_wrong_with_a_sound_session(sound):
     assert re.search(r"in 15 images, over [5-9]\d % of their width and [5-9]\d % of", str(found))
 
 
-def test_stops_that_are_too_few_to_check_a_result_are_counted(sound):
+def test_stops_that_are_too_few_to_check_a_result_are_said_as_the_verdict_says_them(sound):
     views = Session.load(sound).only(range(6))
     (found,) = visioncal.doctor(views).findings
-    assert found.kind == "few_stops"
-    assert found.words == "6 stops can be used, but checking a result takes 10 or more."
-    assert "Add 5 views or more" in found.do.words
+    judged = visioncal.calibrate(views).verdict
+    (said,) = (finding for finding in judged.findings if finding.kind == "few_stops")
+    assert (found.kind, found.words, found.do) == (said.kind, said.words, said.do)
+    assert "Only 6 views" in found.words
+    assert "Add 5 views or more, tilted" in found.do.words
 
 
 def first_of_blurred(shown, sigma_px):

@@ -13,6 +13,7 @@ from support.following import follow
 from support.misfits import misfit
 from support.refusals import raised
 
+import visioncal
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import calibrate, run
@@ -179,6 +180,18 @@ def test_four_axes_give_a_result_with_a_measured_height_and_none_without():
     # Chi-square of twelve, which chance leaves in one of a thousand cases on either side; the noise
     # is itself estimated from each session, to a tenth.
     assert 1.8 < np.sum(squares) < 40.0
+
+
+def test_doctor_says_of_few_stops_what_the_verdict_says_and_tilts_no_arm_that_cannot():
+    prior = {"z_m": float(X[2, 3]), "sigma_m": SIGMA_M}
+    session = scara(0, {"flange_from_cam": prior}, views=8)
+    judged = calibrate(session).verdict.findings
+    (said,), (found,) = (
+        [(finding.words, finding.do) for finding in findings if finding.kind == "few_stops"]
+        for findings in (judged, visioncal.doctor(session).findings)
+    )
+    assert found == said
+    assert "tilt" not in str(found)
 
 
 def test_a_board_of_several_may_be_known_whole():

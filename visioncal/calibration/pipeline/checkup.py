@@ -17,6 +17,8 @@ from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.stages.other_board import OtherBoardError
+from visioncal.calibration.suspects.judged import Findings, JudgedArm, Sensor
+from visioncal.calibration.suspects.limits import few_stops
 from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards, with_undone
 from visioncal.calibration.suspects.rounded_poses import rounded
 from visioncal.core.arguments import typed
@@ -24,9 +26,9 @@ from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Progress
+from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
-from visioncal.estimation.observability import check_determined
+from visioncal.estimation.observability import Turning, check_determined
 from visioncal.estimation.solve import starting_noise
 from visioncal.robot.model import REPEATABILITY
 from visioncal.session import Session
@@ -176,16 +178,8 @@ def _motion(run: RunState) -> Iterator[Finding]:
         )
     limits, used = CalibrationLimits(), np.flatnonzero(inliers.used).tolist()
     poses = (run.base_from_flange.get(cell.rows[at].view) for at in used)
-    stops, needed = len({pose.tobytes() for pose in poses if pose is not None}), limits.stops[0]
-    if 0 < stops < needed:
-        yield Finding(
-            "few_stops",
-            f"{counted(stops, 'stop')} can be used, but checking a result takes {needed} or more.",
-            Remedy(
-                f"Add {max(5, needed - stops)} views or more, tilted by 20 to 40 degrees about "
-                "different axes; with another corner of the image filled in each."
-            ),
-        )
+    if stops := {pose.tobytes(): pose for pose in poses if pose is not None}:
+        yield from few_stops(_judged(run, np.array([*stops.values()])), len(used))
     repeats_mm, _ = REPEATABILITY if run.robot is None else run.robot.repeatability
     rad, metres = inliers.fit.noise.robots[0].tolist()
     too_few_digits = rounded(run, next(iter(run.session.robots)), 1e3 * metres, np.rad2deg(rad))
@@ -199,6 +193,18 @@ def _motion(run: RunState) -> Iterator[Finding]:
             "the lens is not this camera's, or the poses are not of these images.",
             Remedy("Calibrate: the verdict weighs the causes.", CALIBRATE),
         )
+
+
+def _judged(run: RunState, poses: FloatArray) -> Findings:
+    """What the verdict knows of the motion of a robot, by the poses (n, 4, 4) of its stops."""
+    can_tilt = len(poses) < 2 or Turning.of(poses).is_enough
+    model, seen = run.robot, 0.0 if run.scenes else None
+    arm = JudgedArm(
+        len(poses),
+        modelled=model is not None,
+        can_tilt=can_tilt if model is None else model.can_tilt,
+    )
+    return Findings(pairs=(), sensors=[Sensor(len(poses), pixel_px=seen)], arms=[arm], worst=())
 
 
 def _contents(run: RunState) -> Iterator[str]:

@@ -38,7 +38,7 @@ def collect_findings(judged: Findings) -> list[Finding]:
         *(doubt.of(pair.name) for pair in judged.pairs for doubt in _left_out(pair)),
         *(doubt.of(pair.name) for pair in judged.pairs for doubt in _holdout(pair)),
         *([] if is_wild else [*_sigmas(judged), *_place(judged), *_workspace(judged)]),
-        *_few_stops(judged),
+        *few_stops(judged, sum(view.used for view in judged.views)),
         *(doubt.of(sensor.name) for sensor in judged.sensors for doubt in _lost_views(sensor)),
         *(doubt.of(sensor.name) for sensor in judged.sensors for doubt in _corner_noise(sensor)),
         *robots,
@@ -246,8 +246,9 @@ def _workspace(judged: Findings) -> Iterator[Finding]:
         ).of(arm.name)
 
 
-def _few_stops(judged: Findings) -> Iterator[Finding]:
-    used, (check, bad) = sum(view.used for view in judged.views), _LIMITS.stops
+def few_stops(judged: Findings, used: int) -> Iterator[Finding]:
+    """Findings on arms whose stops, of `used` views, are too few to check a result."""
+    check, bad = _LIMITS.stops
     for arm in judged.arms:
         if arm.stops < check:
             is_fatal, thing = arm.stops < bad, "view" if arm.stops == used else "stop"
