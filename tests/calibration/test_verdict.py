@@ -248,6 +248,9 @@ def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     # An apostrophe of a sentence is no quotation.
     assert with_paths("Look at the camera's driver.", folder) == "Look at the camera's driver."
     assert with_paths(GUESS, folder) == f"visioncal convert {folder} {folder}-fixed --guess --yes"
+    some = ("--need-mm", "0.5", "--views", "1-9")
+    of_others = with_paths("visioncal calibrate SESSION -o NEW --views 2-5", "s", "out", need=some)
+    assert of_others == "visioncal calibrate s -o out-new --need-mm 0.5 --views 2-5"
     needed = with_paths(GUESS_AND_CALIBRATE, "s", "out", need=("--need-mm", "0.5"))
     assert needed.endswith("&& visioncal calibrate s-fixed -o out --need-mm 0.5")
     command = correcting(Need(mm=0.5)).command

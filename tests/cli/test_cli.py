@@ -487,6 +487,17 @@ def test_stops_to_repeat_come_with_the_board_of_the_result(rendered, tmp_path, m
     assert "BOARD" not in recovering.err
 
 
+def test_next_steps_keep_the_views_that_were_typed(tmp_path):
+    cell, out = tmp_path / "cell", tmp_path / "out"
+    visioncal("simulate", cell, "--no-images").good()
+    document = (cell / "session.toml").read_text()
+    assert "914.2, 913.6" in document
+    (cell / "session.toml").write_text(document.replace("914.2, 913.6", "928.2, 927.6"))
+    quick = ("--no-report", "--no-recording")
+    done = visioncal("calibrate", cell, "-o", out, "--views", "0-14", *quick)
+    assert f"visioncal calibrate {cell} -o {out} --views 0-14" in done.out
+
+
 def test_a_bad_result_has_status_3_and_is_used_by_force_alone(pairs, tmp_path):
     # No cell of this kind reaches it: the probability of the need is zero.
     out, need = tmp_path / "out", ("--need-mm", "0.001")

@@ -12,6 +12,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import CalibrateOptions
 from visioncal.cli.summary import print_summary
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import ranges
 from visioncal.core.verdict import need_options
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import frames_to_keep, load_calibration
@@ -43,8 +44,11 @@ def calibrate_command(options: CalibrateOptions) -> None:
     with with_run_paths(session, options.out), shown_progress(quiet=options.as_json) as progress:
         result = run(loaded, **(asked | {"progress": progress}))
         progress("write", 0, 1)
-        need = need_options(options.need_mm, options.need_deg, corrected=options.corrected)
-        result = result.with_paths(session, options.out, need)
+        typed = need_options(options.need_mm, options.need_deg, corrected=options.corrected)
+        if options.views is not None:
+            # The others stay left out, unless a step names its own.
+            typed += ("--views", ranges(options.views))
+        result = result.with_paths(session, options.out, typed)
         if left is not None:
             left.keep()
         written = write_outputs(

@@ -272,6 +272,9 @@ def with_paths(
     new = f"{result.parent if is_file else result}-new"
     paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}
     words = {name: shlex.quote(path) for name, path in paths.items()}
+    if "--views" in need and " --views " in command:
+        # A step's own views are among the typed ones.
+        need = need[: [*need].index("--views")]
     # Of an option that is typed twice, the last one counts.
     words[AGAIN] = shlex.join(again)
     words |= {f"-o {name}": " ".join(["-o", words[name], *need]) for name in ("OUT", "NEW")}
