@@ -88,6 +88,17 @@ def test_a_false_depth_is_found_with_a_box_before_the_board(mount):
     assert stored.values == pytest.approx(depth.values)
 
 
+def test_the_noise_of_the_robot_is_in_no_depth():
+    session, result = made()
+    moved = exp(np.repeat([[2e-3, 1e-3]], 3, axis=1)[0])
+    evidence = [
+        replace(view, base_from_flange=view.base_from_flange @ moved) for view in result.evidence
+    ]
+    found, _ = with_depth(without(result.calibration), evidence, session)
+    depth = result.calibration.camera.depth
+    assert found.camera.depth.values == pytest.approx(depth.values, abs=1e-12)
+
+
 def test_a_true_depth_is_not_accused():
     _, result = made(depth=TRUE)
     words = {found.kind: found.words for found in result.calibration.verdict.findings}
@@ -266,6 +277,9 @@ def test_verify_says_whether_depth_is_what_it_was():
     same = verify(session, result.calibration)
     assert same.passed
     assert "depth is what it was" in " ".join(verdict_of(same).reasons)
+    # Wherever the board stands.
+    elsewhere = verify(session, result.calibration, board_placed_anew=True)
+    assert "depth is what it was" in " ".join(found.words for found in elsewhere.depth)
     # A millimetre and a half at half a metre, of a model that is known to a third of one.
     other = verify(
         changed(lambda raw, _: np.rint(1.003 * raw).astype(np.uint16)), result.calibration

@@ -1,10 +1,11 @@
-"""Whether a camera's depth is true: its distances against those that the calibrated chain predicts.
+"""Whether a camera's depth is true: its distances against the board's plane by its own images.
 
-Distances of the board's white in small cells are compared with the board's plane at each view. By
-generalised least squares the deviations give the model of `DepthResult`; the offset and tilt of
-each view by the noise of the robot and of the sensor are random effects, whose variances are
-estimated by REML (Patterson and Thompson 1971), and the errors of the calibration have their joint
-covariance. Only what a calibration says of itself is used.
+Distances of the board's white in small cells are compared with the plane of the board's pose by the
+view's own corners, in which there is no noise of the robot. By generalised least squares the
+deviations give the model of `DepthResult`; the noise of a view's corners and the errors of lens and
+board have their covariance, and the offset and tilt of each view by the sensor are random effects,
+whose variances are estimated by REML (Patterson and Thompson 1971). Only what a calibration says of
+itself is used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,16 +14,21 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize, nnls
+from scipy.linalg import block_diag
+from scipy.optimize import least_squares, nnls
 
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
-from visioncal.core.number_format import counted, figure, some_of
+from visioncal.core.number_format import counted, figure, view_words
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import adjoint, apply, invert
-from visioncal.core.types import Camera, FloatArray, Image, Mask
+from visioncal.core.types import Camera, Corners, FloatArray, Image, Mask, chosen_rows
 from visioncal.core.verdict import DEPTH_CHANGED, NOTE, Finding, Remedy
-from visioncal.estimation.chain import edge_names
+from visioncal.estimation.appearance import shape_basis
+from visioncal.estimation.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
+from visioncal.estimation.lens_field import depths_m, zooms
+from visioncal.fit.mixed import Estimate, Mixed, Term, prior_term
+from visioncal.fit.sizes import most_likely
 from visioncal.results import Calibration, CameraResult
 from visioncal.results.depth import DepthCamera, DepthResult, bending
 from visioncal.results.evidence import ViewEvidence
@@ -44,6 +50,17 @@ _PIXELS = 60_000
 _GATE, _BENT = 4.0, 0.008
 # Robust standard deviation of a median absolute deviation.
 _MAD = 1.4826
+# Of a pose's right perturbation, what moves its plane: turns about x and y, and z.
+_OF_PLANE = [0, 1, 5]
+
+
+def distances(pose: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n,) depth of a frame's plane z = 0 along (n, 3) rays of unit depth, and by `_OF_PLANE`."""
+    normal, origin = pose[:3, 2], pose[:3, 3]
+    along = rays @ normal
+    depth = normal @ origin / along
+    x, y = ((depth[:, None] * rays - origin) @ pose[:3, :2]).T
+    return depth, np.stack([y, -x, np.ones_like(x)], axis=1) / along[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,83 +72,85 @@ class Cells:
     true_m: FloatArray  # (n,) predicted distances [m].
     excess_m: FloatArray  # (n,) medians of measured minus predicted distances [m].
     noise_m: FloatArray  # (n,) robust standard deviation of the pixels [m].
-    by_px: FloatArray  # (n, 2) derivatives of the predicted distances by the pixels [m/px].
-    by_common: FloatArray  # (n, q) the same by independent errors of the calibration [m].
-    by_robot: FloatArray  # (n, 6) the same by the independent noise of the flange [m].
     inks_m: FloatArray  # (n,) how much deeper black is read, NaN where unknown [m].
-
-    def take(self, kept: Mask) -> "Cells":
-        """Some of the cells."""
-        names = ("px", "true_m", "excess_m", "noise_m", "by_px", "by_common", "by_robot", "inks_m")
-        return replace(self, **{name: getattr(self, name)[kept] for name in names})
-
-
-@dataclass(frozen=True, eq=False)
-class BoardPlane:
-    """A board as the calibrated chain places it at one view, and how errors move it."""
-
-    cam_from_target: FloatArray  # (4, 4).
-    by_edges: FloatArray  # (6, 12) its right perturbation by those of both edges.
-    by_flange: FloatArray  # (6, 6) the same by the flange's.
-
-    def distances(self, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) its depth along (n, 3) rays of unit depth, and (n, 6) Jacobian by its pose."""
-        rotation, origin = self.cam_from_target[:3, :3], self.cam_from_target[:3, 3]
-        along = rays @ rotation[:, 2]
-        depth = (rotation[:, 2] @ origin) / along
-        lever = (origin - depth[:, None] * rays) @ rotation
-        z = np.broadcast_to([0.0, 0.0, 1.0], lever.shape)
-        by_pose = np.concatenate([np.cross(z, lever), z], axis=1) / along[:, None]
-        return depth, by_pose
-
-
-def plane_at(calibration: Calibration, base_from_flange: FloatArray) -> BoardPlane:
-    """The board of one camera and robot at a pose (4, 4) of the flange."""
-    x, z = (calibration.edges[name].matrix for name in edge_names(calibration.mount))
-    if calibration.mount == "eye-in-hand":
-        pose = invert(base_from_flange @ x) @ z
-        by_flange = -adjoint(invert(z) @ base_from_flange)
-    else:
-        pose = invert(x) @ base_from_flange @ z
-        by_flange = adjoint(invert(z))
-    return BoardPlane(pose, np.concatenate([-adjoint(invert(pose)), np.eye(6)], axis=1), by_flange)
+    by_px: FloatArray  # (n, 2) derivatives of the predicted distances by the pixels [m/px].
+    by_corners: FloatArray  # (n, 3) the same by independent errors of the view's own corners [m].
+    by_common: FloatArray  # (n, q) the same by independent errors that all views share [m].
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
     """What the depth of one camera is compared with."""
 
-    calibration: Calibration  # Of one camera, robot and board.
+    calibration: Calibration  # Of one camera and board.
     camera: CameraResult  # Its camera.
     session: Session
-    corners_m: FloatArray  # (c, 3) the board's corners in its frame [m].
-    lens: Camera  # The lens of the depth pictures.
-    cam_from_depth: FloatArray  # (4, 4); the identity where they are aligned to the image.
-    place: FloatArray  # (6,) its standard deviations [rad, m].
-    unit_m: float | None  # Their unit, where stated [m].
+    corners_m: FloatArray  # (c, 3) corners of its board [m].
+    shape: FloatArray  # (c, 3, s) their derivatives by its shape.
+    unit_m: float | None  # The unit of depth pictures, where stated [m].
     is_ray: bool  # Whether distances are along the ray.
+    by: DepthCamera | None = None  # The camera that measures depth, where it is another one.
+    place: tuple[float, float] = (0.0, 0.0)  # Standard deviations of its pose, per axis [rad], [m].
+
+    @classmethod
+    def of(cls, pair: Calibration, session: Session, camera: str, board: str) -> "Sensor":
+        """The depth beside a camera's images of a board; raises DataError."""
+        own, target, lens = session.declaration.depth, session.boards[board], pair.camera
+        if lens is None or np.ptp(corner_positions(target)[:, 2]) > 0.0:
+            raise DataError("it needs a camera and a flat board.")
+        table = session.cameras[camera] if own is None else own
+        corners = corner_positions(target) if pair.board is None else pair.board.corners(target)
+        seen, shape = (pair, lens, session), (corners, shape_basis(target))
+        sensor = cls(*seen, *shape, table.depth_unit_m, table.depth_of == "ray")
+        if own is None or own.stated is None:
+            return sensor
+        prior = session.declaration.prior["cam_from_depth"]
+        pose = np.eye(4) if prior.pose is None else prior.pose
+        by = DepthCamera(**vars(own.stated), cam_from_depth=pose)
+        return replace(sensor, by=by, place=(prior.sigma_rad or 0.0, prior.sigma_m or 0.0))
+
+    @property
+    def lens(self) -> Camera:
+        """The lens of the depth pictures."""
+        return self.camera.camera if self.by is None else self.by.camera
 
     @cached_property
     def root(self) -> FloatArray:
-        """(12 + k + m, q) root of the covariance of edges, lens and field."""
-        joint = self.calibration.joint_covariance[:12, :12]
-        values, vectors = np.linalg.eigh(self.camera.covariance_with(joint))
-        kept = values > 1e-12 * values.max()
-        return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+        """(c, q) root of the covariance of edges, lens, field, board's shape and place."""
+        known = self.camera.covariance_with(self.calibration.joint_covariance[:12, :12])
+        count, lens = len(known), 4 + len(self.camera.camera.distortion)
+        shape, place = np.zeros(self.shape.shape[2]), np.repeat(self.place, 3)
+        covariance = block_diag(known, np.diag(shape), np.diag(place**2))
+        if (fit := self.calibration.joint_fit) is not None:
+            looks = np.array(fit.looks, dtype=np.int64)
+            fitted = np.append(np.arange(12), looks + np.where(looks < lens, 12, count - lens))
+            covariance[np.ix_(fitted, fitted)] = fit.covariance[: len(fitted), : len(fitted)]
+            # Field and shape are correlated through the rest.
+            rest, board = fitted[fitted < count], fitted[fitted >= count]
+            inverse = np.linalg.pinv(known[np.ix_(rest, rest)], hermitian=True)
+            cross = known[12 + lens :, rest] @ inverse @ covariance[np.ix_(rest, board)]
+            covariance[12 + lens : count, board] = cross
+            covariance[board, 12 + lens : count] = cross.T
+        scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+        kept = values > 1e-12
+        return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
 
     def rays(self, px: FloatArray) -> FloatArray:
         """(n, 3) rays of unit depth of pixels of the depth picture."""
-        in_model = self.camera.in_model(px) if self.lens is self.camera.camera else px
+        in_model = self.camera.in_model(px) if self.by is None else px
         return np.column_stack([normalise(self.lens, in_model), np.ones(len(px))])
 
-    def cells(self, view: View, plane: BoardPlane) -> Cells:
+    def cells(self, view: View, seen: ViewEvidence | None) -> Cells:
         """The cells of a view that are of the board; raises DataError where there are too few."""
         images, size = self.session.images, self.lens.resolution
         if why := images.absence(view.depth):
             raise DataError(f"{view.depth} {why}.")
+        if seen is None or seen.corners is None or seen.cam_from_target is None:
+            raise DataError("the board was not found in the image.")
         depth = read_depth(images.read(view.depth), view.depth, size, self.unit_m)
-        pose = invert(self.cam_from_depth) @ plane.cam_from_target
-        plane = replace(plane, cam_from_target=pose)
+        beside = np.eye(4) if self.by is None else self.by.cam_from_depth
+        pose = invert(beside) @ seen.cam_from_target
         corners = project(self.lens, apply(pose, self.corners_m))
         if not np.isfinite(corners).all():
             raise DataError("the board is not in front of the camera.")
@@ -142,49 +161,68 @@ class Sensor:
         rows, columns = (step * axis for axis in np.nonzero(mask[::step, ::step]))
         px = np.column_stack([columns, rows]).astype(float)
         rays = self.rays(px)
-        true = plane.distances(rays)[0]
-        length = np.linalg.norm(rays, axis=1) if self.is_ray else np.ones(len(px))
-        excess = depth[rows, columns] - true * length
-        shades = self._shades(view, apply(self.cam_from_depth, true[:, None] * rays))
+        true = distances(pose, rays)[0]
+        excess = depth[rows, columns] - true * self.lengths(rays)
+        shades = self._shades(view, apply(beside, true[:, None] * rays))
         side = max(float(np.ptp(corners, axis=0).max()) / _CELLS, 6.0)
         key = px // side @ [1e4, 1.0]
-        order, found, inks = np.argsort(key, kind="stable"), [], []
+        order, found = np.argsort(key, kind="stable"), []
         for cell in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
             white, ink = (cell[shade[cell] & np.isfinite(excess[cell])] for shade in shades)
             if len(white) >= _LEAST:
                 middle = float(np.median(excess[white]))
                 spread = _MAD * float(np.median(np.abs(excess[white] - middle)))
-                found.append((*px[white].mean(axis=0), middle, spread))
                 deeper = float(np.median(excess[ink])) - middle if len(ink) >= _LEAST else np.nan
-                inks.append(deeper)
+                found.append((*px[white].mean(axis=0), middle, spread, deeper))
         if len(found) < _FEWEST:
             raise DataError(
                 f"{view.depth} has depth in {counted(len(found), 'cell')} of the board, but needs "
                 f"{_FEWEST}."
             )
-        table = np.array(found)
-        px, rays = table[:, :2], self.rays(table[:, :2])
-        true, by_pose = plane.distances(rays)
-        length = np.linalg.norm(rays, axis=1) if self.is_ray else np.ones(len(px))
+        u, v, excess, noise, inks = np.array(found).T
+        px = np.column_stack([u, v])
+        rays = self.rays(px)
+        true, by_pose = distances(pose, rays)
+        by_corners, by_looks = self._plane_errors(seen.corners, seen.cam_from_target)
         by_errors = np.zeros((len(px), len(self.root)))
-        by_errors[:, :12] = by_pose @ plane.by_edges
-        if self.lens is self.camera.camera:
+        by_errors[:, 12:-6] = by_pose @ by_looks
+        by_errors[:, -6:] = -by_pose @ adjoint(invert(pose))[_OF_PLANE]
+        if self.by is None:
             by_lens = self.camera.rays_by_lens(px, true[:, None] * rays)[1]
             normal = pose[:3, 2] / (rays @ pose[:3, 2])[:, None]
-            by_errors[:, 12:] = -np.einsum("na,nak->nk", normal, by_lens)
-        ahead, behind = (
-            np.stack([plane.distances(self.rays(px + sign * step))[0] for step in np.eye(2)])
-            for sign in (0.5, -0.5)
-        )
-        by_robot = by_pose @ plane.by_flange * flange_sigmas(self.calibration)
-        lengths = length[:, None]
-        by_place = -by_pose @ adjoint(invert(pose)) * self.place
-        by_common = np.hstack([by_errors @ self.root, by_place])
+            by_errors[:, 12 : 12 + by_lens.shape[2]] -= np.einsum("na,nak->nk", normal, by_lens)
+        by_px = [distances(pose, self.rays(px + step))[0] - true for step in np.eye(2)]
+        lengths = self.lengths(rays)
         cells = Cells(
-            *(view.number, px, true * length, table[:, 2], table[:, 3], (ahead - behind).T),
-            *(lengths * by_common, lengths * by_robot, np.array(inks)),
+            *(view.number, px, true * lengths, excess, noise, inks, np.transpose(by_px)),
+            *(lengths[:, None] * by_pose @ by_corners, lengths[:, None] * by_errors @ self.root),
         )
-        return cells.take(on_board(cells, size))
+        return chosen_rows(cells, on_board(cells, size))
+
+    def lengths(self, rays: FloatArray) -> FloatArray:
+        """(n,) what is measured along (n, 3) rays of unit depth, over their depth."""
+        return np.linalg.norm(rays, axis=1) if self.is_ray else np.ones(len(rays))
+
+    def _plane_errors(self, seen: Corners, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Errors of a board's plane in the camera's frame, by `_OF_PLANE`.
+
+        Returns:
+            (3, 3) root of their covariance by the corners' noise, and (3, k + m + s) their Jacobian
+            by lens, field and the board's shape.
+        """
+        camera, noise_px = self.camera.camera, floored_sigma_px(self.calibration.noise["pixel_px"])
+        stack = CornerStack.of({seen.view: seen}, self.corners_m)
+        if self.camera.field is not None and self.camera.field.jitter:
+            jitter = self.camera.field.jitter / noise_px
+            stack = replace(stack, zooms=jitter * zooms(stack.px, camera))
+        seen_at = reproject(stack, camera, pose[None])
+        field = self.camera.displacements(stack.px, float(depths_m(stack, pose[None])[0]))
+        shape = seen_at.by_point @ self.shape[seen.ids]
+        stack.weigh(field, shape)
+        columns = np.concatenate([seen_at.by_intrinsics, field, shape], axis=2)
+        fitted = WithoutPoses.of(stack, seen_at.by_pose, columns, None)
+        noise = noise_px**2 * fitted.inverse[0][np.ix_(_OF_PLANE, _OF_PLANE)]
+        return np.linalg.cholesky(noise), fitted.answer[0][_OF_PLANE]
 
     def _shades(self, view: View, points_cam: FloatArray) -> tuple[Mask, Mask]:
         """(n,) which of some points are imaged well within white, and which within black."""
@@ -197,13 +235,6 @@ class Sensor:
         u, v = np.clip(px, 0, np.array(camera.resolution) - 1).astype(int).T
         white, ink = _shaded(image)
         return white[v, u], ink[v, u]
-
-
-def flange_sigmas(calibration: Calibration) -> FloatArray:
-    """(6,) noise of a robot's flange at one stop [rad, m]."""
-    of = "robot" if "robot_translation_mm" in calibration.noise else "combined"
-    turn = np.deg2rad(calibration.noise.get(f"{of}_rotation_deg", 0.0))
-    return np.repeat([turn, 1e-3 * calibration.noise.get(f"{of}_translation_mm", 0.0)], 3)
 
 
 def _shaded(image: Image) -> tuple[Mask, Mask]:
@@ -233,19 +264,9 @@ def on_board(cells: Cells, size: tuple[int, int]) -> Mask:
     return np.asarray(kept, dtype=bool)
 
 
-@dataclass(frozen=True, eq=False)
-class Mixed:
-    """Estimates of a linear mixed model."""
-
-    values: FloatArray  # (p,) fixed effects.
-    covariance: FloatArray  # (p, p).
-    with_known: FloatArray  # (p, q) covariance of their errors with known random effects.
-    levels: FloatArray  # (3,) standard deviations: of noise, and of the views' offset and tilt.
-
-
 def fit_mixed(
     excess: FloatArray, fixed: FloatArray, known: FloatArray, views: FloatArray, noise: FloatArray
-) -> Mixed:
+) -> Estimate:
     """Fits fixed effects beside random ones, of which some variances are estimated by REML.
 
     Args:
@@ -254,32 +275,22 @@ def fit_mixed(
         known: (n, q) columns of random effects with unit variance.
         views: (n, 3 v) columns of each view's own offset and two tilts.
         noise: (n,) relative standard deviations of the observations.
+
+    Returns:
+        The estimate of all columns, by sizes of the noise and of the views' offset and tilt.
     """
     table = np.column_stack([fixed, known, views, excess]) / noise[:, None]
-    gram, size = table.T @ table, fixed.shape[1]
-    count, both = views.shape[1] // 3, size + known.shape[1]
-
-    def solved(logs: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        of_noise, offset, tilt = np.exp(-2.0 * logs)
-        prior = np.repeat([0.0, 1.0], [size, both - size])
-        prior = np.concatenate([prior, np.tile([offset, tilt, tilt], count)])
-        information = of_noise * gram[:-1, :-1] + np.diag(prior)
-        estimate = np.linalg.solve(information, of_noise * gram[:-1, -1])
-        misfit = of_noise * (gram[-1, -1] - estimate @ gram[:-1, -1])
-        logs_of_g = 2.0 * count * (logs[1] + 2.0 * logs[2])
-        determinant = np.linalg.slogdet(information)[1]
-        return 2.0 * len(excess) * logs[0] + logs_of_g + determinant + misfit, estimate, information
-
+    count = table.shape[1] - 1
+    _, randoms, own = np.split(np.arange(count), np.cumsum([fixed.shape[1], known.shape[1]]))
+    groups = ((-1, randoms), (1, own[::3]), (2, np.delete(own, np.s_[::3])))
+    terms = [prior_term(size, of, np.zeros(len(of)), 1.0) for size, of in groups]
+    every = Term(0, len(table), np.arange(count), table.T @ table)
+    mixed = Mixed((every, *terms), (), count, 3)
     # From a tenth of a millimetre on; less than a micrometre is none.
-    start, least = np.log([0.3, 1e-4, 1e-4]), np.log([1e-3, 1e-6, 1e-6])
-    bounds = list(zip(least.tolist(), np.log([30.0, 0.1, 0.1]).tolist(), strict=True))
-    logs = minimize(lambda at: solved(at)[0], start, method="L-BFGS-B", bounds=bounds).x
-    _, estimate, information = solved(logs)
-    inverse = np.linalg.inv(information)[:size]
-    covariance, cross = np.split(inverse[:, :both], [size], axis=1)
-    return Mixed(
-        estimate[:size], np.asarray((covariance + covariance.T) / 2.0), cross, np.exp(logs)
-    )
+    logs, low, high = np.log([[0.3, 1e-4, 1e-4], [1e-3, 1e-6, 1e-6], [30.0, 0.1, 0.1]])
+    for _ in range(3):
+        logs = (found := most_likely(mixed, logs, low, high).estimate).logs
+    return found
 
 
 def with_depth(
@@ -289,8 +300,7 @@ def with_depth(
     seen = {view.view: view for view in evidence}
     used = {view.view for view in calibration.views if view.used}
     views: dict[tuple[str, str], list[View]] = {}
-    for observation in session.observations:
-        view = observation.view
+    for view in session.views:
         if view.depth and view.number in used:
             key = view.text.get("camera", "").strip(), session.board_of(view)
             views.setdefault(key, []).append(view)
@@ -300,9 +310,8 @@ def with_depth(
         board = max((key for key in views if key[0] == camera), key=lambda key: len(views[key]))[1]
         try:
             pair = calibration.chosen(Choice(camera or None, None, board or None))
-            of_board = views[camera, board]
-            flanges = {view.number: seen[view.number].base_from_flange for view in of_board}
-            result, cells, said = _depth_of(pair, session, camera, board, of_board, flanges)
+            sensor = Sensor.of(pair, session, camera, board)
+            result, cells, said = _depth_of(sensor, views[camera, board], seen)
         except DataError as error:
             findings.append(Finding("depth_unread", f"Depth was not compared: {error}").of(camera))
             continue
@@ -310,8 +319,7 @@ def with_depth(
         if result is not None:
             found[camera] = result
         for part in cells:
-            table = _shown(part, result, pair)
-            seen[part.view] = replace(seen[part.view], depth=table)
+            seen[part.view] = replace(seen[part.view], depth=_shown(part, result, sensor))
     verdict = calibration.verdict
     verdict = replace(verdict, findings=(*verdict.findings[:1], *findings, *verdict.findings[1:]))
     calibration = replace(calibration, verdict=verdict)
@@ -327,80 +335,57 @@ def with_depth(
     return calibration, tuple(seen[view.view] for view in evidence)
 
 
-def _shown(cells: Cells, result: DepthResult | None, pair: Calibration) -> FloatArray:
+def _shown(cells: Cells, result: DepthResult | None, sensor: Sensor) -> FloatArray:
     """(n, 5) a view's cells, as its evidence has them."""
     px, left, true = cells.px, cells.excess_m, cells.true_m
-    if result is not None and pair.camera is not None:
-        camera = pair.camera.camera
-        size = camera.resolution if result.by is None else result.by.resolution
-        left = result.true_m(true + left, px, size) - true
-        if result.by is not None:
-            rays = np.column_stack([normalise(result.by.camera, px), np.ones(len(px))])
-            px = project(camera, apply(result.by.cam_from_depth, true[:, None] * rays))
+    if result is not None:
+        left = result.true_m(true + left, px, sensor.lens.resolution) - true
+    if sensor.by is not None:
+        rays = sensor.rays(px)
+        points = (true / sensor.lengths(rays))[:, None] * rays
+        px = project(sensor.camera.camera, apply(sensor.by.cam_from_depth, points))
     return np.column_stack([px, true, cells.excess_m, left])
 
 
 def depth_now(
-    calibration: Calibration, session: Session, flanges: Mapping[int, FloatArray | None]
+    calibration: Calibration, session: Session, seen: Mapping[int, ViewEvidence]
 ) -> tuple[Finding, ...]:
-    """Whether the depth of one camera, robot and board still is what it was.
+    """Whether the depth of one camera and board still is what it was.
 
     Args:
         calibration: Theirs, with the depth.
         session: New views.
-        flanges: (4, 4) the flange's pose at each by the calibrated arm.
+        seen: The board in each.
     """
     views = [view for view in session.views if view.depth]
     if not views or calibration.camera is None or calibration.camera.depth is None:
         return ()
     camera, board = next(iter(session.cameras), ""), next(iter(session.boards), "")
     try:
-        before = calibration.camera.depth
-        return tuple(_depth_of(calibration, session, camera, board, views, flanges, before)[2])
+        sensor, before = Sensor.of(calibration, session, camera, board), calibration.camera.depth
+        return tuple(_depth_of(sensor, views, seen, before)[2])
     except DataError as error:
         return (Finding("depth_unread", f"Depth was not compared: {error}"),)
 
 
 def _depth_of(
-    pair: Calibration,
-    session: Session,
-    camera: str,
-    board: str,
+    sensor: Sensor,
     views: Sequence[View],
-    flanges: Mapping[int, FloatArray | None],
+    seen: Mapping[int, ViewEvidence],
     before: DepthResult | None = None,
 ) -> tuple[DepthResult | None, list[Cells], list[Finding]]:
     """The depth of one camera, the cells that it is from, and what is to be said of it.
 
     Where it was something else before, whether it still is.
     """
-    table, target = session.cameras[camera], session.boards[board]
-    corners = corner_positions(target)
-    if pair.camera is None or np.ptp(corners[:, 2]) > 0.0:
-        raise DataError("it needs a camera and a flat board.")
-    lens, own, beside, place = pair.camera.camera, session.declaration.depth, np.eye(4), np.zeros(6)
-    by = None
-    if own is not None and (stated := own.stated) is not None:
-        prior, lens, table = session.declaration.prior["cam_from_depth"], stated, own
-        beside = np.eye(4) if prior.pose is None else prior.pose
-        place = np.repeat([prior.sigma_rad or 0.0, prior.sigma_m or 0.0], 3)
-        by = DepthCamera(**vars(lens), cam_from_depth=beside)
-    sensor = Sensor(
-        *(pair, pair.camera, session, corners, lens, beside, place),
-        *(table.depth_unit_m, table.depth_of == "ray"),
-    )
-    found, lost = list[Cells](), dict[str, list[int]]()
+    size, found, lost = sensor.lens.resolution, list[Cells](), dict[str, list[int]]()
     for view in views:
-        if (flange := flanges.get(view.number)) is None:
-            continue
         try:
-            found.append(sensor.cells(view, plane_at(pair, flange)))
+            found.append(sensor.cells(view, seen.get(view.number)))
         except DataError as error:
             lost.setdefault(str(error).replace(view.depth, "depth"), []).append(view.number)
     said = [
-        Finding(
-            "depth_unread", f"No depth of view {some_of([*map(str, of)])}: {words}", views=tuple(of)
-        )
+        Finding("depth_unread", f"No depth of {view_words(of)}: {words}", views=tuple(of))
         for words, of in lost.items()
     ]
     if len(found) < CheckLimits.stops:
@@ -410,19 +395,17 @@ def _depth_of(
     ratios = np.array([np.median(at.excess_m / at.true_m) for at in found])
     ratio = 1.0 + float(np.median(ratios))
     if not 0.67 < ratio < 1.5:
-        return None, found, [*said, _another_unit(ratio, table.depth_unit_m)]
+        return None, found, [*said, _another_unit(ratio, sensor.unit_m)]
     # Views that something hides whole.
     off = np.abs(ratios - np.median(ratios))
     within = off < max(_GATE * _MAD * float(np.median(off)), 0.03)
     found = [cells for cells, is_kept in zip(found, within, strict=True) if is_kept]
-    kept, shift = agreeing(found, sensor.lens.resolution)
+    kept, shift = agreeing(found, size)
     if shift.any():
         return None, found, [*said, _shifted(shift)]
     found = [cells for cells, is_kept in zip(found, kept, strict=True) if is_kept]
-    stamps = {view.number: view.stamp_s for view in views}
-    result, further = estimated(found, sensor.lens.resolution, stamps, sensor.root)
-    result = replace(result, of=table.depth_of, unit_m=table.depth_unit_m, by=by)
-    return result, found, [*said, _judged(result, found, sensor.lens.resolution, further, before)]
+    result, further = estimated(found, sensor, {view.number: view.stamp_s for view in views})
+    return result, found, [*said, _judged(result, found, size, further, before)]
 
 
 def agreeing(found: Sequence[Cells], size: tuple[int, int]) -> tuple[Mask, FloatArray]:
@@ -433,20 +416,18 @@ def agreeing(found: Sequence[Cells], size: tuple[int, int]) -> tuple[Mask, Float
     middles = np.array([np.median(cells.excess_m) for cells in found])
     columns = np.array(
         [
-            [np.median(cells.true_m), *bending(cells.px, size).mean(axis=0)[[0, 3]], *-by_px]
-            for cells in found
-            for by_px in [cells.by_px.mean(axis=0)]
+            [np.median(at.true_m), *bending(at.px, size).mean(axis=0)[[0, 3]], *-at.by_px.mean(0)]
+            for at in found
         ]
     )
 
     def fitted(count: int) -> tuple[FloatArray, FloatArray]:
-        weights, values = np.ones(len(middles)), np.zeros(count)
-        for _ in range(30):
-            rows = weights[:, None] * columns[:, :count]
-            values = np.linalg.lstsq(rows, weights * middles, rcond=1e-6)[0]
-            left = np.abs(middles - columns[:, :count] @ values)
-            weights = 1.0 / np.sqrt(np.maximum(left, 1e-5))
-        return np.abs(middles - columns[:, :count] @ values), values
+        def misfit(values: FloatArray) -> FloatArray:
+            return np.asarray(columns[:, :count] @ values - middles)
+
+        start = np.zeros(count)
+        fit = least_squares(misfit, start, x_scale="jac", loss="soft_l1", f_scale=1e-5)
+        return np.abs(misfit(fit.x)), fit.x
 
     (off, _), (left, values) = fitted(3), fitted(5)
     # Views that something hides are few: a shift moves most of them.
@@ -466,38 +447,32 @@ def _shifted(shift: FloatArray) -> Finding:
 
 
 def estimated(
-    found: Sequence[Cells],
-    size: tuple[int, int],
-    stamps: Mapping[int, float | None],
-    root: FloatArray,
+    found: Sequence[Cells], sensor: Sensor, stamps: Mapping[int, float | None]
 ) -> tuple[DepthResult, str]:
     """The model of some views' cells, and a sentence on what else they show."""
     px, true, excess, noise, by_common, inks = (
         np.concatenate([getattr(cells, name) for cells in found])
         for name in ("px", "true_m", "excess_m", "noise_m", "by_common", "inks_m")
     )
-    of_pixel = nnls(np.column_stack([np.ones_like(true), true**4]) * 1e6, noise**2 * 1e6)[0]
-    noise = np.sqrt(np.maximum(of_pixel @ [np.ones_like(true), true**4], 1e-10))
-    bent = bending(px, size)
-    fixed = np.column_stack([true, bent])
-    views, robot = (np.zeros((len(true), count * len(found))) for count in (3, 6))
-    first, times = 0, np.zeros(len(true))
-    for at, cells in enumerate(found):
-        rows = slice(first, first := first + len(cells.px))
-        views[rows, 3 * at : 3 * at + 3] = bent[rows, :3]
-        robot[rows, 6 * at : 6 * at + 6] = cells.by_robot
-        times[rows] = stamps.get(cells.view) or 0.0
-    known = np.column_stack([by_common, robot])
-    further = ""
-    extra = np.zeros((len(true), 0))
+    powers = np.column_stack([np.ones_like(true), true**4])
+    of_pixel = nnls(powers * 1e6, noise**2 * 1e6)[0]
+    noise = np.sqrt(np.maximum(powers @ of_pixel, 1e-10))
+    bent = bending(px, sensor.lens.resolution)
+    rows = np.split(bent[:, :3], np.cumsum([len(cells.px) for cells in found])[:-1])
+    known = np.column_stack([by_common, block_diag(*(cells.by_corners for cells in found))])
+    times = np.concatenate([np.full(len(at.px), stamps.get(at.view) or 0.0) for at in found])
+    fixed, further, views = np.column_stack([true, bent]), "", block_diag(*rows)
     if np.ptp(times) > 60.0:
-        extra = ((times - times.mean()) / 3600.0)[:, None]
-    mixed = fit_mixed(excess, np.column_stack([fixed, extra]), known, views, noise)
-    if extra.size and abs(mixed.values[5]) > _GATE * np.sqrt(mixed.covariance[5, 5]):
-        further = f" It drifts by {1e3 * mixed.values[5]:.2g} mm an hour."
-    elif extra.size:
-        mixed = fit_mixed(excess, fixed, known, views, noise)
+        drifting = np.column_stack([fixed, (times - times.mean()) / 3600.0])
+        mixed = fit_mixed(excess, drifting, known, views, noise)
+        if abs(mixed.values[5]) > _GATE * np.sqrt(mixed.covariance[5, 5]):
+            further = f" It drifts by {1e3 * mixed.values[5]:.2g} mm an hour."
+            fixed = drifting
+    mixed = fit_mixed(excess, fixed, known, views, noise)
     scale, offset, u, v, bowl = mixed.values[:5].tolist()
+    # Of edges, lens and field, which come first.
+    root = sensor.root[: -6 - sensor.shape.shape[2]]
+    errors = fixed.shape[1] + np.arange(root.shape[1])
     return (
         DepthResult(
             scale=1.0 + scale,
@@ -505,11 +480,14 @@ def estimated(
             tilt_m=(u, v),
             bowl_m=bowl,
             covariance=mixed.covariance[:5, :5],
-            with_calibration=mixed.with_known[:5, : root.shape[1]] @ root.T,
+            with_calibration=mixed.covariance[:5, errors] @ root.T,
             noise_m=(float(np.sqrt(of_pixel[0])), float(np.sqrt(of_pixel[1]))),
-            view_m=float(mixed.levels[1]),
+            view_m=float(np.exp(mixed.logs[1])),
             ink_m=float(np.nanmedian(inks)) if np.isfinite(inks).sum() >= _FEWEST else 0.0,
             distances_m=(float(true.min()), float(true.max())),
+            of="ray" if sensor.is_ray else "z",
+            unit_m=sensor.unit_m,
+            by=sensor.by,
         ),
         further,
     )

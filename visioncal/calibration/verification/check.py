@@ -30,6 +30,7 @@ from visioncal.estimation.model_evidence import (
     with_change,
 )
 from visioncal.results import Calibration, select_matching
+from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.selecting import Choice
 
@@ -129,15 +130,16 @@ def verify(
     found = check(
         predicted, prior, board_placed_anew=board_placed_anew, with_repeats=not is_its_own
     )
-    # Depth is compared with the board, where it stands still.
-    if found.named or board_placed_anew or not any(view.depth for view in session.views):
+    if not any(view.depth for view in session.views):
         return found
     # Few sessions have depth.
     from visioncal.calibration.stages.depth import depth_now
 
-    return replace(
-        found, depth=depth_now(calibration, session, predicted.observed.base_from_flange)
-    )
+    seen = {
+        view: ViewEvidence(view, pose.corners, cam_from_target=pose.cam_from_target[0])
+        for view, pose in predicted.observed.poses.items()
+    }
+    return replace(found, depth=depth_now(calibration, session, seen))
 
 
 def check(

@@ -139,7 +139,7 @@ def verdict_of(check: Check) -> Verdict:
         words = "Alone it does not explain the stops: something else has changed too."
         anew = _runnable(check, Remedy(_sentence(_ANEW), CALIBRATE_ANEW))
         reasons.append(Finding("unexplained", words, anew))
-    return Verdict("bad", (*bad, *reasons, *(few if others else ())))
+    return Verdict("bad", (*bad, *reasons, *check.depth, *(few if others else ())))
 
 
 def _runnable(check: Check, step: Remedy) -> Remedy:
