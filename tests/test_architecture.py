@@ -288,3 +288,11 @@ def test_names_have_the_terms_of_the_field():
             if identifier == "it" or VAGUE & set(identifier.lower().split("_"))
         }
         assert not vague, (path, vague)
+
+
+def test_no_docstring_begins_with_a_relative_clause():
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    for path in modules():
+        for node in nodes(path):
+            words = (ast.get_docstring(node) or "") if isinstance(node, documented) else ""
+            assert not words.startswith(("What ", "Which ", "That ")), (path, words.splitlines()[0])

@@ -231,7 +231,7 @@ def _springs(
 
 
 def _words(elastic: ElasticResult, sigma_mm: float, readings: int, unloaded: Calibration) -> str:
-    """What the loads show, joint by joint."""
+    """Findings about the loads, joint by joint."""
     shown, bounds = [], []
     for row in elastic.joints:
         if row.stiffness_nm_per_rad is not None and row.stiffness_sigma_nm_per_rad is not None:

@@ -81,7 +81,7 @@ def parted(session: Session) -> tuple[Session, Session]:
 
 
 def causes_found(check: Check) -> tuple[str, ...]:
-    """What changed, by the check alone; empty where that is not one thing that can be recovered."""
+    """The change by the check alone; empty where it is not one that can be recovered."""
     if len(check.named) != 1:
         return ()
     name = check.named[0].name
@@ -251,7 +251,7 @@ def along(old: Calibration, causes: Iterable[str]) -> tuple[str, ...]:
 
 
 def parts_changed(old: Calibration, causes: Sequence[str], shown: Iterable[str] = ()) -> set[str]:
-    """What changed by `causes`, of what is shown by stops, or else of all that a calibration has.
+    """The changes of `causes`, among those that stops show, or else all that a calibration has.
 
     Raises:
         DataError: One of them is not possible here.

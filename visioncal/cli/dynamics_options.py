@@ -33,7 +33,7 @@ against_option = partial(
 
 @dataclass(frozen=True, kw_only=True)
 class StreamOptions:
-    """Which samples are used, and how currents become torques."""
+    """Choice of samples, and conversion of currents to torques."""
 
     stream: list[str] | None = option("A stream with torques; may be repeated. Default: all.")
     cutoff_hz: float | None = cutoff_option()
@@ -73,12 +73,12 @@ class DynamicsPlanOptions(ClearanceOptions):
     acceleration: float = kept_option("Fraction of the maximum accelerations.", default=0.9)
     torque_margin: float = kept_option("Safety factor on nominal torques.", default=1.2)
     tool: tuple[float, float] | None = numbers_option(
-        "What sticks out of the flange, along its z, in mm.",
+        "A tool that sticks out of the flange, along its z, in mm.",
         form="length,radius",
         panel="What the arm must keep",
     )
     payload: tuple[float, ...] | None = numbers_option(
-        "What the flange carries: its mass, and its centre in the flange's frame in mm.",
+        "Payload of the flange: its mass, and its centre in the flange's frame in mm.",
         form="kg,x,y,z",
         panel="What the arm must keep",
     )

@@ -42,7 +42,7 @@ def check_order(cell: LiveCell, *, is_resumed: bool) -> None:
 
 
 def recorded_cell(plan: PlanFile | None, described: RecordOptions) -> RecordedCell | PlanCell:
-    """What is recorded, by the plan or by options."""
+    """The cell that is recorded, by the plan or by options; raises DataError."""
     target, robot, mount = described.target, described.robot, described.mount
     found: RecordedCell | PlanCell
     if plan is not None:

@@ -93,7 +93,7 @@ def numbers_option(
 
 @dataclass(frozen=True, kw_only=True)
 class PartOptions:
-    """Which camera, robot and target of a cell are meant."""
+    """Choice of a camera, a robot and a target of a cell."""
 
     camera: str | None = camera_name()
     robot: str | None = robot_name()
@@ -146,7 +146,7 @@ class WorkOptions:
     no_report: bool = flag(f"Leave {REPORT} out, which takes a second to draw.")
     no_recording: bool = flag(f"Leave {RECORDING} out, for the viewer.")
     images: ImagesKept = option(
-        f"What {RECORDING} keeps of them: faint copies to look at, all of them, or none. "
+        f"Form in which {RECORDING} keeps them: faint copies to look at, all of them, or none. "
         "The corners found in them are kept in any case, and give the same result again.",
         default="thumbnail",
     )

@@ -238,7 +238,7 @@ def _with_devices(recording: RecordOptions, setup: Setup) -> RecordOptions:
 
 
 def _remembered(folder: Path) -> Setup:
-    """What was chosen last; the defaults where nothing is remembered that can be read."""
+    """The last choice; the defaults where nothing is remembered that can be read."""
     try:
         return read(Setup, read_json(folder / _REMEMBERED), _REMEMBERED)
     except DataError:
@@ -300,7 +300,7 @@ def _result(check: Path) -> Path:
 
 @dataclass(frozen=True)
 class _Checked:
-    """What a page shows of a verify.json."""
+    """A verify.json as a page shows it."""
 
     passed: bool
     sentences: tuple[str, ...]

@@ -52,7 +52,7 @@ _ACT, _TABLE, _TARGETS = "recover.json", "views.csv", "targets.csv"
 
 @dataclass(kw_only=True)
 class _Act:
-    """What recover.json holds; it grows with each step."""
+    """Content of recover.json; it grows with each step."""
 
     schema: Literal[1] = 1
     against: tuple[str, str]  # Digest of the earlier calibration's session, and when it was made.
@@ -70,7 +70,7 @@ class _Act:
 
 
 def _opened(options: RecoverOptions, old: Calibration) -> _Act:
-    """What recover.json says of a recovery, or its begin; raises DataError."""
+    """The state of a recovery by recover.json, or its begin; raises DataError."""
     folder, taught = options.folder, options.targets
     if taught is not None and taught.resolve() == (folder / _TARGETS).resolve():
         raise DataError(

@@ -76,7 +76,7 @@ class CalibrateOptions(NeedOptions, WorkOptions, ActOptions):
     views: tuple[int, ...] | None = option("These views alone.", metavar="1-12,14", parse=views_in)
     solver: SolverName = option("The joint fit, or a closed form.", default="joint")
     level: str = option(
-        "What is calibrated of the arm: hand-eye (nothing), offsets (of its joints), "
+        "Part of the arm that is calibrated: hand-eye (nothing), offsets (of its joints), "
         "kinematics, elastic (bending joints, too), thermal (drift with temperature, too).",
         default="auto",
         metavar="auto|hand-eye|offsets|kinematics|elastic|thermal",
@@ -242,7 +242,7 @@ class AuditOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class LoadOptions:
-    """What the arm carries at targets, and how warm it is."""
+    """Payload of the arm at targets, and its temperatures."""
 
     payload_kg: float = option(
         "Payload on the flange, for joints that bend (kg).", default=0.0, needs="targets"
@@ -275,7 +275,7 @@ class RecoverOptions(LoadOptions, PartOptions, ActOptions):
         "How many stops.", default=RecoveryLimits.stops, min=RecoveryLimits.fewest, max=200
     )
     cause: list[str] | None = option(
-        "What happened, where stops cannot tell; may be repeated. base: the base moved, away from "
+        "A cause that stops cannot show; may be repeated. base: the base moved, away from "
         "all that stands around it; mount: camera and tools are on another mount.",
         metavar="camera|board|base|mount|'joint N'",
     )
@@ -360,7 +360,7 @@ class CorrectOptions(LoadOptions, PartOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions(RobotPoseOptions, PartOptions, ActOptions):
-    """What places a frame, and where it goes."""
+    """Source and destination of a frame."""
 
     touches: Path | None = argument("A table of touches, or a session that shows it.", default=None)
     calibration: Path | None = option(
@@ -420,7 +420,7 @@ class FixtureOptions(FrameOptions):
 
     first: ClassVar = "calibration name cad tool out force _example"
     cad: Path | None = option("Points of the drawing: point, x_mm, y_mm, z_mm, sigma_mm.")
-    cad_unit: str | None = option("What x, y, z in it are in.", metavar="|".join(UNITS_M))
+    cad_unit: str | None = option("Unit of x, y, z in it.", metavar="|".join(UNITS_M))
     tool: str | None = option("A tool of the calibration or of a file, or none: poses of the tip.")
     _example: bool = example_flag("fixture")
 
@@ -478,7 +478,7 @@ class LocateOptions:
     target: str | None = option("Another target than the session's; see convert.")
     camera: str | None = camera_name()
     robot: str | None = robot_name()
-    view: int | None = option("Which of the session's views; else all that show the target.")
+    view: int | None = option("One of the session's views; else all that show the target.")
     pose: str | None = option(
         f"Pose of the flange at the image, for a camera on it: {POSE} in metres, or as a pendant "
         "shows it.",

@@ -149,7 +149,7 @@ class BoardOptions:
     """Options that describe a board."""
 
     kind: str | None = option(
-        "What to print.", metavar="charuco|checkerboard|aprilgrid|gridboard|circles|dots|marker"
+        "Kind of the board.", metavar="charuco|checkerboard|aprilgrid|gridboard|circles|dots|marker"
     )
     columns: int | None = option("Squares along x; inner corners of a checkerboard, tags, circles.")
     rows: int | None = option("The same along y.")
@@ -233,7 +233,7 @@ class PlanOptions(ClearanceOptions):
         "Calibrated stops to repeat for visioncal verify, five by default.", "--verify"
     )
     purpose: str | None = _what(
-        "What they are for; hand-eye, for an instrument kinematics.",
+        "Purpose of the stops; else hand-eye, for an instrument kinematics.",
         "--for",
         metavar="|".join(PURPOSES),
     )
@@ -257,7 +257,7 @@ class PlanOptions(ClearanceOptions):
     resolution: tuple[int, int] | None = _cell("Size of the images in pixels.", **SIZE)
     mount: Mount | None = _cell("Where the camera is, or that it is an instrument.")
     instrument: str | None = _cell("A known instrument, such as leica-at960.", metavar="NAME")
-    probe: Literal["point", "pose"] | None = _cell("What it reads on the flange: point (default).")
+    probe: Literal["point", "pose"] | None = _cell("Its reading on the flange: point (default).")
     cam: str | None = _cell(
         f"Rough camera on the flange (or in the base, as an instrument). {_ROUGH}", metavar=_POSE
     )
@@ -329,7 +329,7 @@ class RecordOptions(PageOptions):
     exposure_us: int | None = _device("Exposure time in microseconds.")
     gain: int | None = _device("ISO, or the device's own unit.")
     focus: int | None = _device("Lens position, in the device's own unit.")
-    plan: Path | None = option("What visioncal plan wrote: a folder, or its plan.json.")
+    plan: Path | None = option("Output of visioncal plan: a folder, or its plan.json.")
     follow: bool = flag("Move nothing: take a view whenever the arm, guided by hand, rests.")
     views: int = option("With --follow, manual or socket: end after this number.", default=0, min=0)
     resume: bool = flag("Go on with a recording that was ended or cut off.")

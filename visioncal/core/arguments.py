@@ -168,7 +168,7 @@ def _refusal(
 
 
 def _needed(entry: ErrorDetails) -> str:
-    """What is needed in place of the input of an error."""
+    """Words for valid input in place of that of an error."""
     context = entry.get("ctx", {})
     kind = context.get("class", entry["type"])
     article = "an" if kind[0] in "AEIOU" else "a"

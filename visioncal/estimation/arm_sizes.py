@@ -186,7 +186,7 @@ class _Blocks:
 
     @cached_property
     def likelihood(self) -> RobotLikelihood:
-        """That of the robots' levels, with the q errors of the arm as the last unknowns."""
+        """The likelihood of the robots' levels, with the arm's q errors as the last unknowns."""
         if not self.bases:
             return self.nominal
         factor = {COMPLIANCE: self.torque_nm / 10.0}

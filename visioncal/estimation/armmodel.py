@@ -31,7 +31,7 @@ class JointFunctions:
     # (2 n k,) prior sizes of sine and cosine of each joint and order, relative to their block.
     sizes: FloatArray
     # (2 n k, r) Jacobian of these by the block's values: combinations that the observations
-    # determine. What it does not span keeps its prior.
+    # determine. Parameters beyond its span keep their prior.
     directions: FloatArray
     length_rad: float  # Their correlation length over the joint angle [rad].
     gain: float  # Twice the gain in log-likelihood over the same arm without them.

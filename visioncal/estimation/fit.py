@@ -37,7 +37,7 @@ from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, Unknow
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """What m sightings saw relative to what the chain of frames predicts, as a forward model.
+    """Residuals of m sightings against the chain of frames, as a forward model.
 
     It is a right perturbation (rotation [rad], translation [m]); of a mere place, without rotation.
     """

@@ -350,7 +350,7 @@ class MixedModel:
 def _corrected(
     curvature: FloatArray, correction: FloatArray, step: FloatArray, change: FloatArray
 ) -> FloatArray:
-    """What to add to the curvature for the gradient's change along a short step; else nothing."""
+    """A correction of the curvature by the gradient's change along a short step; or zero."""
     moved = step != 0.0
     if np.abs(step).max(initial=0.0) > _SHORT_STEP or not moved.any():
         return np.zeros_like(correction)

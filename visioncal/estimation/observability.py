@@ -59,7 +59,7 @@ class Direction:
         return self.sigma > _OPEN
 
     def fault(self, at: str) -> str:
-        """What is wrong with it, at a noise in words."""
+        """The fault of the motion, at a noise in words."""
         if self.is_open:
             return "is not determined at all"
         return f"has a predicted sigma of {self.figure}{at}"
@@ -122,7 +122,7 @@ class Turning:
         return not self.is_still and not self.has_lone_axis
 
     def words(self, flange: FloatArray, stops: str, frame: str) -> str:
-        """What is wrong with the motion of an (m, 4, 4) flange, by names of stops and frame."""
+        """The fault of the motion of an (m, 4, 4) flange, by names of stops and frame."""
         largest, aside = np.rad2deg(self.largest_rad), np.rad2deg(self.aside_rad)
         if self.is_still and np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0)) < 1e-3:
             return f"the {stops} are all from one pose of the robot"
@@ -179,7 +179,7 @@ def chain_words(problem: Problem, mount: Mount) -> CellWords:
 
 
 def _of_straight(placed: str, flange: FloatArray) -> str:
-    """What to measure where (m, 4, 4) flange poses differ in position alone; or empty."""
+    """Advice where (m, 4, 4) flange poses differ in position alone; or empty."""
     away = flange[:, :3, 3] - flange[:, :3, 3].mean(axis=0)
     directions = int(np.sum(np.linalg.norm(away @ np.linalg.svd(away)[2].T, axis=0) > 1e-2))
     if not directions:

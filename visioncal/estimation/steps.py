@@ -46,7 +46,7 @@ _MOST_EXPLAINED = 0.99
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """What may have changed during the session."""
+    """A possible change during the session."""
 
     kind: str  # `FRAME`, `JOINT`, `SIZE` or `DRIFT`.
     of: str  # The frame; of a joint or a drift the robot, as the problem names it.
@@ -72,7 +72,7 @@ class Step:
 
     @property
     def kind(self) -> str:
-        """What changed: `FRAME`, `JOINT`, `SIZE` or `DRIFT`."""
+        """Kind of the change: `FRAME`, `JOINT`, `SIZE` or `DRIFT`."""
         return self.candidate.kind
 
     @property

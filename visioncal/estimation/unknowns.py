@@ -58,7 +58,7 @@ class Unknowns:
         return self.parts.get(Unknown(*unknown), slice(0, 0))
 
     def of(self, kind: str) -> tuple[str, ...]:
-        """What there are unknowns of a kind of, in the order of their columns."""
+        """Names of the unknowns of a kind, in the order of their columns."""
         return tuple(unknown.name for unknown in self.all_of(kind))
 
     def all_of(self, *kinds: str) -> tuple[Unknown, ...]:

@@ -1,4 +1,4 @@
-"""What may act beside noise: opened one at a time, where the score of a fit without it is clear."""
+"""Effects beside noise: opened one at a time, where the score of a fit without it is clear."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""What a lens does beyond its model: a smooth field of displacements over the image.
+"""Displacements by a lens beyond its model: a smooth field of displacements over the image.
 
 It is a Gaussian process with a squared exponential kernel, by waves over somewhat more than the
 image whose variances are the kernel's spectrum (Solin and Sarkka 2020). Its length is chosen with

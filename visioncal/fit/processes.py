@@ -51,7 +51,7 @@ _AVERAGED = 100
 
 @dataclass(frozen=True, eq=False)
 class Considered:
-    """What an arm's lasting errors change."""
+    """Changes of a fit by an arm's lasting errors."""
 
     shift: FloatArray  # (p,) of the estimate, in units of the columns.
     covariance: FloatArray  # (p, p) beyond that of independent errors, in units of the columns.
@@ -138,7 +138,7 @@ def _beyond_mean(kernel: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class StopErrors:
-    """What each stop alone says of one flange's errors, as rows in the common unknowns."""
+    """Residuals of each stop alone of one flange, as rows in the common unknowns."""
 
     stops: IntArray  # (s,)
     known: FloatArray  # (s, d, d) covariance of what it says.
@@ -158,7 +158,7 @@ class StopErrors:
 
 
 def consider(fit: Fit, flange: str) -> Considered | None:
-    """What lasting errors of one arm add; None where too few stops show any."""
+    """The changes by lasting errors of one arm; None where too few stops show any."""
     alone = _alone(fit, flange)
     if alone is None:
         return None
@@ -423,7 +423,7 @@ def _estimated(
 
 
 def _alone(fit: Fit, flange: str, added: Sequence[Products] = ()) -> StopErrors | None:
-    """What each stop alone says; None where too few say anything.
+    """Residuals of each stop alone; None of too few stops.
 
     Args:
         fit: The fit.

@@ -133,7 +133,7 @@ def _frames_with(cell: Cell, frame: str) -> set[str]:
 
 
 def _motion(cell: Cell, flange: str, frame: str, *, is_any: bool = False) -> str:
-    """What is wrong with the motion of an arm, in a frame; nothing of a turn about two axes.
+    """The fault of the motion of an arm, in a frame; nothing of a turn about two axes.
 
     If `is_any`, that is said, too.
     """

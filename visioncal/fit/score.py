@@ -1,4 +1,4 @@
-"""What more columns would explain, from the factorisation of a fit: nothing is fitted again.
+"""The gain of further columns, from the factorisation of a fit: nothing is fitted again.
 
 With the columns A, and P what the fit leaves of the rows' information, A'P y is the score of their
 values and A'P A their information; the likelihood of values ~ N(0, s^2) at the fit's other sizes
@@ -35,7 +35,7 @@ class Added:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """What the rows say of c more columns."""
+    """Score and information of c further columns."""
 
     pull: FloatArray  # (c,) A'P y.
     information: FloatArray  # (c, c) A'P A.

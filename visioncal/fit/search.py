@@ -31,7 +31,7 @@ _SCALED, _WIDENED = 4, 6
 
 @dataclass
 class Effort:
-    """What a fit took."""
+    """The cost of a fit."""
 
     linearisations: int = 0
     likelihoods: int = 0

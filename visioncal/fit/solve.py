@@ -190,7 +190,7 @@ def state_of(start: Start, effects: Sequence[Effect]) -> State:
 
 
 def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
-    """What is estimated of a cell."""
+    """The unknowns of a cell."""
     cell = start.cell
     # The turn of a frame of which places alone are known is a convention: it is held.
     held = (Prior(np.arange(3), sigma=1e-9),)

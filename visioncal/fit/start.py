@@ -394,7 +394,7 @@ class _Places:
     def _joint(
         self, pair: tuple[str, str], rows: Sequence[int], options: Sequence[Candidates]
     ) -> _Joint | None:
-        """What the sightings of a pair determine, where one or two edges are unknown."""
+        """Edges by the sightings of a pair, where one or two are unknown."""
         seen_rows = [row for row in rows if not self.cell.sightings[row].is_stated]
         if not seen_rows:
             return self._stated(rows)
@@ -472,7 +472,7 @@ class _Places:
         return found
 
     def _stated(self, rows: Sequence[int]) -> _Joint | None:
-        """What priors state of two frames where they state all of it: the last to be used."""
+        """Edges by priors of two frames that state all six numbers: the last to be used."""
         matrix, known = np.eye(4), 0
         for row in rows:
             evidence = self.cell.sightings[row].evidence
@@ -490,7 +490,7 @@ class _Places:
 def _placed(
     links: Sequence[tuple[str, str]], parts: Sequence[FloatArray], places: FloatArray
 ) -> _Joint | None:
-    """What (m, 3) places determine: rotations of frames at their ends are left as they are."""
+    """Edges by (m, 3) places: rotations of frames at their ends are left as they are."""
     near = apply_each(invert(parts[0]), places)
     far = parts[-1][:, :3, 3]
     is_point = float(np.ptp(far, axis=0).max()) < 1e-9  # But for rounding.

@@ -1,4 +1,4 @@
-"""What an effect of a known size explains, by a fit's linearisation with it.
+"""The gain of an effect of a known size, by a fit's linearisation with it.
 
 A score from the factorisation does for effects that are linear in their values. Others are
 linearised, once, at the point where the fit was.

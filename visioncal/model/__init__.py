@@ -1,4 +1,4 @@
-"""What is seen in a cell, and what it depends on: frames, arms, boards, sightings, effects."""
+"""A cell's sightings, and all that they depend on: frames, arms, boards, sightings, effects."""
 
 from visioncal.model.arm import Arm as Arm
 from visioncal.model.arm import Moments as Moments

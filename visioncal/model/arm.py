@@ -51,7 +51,7 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Reported:
-    """What a robot's rows are known to report, by view."""
+    """The reports of a robot's rows, by view."""
 
     poses: Mapping[int, FloatArray]  # (4, 4) `base_from_flange`.
     joints: Mapping[int, FloatArray]  # (n,) joint angles that belong to the model [rad].

@@ -1,4 +1,4 @@
-"""What heats arms, as sessions record it, and how arms usually follow.
+"""Heat sources of arms, as sessions record them, and the arms' usual response.
 
 Temperatures or motor currents are read from streams, or else from columns of views. Known
 properties of steel, aluminium and of warm-up are priors of what is then estimated.

@@ -1,4 +1,4 @@
-"""What `[prior.A_from_B]` of session.toml states of a cell's frames, as sightings of B by A."""
+"""Priors `[prior.A_from_B]` of session.toml on a cell's frames, as sightings of B by A."""
 
 from collections.abc import Iterator, Sequence
 

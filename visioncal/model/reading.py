@@ -139,7 +139,7 @@ def _arms(
 
 
 def _evidence(session: Session, row: Observation, corners: Corners | None) -> Evidence | None:
-    """What a row says; None where that is nothing."""
+    """The sighting of a row; None for none."""
     if corners is not None:
         return corners if len(corners.ids) >= FEWEST_CORNERS else None
     measured = row.view.matrix(MEASURED_CAM_POSE)

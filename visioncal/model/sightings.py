@@ -1,4 +1,4 @@
-"""What one frame saw of another: corners in an image, a measured pose, or a measured place."""
+"""Sightings of one frame by another: corners in an image, a measured pose, or a measured place."""
 
 from dataclasses import dataclass
 from typing import TypeAlias

@@ -39,7 +39,7 @@ def joint_words(name: str) -> str:
 
 
 def level_words(name: str) -> str:
-    """What a level of the arm's model estimates."""
+    """The parameters that a level of the arm's model estimates."""
     return LEVELS.get(name, name.replace("_", " "))
 
 

@@ -261,7 +261,7 @@ class ElasticResult(Section):
 
     @property
     def under_words(self) -> str:
-        """What bends the joints at the stops."""
+        """The loads that bend the joints at the stops."""
         return (
             f"the {self.loads_words} of the stops" if self.loads_words else "the arm's own weight"
         )

@@ -1,4 +1,4 @@
-"""What a result is valid for: `conditions` in calibration.json, which every output carries."""
+"""Conditions of a result: `conditions` in calibration.json, which every output carries."""
 
 import math
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ class Condition:
 
 
 def uncorrected_words(verdict: Verdict) -> str:
-    """That transforms belong to a calibrated arm, and what its targets cost uncorrected."""
+    """The condition of a calibrated arm, with the cost of uncorrected targets."""
     words = "The transforms belong to the calibrated arm, not to the controller's model of it"
     if verdict.good_for_mm is None or verdict.good_for_mm_uncorrected is None:
         return f"{words}."

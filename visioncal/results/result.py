@@ -86,7 +86,7 @@ class Calibration(CalibrationSections):
 
     @cached_property
     def conditions(self) -> tuple[Condition, ...]:
-        """What the result is valid for."""
+        """The conditions under which the result is valid."""
         return tuple(conditions_of(self))
 
     @property

@@ -1,4 +1,4 @@
-"""What the entries of a cell say of its years: steps, drift, and when a need will be missed.
+"""The years of a cell by its entries: steps, drift, and when a need will be missed.
 
 Assumptions, all of them: an entry's transform errs by its own covariance, times a factor of 1, 2, 4
 or 9 that all entries of a transform share (each half as likely as the one before). A transform

@@ -37,7 +37,7 @@ class ImageStore(ABC):
         return sha256(self.read(path)) if self.exists(path) else ""
 
     def search_of(self, path: str, board: str) -> Searched | None:
-        """What was found of a board in an image that is elsewhere; None where it is to be searched.
+        """Corners of a board in an image that is elsewhere; None where it is to be searched.
 
         Args:
             path: The image's.

@@ -43,7 +43,7 @@ _RIVAL = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """What an image says of the camera since the reference; without a reason it is to be used."""
+    """Motion of the camera in an image since the reference; without a reason it is to be used."""
 
     reason: str  # Why it says nothing; empty where it does.
     # (3,) rotation vector of `before_from_now`, the camera's pose in its frame before [rad]; with a
@@ -275,7 +275,7 @@ def _fitted(
 
 
 def _covariance(places: FloatArray, rows: FloatArray, rest: FloatArray) -> FloatArray:
-    """That of the jackknife over blocks of the image; NaN by too few of them.
+    """Covariance by the jackknife over blocks of the image; NaN by too few of them.
 
     Args:
         places: (n, 2) patches, in the image's sides.

@@ -165,7 +165,7 @@ class JointGuess:
 
     @property
     def fix(self) -> str:
-        """What the user can do about it."""
+        """The remedy, for the user."""
         return " Or: ".join(reading.fix for reading in self._readings)
 
 

@@ -279,7 +279,7 @@ def check_answer(run: RunState) -> None:
 
 
 def words_of(cell: Cell, part: Problem) -> CellWords:
-    """What is wrong with a motion that leaves a frame undetermined, and what to do."""
+    """The fault of a motion that leaves a frame undetermined, and its remedy."""
     if cell.mount is not None:
         return chain_words(part, cell.mount)
 

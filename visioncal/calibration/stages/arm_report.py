@@ -1,4 +1,4 @@
-"""What stops determine of a calibrated arm: its parameters, its accuracy, and remarks on both."""
+"""A calibrated arm as stops determine it: its parameters, its accuracy, and remarks on both."""
 
 from dataclasses import dataclass, field, replace
 
@@ -38,7 +38,7 @@ _PLACES = 200
 
 @dataclass(frozen=True, eq=False)
 class ArmReport:
-    """What was found of an arm."""
+    """Findings about an arm."""
 
     sections: ArmSections = field(default_factory=ArmSections)  # Its sections of a calibration.
     notes: tuple[str, ...] = ()  # Remarks that are no reason for doubt.

@@ -231,7 +231,7 @@ class RobotArm:
     def report(
         self, fit: Fit, middles: Mapping[str, FloatArray], convention: Convention | None = None
     ) -> ArmReport:
-        """What was found of the arm.
+        """Findings about the arm.
 
         Args:
             fit: The fit of a cell, with the arm's errors among the unknowns.

@@ -80,7 +80,7 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What the depth of one camera is compared with."""
+    """The board and lens with which the depth of one camera is compared."""
 
     calibration: Calibration  # Of one camera and board.
     camera: CameraResult  # Its camera.

@@ -245,7 +245,7 @@ def is_scaled(size: Size, usual: Size) -> bool:
 
 
 def _of_size(view: View, searched: Searched, size: Size) -> Searched:
-    """What was found in an image; a rejection for one of another size than the camera's."""
+    """The corners found in an image; a rejection for one of another size than the camera's."""
     if searched.size in (None, size):
         return searched
     turned = ", turned by a quarter" if searched.size == size[::-1] else ""

@@ -167,7 +167,7 @@ def _remedy(
     found: dict[str, object],
     looked: Sequence[tuple[View, Image]],
 ) -> Remedy:
-    """What to write into the description of a board, or the command that describes the one seen."""
+    """The lines to write into a board's description, or the command that describes the one seen."""
     declared, board = session.boards[name], identity.board
     share = declared.marker_m / declared.square_m
     if "kind" not in found and abs(board.marker_m - share) < 0.06:
@@ -204,7 +204,7 @@ def board_correction(session: Session | None, board: str, figures: str) -> tuple
 
 
 def _differences(declared: Target, identity: Identity) -> dict[str, object]:
-    """What an identified board has otherwise than a declared target, by the description's keys.
+    """Differences of an identified board from a declared target, by the description's keys.
 
     Empty where the images may show the declared target: a part of it, or one that is not clear.
     """

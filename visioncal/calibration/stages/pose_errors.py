@@ -94,7 +94,7 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
 def _stop_errors(
     problem: Problem, state: State, noise: Noise, robot: str
 ) -> tuple[StopErrors, FloatArray]:
-    """What each stop alone says of a robot's flange, and (s, d, 6) how that moves with it."""
+    """Residuals of each stop alone, and their (s, d, 6) derivatives by a robot's flange."""
     index, count = problem.robots.index(robot), len(problem.poses[robot])
     likelihood = robot_likelihood(problem, state, noise)
     (units,), (common,) = likelihood.model.units, likelihood.model.common

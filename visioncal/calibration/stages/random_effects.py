@@ -113,7 +113,7 @@ def _of_flange(
     kinds: Sequence[type[Named]],
     step: GrowingEffect | None = None,
 ) -> dict[Effect, float]:
-    """What may act on a flange, with its largest size."""
+    """Effects that may act on a flange, each with its largest size."""
     poses = np.where(np.isfinite(problem.poses[robot]), problem.poses[robot], np.eye(4))
     stood, count = Stood(poses, stops, is_swept=False), len(poses)
     moments = Moments({robot: poses}, {}, even_progress(count), np.arange(count))

@@ -185,7 +185,7 @@ def _entries(pose: FloatArray | None) -> FloatArray:
 
 
 def _others(row: View) -> frozenset[tuple[str, float]]:
-    """What a row measured besides: loads, temperatures, torques."""
+    """Other measurements of a row: loads, temperatures, torques."""
     own = _others_among(tuple(row.numbers))
     return frozenset((name, row.numbers[name]) for name in own)
 

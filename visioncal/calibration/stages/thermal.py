@@ -64,7 +64,7 @@ class HeatedStops:
         return replace(self, q=self.q[rows], views=views, stamps_s=stamps_s)
 
     def inputs(self) -> Inputs:
-        """What heats the arm, where it warms up during the views.
+        """The heat sources of an arm that warms up during the views.
 
         Raises:
             DataError: The session lacks data.

@@ -1,1 +1,1 @@
-"""What is wrong with a result: checks against limits, tests of its fit, causes, and the verdict."""
+"""Faults of a result: checks against limits, tests of its fit, causes, and the verdict."""

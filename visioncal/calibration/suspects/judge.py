@@ -103,7 +103,7 @@ def _status_of(doubts: Sequence[Finding], met: NeedMet | None) -> VerdictStatus:
 
 
 def in_reading_order(findings: Sequence[Finding], status: VerdictStatus) -> tuple[Finding, ...]:
-    """What is missing, the likeliest cause, its cost, other likely causes, then the rest."""
+    """Missing images, the likeliest cause, its cost, other likely causes, then the rest."""
 
     def by_likelihood(finding: Finding) -> tuple[float, int, float]:
         most = -finding.probability

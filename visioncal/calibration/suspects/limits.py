@@ -85,7 +85,7 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
 
 
 def _unexplained_words(away: Rms) -> str:
-    """What to look for where nothing that was tried explains left-out residuals."""
+    """Advice where no tried cause explains left-out residuals."""
     sides = [
         "the robot's poses (commanded or rounded ones, or read before the arm stood still; a "
         "servo arm; another tool in some rows)",

@@ -89,7 +89,7 @@ def moved_finding(moved: Moved) -> Finding:
 
 
 def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[int, str]]:
-    """What explains outliers, and why each is left out, by view.
+    """Faults that explain outliers, and the reason why each view is left out.
 
     Exchanged or wrong poses, and what moved; else the stops that a view fits instead of its own.
     """
@@ -146,7 +146,7 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
 
 
 def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str, str]:
-    """What was another one from some view on, and by how much, in words."""
+    """The frame that moved from some view on, and by how much, in words."""
     if not frame:
         return "the camera, the target or a frame of the controller", ""
     thing, edge = ("camera" if frame.startswith("cam") else "target"), cell_fit.fit.frames[frame]

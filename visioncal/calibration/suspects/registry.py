@@ -134,7 +134,7 @@ SUSPECTS: Mapping[str, Suspect] = {suspect.kind: suspect for suspect in _ENTRIES
 
 
 def found_in(run: RunState) -> Iterator[Finding]:
-    """What all suspects find in a finished run."""
+    """Findings of all suspects in a finished run."""
     for suspect in _ENTRIES:
         if suspect.finds is not None:
             yield from suspect.finds(run)

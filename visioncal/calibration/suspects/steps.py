@@ -1,4 +1,4 @@
-"""What moved, slipped or was exchanged at some stop, or drifted over the session."""
+"""Parts that moved, slipped or were exchanged at some stop, or drifted over the session."""
 
 from collections.abc import Iterator
 

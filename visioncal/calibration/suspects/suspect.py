@@ -1,4 +1,4 @@
-"""What may be wrong with a session, a cell or a result; see `registry`."""
+"""Possible faults of a session, a cell or a result; see `registry`."""
 
 import math
 from collections.abc import Callable, Iterable

@@ -123,7 +123,7 @@ class CalibrationPrior:
         return min(self.calibration.noise_dof, 1e6)
 
     def belief(self, problem: Problem, boards: IntArray | None) -> CalibrationPosterior:
-        """What is believed before a check, by its problem.
+        """The prior of a check, by its problem.
 
         `boards` are the (n,) indices of those that its observations show; None where they are not
         compared with calibrated stops that they repeat.

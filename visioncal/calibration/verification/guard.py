@@ -81,7 +81,7 @@ class Look:
 
 @dataclass(frozen=True, kw_only=True)
 class PossibleCause:
-    """What may have changed."""
+    """A possible change."""
 
     cause: str  # `camera`, `board NAME`, `joint 3`, or `none of these`.
     probability: float  # Its probability among all, given that something has changed.
@@ -93,7 +93,7 @@ class PossibleCause:
 
 @dataclass(frozen=True, kw_only=True)
 class Guarded:
-    """What the looks so far say of the calibration."""
+    """The state of the calibration after the looks so far."""
 
     look: int  # Number of looks.
     time_s: float  # Time of the last [s].

@@ -155,7 +155,7 @@ class Detector:
         )
 
     def without_candidates(self) -> "Detector":
-        """What the test has learned, with no change supposed so far."""
+        """The state of the test so far, with no change supposed."""
         none = {name: getattr(self, name)[:0] for name in CANDIDATE}
         return replace(self, **none)
 

@@ -40,7 +40,7 @@ _RARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class SceneLook:
-    """What one view says of the camera since the reference of its pose."""
+    """Motion of the camera in one view since the reference of its pose."""
 
     view: int  # Number of the view.
     reference: int  # That of the first view of the same pose; its own if it is the first.

@@ -189,7 +189,7 @@ class TableReader(NumberChecks):
 
 
 def _unit_step(names: Sequence[str], numbers: FloatArray, norms: FloatArray) -> str:
-    """What mends quaternions (4, n), of some norms (n,), of another unit or form, if anything."""
+    """The remedy of quaternions (4, n) of another unit or form, with their norms (n,); or empty."""
     known = np.isfinite(norms)
     # Squares of the largest numbers overflow, and no unit is so small.
     squares = np.clip(numbers[:, known], -1e100, 1e100) ** 2

@@ -62,7 +62,7 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
 
 
 def _mended_line(text: str, error: str) -> str:
-    """Which line of a TOML file is to be written otherwise, as a sentence; empty where unknown."""
+    """A faulty line of a TOML file and its correction, as a sentence; empty where unknown."""
     found = re.search(r"\(at line (\d+)", error)
     line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
     for pattern, right in _TOML_MISTAKES:

@@ -64,7 +64,7 @@ class Job:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What became of one session of a batch."""
+    """The outcome of one session of a batch."""
 
     name: str  # Name of the session and of its result's folder.
     session: str  # Path of the session.
@@ -193,7 +193,7 @@ def _session(job: Job) -> Session:
 
 
 def _made_by(job: Job, session: Session) -> dict[str, object]:
-    """What a result depends on."""
+    """All that a result depends on."""
     return {
         "session_sha256": session.digest(),
         "visioncal": __version__,

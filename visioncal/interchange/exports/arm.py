@@ -60,7 +60,7 @@ class ArmContent:
 
     @cached_property
     def omitted(self) -> tuple[str, ...]:
-        """What the file leaves out of the arm, with its size."""
+        """Parts of the arm that the file leaves out, with their sizes."""
         omitted, source, sag_mm = [], self.calibration, _sag_mm(self.calibration)
         if self.links is not None:
             missing = [*unexportable_functions(self.robot)]
@@ -207,7 +207,7 @@ def _warn_ur(content: ArmContent) -> Iterator[str]:
     if max(turned, moved) > 1e-4:
         yield (
             f"the flange lies {moved:.2g} mm and {turned:.2g} deg from wrist_3, which has no field "
-            "for that: a comment in the file has its pose. What sits on the flange goes behind it."
+            "for that: a comment in the file has its pose. Parts on the flange go behind it."
         )
     if content.calibration_hash is None:
         yield (

@@ -213,7 +213,7 @@ class Load:
 
 @dataclass(frozen=True)
 class Selection:
-    """What to export; None leaves the choice to the format."""
+    """The choice of an export; None leaves it to the format."""
 
     # A transform by name; None for the camera's, or in a format of tools or fixtures for the only
     # one of its kind.
@@ -260,7 +260,7 @@ class Content(Placement):
 
     @property
     def field_error_words(self) -> str:
-        """What matrix and coefficients leave of a lens's field, in words; empty without one."""
+        """The part of a lens that matrix and coefficients leave out, in words; empty for none."""
         rms_px, most_px = (0.0, 0.0) if self.lens is None else self.lens.beyond_model_px()
         if rms_px < 0.01:
             return self.poorer

@@ -41,7 +41,7 @@ def _polynomial(camera: Camera) -> tuple[FloatArray, float]:
 
     The model turns distorted places u, v of the image plane [m] into undistorted ones
     (calibrate_cameras): u + u (K1 r^2 + K2 r^4 + K3 r^6) + P1 (r^2 + 2 u^2) + 2 P2 u v, and v
-    likewise. That is linear in the coefficients: they are those nearest to the lens's own inverse.
+    likewise, linear in the coefficients: they are those nearest to the lens's own inverse.
 
     Returns:
         (5,) coefficients in units of the focal length, and the largest distance [px].

@@ -53,7 +53,7 @@ def _words(values: FloatArray) -> str:
 
 
 def _warn(content: Content) -> Iterator[str]:
-    """What a pinhole in the middle of the image leaves out of the lens."""
+    """The part of the lens that a pinhole in the middle of the image leaves out."""
     if content.lens is not None and content.frames[1].startswith("cam"):
         camera = content.lens.camera
         middle = (np.array(camera.resolution) - 1) / 2.0

@@ -36,7 +36,7 @@ class FileImages(ListedImages[Path]):
     searches: Mapping[Path, Searched] = field(default_factory=dict)
 
     def search_of(self, path: str, board: str) -> Searched | None:
-        """What was found of the board in an image before; None where it is to be searched."""
+        """Corners of the board found in an image before; None where it is to be searched."""
         del board
         return self.searches.get(self.files[path]) if path in self.files else None
 

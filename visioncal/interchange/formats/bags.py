@@ -84,7 +84,7 @@ class _Images:
 
 @dataclass(frozen=True, eq=False)
 class _Contents:
-    """What a bag holds of one cell, by topic; of images their timestamps alone."""
+    """Content of a bag by topic; of images their timestamps alone."""
 
     images: dict[str, _Images] = field(default_factory=dict)
     depths: dict[str, _Images] = field(default_factory=dict)
@@ -418,7 +418,7 @@ _READERS = {
 
 
 def _namespace(topic: str) -> str:
-    """What the topics of one camera begin with."""
+    """The beginning of the topics of one camera."""
     parts = topic.strip("/").split("/")
     endings = ("compressed", "image_raw", "image_rect", "image_color", "image_rect_color", "image")
     while parts and parts[-1] in (*endings, "camera_info"):

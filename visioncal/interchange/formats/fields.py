@@ -28,7 +28,7 @@ MOST_NUMBERS = 200
 
 
 def named_by(place: str) -> str:
-    """What the option that names fields is called after: the `columns` of a table, else a `key`."""
+    """End of the name of the option that names fields: the `columns` of a table, else a `key`."""
     return "columns" if ", line " in place else "key"
 
 
@@ -102,7 +102,7 @@ class Fields:
 
     @cached_property
     def keys(self) -> "Keys":
-        """What identifies the rows."""
+        """The key of the rows."""
         names = {"": self.stems} if self.stems else {}
         # The values of a list of their own are no keys.
         for name, cells in self.texts.items() if len({*self.numbers, *self.texts}) > 1 else ():
@@ -217,7 +217,7 @@ def appearance(numbers: FloatArray) -> str:
 
 
 def _are_rotations(flat: FloatArray) -> Mask:
-    """Which of (n, 9) numbers are rotation matrices by rows."""
+    """Whether each of (n, 9) numbers is a rotation matrix by rows."""
     # Of others the nearest rotations, which take long to compute, are not needed.
     rows_away = np.abs(np.linalg.norm(flat.reshape(-1, 3, 3), axis=2) - 1.0)
     found = np.asarray((rows_away < _NORM_TOLERANCE).all(axis=1))
@@ -309,7 +309,7 @@ def in_seconds(stamps: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Keys:
-    """What identifies n rows or files, and matches them with those of another source."""
+    """The key of n rows or files, which matches them with those of another source."""
 
     count: int
     # By the kind of key, among `HOW`, and the column, which names of files have none of.

@@ -45,7 +45,7 @@ _DRAWN = re.compile(
 
 @dataclass(frozen=True)
 class ImageKind:
-    """What an image file holds."""
+    """Content of an image file."""
 
     size: tuple[int, int]  # (width, height) [px].
     words: str  # `8-bit colour`.
@@ -76,7 +76,7 @@ class FileGroup:
 
     @property
     def name(self) -> str:
-        """What the files are called without numbers, else their folder."""
+        """Name of the files without numbers, else of their folder."""
         parts = reversed(Path(self.label).with_suffix("").parts)
         return next(filter(None, (part.replace("#", "").strip("_-. ") for part in parts)), "")
 
@@ -95,7 +95,7 @@ class FileGroup:
 
     @cached_property
     def keys(self) -> Keys:
-        """What identifies the files."""
+        """The key of the files."""
         parts = [(file.stem, *reversed(file.parent.parts)) for file in self.files]
         # In folders of their own, files of one name are identified by these.
         names = next((each for each in zip(*parts, strict=False) if len({*each}) == len(parts)), ())

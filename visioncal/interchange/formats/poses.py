@@ -258,7 +258,7 @@ class _Piece:
 
     @property
     def parent(self) -> str:
-        """What the fields stand in."""
+        """The table of the fields."""
         return self.names[0].rpartition(".")[0]
 
 

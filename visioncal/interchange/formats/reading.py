@@ -301,7 +301,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
 
 
 def read_record(path: Path, document: object = None) -> dict[str, object]:
-    """What the file of one view holds, by name; numbers without a name are its `matrix`."""
+    """Content of the file of one view, by name; numbers without a name are its `matrix`."""
     if path.suffix.lower() in DOCUMENTS:
         document = document or read_document(path)
     elif not (document := _keyed(text := read_plain_text(path)) or _halcon(text, path)):

@@ -94,7 +94,7 @@ class DoubtfulSession:
 
 
 def _measured(session: Session, progress: Progress | None) -> RunState:
-    """What the camera's poses need, whatever the robot's are; raises as `DoubtfulSession.guess`."""
+    """The turn of the camera's poses, for any of the robot's; raises as `DoubtfulSession.guess`."""
     # The offset of a stream's clock is found by rotation angles, which no reading changes.
     by_clock = {"robot", "clock"} if waits_for_clock(session) else set()
     names = {"detect", "intrinsics", "pnp"} | by_clock
@@ -201,7 +201,7 @@ def _reordered(foreign: ForeignRecording) -> Iterator[ForeignRecording]:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What the camera saw in some rows of a source, by which its readings are tested."""
+    """Corners in some rows of a source, by which its readings are tested."""
 
     run: RunState | None  # With the board's poses by the images; None for poses of the target.
     images: tuple[Path | None, ...]  # The images of these rows.
@@ -216,7 +216,7 @@ class _Seen:
         progress: Progress | None,
         searches: Mapping[Path, Searched],
     ) -> Self:
-        """What was seen in at most so many rows; raises VisioncalError.
+        """The corners in at most so many rows; raises VisioncalError.
 
         `searches` has what was found in images before.
         """
@@ -236,7 +236,7 @@ class _Seen:
 
     @property
     def searches(self) -> dict[Path, Searched]:
-        """What was found in the images, by file."""
+        """The corners found in the images, by file."""
         if self.run is None or not isinstance(images := self.run.session.images, FileImages):
             return {}
         views, found = self.run.session.views, self.run.searches
@@ -344,7 +344,7 @@ def _untested(
                 culprits=[f"--{whose}-form"],
                 next_step=f"Say --{whose}-form {forms}.",
             )
-    note = f"What the source does not say of its poses was not tested: {why}."
+    note = f"Forms of poses that the source does not state were not tested: {why}."
     return replace(foreign, notes=(*foreign.notes, note))
 
 

@@ -1,4 +1,4 @@
-"""What an unknown source holds: files by kind, rows of named values, images and lenses.
+"""Content of an unknown source: files by kind, rows of named values, images and lenses.
 
 `describe` reads a source, and `proposed` ranks which of its rows may be a recording's.
 """
@@ -60,7 +60,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What a file or folder holds."""
+    """Content of a file or folder."""
 
     path: Path
     parts: tuple[Part, ...]

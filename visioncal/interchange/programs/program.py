@@ -54,7 +54,7 @@ class Use:
 
 @dataclass
 class Found:
-    """What a reader finds in a program."""
+    """Content of a program."""
 
     uses: list[Use] = field(default_factory=list)
     left: list[str] = field(default_factory=list)  # What stays, and why.

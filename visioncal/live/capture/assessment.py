@@ -1,4 +1,4 @@
-"""What the views so far amount to: coverage, advice, predicted accuracy, joints against poses."""
+"""Assessment of the views so far: coverage, advice, predicted accuracy, joints against poses."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

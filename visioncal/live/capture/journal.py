@@ -51,7 +51,7 @@ _SPARE_BYTES = 256_000
 
 @dataclass(frozen=True, eq=False)
 class RecordedCell:
-    """What a recording without a plan is of; that of a plan is its cell."""
+    """The cell of a recording without a plan."""
 
     mount: Mount
     target: Target

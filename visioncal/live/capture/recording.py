@@ -41,7 +41,7 @@ class CaptureEvent:
 
     @property
     def words(self) -> str:
-        """What became of it: `view 2: 54 corners, edges 0.8 px, 0.01 px still`."""
+        """The outcome: `view 2: 54 corners, edges 0.8 px, 0.01 px still`."""
         view = self.found
         if isinstance(view, Missed):
             return f"view {self.view}: not taken: {view.reason}"

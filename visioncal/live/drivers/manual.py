@@ -106,9 +106,7 @@ class ManualArm:
         forms = possible_forms(line)
         while self._form is None and len(forms) > 1:
             # Asked once: a pendant keeps its form.
-            chosen = self._answer(
-                f"That may be a pose of {', '.join(forms)}. Which is it? "
-            ).strip()
+            chosen = self._answer(f"It may be a pose of {', '.join(forms)}: of which? ").strip()
             self._form = chosen if chosen in forms else None
         try:
             return read_pose(line, "the line", self._form)

@@ -1,4 +1,4 @@
-"""What streaming cameras share: a thread that reads them, and the first picture that is new enough.
+"""Streaming cameras: a thread that reads them, and the first picture that is new enough.
 
 Unread pictures wait in a driver's or a network's buffers and get old. A thread therefore takes all
 of them as they come, and notes the time.

@@ -133,7 +133,7 @@ class Admission:
         return query
 
     def _refused(self, asked: HTTPConnection) -> Response | None:
-        """What a request gets that is not for the page; None for one that is."""
+        """The answer to a request that is not for the page; None for one that is."""
         by, is_socket = asked.headers, asked.scope["type"] == "websocket"
         host, *others = by.getlist("host") or [""]
         match = _HOST.fullmatch(host.lower())

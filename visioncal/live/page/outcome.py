@@ -1,4 +1,4 @@
-"""What a calibration or a check says of the views so far, by the command that a user would run."""
+"""Calibration or check of the views so far, by the command that a user would run."""
 
 import json
 import os

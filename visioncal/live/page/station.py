@@ -52,7 +52,7 @@ _CHANGED = (
 
 @dataclass(frozen=True)
 class Setup:
-    """What a page asks before a recording begins, in the words of the command line."""
+    """Questions of a page before a recording begins, in the words of the command line."""
 
     target: str = "charuco_9x6_30mm"  # The board.
     mount: str = "eye-in-hand"
@@ -65,7 +65,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class PageText:
-    """What a page asks and says."""
+    """Questions and words of a page."""
 
     title: str
     # Fields of the setup that are asked for, by their names: label, and what may be chosen.
@@ -118,7 +118,7 @@ class Visitor:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """What pages show."""
+    """Content of the pages."""
 
     phase: Literal["setup", "opening", "live", "stopped"] = "setup"
     setup: Setup = field(default_factory=Setup)
@@ -570,7 +570,7 @@ class Station:
         return tuple(rows)
 
     def _outdated(self) -> str:
-        """What has changed since the newest outcome."""
+        """The change since the newest outcome, in words."""
         outcome, views = self.snapshot.outcome or self.snapshot.trial, self._capture.journal.views
         if outcome is None or outcome.views == views:
             return ""

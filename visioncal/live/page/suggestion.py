@@ -89,7 +89,7 @@ def _apart(views: FloatArray, view: FloatArray, centre: FloatArray, lens: Camera
 
 
 def near(flanges: FloatArray, taken: FloatArray) -> Mask:
-    """Which poses of the flange (k, 4, 4) are near those taken (n, 4, 4), and no farther out [m].
+    """Whether poses of the flange (k, 4, 4) are near those taken (n, 4, 4), and no farther out [m].
 
     Where an arm has stood it can stand; what it reaches beyond, and what stands there, only its
     user knows.

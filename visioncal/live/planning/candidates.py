@@ -148,7 +148,7 @@ class _CandidateSearch:
         words = some_of([f"{times} to {limit}" for limit, times in (+self.lost).most_common()], 6)
         return DataError(
             f"plan: {len(self.kept)} of {self._count} possible stops were found in "
-            f"{max(self.tried.values())} tries. Lost were {words}. Most in the way is {worst}, "
+            f"{max(self.tried.values())} tries; {words} were lost. Most in the way is {worst}, "
             f"which kept out {100.0 * shares[worst]:.1f} % of those that came so far.",
             culprits=[worst],
             next_step=_ADVICE[worst],

@@ -87,7 +87,7 @@ class InstrumentPlan:
         return float(np.linalg.cond(self._phi(q)[:, self._identifiable])) ** 2
 
     def sentences(self, seed: int) -> tuple[str, ...]:
-        """What the stops give, and what as many random ones would."""
+        """The accuracy by the stops, and by as many random ones, in words."""
         rng = np.random.default_rng(seed)
         count = len(self.q) + len(self.recorded)
         chance = rng.choice(len(self.candidates), min(count, len(self.candidates)), replace=False)

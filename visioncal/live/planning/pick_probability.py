@@ -40,7 +40,7 @@ class Picking:
         chances = []
         for cell, world in zip(self.cells, self.worlds, strict=True):
             # Covariances of picks at the target are in the axes of what carries the camera: the
-            # flange, or the base. That of the camera's pose is of a right perturbation.
+            # flange, or the base; that of the camera's pose is of a right perturbation.
             noise = np.repeat(cell.noise.robots[0], 3) ** 2
             middle = corner_positions(cell.target).mean(axis=0)
             points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]

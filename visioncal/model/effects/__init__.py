@@ -1,4 +1,4 @@
-"""What moves a frame, or changes a lens, beside noise: one file an effect.
+"""Effects that move a frame, or change a lens, beside noise: one file each.
 
 Those that a finding names are in `NAMED`, too.
 """

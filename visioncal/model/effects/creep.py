@@ -95,9 +95,9 @@ class BaseCreeps(_Creep, _OfBase):
 
 @dataclass(frozen=True, eq=False)
 class MountCreeps(_Creep, _OfMount):
-    """What the flange carries, which creeps."""
+    """Creep of all that the flange carries."""
 
-    kind, what = "mount creeps", "What the flange carries"
+    kind, what = "mount creeps", "The load on the flange"
     do = "Fasten what the flange carries, let the cell warm up, and record again."
 
 
@@ -121,6 +121,6 @@ class BaseSteps(_Step, _OfBase):
 
 @dataclass(frozen=True, eq=False)
 class MountSteps(_Step, _OfMount):
-    """What the flange carries, which was moved at once."""
+    """A sudden move of all that the flange carries."""
 
     kind = "mount steps"

@@ -122,7 +122,7 @@ class Named(ABC):
     @classmethod
     @abstractmethod
     def says(cls, values: FloatArray) -> str:
-        """What (c,) estimated values mean, as a sentence."""
+        """The meaning of (c,) estimated values, as a sentence."""
 
 
 @dataclass(frozen=True, eq=False)

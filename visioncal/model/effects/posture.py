@@ -119,7 +119,7 @@ class BracketBends(PostureEffect, Named):
         turn, shift = (np.linalg.norm(at, ord=2) for at in values.reshape(2, 3, 3))
         by = mm_and_deg(1e3 * float(shift), float(np.rad2deg(turn / 0.1)))
         return (
-            f"What the flange carries bends with its weight, by up to {by}. The result is that of "
+            f"The load on the flange bends with its weight, by up to {by}. The result is that of "
             "the views' mean attitude."
         )
 

@@ -116,7 +116,7 @@ def image_names(record: Record) -> list[str]:
 
 
 def searches_of(record: Record) -> dict[tuple[str, str], Searched]:
-    """What was found in images, by their names and those of their boards."""
+    """Corners found in images, by their names and those of their boards."""
     return {
         (image, board): Searched(
             Rejection(0, found) if isinstance(found, str) else Corners(0, *found),

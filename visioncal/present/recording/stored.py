@@ -165,7 +165,7 @@ class RecordedImages(ImageStore):
         return self._stored(path) if self.kept == "thumbnail" and path in self.places else None
 
     def search_of(self, path: str, board: str) -> Searched | None:
-        """What was found of a board in an image; None where it was not searched."""
+        """Corners of a board in an image; None where it was not searched."""
         return self.searches.get((path, board))
 
     def absence(self, path: str) -> str:

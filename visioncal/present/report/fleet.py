@@ -23,7 +23,7 @@ _CHECKS = ("calibrated", "verified", "touched")
 
 @dataclass(frozen=True, order=True)
 class Matter:
-    """What is to be said of a cell."""
+    """A remark on a cell."""
 
     rank: int  # Its place among the matters of all cells; the least comes first.
     words: str  # In sentences, with what to do.
@@ -74,7 +74,7 @@ class FleetRow:
 
     @cached_property
     def matters(self) -> list[Matter]:
-        """What is to be said of it, the worst first; never empty."""
+        """Remarks on the cell, the worst first; never empty."""
         worst, last = self.worst, self.last(*_CHECKS)
         if worst is None:
             return [Matter(0, self.failure)]

@@ -104,7 +104,7 @@ def write_certificate(
 
 
 def _head(kind: str, calibration: Calibration, session: Session | None) -> dict[str, object]:
-    """What report and certificate begin and end with."""
+    """Beginning and end of report and certificate."""
     cell = calibration.cell
     subject = calibration.mount if cell is None else network.kinds(calibration.tree)
     return {

@@ -99,7 +99,7 @@ class Charuco(Board):
         return tuple(grids)
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it."""
+        """The words on a printed sheet."""
         layout = "legacy layout" if target.legacy else "layout of OpenCV 4.6 and later"
         return (
             f"ChArUco, {target.columns} x {target.rows} squares of {1e3 * target.square_m:g} mm, "

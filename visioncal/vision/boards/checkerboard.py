@@ -71,7 +71,7 @@ class Checkerboard(Board):
         return (Cells(np.full(2, -side), side, (row + column) % 2 == 0),)
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it."""
+        """The words on a printed sheet."""
         return (
             f"checkerboard, {target.columns} x {target.rows} inner corners, squares of "
             f"{1e3 * target.square_m:g} mm",

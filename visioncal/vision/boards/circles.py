@@ -100,7 +100,7 @@ class CircleGrid(Board):
         return places
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it."""
+        """The words on a printed sheet."""
         side_mm, steps = 1e3 * target.square_m, target.rows - 1
         words = self.words(target, f"{target.columns} x {target.rows}")
         return (

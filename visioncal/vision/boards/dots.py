@@ -118,7 +118,7 @@ class Dots(PointsKind, Board):
         )
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it."""
+        """The words on a printed sheet."""
         large = _large(target)
         apart = cdist(large_m := self.corners(target)[large], large_m)
         first, second = np.unravel_index(int(apart.argmax()), apart.shape)

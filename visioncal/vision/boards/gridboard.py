@@ -112,7 +112,7 @@ class GridBoard(BoardKind):
         )
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it."""
+        """The words on a printed sheet."""
         side_mm = 1e3 * target.square_m
         sides = target.columns + (target.columns - 1) * target.spacing
         return (

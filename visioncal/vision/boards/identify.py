@@ -419,7 +419,7 @@ class _Grid:
         kind, columns, *_ = self.tied[0]
         others = {one.columns for one in self.tied if one.kind == kind and not one.first}
         if more := [str(count) for count in sorted(others - {columns})[:4]]:
-            yield f"What is seen of it fits {listed(more)} columns as well: show more of the board."
+            yield f"Its visible part fits {listed(more)} columns as well: show more of the board."
 
 
 def describe(identity: Identity) -> str:

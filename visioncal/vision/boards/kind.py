@@ -136,7 +136,7 @@ class BoardKind(ABC):
 
     @abstractmethod
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it: words, the origin's place, how to measure its size."""
+        """The words on a printed sheet: its name, the origin's place, how to measure its size."""
 
     @abstractmethod
     def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:

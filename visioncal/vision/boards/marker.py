@@ -68,7 +68,7 @@ class MarkerKind(BoardKind):
         return (Cells(np.full(2, -0.5 * side), side / len(dark), dark),)
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it."""
+        """The words on a printed sheet."""
         return (
             f"{self.words(target, '')}, {1e3 * target.square_m:g} mm a side",
             "the marker's centre",

@@ -1,7 +1,7 @@
 """Any flat print as a target: a poster, a label, a circuit board, by its picture.
 
 Features give the start (Lowe 2004, SIFT; Barath et al. 2020, MAGSAC++), and the picture is then
-registered to all pixels. What leaves are the places of some hundred patches, each by its own
+registered to all pixels. It leaves the places of some hundred patches, each by its own
 pixels, which serve as a board's corners do.
 """
 
@@ -125,7 +125,7 @@ class Picture(BoardKind):
         return np.zeros(2), target.square_m * np.array([1.0, shape[0] / shape[1]])
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it."""
+        """The words on a printed sheet."""
         width, height = (1e3 * self.extent_m(target)[1]).tolist()
         return (
             f"picture, {width:g} x {height:.4g} mm",
@@ -227,7 +227,7 @@ class _Known:
     def _agreeing(
         self, seen: Features, pairs: IntArray
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """What `matched` gives, by (m, 2) indices of features; None where they do not agree."""
+        """The answer of `matched`, by (m, 2) indices of features; None where they do not agree."""
         if len(pairs) < _FEWEST:
             return None
         places = self.print_.texel_m * (self.features.px[pairs[:, 1]] + 0.5)

@@ -156,7 +156,7 @@ class Rig(PointsKind):
         return tuple(grids)
 
     def on_sheet(self, target: Target) -> tuple[str, str, str]:
-        """What a printed sheet says of it."""
+        """The words on a printed sheet."""
         return (
             f"{len(target.point_tags) // 4} tags of {target.dictionary}",
             "the origin of the table of their corners",
