@@ -196,7 +196,7 @@ def _motion(run: RunState) -> Iterator[Finding]:
 
 
 def _judged(run: RunState, poses: FloatArray) -> Findings:
-    """What the verdict knows of the motion of a robot, by the poses (n, 4, 4) of its stops."""
+    """The verdict's findings about a robot's motion, by the poses (n, 4, 4) of its stops."""
     can_tilt = len(poses) < 2 or Turning.of(poses).is_enough
     model, seen = run.robot, 0.0 if run.scenes else None
     arm = JudgedArm(
