@@ -9,9 +9,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration.guess import Candidate, Guess
-from visioncal.calibration.guess.readings import Hypothesis
-from visioncal.calibration.guess.search import CLEAR, FEWEST_ROWS
+from visioncal.calibration.guess import CLEAR, FEWEST_ROWS, Candidate, Guess, Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,

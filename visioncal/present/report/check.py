@@ -4,10 +4,13 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from visioncal.calibration.verification.change_hypotheses import NOISE
-from visioncal.calibration.verification.check import Check
-from visioncal.calibration.verification.messages import change_words, listed_changes
-from visioncal.calibration.verification.triggers import Trigger
+from visioncal.calibration.verification import (
+    NOISE,
+    Check,
+    Trigger,
+    change_words,
+    listed_changes,
+)
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
