@@ -26,6 +26,7 @@ from visioncal.core.types import Camera
 from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document, export
 from visioncal.interchange.result_files import load_calibration, load_result_or_frames
 from visioncal.results import Calibration, CameraResult, Edge, FrameFile, Verdict
+from visioncal.results.depth import DepthCamera, DepthResult
 from visioncal.vision.camera import (
     intrinsics,
     normalise,
@@ -90,6 +91,41 @@ def test_any_edge_and_frame_and_its_inverse(name):
             assert off(name, export(source, name, Selection(edge)), matrix) < 1e-9
             inverse = export(source, name, Selection(edge, inverse=True))
             assert off(name, inverse, invert(matrix)) < 1e-9
+
+
+def test_the_depth_camera_is_a_frame_of_the_tree():
+    beside = compose(
+        exp(np.array([0.01, -0.03, 0.005, 0, 0, 0]))[:3, :3], np.array([0.05, 0, 0.01])
+    )
+    lens = SAMPLE.camera.camera
+    depth = DepthResult(
+        scale=1.0, offset_m=0.0, tilt_m=(0.0, 0.0), bowl_m=0.0, covariance=np.eye(5) * 1e-8,
+        noise_m=(0.0, 1e-3), view_m=0.0, distances_m=(0.3, 1.0),
+        by=DepthCamera(**vars(lens), cam_from_depth=beside, sigmas=(1e-3, 2e-4)),
+    )  # fmt: skip
+    source = replace(SAMPLE, camera=replace(SAMPLE.camera, depth=depth))
+    x = SAMPLE.edges["flange_from_cam"].matrix
+    for name, matrix in (("cam_from_depth", beside), ("flange_from_depth", x @ beside)):
+        for to in ("ros", "urdf", "kuka", "text"):
+            assert off(to, export(source, to, Selection(name)), matrix) < 1e-9
+    stated = yaml.safe_load(export(source, "ros", Selection("cam_from_depth")))
+    assert stated["header"]["frame_id"] == "camera_optical_frame"
+    assert stated["child_frame_id"] == "camera_depth_optical_frame"
+    text = export(source, "text", Selection("flange_from_depth"))
+    sigma_mm = float(text.partition("sigma ")[2].split()[0])
+    spread = log(invert(x @ beside) @ x @ exp(RNG.multivariate_normal(
+        np.zeros(6), SAMPLE.edges["flange_from_cam"].covariance, 20_000)) @ beside)  # fmt: skip
+    spread = spread + RNG.standard_normal(spread.shape) * np.repeat([1e-3, 2e-4], 3)
+    worth = 1e3 * np.sqrt(np.trace(np.cov(spread[:, 3:].T)))
+    assert sigma_mm == pytest.approx(worth, rel=0.06)  # of two digits
+    # In the tree each frame has one parent.
+    joints = ET.fromstring(export(source, "urdf", Selection("all"))).findall("joint")
+    ends = {(one.find("child").get("link"), one.find("parent").get("link")) for one in joints}
+    assert ("camera_depth_optical_frame", "camera_optical_frame") in ends
+    assert ("camera_optical_frame", "tool0") in ends
+    assert len({child for child, _ in ends}) == len(joints)
+    with pytest.raises(DataError, match="frame of a camera's body"):
+        export(source, "ros", Selection("flange_from_depth", child="camera_depth_frame"))
 
 
 def test_every_format_is_read_by_a_test_and_has_a_name_of_its_own():

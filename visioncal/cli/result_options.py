@@ -311,7 +311,7 @@ class ExportOptions(PartOptions):
     source: Path = argument("An output folder, its .json, a recording, or a file of frames.")
     to: str = option("A format, as ros or ur; see --list.", default=REQUIRED, metavar="FORMAT")
     out: Path | None = out_file()
-    edge: str | None = option("The transform; of a cell any frame from any other, or all.")
+    edge: str | None = option("The transform, or all; of a cell any frame from any other.")
     inverse: bool = flag("Write the inverse of it.")
     parent: str | None = option("Exported name of the frame in which the pose is given.")
     child: str | None = option("Exported name of the frame whose pose it is.")

@@ -90,7 +90,6 @@ class Sensor:
     unit_m: float | None  # The unit of depth pictures, where stated [m].
     is_ray: bool  # Whether distances are along the ray.
     by: DepthCamera | None = None  # The camera that measures depth, where it is another one.
-    place: tuple[float, float] = (0.0, 0.0)  # Standard deviations of its pose, per axis [rad], [m].
 
     @classmethod
     def of(cls, pair: Calibration, session: Session, camera: str, board: str) -> "Sensor":
@@ -106,8 +105,10 @@ class Sensor:
             return sensor
         prior = session.declaration.prior["cam_from_depth"]
         pose = np.eye(4) if prior.pose is None else prior.pose
-        by = DepthCamera(**vars(own.stated), cam_from_depth=pose)
-        return replace(sensor, by=by, place=(prior.sigma_rad or 0.0, prior.sigma_m or 0.0))
+        sigmas = (prior.sigma_rad or 0.0, prior.sigma_m or 0.0)
+        return replace(
+            sensor, by=DepthCamera(**vars(own.stated), cam_from_depth=pose, sigmas=sigmas)
+        )
 
     @property
     def lens(self) -> Camera:
@@ -119,7 +120,8 @@ class Sensor:
         """(c, q) root of the covariance of edges, lens, field, board's shape and place."""
         known = self.camera.covariance_with(self.calibration.joint_covariance[:12, :12])
         count, lens = len(known), 4 + len(self.camera.camera.distortion)
-        shape, place = np.zeros(self.shape.shape[2]), np.repeat(self.place, 3)
+        shape = np.zeros(self.shape.shape[2])
+        place = np.repeat((0.0, 0.0) if self.by is None else self.by.sigmas, 3)
         covariance = block_diag(known, np.diag(shape), np.diag(place**2))
         if (fit := self.calibration.joint_fit) is not None:
             looks = np.array(fit.looks, dtype=np.int64)

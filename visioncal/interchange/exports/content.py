@@ -6,11 +6,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
+import numpy as np
 import yaml
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.number_format import did_you_mean, figure
+from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
@@ -110,8 +112,8 @@ def ends_of(name: str) -> tuple[str, str]:
 
 
 def is_camera(frame: str) -> bool:
-    """Whether a frame, by our name, is a camera's optical frame."""
-    return bool(frames_of_kind((frame,), "camera"))
+    """Whether a frame, by our name, is a camera's optical frame, of images or of depth."""
+    return frame == "depth" or bool(frames_of_kind((frame,), "camera"))
 
 
 def is_kind(name: str, kind: FrameKind) -> bool:
@@ -137,6 +139,7 @@ def placements(source: Source, camera: str | None = None) -> Placements:
             name: Placement(edge, origin, source.verdict, edge.oriented, conditions=holds)
             for name, edge in source.edges.items()
         }
+        edges |= _of_depth(source, edges)
         by_name = edges | {name: replace(one, conditions=holds) for name, one in frames.items()}
         words = "this calibration"
         return Placements(by_name, tuple(frames), words, source.mount, source.camera)
@@ -158,6 +161,25 @@ def placements(source: Source, camera: str | None = None) -> Placements:
             )
         lens = lenses[frame]
     return Placements(edges | frames, tuple(frames), "this cell", None, lens, source, lenses)
+
+
+def _of_depth(source: Calibration, edges: Mapping[str, Placement]) -> dict[str, Placement]:
+    """The camera of depth beside that of the images: in this one's frame, and in its parent's."""
+    model = None if source.camera is None else source.camera.depth
+    if model is None or model.by is None or source.mount is None:
+        return {}
+    on_camera = edges[HAND_EYE[source.mount]]
+    pose, origin = model.by.cam_from_depth, f"stated in session {source.session_name!r}"
+    stated = Edge(pose, np.diag(np.repeat(model.by.sigmas, 3) ** 2))
+    # T exp(x) D exp(y) = T D exp(adjoint(D^-1) x + y).
+    carried = adjoint(invert(pose))
+    covariance = carried @ on_camera.edge.covariance @ carried.T + stated.covariance
+    placed = Edge(on_camera.edge.matrix @ pose, covariance)
+    parent = HAND_EYE[source.mount].removesuffix("cam")
+    return {
+        f"{parent}depth": replace(on_camera, edge=placed),
+        "cam_from_depth": replace(on_camera, edge=stated, origin=origin),
+    }
 
 
 def worst_of(verdicts: Iterable[Verdict]) -> Verdict:

@@ -25,6 +25,7 @@ from visioncal.interchange.exports.content import (
     Placements,
     Selection,
     Source,
+    ends_of,
     is_camera,
     is_kind,
     placements,
@@ -47,7 +48,7 @@ EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     *ARMS,
 )
 _EVERYTHING = Selection()
-# In place of a transform's name: all transforms of a cell.
+# In place of a transform's name: all transforms.
 _ALL = "all"
 # Such a name needs no quotes in YAML, XML, Python or a shell, and is no command option.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*", re.ASCII)
@@ -109,15 +110,17 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
         available = placements(source, selection.camera)
         _check_takes(form, selection)
         one = (getattr(selection, field) for field in OF_TRANSFORMS if field != "edge")
-        if form.write_all is None or any(one) or available.cell is None:
+        if form.write_all is None or any(one):
             forms = [one.name for one in EXPORT_FORMATS if getattr(one, "write_all", None)]
             raise DataError(
-                f"--edge all: all transforms are of a whole cell, written as {', '.join(forms)}, "
-                "without --inverse, --parent and --child.",
+                f"--edge all: all transforms are written as {', '.join(forms)}, without --inverse, "
+                "--parent and --child.",
                 culprits=["--edge"],
                 next_step=f"Name one of {', '.join(available.by_name)}.",
             )
-        contents = tuple(_content(form, selection, available, name) for name in available.by_name)
+        # In a tree, a frame has one parent: the depth camera's is that of the images.
+        names = {ends_of(name)[1]: name for name in available.by_name}
+        contents = tuple(_content(form, selection, available, name) for name in names.values())
         text = form.write_all(contents)
     else:
         contents = (select(source, selection, form),)

@@ -149,13 +149,19 @@ FILES = (
 )
 
 
-ROS_FRAMES: Mapping[str, str] = {"base": "base", "flange": "tool0", "cam": "camera_optical_frame"}
+ROS_FRAMES: Mapping[str, str] = {
+    "base": "base",
+    "flange": "tool0",
+    "cam": "camera_optical_frame",
+    "depth": "camera_depth_optical_frame",
+}
 _MEANINGS: Mapping[str, str] = {
     "base": "the controller's own base frame; base_link may differ (on a UR it is turned by "
     "180 deg about z)",
     "flange": "the frame of the session's robot poses, which is the robot's tool0 where they were "
     "reported without a tool",
     "cam": "the camera's optical frame: z forward, x right, y down",
+    "depth": "the depth camera's optical frame, which its clouds are in",
     "target": "the frame of the printed target",
     "tool": "the tool's frame: its origin is the tool's centre point",
     "fixture": "the fixture's own frame",
