@@ -124,7 +124,7 @@ def test_any_frame_is_placed_in_any_other_with_the_covariance_of_the_chain(clean
     # Differences of 1e-6 are exact to 1e-6 of themselves.
     covariance = found.between(*ends, poses).covariance
     np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-13)
-    raised(DataError, "moves with robot 'b': its pose is needed", found.between, *ends)
+    raised(DataError, "moves with robot .b., whose pose must be given", found.between, *ends)
     raised(DataError, "no frame 'cam_lft'", found.between, "cam_lft", "base_a")
 
 

@@ -179,8 +179,18 @@ def hardly_turned(seed, noise_rad=2e-4):
         (partial(hardly_turned, noise_rad=0.0), "eye-in-hand", 6, "differ in position only"),
         (hardly_turned, "eye-in-hand", 6, "differ in position only"),
         (hardly_turned, "eye-to-hand", 6, "differ in position only"),
-        (lambda _: some_motion(0), "eye-in-hand", 1, "0 usable stops of the robot, at least 3"),
-        (lambda _: some_motion(1), "eye-in-hand", 1, "1 usable stop of the robot, at least 3"),
+        (
+            lambda _: some_motion(0),
+            "eye-in-hand",
+            1,
+            "0 usable stops of the robot, but it takes at least 3",
+        ),
+        (
+            lambda _: some_motion(1),
+            "eye-in-hand",
+            1,
+            "1 usable stop of the robot, but it takes at least 3",
+        ),
         (
             lambda _: np.repeat(some_motion(1), 12, axis=0),
             "eye-in-hand",

@@ -232,7 +232,7 @@ def test_a_misspelt_point_is_named_and_measured_poses_come_before_readings():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda q: q[:3], "3 usable stops of the robot; at least 4"),
+        (lambda q: q[:3], "3 usable stops of the robot, but it takes at least 4"),
         (
             lambda q: np.repeat(q[:1], 12, axis=0),
             "12 used views are all from one pose of the robot",

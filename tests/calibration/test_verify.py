@@ -340,7 +340,7 @@ def test_other_cells_are_refused_by_what_differs(place):
         raised(DataError, words, predict_stops, wrong, prior)
     board, wider = session.target, replace(session.target, columns=11)
     several = replace(prior, targets={"floor": board, "wall": replace(board, rows=8)})
-    for target, words in ((None, "which of the targets"), (wider, "is none of those")):
+    for target, words in ((None, "which of the targets"), (wider, "must be one of those")):
         raised(DataError, words, predict_stops, replace(session, target=target), several)
     known = known_again(place.cell, np.random.default_rng(9))
     small = replace(known.cameras["cam"], resolution=(640, 480))

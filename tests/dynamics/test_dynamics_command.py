@@ -83,7 +83,7 @@ def test_json_holds_what_was_asked_for(folder):
     ("arguments", "words"),
     [
         (("--stream", "exite"), "no stream 'exite'; it has excite, fresh, motors, sweeps"),
-        (("--stream", "motors"), "currents and no torques; 6 gains"),
+        (("--stream", "motors"), "currents and no torques: it needs 6 gains"),
         (("--stream", "excite", "--validate-on", "excite"), "its only stream of torques"),
         (("--stream", "excite", "--friction", "dry"), "--friction names dry"),
         (("--stream", "excite", "--gains", "1,x"), "--gains is '1,x'"),

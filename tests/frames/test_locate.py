@@ -398,7 +398,7 @@ def test_one_image_needs_a_target_and_a_pose(cell, tmp_path):
     (same,) = shown(source=session, calibration=calibration, view=31)
     assert found["image"] == "shot.png"
     np.testing.assert_allclose(found["p_base_m"], same["p_base_m"], atol=1e-9)
-    refused("--target is needed", "locate", image, calibration=calibration)
+    refused("name it with --target", "locate", image, calibration=calibration)
     other = wanted | {"target": "aprilgrid_6x4_32mm"}
     refused(r"shot\.png: target aprilgrid", "locate", **other, pose=pose)
     if pose is not None:
@@ -431,7 +431,7 @@ def test_pixels_are_placed_on_planes(cell):
         wanted = {"source": session, "calibration": file, "pixel": [PIXEL], "plane": "z=-50"}
         (found,) = shown(**wanted, view=31)
         np.testing.assert_allclose(found["p_base_m"], expected.p_base, atol=1e-9)
-        refused(r"4 views, .* --view is needed", "locate", **wanted)
+        refused(r"4 views, .* name one with --view", "locate", **wanted)
         refused(r"view 33 .* has no pose of the robot", "locate", **wanted, view=33)
 
 
@@ -446,7 +446,7 @@ def test_pixels_are_placed_on_planes(cell):
         ({"source": "part", "point": "1,2"}, "--point-mm is '1,2', but must be x,y,z"),
         ({"source": "part", "point": "0,0,99000"}, "farther than 20 m"),
         ({"source": "part", "target": "charuco"}, "There is no target 'charuco'"),
-        ({"source": "part/views.csv", "target": "charuco_9x6_30mm"}, "it must be a png"),
+        ({"source": "part/views.csv", "target": "charuco_9x6_30mm"}, "cannot be decoded"),
         ({"pixel": ["1"], "plane": "z=0"}, "--pixel is '1', but must be u,v"),
         ({"pixel": ["1,2"], "plane": "z=low"}, "--plane z is 'low'"),
         ({"pixel": ["1,2"], "plane": "gig"}, "'gig', .* there are: .*base_from_jig"),

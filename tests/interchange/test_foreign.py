@@ -151,7 +151,7 @@ def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):
     ("requested", "words"),
     [
         ({"robot": PoseImportOptions(("X", "Y", "Q"))}, "it has X, Y, Z, A, B, C"),
-        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "operator"))}, "holds 'Ann'"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "operator"))}, "is 'Ann'"),
         ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), form="kuko")}, "kuka"),
         ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), unit="feet")}, "m, cm, mm"),
         ({"mount": None}, "--mount"),

@@ -248,8 +248,16 @@ def test_points_are_understood_as_ever_and_commas_as_points_or_not_at_all(number
             None,
             "ur, kuka, fanuc, yaskawa, staubli, doosan, xarm, mecademic, kawasaki",
         ),
-        ("X 1 Y 2 Z 3 RX 4 RY 5 RZ 6", None, "a pose of ur, yaskawa, staubli, techman;"),
-        ("X 1 Y 2 Z 3 roll 4 pitch 5 yaw 6", None, "a pose of xarm, rpy, rpy-deg;"),
+        (
+            "X 1 Y 2 Z 3 RX 4 RY 5 RZ 6",
+            None,
+            "a pose of ur, yaskawa, staubli, techman, but must have one",
+        ),
+        (
+            "X 1 Y 2 Z 3 roll 4 pitch 5 yaw 6",
+            None,
+            "a pose of xarm, rpy, rpy-deg, but must have one",
+        ),
         ("X 1 Y 2 Z 3 O 4 A 5 T 6", "comau", "a pose of kawasaki, not of 'comau'"),
         ("1 2 3 4 5 6 7", "kuka", "a pose of ros, not of 'kuka'"),
         (" ".join(map(str, range(16))), None, "is no pose"),

@@ -250,7 +250,7 @@ def test_a_hostile_description_of_a_data_set_is_refused(version, source, rendere
         assert len(caught.value.message) < 500
     # A playlist may name any file of the machine.
     file.write_text(json.dumps(info | {"video_path": "list.m3u8"}))
-    raised(DataError, "ends in .mp4", convert, path, tmp_path / "out", requested=BOARD)
+    raised(DataError, "must end in .mp4", convert, path, tmp_path / "out", requested=BOARD)
     # What says how much there is is no reason to look for as much.
     file.write_text(json.dumps(info | {"total_episodes": 10**12}))
     assert convert(path, tmp_path / "out", requested=BOARD).views

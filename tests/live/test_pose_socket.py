@@ -307,7 +307,7 @@ def test_a_robot_that_does_not_come_back_ends_the_recording():
     arm = SocketArm("127.0.0.1", 0, patience_s=0.05)
     asked(arm, b"hello\n")
     raised(DriverError, "no stop .* was last refused: 'hello' is no stop", arm.request, 5.0)
-    raised(DriverError, "cannot be listened at", SocketArm, "127.0.0.1", arm.port)
+    raised(DriverError, "cannot be opened for", SocketArm, "127.0.0.1", arm.port)
     arm.close()
     for words in ("socket:", "socket:127.0.0.1", "socket:70000"):
         raised(DataError, "needs a port", open_arm, words, None, form=None, moves=False)

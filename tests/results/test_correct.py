@@ -189,7 +189,7 @@ def test_without_a_seed_it_is_the_posture_nearest_to_the_middle(result):
         (np.diag([1.0, 1.0, -1.0, 1.0]), None, "rigid"),
         (np.eye(4) + 400 * np.eye(4, k=3), None, "no arm reaches"),
         (np.full((4, 4), np.nan), None, "rigid"),
-        (np.eye(4), np.zeros(5), "seeds of shape"),
+        (np.eye(4), np.zeros(5), "seeds must have the shape"),
         (np.eye(4), [0, 90, 0, 0, 0, 0], "degrees"),
         (np.eye(4), [0, np.nan, 0, 0, 0, 0], "no finite number"),
     ],

@@ -303,7 +303,7 @@ def test_transforms_of_one_robot_are_exported(folder):
     refused = visioncal("export", folder / "out", "--to", "robot-dh")
     assert "several robots (a, b)" in refused.err
     refused = visioncal("export", folder / "out", "--to", "robot-dh", "--robot", "b")
-    assert "writes the calibrated arm, and there is none" in refused.err
+    assert "needs a calibrated arm" in refused.err
 
 
 def test_targets_are_corrected_for_the_robot_that_is_named(folder, tmp_path):

@@ -156,12 +156,12 @@ def test_what_is_no_urdf_is_refused(tmp_path, capfd):
     ("change", "words"),
     [
         ({"schema": 2}, "schema is 2"),
-        ({"repeatability_mm": 0}, "repeatability_mm is 0; a number above 0"),
+        ({"repeatability_mm": 0}, "repeatability_mm is 0, but must be a number above 0"),
         ({"joint": [{"a_m": 0.0, "d_m": 0.1}]}, "joint joint_1: alpha_rad is missing"),
         ({"joint": [{"name": "j", "a_m": 0, "d_m": 0, "alpha_rad": 0}] * 2}, "a name of its own"),
         (
             {"joint": [{"a_m": 0, "d_m": 0, "alpha_rad": 0, "lower_deg": 9, "upper_deg": 3}]},
-            r"lower_deg is 9\.0; less than upper_deg = 3\.0",
+            r"lower_deg is 9\.0, but must be less than upper_deg = 3\.0",
         ),
     ],
 )
@@ -536,8 +536,8 @@ def test_axes_in_one_line_have_a_table():
     ("change", "words"),
     [
         ({"beta_rad": 0.1}, "beta_rad has no place in the convention 'standard'"),
-        ({"a_m": 425.0}, "a_m is 425.0; .* under 20, .* looks like millimetres"),
-        ({"gear_ratio": 0.0}, "gear_ratio is 0.0; a number above 0"),
+        ({"a_m": 425.0}, "a_m is 425.0, but must be .* under 20, .* looks like millimetres"),
+        ({"gear_ratio": 0.0}, "gear_ratio is 0.0, but must be a number above 0"),
         ({"type": "prismatic", "lower_m": 2.0, "upper_m": 1.0}, "less than upper_m = 1.0"),
     ],
 )

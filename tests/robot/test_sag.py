@@ -76,7 +76,9 @@ def test_an_arm_of_unknown_masses_weighs_nothing():
     for row in table["joint"]:
         row |= {"mass_kg": 1.0, "com_m": [0, 0, 0]}
     table["joint"][2]["mass_kg"] = -3.0
-    with pytest.raises(DataError, match=r"joint elbow_joint: mass_kg is -3.0; a mass of 0 kg"):
+    with pytest.raises(
+        DataError, match=r"joint elbow_joint: mass_kg is -3.0, but must be a mass of 0 kg"
+    ):
         Robot.from_document(table)
     document = dict(robot.document) | {"gravity_m_s2": [0, 0, -1000]}
     raised(DataError, "gravity_m_s2", Robot.from_document, document)

@@ -93,11 +93,11 @@ def test_an_unknown_name_lists_the_names_and_a_near_one():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"kind": "chess"}, "kind is 'chess'; \"charuco\" or"),
-        ({"columns": 2}, "columns is 2; a whole number from 3 to 100"),
-        ({"square_sigma_m": 1e-300}, "is 1e-300; a standard deviation from 1e-08 m"),
-        ({"square_sigma_m": 0.04}, r"is 0\.04; .* to the square's own 0\.03 m"),
-        ({"marker_m": 0.03}, r"marker_m is 0\.03; less than square_m = 0\.03"),
+        ({"kind": "chess"}, "kind is 'chess', but must be \"charuco\" or"),
+        ({"columns": 2}, "columns is 2, but must be a whole number from 3 to 100"),
+        ({"square_sigma_m": 1e-300}, "is 1e-300, but must be a standard deviation from 1e-08 m"),
+        ({"square_sigma_m": 0.04}, r"is 0\.04, .* to the square's own 0\.03 m"),
+        ({"marker_m": 0.03}, r"marker_m is 0\.03, but must be less than square_m = 0\.03"),
         ({"dictionary": "DICT_5X5_10"}, "dictionary is 'DICT_5X5_10', which OpenCV does not"),
         ({"columns": 20, "rows": 11}, "has 100 markers; a board of 20 x 11 squares needs 110"),
     ],

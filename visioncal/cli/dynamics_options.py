@@ -122,7 +122,7 @@ class DynamicsIdentifyOptions(StreamOptions):
         f"Terms: {', '.join(FRICTION)}; or none.", default="coulomb,viscous,offset"
     )
     rotors: bool | None = option(
-        "Motors' inertia in the torques; else as fits.", "--rotors/--no-rotors"
+        "Motors' inertia in the torques; else as fits best.", "--rotors/--no-rotors"
     )
     stribeck: bool = option("Humps of friction.", "--stribeck/--no-stribeck", default=True)
     unchecked: bool = flag("Take torques that contradict the robot's inertias.")

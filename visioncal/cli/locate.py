@@ -114,9 +114,9 @@ def _by_pixels(
             places = tuple(replace(at, warnings=(*at.warnings, note)) for at in places)
     else:
         no_pose = flange is None and calibrated.mount == "eye-in-hand"
-        also = ", and so is the flange's pose at the image (--pose)" if no_pose else ""
+        also = ", and the flange's pose at the image (--pose)" if no_pose else ""
         raise DataError(
-            "One image shows no depth: the plane (--plane) that the feature lies in is needed, or "
+            "One image shows no depth: name the plane (--plane) that the feature lies in, or "
             f"its depth (--depth){also}.",
             culprits=["--plane", *["--pose"] * no_pose],
             next_step=f"A plane is {FORMS}. visioncal locate --example prints a line that works.",
@@ -173,7 +173,7 @@ def _write_cloud(
     output = options.output
     if output is None or output.suffix.lower() not in (".ply", ".npy"):
         raise DataError(
-            "--cloud: it is not said where the cloud goes: -o is needed, with a .ply or .npy.",
+            "--cloud needs -o, a .ply or .npy where the cloud goes.",
             culprits=["--output"],
             next_step="Add -o cloud.ply.",
         )
@@ -215,7 +215,7 @@ def _flange_of(
     if len(views) > 1:
         raise DataError(
             f"session {session.name!r} has {len(views)} views, and a camera on the flange "
-            "stands elsewhere in each: --view is needed.",
+            "stands elsewhere in each: name one with --view.",
             culprits=["--view"],
             next_step="Say which of them the pixel is of.",
         )
@@ -311,12 +311,12 @@ def _by_image(
     source = options.source
     if source is None:
         raise DataError(
-            "locate: there is nothing to look for: a session, an image or a pixel is needed.",
+            "locate needs a session, an image or a pixel to look for.",
             next_step="Name a session or an image; or give --pixel U,V and --plane.",
         )
     if target is None:
         raise DataError(
-            f"{source} is one image, which does not say what to look for: --target is needed.",
+            f"{source} is one image, which does not say what to look for: name it with --target.",
             culprits=["--target"],
             next_step="Name the target; or give --pixel U,V and --plane.",
         )

@@ -374,7 +374,7 @@ def _camera(words: str, resolution: tuple[int, int] | None) -> Camera:
     size = lens.get("resolution", resolution)
     if size is None:
         raise DataError(
-            "--resolution is needed beside this --camera: width and height of the images [px].",
+            "This --camera needs --resolution: width and height of the images [px].",
             culprits=["--resolution"],
         )
     distortion = np.array(lens.get("distortion") or np.zeros(5), dtype=float)

@@ -45,7 +45,7 @@ def record_command(options: RecordOptions) -> None:
     drives = not options.follow and str(options.arm).partition(":")[0] not in REQUESTING
     if drives and plan is None and options.arm is not None:
         raise DataError(
-            "record: an arm is driven by a plan, and none is given.",
+            "record needs a plan to drive an arm.",
             culprits=["--plan"],
             next_step="Make one with visioncal plan, or guide the arm by hand: --follow "
             "and --target.",

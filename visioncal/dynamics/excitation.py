@@ -259,8 +259,8 @@ class ExcitationRequest:
             )
         if not self.seconds >= 0.0 or min(self.starts, self.steps) < 1:
             raise DataError(
-                f"a search of {self.seconds:g} s from {self.starts} starts with {self.steps} steps "
-                "is asked for, but must have 0 s or more, a start and a step.",
+                f"a search has {self.seconds:g} s, {self.starts} starts and {self.steps} steps, "
+                "but must have 0 s or more, a start and a step.",
                 culprits=["--starts", "--seconds"],
             )
 

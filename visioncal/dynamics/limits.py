@@ -171,8 +171,8 @@ def motion_limits(
             margin_deg = np.rad2deg(allowed.share.margin_rad)
             raise DataError(
                 f"robot {allowed.robot.name}: of the range of {name} "
-                f"{np.rad2deg(left) + 2.0 * margin_deg:.1f} deg are left, and a margin of "
-                f"{margin_deg:.1f} deg is wished on both sides.",
+                f"{np.rad2deg(left) + 2.0 * margin_deg:.1f} deg are left, but must hold a margin "
+                f"of {margin_deg:.1f} deg on both sides.",
                 culprits=[name],
                 next_step="Make the margin smaller (--margin-deg), or mend the limits.",
             )

@@ -38,8 +38,8 @@ class SweepRequest:
     def __post_init__(self) -> None:
         if not (2 <= self.speeds <= 30 and self.slowest_rad_s > 0.0):
             raise DataError(
-                f"sweeps at {self.speeds} speeds from {self.slowest_rad_s:g} rad/s are wished; 2 "
-                "to 30 speeds above zero are needed.",
+                f"sweeps have {self.speeds} speeds from {self.slowest_rad_s:g} rad/s, but must "
+                "have 2 to 30, above zero.",
                 culprits=["--sweep-speeds"],
             )
         if not _SHORTEST_HOLD_S <= self.hold_s <= 60.0:

@@ -106,7 +106,7 @@ class FrameTree:
             return self.edge_of(step.frame).matrix
         if step.robot not in poses:
             raise DataError(
-                f"{step.frame} moves with robot {step.robot!r}: its pose is needed.",
+                f"{step.frame} moves with robot {step.robot!r}, whose pose must be given.",
                 culprits=[step.frame],
                 next_step="Name frames that no robot moves against each other; or in Python, give "
                 f'poses={{"{step.robot}": base_from_flange}}.',

@@ -144,7 +144,7 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
         raise row.refuse(
             "gravity_m_s2",
             gravity.tolist(),
-            "a vector of 9.81 m/s^2 in the robot's base, as [0, 0, -9.81] where it stands upright,",
+            "a vector of 9.81 m/s^2 in the robot's base, as [0, 0, -9.81] where it stands upright",
         )
     return gravity
 

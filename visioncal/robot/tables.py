@@ -249,7 +249,7 @@ def _across(row: DocumentTable, convention: Convention) -> tuple[float, float, f
         raise row.refuse(
             "a_m",
             length_m,
-            f"a number of metres, under {FAR_M:g},",
+            f"a number of metres, under {FAR_M:g}",
             "It looks like millimetres: multiply a_m and d_m of all joints by 0.001.",
         )
     return length_m, row.number("alpha_rad"), beta, float(parallel)

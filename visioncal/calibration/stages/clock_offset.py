@@ -163,7 +163,7 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match], span_s:
     if matches[0].correlation < LEAST_CORRELATION:
         return (
             "the turning of robot and camera goes along with a correlation of "
-            f"{matches[0].correlation:.2f} at best ({LEAST_CORRELATION} is needed), so they are "
+            f"{matches[0].correlation:.2f} at best (below {LEAST_CORRELATION}), so they are "
             "not of the same motion, or it was too slow"
         )
     if not fits:
@@ -176,7 +176,7 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match], span_s:
     if fits[0].sigma_s > LARGEST_SIGMA_S:
         return (
             "the motion is too even: it determines the offset to "
-            f"{figure(1e3 * fits[0].sigma_s)} ms only ({1e3 * LARGEST_SIGMA_S:g} ms are needed)"
+            f"{figure(1e3 * fits[0].sigma_s)} ms only (over {1e3 * LARGEST_SIGMA_S:g} ms)"
         )
     several = " and ".join(f"{1e3 * fit.offset_s:+.0f}" for fit in fits)
     return f"the motion repeats itself: offsets of {several} ms explain it alike"

@@ -62,7 +62,7 @@ class Look:
             pose = getattr(self, name)
             fault = "" if pose is None else rigid_fault(pose)
             if pose is not None and not fault and np.abs(pose[:3, 3]).max() > FAR_M:
-                fault = "its offset looks like millimetres, and metres are needed"
+                fault = "its offset looks like millimetres, but must be in metres"
             if fault:
                 raise DataError(
                     f"look at {self.time_s:g} s: {name} is no pose: {fault}.", culprits=[name]

@@ -221,8 +221,8 @@ def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Sessi
         if differences or shown_name not in calibrated:
             has = f": it has {listed(differences)}" if differences else ""
             raise _other_target(
-                f"{label}: target {shown_name or target.name!r} is none of those that were "
-                f"calibrated with ({names}){has}.",
+                f"{label}: target {shown_name or target.name!r} must be one of those of "
+                f"the calibration ({names}){has}.",
                 "Describe and name it as in the calibration's session, or verify with views of "
                 "that target alone.",
             )

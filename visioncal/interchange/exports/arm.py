@@ -134,7 +134,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
     nominal = source.robot if isinstance(source, Calibration) else None
     if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
         raise DataError(
-            f"{form.name} writes the calibrated arm, and there is none.",
+            f"{form.name} needs a calibrated arm, and this result has none.",
             culprits=[form.name],
             next_step="A calibration has one if its session has q1_rad ... and [robot] model, and "
             "stops all over the workspace show errors of the arm.",

@@ -271,8 +271,8 @@ def _child_from_cam(numbers: Sequence[float], child: str | None, frame: str) -> 
     if child is None or not is_camera(frame) or max(map(abs, numbers[:3])) > 3.0:
         raise DataError(
             f"--child-from-cam is ({', '.join(f'{value:g}' for value in numbers)}), for {frame} "
-            f"under the name {child!r}; where a camera's optical frame is in a frame with a name "
-            "is needed, in metres, at most 3 m away.",
+            f"under the name {child!r}, but must be the pose of a camera's optical frame in a "
+            "named frame, in metres, at most 3 m away.",
             culprits=["--child-from-cam"],
             next_step="Give x,y,z,qx,qy,qz,qw and a name, as --child camera_link, of a camera.",
         )
@@ -297,7 +297,7 @@ def _check_takes(form: ExportFormat, selection: Selection) -> None:
     is_load = load is None or (0.0 < load.mass_kg < np.inf and np.isfinite(load.centre_mm).all())
     if not is_load or (number is not None and number < 1):
         raise DataError(
-            f"{load} and the number {number}: a mass above 0 and three numbers are needed, and "
-            "tools and bases are counted from 1.",
+            f"{load} and the number {number} must be a mass above 0 with three numbers, and a "
+            "number from 1 on.",
             culprits=["--number", "--mass-kg", "--cog-mm"],
         )

@@ -55,8 +55,8 @@ class _StillFrame:
         frame, after = cell.camera.frame(), cell.state()
         if frame.stamp_s < asked - _EARLY_S or frame.stamp_s > cell.clock.now() + _EARLY_S:
             raise DriverError(
-                f"{cell.camera.name}: its picture is stamped {frame.stamp_s - asked:+.3f} s from "
-                "when it was asked for, but must be exposed after that.",
+                f"{cell.camera.name}: its picture is of {frame.stamp_s - asked:+.3f} s from the "
+                "request, but must be exposed after it.",
                 culprits=[cell.camera.name],
                 next_step="The camera hands out old pictures, or its clock is not the host's.",
             )

@@ -126,7 +126,7 @@ class SocketArm:
             self._server = socket.create_server((host, port), backlog=4)
         except (OSError, UnicodeError) as error:
             raise DriverError(
-                f"{host}:{port} cannot be listened at: {error}.",
+                f"{host}:{port} cannot be opened for a robot: {error}.",
                 culprits=[f"{host}:{port}"],
                 next_step="Another program, or an earlier visioncal, may listen there: end it, or "
                 "name another port and set that in the robot's program, too. The address is one "

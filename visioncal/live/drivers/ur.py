@@ -313,13 +313,11 @@ class UrArm:
         """
         goal = np.asarray(q, dtype=float)
         if goal.shape != (6,) or not np.isfinite(goal).all():
-            raise DriverError(
-                f"A UR has six joints; a motion to {goal.tolist()} cannot be asked for."
-            )
+            raise DriverError(f"A motion of a UR must have six joint angles, not {goal.tolist()}.")
         if not (0.0 < speed <= _SPEED_LIMIT and 0.0 < acceleration <= _ACCELERATION_LIMIT):
             raise DriverError(
-                f"A motion at {speed:g} rad/s and {acceleration:g} rad/s^2 cannot be asked for; "
-                f"more than 0 and at most {_SPEED_LIMIT} and {_ACCELERATION_LIMIT} are needed."
+                f"A motion is at {speed:g} rad/s and {acceleration:g} rad/s^2, but must be at "
+                f"more than 0 and at most {_SPEED_LIMIT} and {_ACCELERATION_LIMIT}."
             )
         self._check_open()
         line = self._line

@@ -42,7 +42,7 @@ class PostureEffect(Effect):
 
     @property
     def _weights(self) -> FloatArray:
-        """(6, 1) of a twist: a turn counts as what it moves at the lever [m]."""
+        """(6, 1) weights of a twist: a turn counts by its motion at the lever [m]."""
         return np.repeat([LEVER_M, 1.0], 3)[:, None]
 
     @cached_property

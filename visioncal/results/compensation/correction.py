@@ -69,7 +69,7 @@ class CalibratedArm:
             )
         if real.joint_count < _LEAST_JOINTS:
             raise DataError(
-                f"robot {real.name} has {real.joint_count} joints, and {_LEAST_JOINTS} are needed "
+                f"robot {real.name} has {real.joint_count} joints, but must have {_LEAST_JOINTS} "
                 "to reach a position.",
                 culprits=[real.name],
             )
@@ -270,7 +270,7 @@ def _seeds(q_seed: FloatArray | Sequence[float] | None, robot: Robot, count: int
     seeds = np.asarray(q_seed, dtype=float)
     if seeds.shape not in ((size,), (count, size)):
         raise DataError(
-            f"correct: seeds of shape ({size},) or ({count}, {size}) are needed, for the joints of "
+            f"correct: seeds must have the shape ({size},) or ({count}, {size}), for the joints of "
             f"{robot.name}, not {seeds.shape}."
         )
     if seeds.ndim == 1:

@@ -55,7 +55,7 @@ class Charuco(Board):
         # OpenCV compares the sides in single precision.
         low_m = 0.1 * square_m
         if not low_m < marker_m < square_m or np.float32(marker_m) >= np.float32(square_m):
-            allowed = f"less than square_m = {square_m!r}, above {low_m:g}, in the same unit,"
+            allowed = f"less than square_m = {square_m!r}, above {low_m:g}, in the same unit"
             raise table.refuse("marker_m", marker_m, allowed)
         dictionary = table.text("dictionary")
         size = f"{columns} x {rows} squares"

@@ -66,7 +66,7 @@ class CircleGrid(Board):
         # Distance of the nearest circles.
         spacing_m = square_m * np.sqrt(2.0) if asymmetric else square_m
         if diameter_m >= _WIDEST * spacing_m:
-            needed = f"less than {_WIDEST:g} of the distance of neighbours, {spacing_m:g} m,"
+            needed = f"less than {_WIDEST:g} of the distance of neighbours, {spacing_m:g} m"
             raise table.refuse("diameter_m", diameter_m, needed)
         return Target(
             name,

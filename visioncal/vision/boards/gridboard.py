@@ -65,7 +65,7 @@ class GridBoard(BoardKind):
         else:
             spacing = table.number("spacing", positive=True)
         if spacing > _MOST_SPACING:
-            raise table.refuse("spacing", spacing, "a share of size_m, such as 0.3,")
+            raise table.refuse("spacing", spacing, "a share of size_m, such as 0.3")
         dictionary = table.text("dictionary", *filter(None, [self.usual_dictionary]))
         size = f"{columns} x {rows} {self.sides}"
         first = first_id(table, columns * rows, size, dictionary)

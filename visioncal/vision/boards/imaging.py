@@ -62,7 +62,7 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
     except SyntaxError:
         return "unreadable: the file is damaged"
     except (OSError, ValueError):
-        return "unreadable: it must be a png, jpg, tif, bmp or webp"
+        return "unreadable: it cannot be decoded as png, jpg, tif, bmp or webp"
     flags = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)

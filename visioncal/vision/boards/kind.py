@@ -236,7 +236,7 @@ def size_of(table: DocumentTable, key: str) -> float:
     size_m = table.number(key, positive=True)
     if size_m > _LARGEST_IN_CM:
         raise table.refuse(
-            key, size_m, f"a length in metres, such as {1e-3 * size_m:g} for {size_m:g} mm,"
+            key, size_m, f"a length in metres, such as {1e-3 * size_m:g} for {size_m:g} mm"
         )
     if size_m > LARGEST_M:
         cm, inches = f"{1e-2 * size_m:g} for {size_m:g} cm", f"{0.0254 * size_m:g} for inches"
