@@ -439,7 +439,7 @@ def test_pixels_are_placed_on_planes(cell):
     ("options", "words"),
     [
         ({"calibration": "nowhere"}, "nowhere"),
-        ({}, "nothing to look for"),
+        ({}, "needs a session, an image or a pixel"),
         ({"source": "part", "plane": "z=1"}, "--plane: it is for --pixel"),
         ({"source": "part", "pose": "0,0,0,0,0,0,1"}, "--pose: the session has the poses"),
         ({"source": "part", "view": 99}, "view 99: .* it has 30, 31, 32, 33"),

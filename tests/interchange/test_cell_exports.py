@@ -307,7 +307,7 @@ def test_a_lens_is_that_of_the_camera_that_is_named():
     ("to", "selection", "words"),
     [
         ("ros", Selection(), r"and one is written.*--edge \w+_from_cam_\w+"),
-        ("ros", Selection("base_a_from_target_plate"), "its pose is needed"),
+        ("ros", Selection("base_a_from_target_plate"), "whose pose must be given"),
         ("ros", Selection("base_a_from_cam_tpo"), "Did you mean cam_top"),
         ("ros", Selection("all", inverse=True), "without --inverse, --parent and --child"),
         ("opencv", Selection("all"), "written as ros, "),

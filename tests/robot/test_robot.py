@@ -536,7 +536,7 @@ def test_axes_in_one_line_have_a_table():
     ("change", "words"),
     [
         ({"beta_rad": 0.1}, "beta_rad has no place in the convention 'standard'"),
-        ({"a_m": 425.0}, "a_m is 425.0, but must be .* under 20, .* looks like millimetres"),
+        ({"a_m": 425.0}, "a_m is 425.0, but must be .* under 20. .* looks like millimetres"),
         ({"gear_ratio": 0.0}, "gear_ratio is 0.0, but must be a number above 0"),
         ({"type": "prismatic", "lower_m": 2.0, "upper_m": 1.0}, "less than upper_m = 1.0"),
     ],

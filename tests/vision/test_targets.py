@@ -113,7 +113,7 @@ def test_a_side_in_another_unit_is_refused(change):
 
 def test_a_marker_needs_an_id_of_its_dictionary():
     assert target_from_document(MARKER, "tag").marker_id == 7
-    with pytest.raises(DataError, match="id is 587; a whole number from 0 to 586"):
+    with pytest.raises(DataError, match="id is 587, but must be a whole number from 0 to 586"):
         target_from_document(MARKER | {"id": 587}, "tag")
 
 
