@@ -77,7 +77,7 @@ def test_threads_change_no_digit(tmp_path, monkeypatch):
     )
     assert asked == [1, 3]
     assert to_document(one) == to_document(three)
-    raised(DataError, "threads is 0, but must be at least 1", calibrate, tmp_path / "cell", threads=0)
+    raised(DataError, "but must be at least 1", calibrate, tmp_path / "cell", threads=0)
 
 
 def test_a_shared_setting_is_made_by_the_first_and_undone_by_the_last():

@@ -270,7 +270,7 @@ def test_kalibrs_own_file_describes_a_board(tmp_path):
     board = load_target(squares)
     assert (board.kind, board.columns, board.rows, board.square_m) == ("checkerboard", 6, 7, 0.06)
     squares.write_text(text.format(0.05))
-    raised(DataError, "rowSpacingMeters is 0.05, but must be as much as colSpacing", load_target, squares)
+    raised(DataError, "0.05, but must be as much as colSp", load_target, squares)
     squares.write_text("target_type: circlegrid\n")
     raised(DataError, "target_type is 'circlegrid'", load_target, squares)
     # What is written of a session has a description of our own.
