@@ -101,7 +101,9 @@ def device_faults(arms, cameras):
 
 def kind_faults(kinds):
     """Kinds of boards that `target make` or the page of boards leave out."""
-    for name in kinds:
+    for name, kind in kinds.items():
+        if kind.options and not in_help(name, "target", "make"):
+            yield f"{name}: not among --kind of visioncal target make --help"
         if f'"{name}"' not in page("visioncal/vision/README.md"):
             yield f"{name}: not among the kinds of visioncal/vision/README.md"
         file = "points" if name == "points" else name
@@ -220,13 +222,13 @@ def test_every_entry_is_where_a_user_looks():
 
 def test_an_entry_that_is_left_out_is_found():
     export, maker = EXPORT_FORMATS[0], POSE_FORMS["xarm"]
-    assert len([*export_faults([replace(export, name="acme")])]) == 3
+    assert len([*export_faults([replace(export, name="no-such")])]) == 3
     # Form, pages, manual: a maker's export follows from its form.
-    assert len([*maker_faults([replace(maker, name="acme")])]) == 5
-    assert len([*device_faults(["acme"], ["acme-cam"])]) == 4
-    assert len([*kind_faults(["acme"])]) == 2
-    assert len([*command_faults(["acme"])]) == 1
-    assert len([*finding_faults({"acme": "calibration/stages/acme.py"})]) == 1
-    assert len([*import_faults([replace(FOREIGN_FORMATS[0], name="acme")])]) == 1
+    assert len([*maker_faults([replace(maker, name="no-such")])]) == 5
+    assert len([*device_faults(["no-such"], ["no-such-cam"])]) == 4
+    assert len([*kind_faults({"no-such": KINDS["charuco"]})]) == 3
+    assert len([*command_faults(["no-such"])]) == 1
+    assert len([*finding_faults({"no-such": "calibration/stages/no_such.py"})]) == 1
+    assert len([*import_faults([replace(FOREIGN_FORMATS[0], name="no-such")])]) == 1
     text = page(".github/CONTRIBUTING.md").replace("`STAGES`", "`STEPS`")
     assert len([*contributing_faults(text)]) == 1
