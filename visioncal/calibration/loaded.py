@@ -152,7 +152,7 @@ def calibrate_loaded(session: Session, unloaded: Calibration) -> Calibration:
             "arm.",
         )
     if unloaded.elastic is None:
-        # What the arm's own weight bends is in the geometry already.
+        # Bends by the arm's own weight are in the geometry already.
         arm = arm.with_weight_compensated
     torques = arm.load_torques(seen.q, seen.loads) - arm.load_torques(seen.q)
     bends = seen.by_flange @ (arm.axis_jacobian(seen.q) * torques[:, None])

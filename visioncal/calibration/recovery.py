@@ -47,7 +47,7 @@ from visioncal.results.sections import FittedArm, FittedStops, NoiseIntervals
 from visioncal.results.views import rms_of
 from visioncal.session import Session
 
-# What may have happened, as a user says it: the base moved on its foundation, or the flange's mount
+# Possible causes, as a user says them: the base moved on its foundation, or the flange's mount
 # was exchanged, with all that stands on that side of the arm.
 BASE, MOUNT = "base", "mount"
 _SIDES = {"eye-in-hand": {CAMERA: MOUNT, BOARD: BASE}, "eye-to-hand": {CAMERA: BASE, BOARD: MOUNT}}
@@ -114,7 +114,7 @@ def recover(
     before, without, digest = old.validation.held_out, "", session.digest()
     warnings: tuple[str, ...] = ()
     if check is not None and old.robot is not None and session.robot_document is not None:
-        # What was checked may name the arm as it was: a recording by a plan of that does.
+        # The checked session may name the arm as it was: a recording by a plan of that does.
         session = replace(session, robot_document=old.robot.document)
     fit, held = parted(session)
     if causes and check is not None:
@@ -204,7 +204,7 @@ def changed(check: Check, causes: Sequence[str], off: Rms) -> tuple[Calibration,
         boards=tuple(check.predicted.boards.tolist()),
         poses=log(problem.poses[ROBOT][problem.observations.stops]),
         residuals=np.round(residuals, 9),
-        # That nothing of it repeats itself is the safe side.
+        # It is safe to suppose that nothing of it repeats itself.
         by_noise=covariance,
     )
     new = replace(
@@ -307,7 +307,7 @@ def _estimated(
     units = np.concatenate([cause.units for cause in chosen])
     together = ChangeHypothesis("all", units, by_sensor, by_flange)
     belief = prior.belief(problem, check.predicted.boards)
-    # What changed is moved step by step until the last step is zero, which takes simultaneous
+    # Changed frames are moved step by step until the last step is zero, which takes simultaneous
     # motions exactly.
     for _ in range(_MOST_STEPS):
         found = evidence_of(problem, belief, together)

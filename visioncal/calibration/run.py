@@ -38,7 +38,7 @@ class Run:
     evidence: tuple[ViewEvidence, ...]  # One entry for each view of the session.
     # Residual of each view, by a fit without its stop [m], [px].
     left_out: Mapping[int, tuple[float, float]] = field(default_factory=dict)
-    # What was found in each image, by view, from which alone the run can be repeated; empty where
+    # Corners found in each image, by view, from which alone the run can be repeated; empty where
     # more of the images was used.
     searches: Mapping[int, Searched] = field(default_factory=dict)
 

@@ -44,9 +44,9 @@ from visioncal.live.planning.repeated import stops_to_repeat
 from visioncal.robot.files import robot_names
 from visioncal.vision.targets import target_from_document, target_names
 
-# What was chosen last, beside the views.
+# The last choice, beside the views.
 _REMEMBERED = "page.json"
-# What a browser of the network may have OpenCV open.
+# Addresses that a browser of the network may have OpenCV open.
 _STREAMS = ("http://", "https://", "rtsp://", "rtsps://")
 # Labels of the setup's fields, and what may be chosen; anything else may be typed.
 _FIELDS: Mapping[str, tuple[str, Sequence[str]]] = {

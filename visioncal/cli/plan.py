@@ -46,7 +46,7 @@ from visioncal.session.selecting import ANY, LENS
 from visioncal.vision.targets import stored_target, target_from_document
 
 _SHOWN = 12
-_USUAL = "hand-eye"  # What stops of a camera are for.
+_USUAL = "hand-eye"  # Purpose of a camera's stops.
 # Options without which a cell is not known.
 _NEEDED = ("target", "camera", "cam", "board")
 

@@ -97,7 +97,7 @@ def _lines(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
         last, pauses = "", 0
         while not over.wait(PAUSE_S):
             pauses += 1
-            # What takes long is said again each minute.
+            # Long work is said again each minute.
             if steps.line != last or pauses % 30 == 0:
                 last = steps.line
                 console().print(f"{last} ({time.monotonic() - start_s:.0f} s)", markup=False)

@@ -59,7 +59,7 @@ class _Act:
     minutes: dict[str, float]  # Of each step that is done.
     stated: tuple[str, ...]  # Causes.
     record: str | None = None  # The command that records the planned stops; None before the plan.
-    # What a newer version has noted, unchanged.
+    # Notes of a newer version, unchanged.
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -22,7 +22,7 @@ from visioncal.core.types import Target, scalar_of
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
 
-# What numbers of numpy are instances of, too.
+# Classes of NumPy's numbers, too.
 _NUMBERS: dict[Any, Any] = {float: Real, int: Integral}
 # Words for pydantic's kinds of errors, and for the classes that a value is no instance of.
 _WORDS = {

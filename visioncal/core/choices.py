@@ -20,7 +20,7 @@ MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
 # Mount of the observing device: a camera on the flange, a fixed camera, or a fixed measuring
 # instrument that observes a probe or points on the flange.
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
-# What planned stops minimise: the mean variance of positions, or the determinant of the covariance.
+# Criteria of planned stops: the mean variance of positions, or the determinant of the covariance.
 Criterion: TypeAlias = Literal["I", "D"]
 # Standards by which an arm is tested.
 Standard: TypeAlias = Literal["iso9283"]

@@ -106,7 +106,7 @@ class RecoveryLimits:
     # board together explain any two.
     held_back_each: int = 3
     fewest: int = 9  # The others then are no fewer than a check needs.
-    stops: int = 15  # What is asked for.
+    stops: int = 15  # As asked for.
 
 
 @dataclass(frozen=True)

@@ -39,11 +39,11 @@ class IdentificationRequest:
     cutoff_hz: float | None = None  # Cut-off of the low-pass [Hz]; by the motion where None.
     # Torque per current, by joint, where currents were recorded [N m/A].
     gains_nm_a: tuple[float, ...] = ()
-    options: Options = field(default_factory=Options)  # What is estimated.
+    options: Options = field(default_factory=Options)  # The unknowns.
     # Whether rotor inertias are estimated; None to decide by the held-out torques, since torques
     # sensed behind the gears do not include them.
     rotors: bool | None = None
-    # Which robot of a whole cell; its streams have, or begin with, its name.
+    # A robot of a whole cell; its streams have, or begin with, its name.
     robot: str | None = None
     lag_s: float | None = None  # Delay of the torques behind the angles; estimated where None [s].
 

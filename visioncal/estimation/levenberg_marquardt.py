@@ -66,7 +66,7 @@ def levenberg_marquardt(
             if decrease <= tolerance:
                 return now.state, True
         else:
-            # What remains is rounding, curvature that Gauss-Newton neglects, or an error of the
+            # The rest is rounding, curvature that Gauss-Newton neglects, or an error of the
             # derivatives.
             if predicted <= _LITTLE:
                 return now.state, True

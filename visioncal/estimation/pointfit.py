@@ -30,7 +30,7 @@ from visioncal.estimation.robust import SETS, small_sets
 
 FeatureKind: TypeAlias = Literal["origin", "x", "xy"]
 FEATURE_KINDS: tuple[FeatureKind, ...] = ("origin", "x", "xy")
-# Which of x, y, z in the fixture's frame are stated, by kind; empty for a drawn point.
+# Those of x, y, z in the fixture's frame that are stated, by kind; empty for a drawn point.
 _STATED = {
     "": (True, True, True),
     "origin": (True, True, True),

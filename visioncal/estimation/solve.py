@@ -205,7 +205,7 @@ def posterior(problem: Problem, state: State, noise: Noise) -> tuple[FloatArray,
     whitening = Whitening.of(problem, noise, linear.by_errors)
     information, gradient, _, shared = whitening.equations(problem, state, linear)
     fitted = covariance_among(information, problem.moving)
-    # What the unknowns absorb, of each observation alone and through its unit's shared errors.
+    # The part that unknowns absorb, of each observation alone and through its unit's shared errors.
     carried, step = shared @ fitted, fitted @ gradient
     of_unit = np.eye(shared.shape[1]) + carried @ np.swapaxes(shared, 1, 2)
     weights, taken, units = whitening.weights, whitening.taken, whitening.units

@@ -59,7 +59,7 @@ class Candidate:
 class Step:
     """A change from some stop on."""
 
-    candidate: Candidate  # What changed.
+    candidate: Candidate  # The change.
     stop: int  # The first stop after it.
     # (c,) change: twist of a frame in its own old pose, or of a base over the session [rad, m];
     # actual minus reported angle [rad]; relative size.

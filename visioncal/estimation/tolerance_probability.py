@@ -20,7 +20,7 @@ from visioncal.core.quantiles import root_of
 from visioncal.core.types import FloatArray
 
 _POINTS, _SIZE = 4096, 6
-# What stands for infinity: degrees of freedom, radii, and the ratio of a radius to a first guess.
+# In place of infinity: degrees of freedom, radii, and the ratio of a radius to a first guess.
 _INFINITE = 1e6
 # Relative tolerance of a radius.
 _TOLERANCE = 1e-9

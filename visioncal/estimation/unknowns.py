@@ -32,7 +32,7 @@ class Unknown(NamedTuple):
     """Name of an unknown of one or more values."""
 
     kind: str  # See the module.
-    name: str = ""  # What it is of.
+    name: str = ""  # Its owner.
 
     @classmethod
     def of_effect(cls, name: str) -> "Unknown":

@@ -138,8 +138,8 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
             best = own.best(np.ones(len(own.pull)), bounds.low, bounds.high)
             found.append((effect, *best))
     if flange:
-        # What gains little beside independent noise gains less beside errors that last; what
-        # differs from stop to stop does not last.
+        # An effect that gains little beside independent noise gains less beside errors that last;
+        # one that differs from stop to stop does not last.
         lasting = [one[0] for one in found if one[0].typical is one[0]]
         clear = [one[0] for one in found if one[0] in lasting and 4.0 * one[2] >= SIGNIFICANT]
         if any(isinstance(one, BaseCreeps | MountCreeps) for one in clear):

@@ -199,7 +199,7 @@ def _by_waves(fit: Fit, own: Sequence[Pair], camera: str) -> Iterator[Added]:
         product = weight * np.asarray(np.kron(np.eye(2), inner.T @ inner))
         taken = gram if kept.all() else gram.take(kept)
         if len(taken.parts) > 1:
-            # What poses explain has another noise than the rest.
+            # The part that poses explain has another noise than the rest.
             more, by_pose = _weight(fit, gram, 1) - weight, np.swapaxes(local[:, :, :6], 1, 2)
             raw = np.asarray(sum(part.heads for part in taken.parts))
             solved = of_pose_alone(raw) @ by_pose

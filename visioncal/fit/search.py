@@ -20,7 +20,7 @@ from visioncal.model import Cell
 _SUSPECT = 0.4
 # Most linearisations; a step under this share of every sigma is negligible.
 _ROUNDS, _SETTLED = 8, 0.02
-# What a step leaves, over itself and the most that anything turns by it.
+# The rest after a step, over itself and the most that anything turns by it.
 _SECOND = 3.0
 # Change of a size's logarithm from which it is asked again whether chance explains it.
 _MOVED = 0.2
@@ -93,7 +93,7 @@ class Search:
         grams = linearised(self.cell, self.unknowns, state, self.pairs)
         self.effort.linearisations += 1
         mixed = mixed_model(self.cell, self.unknowns, state, grams, used)
-        # What other unknowns leave of the noise may show what it hid.
+        # The noise that other unknowns leave may show what it hid.
         is_again = last is not None and last.unknowns.members == self.unknowns.members
         known = {} if last is None else last.sizes
         closed = frozenset() if last is None else last.unknowns.closed

@@ -49,7 +49,7 @@ class CellFit:
     left_out: LeftOut
     start: Start
     effort: Effort
-    doubts: Sequence[Considered] = ()  # What arms without joint angles err by, and held boards.
+    doubts: Sequence[Considered] = ()  # Errors of arms without joint angles, and of held boards.
 
     @property
     def used(self) -> Mask:
@@ -247,7 +247,7 @@ def _is_of_board(sighting: Sighting) -> bool:
 def _points(cell: Cell) -> set[str]:
     """Frames of which places alone are seen, or the touch of another one at their own."""
     points, frames = set[str](), set[str]()
-    # What is stated of frames makes none a point.
+    # Stated frames are no points.
     for sighting in (one for one in cell.sightings if not one.is_stated):
         place = sighting.evidence
         if isinstance(place, MeasuredPlace):

@@ -94,7 +94,7 @@ def start_of(cell: Cell) -> Start:
     lost = dict.fromkeys(np.setdiff1d(np.arange(len(options)), kept).tolist(), _NO_POSE)
     cell, sound = cell.without(lost), sound[kept]
     known = [option for option in options if option is not None]
-    # What is held out helps no fit.
+    # Sightings that are held out help no fit.
     own = np.flatnonzero(~cell.held).tolist()
     places = _Places(cell.only(own))
     places.join_all([known[at] for at in own])
@@ -120,7 +120,7 @@ def start_of(cell: Cell) -> Start:
         if isinstance(sighting.evidence, MeasuredPlace):
             between = places.predicted(sighting)[:3, 3] - sighting.evidence.place_m
             off = np.array([np.linalg.norm(between)])
-        # What is stated counts until sightings contradict it.
+        # A stated frame counts until sightings contradict it.
         off = off * (not sighting.is_stated)
         best = int(off.argmin())
         distances[at] = off[best]

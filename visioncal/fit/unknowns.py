@@ -35,7 +35,7 @@ class Prior:
     columns: IntArray  # (n,) among the unknown's own.
     size: Size | None = None  # Its standard deviation, which is estimated.
     sigma: float = 1.0  # Its standard deviation where it is known, in the columns' units.
-    # What columns that are held, by a small sigma, may be off by: in the covariance alone.
+    # Columns that are held, by a small sigma: in the covariance alone.
     considered: float = 0.0
 
 
@@ -111,7 +111,7 @@ class Vector(Unknown):
 class State:
     """A point of linearisation."""
 
-    # What is estimated or held: (4, 4) edges, intrinsics, (10,) shapes, effects, fields.
+    # Estimated or held: (4, 4) edges, intrinsics, (10,) shapes, effects, fields.
     values: Mapping[Key, FloatArray]
     errors: Mapping[str, FloatArray]  # (s, 6) right perturbations of each flange's pose.
 

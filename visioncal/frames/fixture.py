@@ -105,7 +105,7 @@ class FitSettings:
 class PointsFit:
     """Fit of a tool or a fixture to n touches or other points."""
 
-    source: str  # What the points were read from, for the record.
+    source: str  # Origin of the points, for the record.
     labels: Sequence[str]  # (n,) their names in the record.
     names: Sequence[str]  # (n,) their names in messages: `Touch 3`, `Point P3`.
     places: Sequence[str]  # (n,) their rows: `touches.csv, line 5`; empty where there are none.

@@ -175,7 +175,7 @@ def locate_by_depth(
                 (true,) = model.true_m(metres[None], where, size)
                 depth = true / along
             else:
-                # What is measured was seen by the other camera, in whose pixels the model is.
+                # The depth is by the other camera, in whose pixels the model is.
                 size, beside = model.by.resolution, model.by.cam_from_depth
                 point = apply(invert(beside), (metres / along * ray)[None])
                 placed, where = model.corrected(point, model.by.camera)
@@ -235,7 +235,7 @@ def seen_distances(calibration: Calibration, depth_m: FloatArray, px: FloatArray
     reach_px = 1.5 * float(np.max(eye.camera.matrix[:2] / model.by.matrix[:2]))
     for at, place in enumerate(px):
         near = np.linalg.norm(seen - place, axis=1) < reach_px
-        # What is nearer hides the rest.
+        # Nearer points hide the rest.
         near &= distances < 1.02 * np.min(distances[near], initial=np.inf)
         if np.sum(near) > 2:
             plane = np.column_stack([np.ones(near.sum()), seen[near] - place])

@@ -29,7 +29,7 @@ NO_TOOL = (
 class TouchRows:
     """The rows of a file of touches, n in all."""
 
-    source: str  # What they were read from, for messages and for the record.
+    source: str  # Their origin, for messages and for the record.
     labels: tuple[str, ...]  # (n,) the rows' view numbers, as text.
     places: tuple[str, ...]  # (n,) the rows' lines: `touches.csv, line 3`.
     # (n, 4, 4) as the controller reported it [m]; NaN in a row without a pose, and in the rotation
@@ -271,7 +271,7 @@ class Tool:
 class MeasuredPoints:
     """Measured points, n in all, with their covariance."""
 
-    source: str  # What they were read from, for the record.
+    source: str  # Their origin, for the record.
     labels: tuple[str, ...]  # (n,) the measurements' names, such as the rows' view numbers.
     places: tuple[str, ...]  # (n,) their rows, `touches.csv, line 3`; empty where there are none.
     names: tuple[str, ...]  # (n,) names of the points; empty where unknown.
@@ -369,7 +369,7 @@ def touched_points(
 class NominalPoints:
     """Nominal points of a drawing, n in all."""
 
-    source: str  # What they were read from, for messages and for the record.
+    source: str  # Their origin, for messages and for the record.
     names: tuple[str, ...]  # (n,) unique names.
     positions: FloatArray  # (n, 3) [m] in the drawing's frame.
     sigma_m: FloatArray  # (n,) standard deviation of each coordinate [m]; 0 where taken as exact.

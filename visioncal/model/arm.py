@@ -20,9 +20,9 @@ class Arm:
     poses: FloatArray
     joints: FloatArray | None = None  # (s, n) joint angles [rad]; None unless known at all stops.
     model: Robot | None = None  # Its geometry, if known.
-    # What it carries at the stops, and the side from which it approached them; None where unknown.
+    # Its loads at the stops, and the side from which it approached them; None where unknown.
     loads: Loads | None = None
-    heat: Inputs | None = None  # What heats it; None where that is not recorded.
+    heat: Inputs | None = None  # Its heat sources; None where they are not recorded.
 
     @property
     def has_joints(self) -> bool:
@@ -80,7 +80,7 @@ class Moments:
     stops: IntArray  # (k,) indices of the cell's stops; -1 of other moments.
     # (k, n) sides from which joints came, as of `Arm.sides`; in the middle of their play elsewhere.
     sides: Mapping[str, FloatArray] = field(default_factory=dict)
-    # What arms carry beside their own weight; those without carry nothing.
+    # Loads of arms beside their own weight; those without carry nothing.
     loads: Mapping[str, Loads] = field(default_factory=dict)
     # (k, 6) twist per second of a flange, in its own frame [rad/s, m/s], while a camera looked: by
     # the camera and the flange. At rest elsewhere.

@@ -27,7 +27,7 @@ class Cell:
     boards: Mapping[str, Target]  # By frame.
     sightings: tuple[Sighting, ...]
     moments: Moments  # At all s stops.
-    sweeps: tuple[Swept, ...] = ()  # What was seen while robots moved.
+    sweeps: tuple[Swept, ...] = ()  # Sightings while robots moved.
     absent: Mapping[int, str] = field(default_factory=dict)  # Why views have no sighting.
     stations: tuple[int, ...] = ()  # Of the session, at the s stops.
 

@@ -9,7 +9,7 @@ from visioncal.present.facts import PLUS_MINUS
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results.arm import NOMINAL, ArmErrorsResult, ArmResult, ElasticResult, ThermalResult
 
-# What each model level estimates.
+# Parameters of each model level.
 LEVELS = {
     NOMINAL: "the arm as stated",
     "backlash": "play of the joints",

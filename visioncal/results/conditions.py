@@ -23,8 +23,8 @@ class Condition:
     """A condition under which a result holds."""
 
     kind: Literal["calibrated-arm", "own-lens", "load", "temperature"]  # Its kind.
-    sentence: str  # What it is, with its figure.
-    do: str  # What follows for whoever uses the result.
+    sentence: str  # The condition, with its figure.
+    do: str  # Its consequence for whoever uses the result.
 
     @property
     def words(self) -> str:

@@ -64,7 +64,7 @@ class CalibrationForm:
     rms: Rms  # Residuals over the used views.
     validation: Validation  # Residuals of views that were left out.
     verdict: StoredVerdict  # Verdict with its reasons.
-    conditions: tuple[Condition, ...] = ()  # What it is valid for.
+    conditions: tuple[Condition, ...] = ()  # Conditions under which it is valid.
     need: NeedMet | None = None  # Required accuracy of picks, and the probability of meeting it.
     # Tools and fixtures by transform name.
     frames: Mapping[str, Frame] = field(default_factory=dict)
@@ -88,7 +88,7 @@ class CellForm:
     views: tuple[CellView, ...]  # One entry for each observation.
     rms: Rms  # Residuals over the used observations.
     verdict: StoredVerdict  # Verdict with its reasons.
-    conditions: tuple[Condition, ...] = ()  # What it is valid for.
+    conditions: tuple[Condition, ...] = ()  # Conditions under which it is valid.
     need: NeedMet | None = None  # Required accuracy of picks, and the probability of meeting it.
     validation: Validation | None = None  # Residuals of left-out observations.
     # Tools and fixtures by transform name.
@@ -145,7 +145,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     if "tree" in document:
         form = read(CellForm, document, "")
         cell, views = form.cell, tuple(view.result(form.cell.tree) for view in form.views)
-        # What is derived is not on disk.
+        # Derived values are not on disk.
         fields: dict[str, Any] = {"mount": cell.mount, "solvers": {}, "noise": {}, "views": views}
         fields |= {"rms": rms_of(views), "validation": form.validation or Validation.of("", views)}
         fields |= {name: getattr(form, name) for name in _OF_CELL}

@@ -65,17 +65,17 @@ class Entry:
     source: str = ""  # Absolute path of the input; empty where unknown.
     out: str = ""  # Absolute path of the result; empty where none was written.
     against: str = ""  # Digest of the calibrated session that a later act is about.
-    # What was estimated, by name.
+    # Estimates, by name.
     edges: Annotated[Mapping[str, StoredEdge], Key("transforms")] = field(default_factory=dict)
     # Transforms of boards, which are put elsewhere on purpose.
     boards: tuple[str, ...] = ()
     need: Need | None = None  # Required accuracy of picks.
     good_for_mm: float | None = None  # The least need for which it is good [mm].
-    conditions: tuple[str, ...] = ()  # What the result is valid for, in sentences.
+    conditions: tuple[str, ...] = ()  # Conditions of the result, in sentences.
     robot: str = ""  # Model of the robot.
     # Numbers of the result by name, with their units: `views`, `noise_mm`, `radius95_mm` ...
     figures: Mapping[str, float] = field(default_factory=dict)
-    # What a newer version has noted, unchanged.
+    # Notes of a newer version, unchanged.
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict, repr=False)
 
     @property
@@ -210,7 +210,7 @@ def entry_of_check(document: Mapping[str, Any], label: str = "verify.json") -> E
             "against": document["calibration"]["sha256"],
             "figures": {"misfit": document["misfit"], "p_value": document["p_value"]},
         }
-        # What cannot be read again stays in a history for ever.
+        # An entry that cannot be read again stays in a history for ever.
         return read(Entry, facts, "")
 
 

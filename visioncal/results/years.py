@@ -161,7 +161,7 @@ class _Model:
     def __init__(self, days: FloatArray, values: FloatArray, covariances: FloatArray) -> None:
         count, self.dimension = values.shape
         self.size = values.size
-        # What is exact to less than a thousandth of a unit, 1 um, does not stay so.
+        # A value that is exact to less than a thousandth of a unit, 1 um, does not stay so.
         weights = np.linalg.inv(covariances + 1e-6 * np.eye(self.dimension))
         weighted = np.einsum("nuv,nv->nu", weights, values)
         # The changes, the level, and none.

@@ -158,6 +158,6 @@ def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
         # A known word with a suffix, as target_id, is not misspelt.
         is_other = name in known or is_number(name) or re.split(r"[_.]", name)[0] in known
         in_radians = name.replace("_deg", "_rad")
-        # That of `status` and `stamp_s` is 0.62.
+        # The similarity of `status` and `stamp_s` is 0.62.
         if hint := "" if is_other else did_you_mean(in_radians, known, 0.76):
             yield f"{where}: column {name} is not a known one and is kept as text. {hint}"

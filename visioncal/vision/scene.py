@@ -4,7 +4,7 @@ The patches of most texture (Shi and Tomasi 1994) are tracked from coarse to fin
 compositional algorithm with a gain and an offset each (Baker and Matthews 2004; Bartoli 2008),
 between pixels by cubic B-splines. A small turn of the camera moves the image of a scene at any
 depth in the same way; it is fitted to the shifts of all patches through the lens, by sampling
-consensus (MSAC; Torr and Zisserman 2000) and weighted least squares. What moves by itself disagrees
+consensus (MSAC; Torr and Zisserman 2000) and weighted least squares. Moving points disagree
 and is left out. The covariance is that of the jackknife over blocks of the image (Efron 1982):
 neighbouring patches share errors of lens and light.
 """
@@ -171,7 +171,7 @@ def _registered(
     if count < max(_FEWEST, _SHARE * len(at)) or not np.isfinite(of_pose).all():
         words = f"{count} of {len(at)} patches of the reference are found and agree"
         return nothing(size, f"another scene, or much of it moved: {words}")
-    # What hangs on the camera, or a belt that carries most of the texture, moves against the rest.
+    # A part on the camera, or a belt that carries most of the texture, moves against the rest.
     away = np.linalg.norm(_seen(camera, points, pose)[0] - at, axis=1) > 2 * _GATE_PX
     if away.any():
         shifts, _, found = _tracked(before[0], now[0], at, np.zeros_like(at))
@@ -297,7 +297,7 @@ def _covariance(places: FloatArray, rows: FloatArray, rest: FloatArray) -> Float
     count = 1.0 / max(float(np.sum(shares**2)), 1e-9)
     if count <= size + 3:
         return unknown
-    # What each block changes: residuals are the smaller the more a block alone determines.
+    # The change by each block: residuals are the smaller the more a block alone determines.
     changes = (np.linalg.pinv(total - information, hermitian=True) @ scores[:, :, None])[:, :, 0]
     # Few blocks tell their spread poorly: by this factor, the squared error over it is one on
     # average. Equal images are no proof of more than a tenth of the patches' own sigmas.

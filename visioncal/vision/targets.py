@@ -30,7 +30,7 @@ _BOX = np.array(
 )
 # Keys of target descriptions.
 KEYS = {"kind", "points", "spacing_m"}.union(*(kind.keys.split() for kind in KINDS.values()))
-# What is to be written for a grid of ArUco markers.
+# Advice for a grid of ArUco markers.
 _GRID = ("gridboard", 'Write kind = "gridboard" with columns, rows, size_m, spacing, dictionary.')
 
 

@@ -50,7 +50,7 @@ class Guess:
     candidates: tuple[Candidate, ...]
     best: Candidate  # The reading that stands out; the declared one where none does.
     sentence: str  # The finding, with its figures.
-    notes: tuple[str, ...] = ()  # What residuals cannot show here, in sentences.
+    notes: tuple[str, ...] = ()  # Limits of the residuals here, in sentences.
 
     @property
     def stands_out(self) -> bool:

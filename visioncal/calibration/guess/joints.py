@@ -46,7 +46,7 @@ class JointReading:
     zeros: FloatArray  # (n,) correction of each joint's zero [rad].
     # The difference from the declared reading; empty for the declared reading itself.
     words: str = ""
-    fix: str = ""  # What the user can do about it.
+    fix: str = ""  # The remedy, for the user.
     columns: tuple[int, ...] = ()  # The columns concerned, numbered from 0; empty for all.
     cost: float = 1.0  # Number of mistakes it implies; a lost zero counts more than one.
 

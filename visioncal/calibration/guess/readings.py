@@ -32,7 +32,7 @@ class SideReading(Reading):
     # Whether rotations are transposed while positions are not those of an inverse.
     transposed: bool = False
     mirrored: bool = False  # Whether the frame is left-handed.
-    # Which number of a recorded position is that along each axis, and the signs of the axes.
+    # The number of a recorded position along each axis, and the signs of the axes.
     axes: tuple[int, int, int] = (0, 1, 2)
     signs: tuple[int, int, int] = (1, 1, 1)
     scale: float = 1.0  # Factor of all distances, beside the unit.
@@ -153,7 +153,7 @@ class Change:
 
     words: str
     part: Literal["robot", "camera", "chain"]  # A side, or the hypothesis itself.
-    fields: Mapping[str, Any]  # What its fields should be.
+    fields: Mapping[str, Any]  # Its right fields.
     cost: int = 1  # Number of mistakes.
 
     def of(self, reading: Hypothesis) -> Hypothesis:

@@ -159,7 +159,7 @@ def with_pose_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotA
         errors = find_pose_errors(fit.problem, fit.state, fit.noise, name)
         if errors is None or errors.white is None:
             return errors
-        # What grows with time, reach or gravity is another at a pick, and in another session.
+        # Errors that grow with time, reach or gravity are others at a pick, and in another session.
         varies = random_effect_rms(fit.problem, fit.state, name)
         return replace(errors, white=np.hypot(errors.white, varies))
 

@@ -54,7 +54,7 @@ class FitAssessment:
     cell_fit: CellFit  # The fit, with what it is of.
     fit: Fit  # The same with its covariance from all sources.
     steps: tuple[Step, ...]  # Steps that the residuals show, likeliest first.
-    arms: Mapping[str, ArmReport]  # What was found of the arms, by robot.
+    arms: Mapping[str, ArmReport]  # Findings about the arms, by robot.
     held_out: HeldOutResiduals  # Residuals of observations that were left out of the fit in turn.
     moved: tuple[Moved, ...]  # Frames that moved, in the order of time.
     faults: tuple[PoseFault, ...]  # Wrong poses and images that explain outliers.

@@ -23,7 +23,7 @@ from visioncal.session import frame_name
 class ObservedPoses(Observed):
     """Observations with given lens, boards and arm, none of which is estimated here."""
 
-    # Which of the session's boards the problem contains, the reference board first.
+    # Those of the session's boards that the problem contains, the reference board first.
     boards: tuple[int, ...] = (0,)
     used: tuple[int, ...] = ()  # The views in the problem, in the session's order.
     # Lens and boards with their free values; None without corners.

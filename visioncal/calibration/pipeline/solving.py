@@ -158,7 +158,7 @@ def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
         of_flange = of_flange.refitted()
         other = _fit_with_inliers(replace(cell_fit, inlier_fit=of_flange), observed)
     except (VisioncalError, np.linalg.LinAlgError):
-        # What no fit converges to is not likelier.
+        # A state to which no fit converges is not likelier.
         return cell_fit
 
     def misfit(found: InlierFit) -> float:

@@ -49,7 +49,7 @@ class Detections:
     corners: Mapping[int, Corners]
     rejections: tuple[Rejection, ...]
     resolution: Size  # The camera's (width, height) [px].
-    searches: Mapping[int, Searched]  # What was found in each image, by view.
+    searches: Mapping[int, Searched]  # Corners found in each image, by view.
 
 
 def detect(

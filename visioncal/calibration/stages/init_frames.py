@@ -224,7 +224,7 @@ class _Growth:
                     return joined, by_turn, counts
                 relations += found
                 continue
-            # What has several transforms comes last: others may be reached unambiguously.
+            # Pairs of several transforms come last: others may be reached unambiguously.
             relation, matrices = min(options, key=lambda item: (len(item[1]), item[0].sigma_m))
             first, second, choice = relation.first, relation.second, 0
             is_placed = self.is_placed(joined, second)

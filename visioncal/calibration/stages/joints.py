@@ -38,8 +38,8 @@ class MatchedJoints:
     joints_rad: Mapping[int, FloatArray] = field(default_factory=dict)
     # (4, 4) the poses' frame in the model's flange.
     flange_from_reported: FloatArray = field(default_factory=lambda: np.eye(4))
-    misread: str = ""  # What is wrong with the angles or the model, and the fix; empty for nothing.
-    # What is wrong with the angles, unless the pose is, by view.
+    misread: str = ""  # The fault of the angles or the model, and the fix; empty for none.
+    # The fault of the angles, unless the pose has one, by view.
     contradicting: Mapping[int, str] = field(default_factory=dict)
     warnings: tuple[Finding, ...] = ()  # Findings to be mended.
     notes: tuple[str, ...] = ()  # Remarks.

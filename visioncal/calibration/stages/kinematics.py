@@ -110,7 +110,7 @@ class SelectedArmLevel:
     """The errors of the arm's model that the views show."""
 
     nominal: LevelFit  # The fit of the nominal arm.
-    fit: LevelFit  # That with the errors; the nominal one where none explain more than chance.
+    fit: LevelFit  # The fit with the errors; the nominal one where none explain more than chance.
     was_asked: bool  # Whether the user named the level.
     views: tuple[int, ...] = ()  # (m,) the view of each residual of these.
 

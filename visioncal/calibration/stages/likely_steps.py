@@ -59,13 +59,13 @@ def likely_steps(
         if step.kind == DRIFT or (drift is not None and step.gain - penalty < drift.gain):
             continue
         gain, apart, there = evidence(problem, fit, step)
-        # What errors of an arm, correlated by posture or time, explain as well is none.
+        # A change that errors of an arm, correlated by posture or time, explain as well is none.
         for robot, arm in errors.items():
             beside = find_pose_errors(apart, there.state, there.noise, robot)
             gain += (beside.gain if beside else 0.0) - arm.gain
         likely.append(replace(step, gain=gain - penalty))
     likely.sort(key=lambda step: -step.gain)
-    # Which errors of an arm there are is known less well than that there are some.
+    # The kind of an arm's errors is known less well than their presence.
     needed = 3.0 * _CLEARLY if any(arm.is_significant for arm in errors.values()) else _CLEARLY
     if likely and likely[0].gain > needed:
         least = max(needed, likely[0].gain - _CLEARLY)

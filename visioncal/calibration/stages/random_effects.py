@@ -94,7 +94,7 @@ def random_effects(
         chosen, value = _with_sizes(inliers, tried, nuisance)
         step = next((at for at in opened if isinstance(at, BaseSteps | MountSteps)), None)
         if step is not None:
-            # What moved at once looks as if it crept; the search for steps comes later.
+            # A frame that moved at once looks as if it crept; the search for steps comes later.
             kinds = [kind for kind in kinds if not issubclass(kind, BaseCreeps | MountCreeps)]
             others = _of_flange(problem, robot, stops, kinds, step)
             instead, least = _with_sizes(inliers, others, nuisance)
@@ -119,7 +119,7 @@ def _of_flange(
     moments = Moments({robot: poses}, {}, even_progress(count), np.arange(count))
     tried = [] if step is None else [(replace(step, frame=robot), np.inf)]
     for kind in kinds:
-        # What fades otherwise is too much alike.
+        # Creeps that fade otherwise are too much alike.
         tried += [(effect, kind.most) for effect in islice(kind.of_flange(robot, stood), 1)]
     found = dict[Effect, float]()
     for effect, most in tried:

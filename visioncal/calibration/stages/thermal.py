@@ -126,7 +126,7 @@ class ThermalFit:
     """Drift of an arm."""
 
     model: ThermalModel  # The arm with its coefficients and their covariance.
-    inputs: Inputs  # What heated the arm.
+    inputs: Inputs  # The heat sources of the arm.
     values: FloatArray  # (p,) deviation of the parameters from their prior, in its sigmas.
     # (p,) posterior over prior sigma of each parameter.
     shares: FloatArray = field(default_factory=lambda: np.zeros(0))

@@ -15,7 +15,7 @@ from visioncal.model.effects.effect import LensEffect
 
 def _found(kind: str, run: RunState) -> Iterator[Finding]:
     fit, effect, arms = run.assessment.fit, KINDS[kind], run.cell_fit.arms.values()
-    # What arms err by from stop to stop looks like it: there the covariance, which has that, says
+    # Errors of arms from stop to stop look like it: there the covariance, which has these, says
     # what chance explains.
     is_alone = not any(arm.errors is not None and arm.errors.is_significant for arm in arms)
     for owner in fit.unknowns.of(kind):

@@ -11,7 +11,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Remedy
 
-# What rides on a flange may be so far from it [m], also where the poses are in the board's frame;
+# A part on a flange may be so far from it [m], also where the poses are in the board's frame;
 # seldom so far, or a camera so far behind the flange: more than the length of one beside the wrist.
 _NEAR_M, _FAR_M, _BEHIND_M = 0.3, 0.5, 0.05
 

@@ -108,7 +108,7 @@ def _line(both: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float
             across = np.eye(3) - np.outer(direction, direction)
             edges = np.linalg.lstsq((across @ rows).reshape(-1, 6), -(places @ across).ravel())[0]
             left = places + rows @ edges
-            # What is the same in all views is a place of the target.
+            # A shift that is the same in all views is a place of the target.
             left -= np.median(left, axis=0)
             direction = np.linalg.svd(left, full_matrices=False)[2][0]
         outside = left - np.outer(left @ direction, direction)

@@ -234,7 +234,7 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
         turned = ""
         if inliers.problem.observations.has_rotation[at]:
             turned = f" and {figure(float(np.rad2deg(off_rad[at])))} deg"
-        # What is far away is rejected even where the prediction is uncertain.
+        # A view that is far away is rejected even where the prediction is uncertain.
         beyond = "many times as far as most"
         if distance[at] > limit[at]:
             beyond = f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"

@@ -121,8 +121,8 @@ def rank_causes(
     found = _with_probabilities(doubts, left_out_mm)
     sigmas = [finding for finding in found if SUSPECTS[finding.kind].is_sigma]
     sigma = min(sigmas, key=lambda finding: SUSPECTS[finding.kind].size, default=None)
-    # A sigma far beyond its limit alone makes a result bad, with no likely mistake. What the fit
-    # accounts for inflates none.
+    # A sigma far beyond its limit alone makes a result bad, with no likely mistake. Errors
+    # that the fit accounts for inflate none.
     is_likely = any(
         finding.probability >= _LIKELIER
         and (finding.kind not in _ACCOUNTED or finding.mahalanobis_sq > 0.0)

@@ -95,7 +95,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("carried_away", is_doubt=False),
     Suspect("untied", _unconnected, FACT),
     Suspect("unseen_target"),
-    # What was seen and read.
+    # Images and readings.
     Suspect("missing_images", is_doubt=False),
     Suspect("repeated_readings", is_doubt=False),
     Suspect("repeated_views", chance=FACT),

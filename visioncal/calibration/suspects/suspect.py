@@ -26,7 +26,7 @@ SOURCES = (
 )
 # False-alarm probabilities of remarks, which no test is behind (1 / e: even odds), and of facts.
 REMARK, FACT = math.exp(-1.0), 1e-12
-# What a change during the session inflates: errors by posture and time correlate before and after
+# Sources that a change inflates: errors by posture and time correlate before and after
 # it, and are tested beside it.
 INFLATED = (ARM_ERRORS, "calibration")
 

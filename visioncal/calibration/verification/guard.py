@@ -234,7 +234,7 @@ class Guard:
         scores = weighed(self._state, kinds, self._units, is_raw=True)
         by_time = np.exp(scores - scores.max()).sum(axis=0)
         candidate = int(by_time.argmax())
-        # What changed is judged at the likeliest time.
+        # The change is judged at the likeliest time.
         shares = np.exp(scores[:, candidate] - scores[:, candidate].max())
         return kinds, shares / shares.sum(), candidate, by_time
 
@@ -337,7 +337,7 @@ class Guard:
             effects=effects,
         )
         linear = problem.linear(prior.state)
-        # What is truly otherwise acts against what is predicted.
+        # A true difference acts against the prediction.
         jacobian = -linear.jacobian[0]
         by_edges, by_values = jacobian[:, :edges], jacobian[:, edges:]
         by_arm = linear.by_errors[0] * np.repeat(self._noise.robots[0], 3)

@@ -51,7 +51,7 @@ _FRESH = 0.4
 # Squared length of an innovation that noise exceeds in one look of a hundred: the largest that
 # counts in full.
 _FAR = float(chi2_limit(0.01, 6))
-# That of noise as unlikely as a wrong look: one of 200, over lengths of centimetres.
+# The likelihood of noise as unlikely as a wrong look: one of 200, over lengths of centimetres.
 _WRONG = 60.0
 # Rotation [rad] and distance [m] of a residual beyond which its rows say nothing, and the log
 # likelihood ratio of such a look, and inverse of any other, after a change of that size to none.
@@ -90,7 +90,7 @@ class ChangeKind:
     """A cause that the test compares."""
 
     name: str  # `camera`, `board NAME`, `joint 3`, or `none of these`.
-    columns: tuple[int, ...]  # Which of the changes of frames and joints it has; none beyond rows.
+    columns: tuple[int, ...]  # Its changes among those of frames and joints; none beyond rows.
     prior: float  # Prior probability.
 
 
@@ -225,7 +225,7 @@ def step(state: Detector, rows: LookRows, *, is_learning: bool) -> Detector:
     grown["raw_gradient"] += accepted[:, None] * (turned @ white)
     grown["excess"] += accepted * 0.5 * max(squared - _WRONG, 0.0)
     grown["raw_beyond"] += 2.0 * (1.0 - accepted) * (squared > _WRONG)
-    # What innovations still have of the slow motions that were predicted, by frames: none if these
+    # The part of predicted slow motions that innovations still have, by frames: none if these
     # are as large as supposed.
     forecast = (whiten @ (rows.by_motion * mean[motions])).reshape(6, -1, 6).sum(axis=2)
     mean = mean + gain @ clipped

@@ -24,7 +24,7 @@ from visioncal.results import Calibration
 from visioncal.session import Session, View
 from visioncal.session.table import reported_matrices
 
-POSES, CYCLES = 5, 30  # What the standard asks for.
+POSES, CYCLES = 5, 30  # By the standard.
 # Estimate, and the ends of its interval of 95 % [mm] or [deg].
 Interval: TypeAlias = tuple[float, float, float]
 _ENDS = np.array([0.025, 0.975])
@@ -40,7 +40,7 @@ class PosePerformance:
     accuracy_mm: Interval  # AP.
     repeatability_mm: Interval  # RP, without the device's own noise.
     measured_repeatability_mm: float  # RP as the standard has it, with that noise.
-    device_mm: float  # What the device alone would show as RP.
+    device_mm: float  # RP that the device alone would show.
     accuracy_deg: tuple[Interval, ...] | None = None  # AP about the base's x, y and z.
     repeatability_deg: tuple[Interval, ...] | None = None  # RP about these.
     variation_mm: float | None = None  # vAP, where column direction names several.
@@ -59,7 +59,7 @@ class Performance:
     poses: tuple[PosePerformance, ...]
     # Distance accuracy AD between two poses, by their names: estimate and interval [mm].
     distances_mm: Mapping[str, Interval]
-    device: str  # What measured.
+    device: str  # The measuring device.
     stated: Mapping[str, str]  # Load, speed, temperature and serial number as the session has them.
 
     def document(self) -> dict[str, Any]:
@@ -290,7 +290,7 @@ def _repeatability(
     freedom = (count - 1) * trace**2 / max(float(np.sum(spread**2)), 1e-30)
     low, high = (freedom / chi2_limit(1.0 - end, freedom) for end in _ENDS[::-1])
     shape = 3.0 if single else _shape(spread)
-    # What falls short of the device's noise by chance bounds no better than that noise.
+    # A spread below the device's noise, by chance, bounds no better than that noise.
     parts = (low * trace, trace, high * max(trace, own))
     ends = [shape * float(np.sqrt(max(part - own, 0.0))) for part in parts]
     return ends[0], ends[1], ends[2], (3.0 if single else _shape(noise)) * float(np.sqrt(own))

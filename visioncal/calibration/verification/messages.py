@@ -120,7 +120,7 @@ def verdict_of(check: Check) -> Verdict:
     if not check.named:
         findings = (Finding(AGREEMENT, _agreement(check)), *check.depth, *bad, *few)
         if not check.passed:
-            # What changed comes first.
+            # The change comes first.
             order = sorted(findings, key=lambda found: found.kind != DEPTH_CHANGED)
             return Verdict("bad", tuple(order))
         return Verdict("check" if bad or few else "good", findings)

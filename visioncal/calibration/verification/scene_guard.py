@@ -43,7 +43,7 @@ class SceneLook:
     """Motion of the camera in one view since the reference of its pose."""
 
     view: int  # Number of the view.
-    reference: int  # That of the first view of the same pose; its own if it is the first.
+    reference: int  # The first view of the same pose; its own if it is the first.
     found: Registration  # Against the reference.
     holds: bool  # Whether the camera stands as it did, by the looks so far.
     evidence: float  # The statistic over its limit.

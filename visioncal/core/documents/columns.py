@@ -203,7 +203,7 @@ def _unit_step(names: Sequence[str], numbers: FloatArray, norms: FloatArray) -> 
         if rest.max() > 10.0 * NORM_TOLERANCE and away < 2.0 * NORM_TOLERANCE:
             which = ", ".join(names[at] for at in chosen)
             return f"Divide {which} by {factor:.6g} in all rows: then all norms are 1."
-    # What the camera saw is read in one form alone.
+    # Poses by the camera are read in one form alone.
     if names[3] != "qw" or norms.max(initial=0.0, where=known) <= 1.5:
         return ""
     if np.nan_to_num(numbers[3]).any():

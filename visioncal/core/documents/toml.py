@@ -17,7 +17,7 @@ from visioncal.core.number_format import did_you_mean
 MAX_VALUES = 1_000_000
 # Matrices in lists in tables need six.
 MAX_DEPTH = 40
-# What people write of TOML's text and numbers, and what is meant.
+# Mistakes in TOML's text and numbers, and their corrections.
 _TOML_MISTAKES = (
     (r"\\", "/"),
     (r"(?<=\d),(?=\d)", "."),

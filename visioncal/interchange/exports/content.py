@@ -251,10 +251,10 @@ class Selection:
     load: Load | None = None
     convention: str | None = None
     calibration_hash: str | None = None  # The `hash` of a UR's own kinematics.
-    camera: str | None = None  # Which camera of a cell is meant, in a format of lenses.
-    # Which robot of a cell: its part is exported as of one camera and robot.
+    camera: str | None = None  # A camera of a cell, in a format of lenses.
+    # A robot of a cell: its part is exported as of one camera and robot.
     robot: str | None = None
-    target: str | None = None  # Which target of a cell; likewise.
+    target: str | None = None  # A target of a cell; likewise.
     lens: str | None = None  # A poorer model of the lens, as of `lenses.POORER`.
 
 
@@ -325,7 +325,7 @@ class Format(Generic[_T]):
     words: str  # Its description with its reader and units, in one line.
     write: Callable[[_T], str]  # Builds the document.
     takes: frozenset[str] = frozenset()  # Fields of the selection that apply to it; see `check`.
-    # What its user should know or do before using the document, in sentences.
+    # Warnings for its user before using the document, in sentences.
     warn: Callable[[_T], Iterable[str]] = field(default=lambda _: ())
 
     def check(self, selection: Selection, also: Collection[str] = ()) -> None:

@@ -69,7 +69,7 @@ class Document:
 
     text: str
     verdict: Verdict  # The worst verdict of what was written.
-    # What else its user should know before it is used, each in plain words.
+    # Further warnings for its user, each in plain words.
     warnings: tuple[str, ...] = ()
     # The heading of what was written, in a format without comments.
     notes: tuple[str, ...] = ()

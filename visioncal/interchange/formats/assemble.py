@@ -32,7 +32,7 @@ from visioncal.vision.targets import target_name
 class FileImages(ListedImages[Path]):
     """Image files anywhere on the disk, by their paths in the session."""
 
-    # What was found of the only board in some files before.
+    # Corners of the only board that were found in some files before.
     searches: Mapping[Path, Searched] = field(default_factory=dict)
 
     def search_of(self, path: str, board: str) -> Searched | None:

@@ -96,7 +96,7 @@ class _Contents:
     moving: dict[tuple[str, str], "array[float]"] = field(default_factory=dict)
     still: dict[tuple[str, str], "array[float]"] = field(default_factory=dict)
     descriptions: list[str] = field(default_factory=list)
-    # What has poses that are none, which are left out, as tf2 does.
+    # Frames with invalid poses, which are left out, as tf2 does.
     refused: set[str] = field(default_factory=set)
 
     @cached_property
@@ -466,7 +466,7 @@ def _depths(
     # Distances come before clouds, which are larger.
     name = min(aligned, key=lambda name: (aligned[name].ending == "npy", name))
     depth, stamps_s = aligned[name], np.array(aligned[name].stamps_s)
-    # That of the same picture is nearer than the next one.
+    # Depth of the same picture is nearer than the next one.
     limit_s = 0.5 * float(np.median(np.abs(np.diff(stamps_s)))) if len(stamps_s) > 1 else 0.05
     for stamp_s, path in rows:
         nearest = int(np.argmin(np.abs(stamps_s - stamp_s)))

@@ -187,7 +187,7 @@ def _pose_fields(fields: Fields, requested: ImportOptions) -> dict[Side, tuple[s
         ("camera", requested.camera),
     ]
     names: dict[Side, tuple[str, ...]] = {"robot": (), "camera": ()}
-    # What the user names of one side is not the other's.
+    # Columns that the user names of one side are not the other's.
     for whose, asked in sorted(sides, key=lambda side: not side[1].names):
         names[whose] = pose_names(fields, asked.names, whose, used)
         used.update(names[whose])

@@ -37,7 +37,7 @@ class Fields:
     """Named values of n rows."""
 
     name: str  # Name of the recording.
-    folder: Path  # What the names of images are relative to.
+    folder: Path  # Names of images are relative to it.
     places: tuple[str, ...]  # (n,) place of each row in the source, for messages.
     numbers: Mapping[str, FloatArray]  # (n, ...) arrays by name; NaN where a row has none.
     # (n,) texts by name, of every column of a table and of single numbers.

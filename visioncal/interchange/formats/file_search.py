@@ -305,7 +305,7 @@ class Pairing:
 
     images: tuple[Path | None, ...]  # (n,) the image of each row; None in a row without.
     depths: tuple[Path | None, ...] = ()  # (n,) its depth picture likewise; empty without any.
-    notes: tuple[str, ...] = ()  # What was paired with what, and what was left out.
+    notes: tuple[str, ...] = ()  # Pairs, and files that were left out.
     # (n,) images in other orders, where no names pair them, and what they are called.
     others: tuple[tuple[str, tuple[Path | None, ...]], ...] = ()
     is_open: bool = False  # Whether what the images show says which of these is right.
@@ -332,7 +332,7 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         group, found = item
         drawn = _DRAWN.search(group.label) is not None
         is_named = re.search("rgb|colou?r", group.label, re.IGNORECASE) is not None
-        # What another program drew, and pictures of some of the rows alone, come last.
+        # Drawings of another program, and pictures of some of the rows alone, come last.
         is_grey = group.image is not None and group.image.words.endswith("grey")
         extra = (
             int((found.rows < 0).sum()),

@@ -13,7 +13,7 @@ from visioncal.core.number_format import known_name
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Progress, chosen_rows, evenly
 from visioncal.session import ImageStore
 
-# What a source does not say of its poses: `rotation`, `angles` (their order and unit), `unit`,
+# Parts of a reading that may be unstated: `rotation`, `angles` (their order and unit), `unit`,
 # `inverse`, and which `images` are theirs.
 Unstated: TypeAlias = frozenset[str]
 Side: TypeAlias = Literal["robot", "camera"]
@@ -127,7 +127,7 @@ class ForeignRecording:
     # Further columns of views.csv with their (n,) cells.
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # Assumptions and omissions, in sentences for the user.
-    # What is assumed of the poses of each side.
+    # The assumed reading of the poses of each side.
     unstated: Mapping[Side, Unstated] = field(default_factory=dict)
     # The same source otherwise read, the likeliest first; each with how unlikely it is beside this.
     rivals: tuple[tuple[int, "ForeignRecording"], ...] = ()

@@ -98,7 +98,7 @@ class PoseFields:
     """Fields that may hold poses: one, or those of a position and of a rotation."""
 
     names: tuple[str, ...]
-    words: tuple[str, ...]  # What the names say beside `position` and the like.
+    words: tuple[str, ...]  # Words of the names beside `position` and the like.
     is_named: bool = True  # Whether the names are those of a pose.
 
     @property
@@ -249,7 +249,7 @@ class _Piece:
     names: tuple[str, ...]
     words: tuple[str, ...]
     size: int  # Number of values.
-    appearance: str  # What these are, as far as they show it.
+    appearance: str  # Their kind, as far as they show it.
 
     @property
     def rest(self) -> tuple[str, ...]:

@@ -238,7 +238,7 @@ _IMAGE = re.compile(
 # Words of JSON, and the same of Python.
 _NAMES_OF = {"true": "True", "false": "False", "null": "None", "NaN": "None"}
 _PYTHON = re.compile(rf"\b(?:{'|'.join(_NAMES_OF)})\b")
-# What a program declares beside targets.
+# Declarations of a program beside targets.
 _FRAMES = re.compile("tool|wobj|load|base", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//", "!")
 # The name of a taught point: `DECL E6POS XP1={`, `CONST robtarget p10:=`, `P[1]{`, `P1: X ..`.

@@ -154,7 +154,7 @@ def _checked(
 ) -> ForeignRecording:
     """The recording with what its source does not say, as tested; raises DataError."""
     robot = foreign.robot if foreign.stream is None else foreign.stream.poses
-    # What was tested is in no doubt.
+    # A tested reading is in no doubt.
     if tested.unstated or not foreign.unstated:
         check_radians(robot, requested.robot, "robot")
         if foreign.camera is not None:
@@ -196,7 +196,7 @@ def write_session(session: Session, dest: Path) -> None:
         write_recording(dest, session, None, (), blueprint(session))
     else:
         session.save(dest)
-    # What a session cannot hold, such as a place outside any cell, is refused, and not left.
+    # Content beyond a session's, such as a place outside any cell, is refused, and not left.
     with ExitStack() as otherwise:
         otherwise.callback(shutil.rmtree if dest.is_dir() else Path.unlink, dest)
         if Session.load(dest).digest() != session.digest():

@@ -65,7 +65,7 @@ class _Reader:
             for name, text in lists.items()
             for each in _RECORD.finditer(text)
         }
-        # What a program assigns is calculated when it runs.
+        # Assigned values are calculated when a program runs.
         assigning = rf"^[ \t]*({_NAME})(?:\.\w+)?\s*="
         self.assigned = {
             name.upper()

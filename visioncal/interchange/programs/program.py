@@ -57,7 +57,7 @@ class Found:
     """Content of a program."""
 
     uses: list[Use] = field(default_factory=list)
-    left: list[str] = field(default_factory=list)  # What stays, and why.
+    left: list[str] = field(default_factory=list)  # Lines that stay, and why.
     kept: set[Literal] = field(default_factory=set)  # Targets that an unknown frame keeps as well.
 
     def add(self, place: str, literal: Literal, base: Frame, tool: Frame) -> None:
@@ -126,7 +126,7 @@ class CorrectedProgram:
 
     texts: Mapping[str, str]  # Its files by name.
     changed: tuple[str, ...]  # Names of the targets that were replaced.
-    left: tuple[str, ...]  # What stays, and why.
+    left: tuple[str, ...]  # Lines that stay, and why.
     moved_mm: FloatArray  # (k,) how far each command moves.
 
 

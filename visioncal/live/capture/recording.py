@@ -37,7 +37,7 @@ class CaptureEvent:
     found: TakenView | Missed  # The view, or why there is none.
     covered: str  # Coverage so far, in words.
     accuracy: Accuracy | None  # Accuracy predicted so far; None while there is no prediction.
-    advice: str  # What comes next, in words.
+    advice: str  # The next step, in words.
 
     @property
     def words(self) -> str:

@@ -34,7 +34,7 @@ class Features:
     name: str  # Name of the camera in messages.
     node: Callable[[str], Handle]  # Gives a feature's node by its name.
     value: str  # Attribute of a node that is its value.
-    # What the library raises for features that are absent, locked, or out of range.
+    # Errors of the library for features that are absent, locked, or out of range.
     errors: tuple[type[Exception], ...]
 
     def get(self, *names: str) -> str | float | None:
@@ -74,7 +74,7 @@ class Features:
         ):
             self._why_not(value, name)
         width, height = requested.resolution or (None, None)
-        # What keeps a feature from being set, and its value that does not.
+        # Features that keep others from being set, and their values that do not.
         for option, number, names, (guard, free) in (
             ("--resolution", width, ("Width",), ("OffsetX", 0)),
             ("--resolution", height, ("Height",), ("OffsetY", 0)),

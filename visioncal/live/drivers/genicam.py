@@ -39,7 +39,7 @@ class GenicamCamera(stream.StreamingCamera):
             why = f"there is no file {path}.cti" if suffix else f"{_VARIABLE} names no .cti file"
             step = "Install its maker's software, and give the file: --camera genicam:PATH.cti."
             raise stream.camera_error("camera genicam", f"has no GenTL producer: {why}", step)
-        # What fails is raised, too, and worded for who reads it.
+        # Failures are raised, too, and worded for their reader.
         logger = logging.getLogger("harvesters")
         logger.addHandler(logging.NullHandler())
         harvester = core.Harvester(logger=logger)
@@ -48,7 +48,7 @@ class GenicamCamera(stream.StreamingCamera):
             for producer in producers:
                 harvester.add_file(str(producer))
             harvester.update()
-            # What a producer does not report of a device is None.
+            # A property that a producer does not report is None.
             infos = [info.property_dict for info in harvester.device_info_list]
         named = [tuple(str(info[key]) for key in _NAMES if info.get(key)) for info in infos]
         index = stream.chosen(kind, named, wanted, "its maker's viewer")

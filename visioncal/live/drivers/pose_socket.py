@@ -34,7 +34,7 @@ _SLICE_S = 0.05
 # Longest line in, and longest answer out [bytes].
 _MAX_LINE, _MAX_ANSWER = 500, 200
 _ENDS = re.compile(rb"[\r\n]")
-# What a client may add to a line without meaning: blanks, and the zeros of a character array.
+# Meaningless characters of a client's line: blanks, and the zeros of a character array.
 _FILL = b" \t\r\n\0"
 
 
@@ -47,7 +47,7 @@ class _Link:
     """A connection to the robot's program."""
 
     peer: socket.socket
-    received: bytes = b""  # What is not yet read of its lines.
+    received: bytes = b""  # Unread bytes of its lines.
     is_understood: bool = False  # Whether it has said where it stands.
 
     def __post_init__(self) -> None:
@@ -211,7 +211,7 @@ class SocketArm:
             return
         words = " ".join(f"{answer} {reason}".split()).encode("ascii", "replace")
         with self._dropped_if_lost(link):
-            # What came before the answer did not wait for it.
+            # A line before the answer did not wait for it.
             link.receive()
             link.send(words[: _MAX_ANSWER - 1])
             link.refuse_more()

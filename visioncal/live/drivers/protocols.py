@@ -12,7 +12,7 @@ from visioncal.core.types import Camera, FloatArray, Image, Image16
 
 # Whether the arm may move; `reduced` still moves, slowly.
 Safety = Literal["normal", "reduced", "protective-stop", "emergency-stop", "fault"]
-# What became of a requested view: go on to the next stop; none was taken, request it again; it was
+# Outcome of a requested view: go on to the next stop; none was taken, request it again; it was
 # the last; it cannot be taken so, and requesting it again would not help.
 Answer = Literal["next", "again", "done", "error"]
 

@@ -39,7 +39,7 @@ class Arrival:
     depth: Callable[[], Image16] | None = None
 
 
-# What a driver opens: a camera's name in messages; its pictures, which end where the camera does,
+# An opened camera: its name in messages; its pictures, which end where the camera does,
 # with None where there was none for a while; and the settings that it reports.
 Opened: TypeAlias = tuple[str, Iterator[Arrival | None], dict[str, str | float]]
 

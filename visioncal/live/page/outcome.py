@@ -27,10 +27,10 @@ class Outcome:
     light: Light
     title: str  # The verdict in a word or two.
     reasons: tuple[str, ...]  # The likeliest first.
-    next_step: str  # What to do; empty for nothing.
+    next_step: str  # The remedy; empty for none.
     folder: Path  # Where its files are; those of a trial are gone.
     views: tuple[View, ...]  # The rows of which it is.
-    document: dict[str, Any]  # What the command printed; empty where it failed.
+    document: dict[str, Any]  # Output of the command; empty where it failed.
 
     @property
     def report(self) -> Path:

@@ -40,7 +40,7 @@ from visioncal.session import View
 from visioncal.vision.boards.imaging import decode_image, grey_of
 
 _P = ParamSpec("_P")
-# What may be wrong with a view of the table. Where its picture has no pose, or its pose no picture,
+# Possible faults of a view of the table. Where its picture has no pose, or its pose no picture,
 # those from it on are one apart.
 Fault = Literal["not wanted", "exchanged", "no pose", "no picture"]
 # Why a request is refused.
@@ -87,7 +87,7 @@ class Task:
     count: int  # Number of views after which it is judged; 0 where the person decides.
     options: CaptureOptions
     command: Sequence[str]  # The command's words, without the folder that it writes.
-    result: Path  # That folder.
+    result: Path  # The folder.
     usual: PoseForm | None = None  # The form of its controller's poses, where it is known.
 
 
@@ -100,7 +100,7 @@ class Row:
     version: str  # Differs for each picture that the view has had.
     pose: str  # As it was typed, else as the pendant shows it.
     is_typed: bool  # Whether its pose may be typed anew.
-    state: str  # What was seen in the picture.
+    state: str  # The board in the picture, in words.
     residual: str = ""  # Of the newest trial; empty where that is of another picture or pose.
     is_odd: bool = False  # Whether that left it out.
 
@@ -122,10 +122,10 @@ class Snapshot:
 
     phase: Literal["setup", "opening", "live", "stopped"] = "setup"
     setup: Setup = field(default_factory=Setup)
-    problem: str = ""  # What is wrong, and what to do.
+    problem: str = ""  # The fault and its remedy.
     picture: bytes = b""  # The live picture, a JPEG.
     pictures: int = 0  # Number of pictures so far.
-    sees: str = ""  # What is seen in it.
+    sees: str = ""  # The board in it, in words.
     is_still: bool | None = None  # None where pictures are no stream.
     arm: str = ""  # The arm's name.
     takes_typed: bool = False  # Whether poses are typed.
@@ -144,7 +144,7 @@ class Snapshot:
     pose_form: str = ""  # The form in which poses are shown.
     trial: Outcome | None = None  # Result of the views so far.
     outcome: Outcome | None = None  # Result at the end.
-    outdated: str = ""  # What has changed since the newer of the two.
+    outdated: str = ""  # The change since the newer of the two.
     is_judging: bool = False
 
 

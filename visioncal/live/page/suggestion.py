@@ -17,7 +17,7 @@ from visioncal.vision.targets import extent_m, outline
 # image's in shares of the image's size, and its distance in shares of the usual one.
 _TILTS_DEG, _TURNS_DEG = (15.0, 32.0), (0.0, 50.0, -50.0)
 _PLACES, _DISTANCES = (-0.22, 0.0, 0.22), (0.85, 1.0, 1.25)
-# What counts as another view: as far apart as these together [rad, shares of the image, log].
+# Distance of another view: as far apart as these together [rad, shares of the image, log].
 _APART = np.array([0.5, 0.35, 0.25])
 # How far from a pose that was taken another may be suggested in numbers [m, rad].
 _NEAR_M, _NEAR_RAD = 0.3, 1.0

@@ -81,7 +81,7 @@ class NeedPlanned:
     before: float  # Probability without the planned stops.
     probability: float  # The same with them.
     best: float  # The same with all candidates.
-    limits: str  # What limits it, in words; empty where the need is met.
+    limits: str  # Its limit, in words; empty where the need is met.
 
     @property
     def met(self) -> bool:

@@ -58,7 +58,7 @@ class PlanRequest:
     seed: int = 0
     # Tolerance of picks at which fewer are enough; None for none.
     need: Annotated[Need, _NEED] | None = None
-    criterion: Criterion = "I"  # What the stops minimise; see `choose_stops`.
+    criterion: Criterion = "I"  # The criterion that the stops minimise; see `choose_stops`.
 
 
 # An accuracy in plan.json; open where a direction is not determined.
@@ -78,7 +78,7 @@ class Stop:
     q: Vector  # (n,) joint angles [rad].
     # (j, n) via postures after the previous stop, connected straight in joint space [rad].
     via: Annotated[Matrix, Key("via_q")]
-    words: Annotated[str, Key("why")]  # What the stop contributes.
+    words: Annotated[str, Key("why")]  # The stop's contribution.
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class Plan:
     start: SessionStart | None  # The session to which the stops are added; None for none.
     candidate_count: int  # Number of candidates.
     lost: Mapping[str, int]  # Number of tries that each limit rejected.
-    in_the_way: tuple[str, ...]  # What blocked stops that were replaced, one entry for each.
+    in_the_way: tuple[str, ...]  # Obstacles to stops that were replaced, one entry for each.
     need: NeedPlanned | None = None  # Prediction for picks; None where there is no need.
 
 

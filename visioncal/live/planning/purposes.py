@@ -16,8 +16,8 @@ class Purpose:
     """Purpose of a plan. Both edges are unknown for any purpose."""
 
     name: str  # Its name, as a user gives it.
-    judged: Judged  # Which errors count.
-    errors: str  # What they are, in words.
+    judged: Judged  # The errors that count.
+    errors: str  # The same in words.
     stops: int  # Default number of stops of a plan that adds to no session.
     # Unknown errors of the arm (see `ArmModel`) with their prior standard deviation [rad]; that of
     # lengths is 0.5 m times as much.

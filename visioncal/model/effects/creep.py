@@ -56,7 +56,7 @@ class _Creep(_Moves, Named):
     """Motion all over the session."""
 
     most = 3e-3
-    what: ClassVar[str]  # That creeps, as a sentence begins.
+    what: ClassVar[str]  # The creeping part, as a sentence begins.
     rate: float = 0.0  # By which it fades, over the session; zero of an even one.
 
     @classmethod

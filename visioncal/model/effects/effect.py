@@ -29,7 +29,7 @@ class Size:
     # Likelihood ratio below which one of random unknowns is none: less of what something else makes
     # likely.
     limit: float = SIGNIFICANT
-    # What it is of, with others: where one of these is not by chance, none is held to be.
+    # Its kind, with others: where one of these is not by chance, none is held to be.
     of: str = ""
 
 

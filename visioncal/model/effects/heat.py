@@ -23,7 +23,7 @@ class Heat(Effect):
 
     kind, curvature = "heat", 1.0
     robot: Robot
-    inputs: Inputs  # What heats it.
+    inputs: Inputs  # Its heat sources.
 
     @property
     def size(self) -> Size:

@@ -115,10 +115,10 @@ class RecordedImages(ImageStore):
     """Images of a recording, which are read on demand; or what it keeps in their place."""
 
     path: Path  # The recording.
-    kept: ImagesKept  # What it stores of them beside their digests.
+    kept: ImagesKept  # Their form in it, beside their digests.
     digests: Mapping[str, str]  # SHA-256 of the images' bytes, by name.
     places: Mapping[str, _Place]  # Places of the stored images or faint copies, by name.
-    # What was found in each image, by its name and that of the board in the session's `boards`.
+    # Corners found in each image, by its name and that of the board in the session's `boards`.
     searches: Mapping[tuple[str, str], Searched]
     depths: Mapping[str, bytes] = field(default_factory=dict)  # Depth files, by name.
 

@@ -32,7 +32,7 @@ class Moment:
     # Its number, its seconds, or its date.
     at: int | float | datetime
     figures: Mapping[str, float]  # By name, as `residual [mm]`.
-    words: str = ""  # What was found there; empty for nothing.
+    words: str = ""  # Findings there; empty for none.
     is_alarm: bool = False
     seen_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # (k, 2) corners [px].
     predicted_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # Where expected.

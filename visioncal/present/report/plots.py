@@ -38,7 +38,7 @@ _MEASURES: tuple[tuple[str, str, str, float | None], ...] = (
     ("orientation [deg]", "residual_deg", "deg", _LIMITS.scatter_deg[0]),
     ("reprojection [px]", "rms_px", "px", None),
 )
-# What each chart of the coverage shows.
+# Titles of the charts of the coverage.
 _CHARTS = {
     "image": "corners in the image",
     "directions": "viewing directions",

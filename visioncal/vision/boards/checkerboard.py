@@ -209,7 +209,7 @@ def _has_marks(image: Image, grid: FloatArray) -> bool:
 
 def _dark_corner_first(image: Image, grid: FloatArray) -> FloatArray:
     """Rotates the grid by the least turn that makes its first corner's outward square dark."""
-    # That square has the colour of the one diagonally inside, and the inner squares alternate. If
+    # Its colour is that of the square diagonally inside, and the inner squares alternate. If
     # no turn changes the colour, the board is symmetric and the grid remains.
     for quarter in (0, 2, 1, 3) if grid.shape[0] == grid.shape[1] else (0, 2):
         rotated = np.rot90(grid, quarter)

@@ -100,8 +100,8 @@ class BoardKind(ABC):
     size_key: ClassVar[str] = "square_m"
     side: ClassVar[str] = "side of a square"
     sides: ClassVar[str] = "squares"
-    unit: ClassVar[str] = "square"  # What is made smaller where it does not fit on a page.
-    noun: ClassVar[str] = "board"  # What it is called before its name.
+    unit: ClassVar[str] = "square"  # The part that is made smaller where it does not fit on a page.
+    noun: ClassVar[str] = "board"  # Its noun before its name.
     # Options of `target make` that describe it; empty where it cannot be made by options.
     options: ClassVar[str] = ""
     # Pattern of its description in one word, after its name and _, with keys as groups; empty
@@ -114,7 +114,7 @@ class BoardKind(ABC):
     fewest: ClassVar[int] = 6  # Corners that a view needs, or all of fewer.
     # Whether its squares alternate over the whole board, for the fit to all pixels.
     is_dense: ClassVar[bool] = False
-    # What a turn has to map to itself to leave the print as it was; empty where no turn does.
+    # The part that a turn must map to itself to leave the print as it was; empty for none.
     symmetric: ClassVar[Literal["", "squares", "places"]] = ""
 
     @abstractmethod

@@ -222,7 +222,7 @@ class Level:
         )
         across = 1 / sum(n[i] * ray[i] for i in range(3))
         depth = np.float32(n @ pose[:3, 3]) * across
-        # What each pixel sees of the print beside one Gaussian for all, by the heat equation, and
+        # The print at each pixel beside one Gaussian for all, by the heat equation, and
         # how that is shifted, as slopes of perspective change within a pixel.
         side = np.float32(_SAMPLED_PX * pixel_m / middle[2])
         (xx, xy), (yx, yy) = (
