@@ -18,7 +18,7 @@ class DepthCamera:
     matrix: Annotated[FloatArray, Array((4,))]  # fx, fy, cx, cy [px].
     distortion: Vector  # The coefficients in OpenCV's order.
     cam_from_depth: Annotated[FloatArray, Array((4, 4))]  # Its pose in the camera's frame [m].
-    sigmas: tuple[float, float] = (0.0, 0.0)  # That pose's, per axis [rad], [m].
+    sigmas: tuple[float, float] = (0.0, 0.0)  # Of that pose, per axis [rad], [m].
 
     @property
     def camera(self) -> Camera:

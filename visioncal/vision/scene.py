@@ -5,7 +5,7 @@ compositional algorithm with a gain and an offset each (Baker and Matthews 2004;
 between pixels by cubic B-splines. A small turn of the camera moves the image of a scene at any
 depth in the same way; it is fitted to the shifts of all patches through the lens, by sampling
 consensus (MSAC; Torr and Zisserman 2000) and weighted least squares. Moving points disagree
-and is left out. The covariance is that of the jackknife over blocks of the image (Efron 1982):
+and are left out. The covariance is that of the jackknife over blocks of the image (Efron 1982):
 neighbouring patches share errors of lens and light.
 """
 
