@@ -389,6 +389,7 @@ def test_corners_outside_the_stated_image_are_refused(folder):
 
 @pytest.mark.slow
 def test_dense_corners_bring_in_refused_views_and_leave_sharp_ones_alone():
+    # The board moves by centimetres, and the robot's poses are those of the middle.
     # A quarter of the pixels.
     lens = replace(CAMERAS["wide"], resolution=(640, 400), matrix=CAMERAS["wide"].matrix / 2)
     cell = simulate(CellOptions(views=8, seed=3, blur_px=0.5, target=CHECKERS, camera=lens))
@@ -402,9 +403,13 @@ def test_dense_corners_bring_in_refused_views_and_leave_sharp_ones_alone():
     session = Session.from_arrays(
         images, cell.robot.base_from_flange, CHECKERS, camera=cell.options.camera
     )
-    plain, dense = (run(session, dense=dense).calibration for dense in (False, True))
-    used = [{view.view for view in found.views if view.used} for found in (plain, dense)]
-    assert used == [set(range(5)), set(range(8))]
+    stated = replace(session, document={**session.document, "clock": {"camera_minus_robot_s": 0.0}})
+    plain, unsure = (run(session, dense=dense).calibration for dense in (False, True))
+    dense = run(stated, dense=True).calibration
+    used = [{view.view for view in found.views if view.used} for found in (plain, unsure, dense)]
+    assert used == [set(range(5)), set(range(5)), set(range(8))]
+    assert "it serves the lens alone" in unsure.views[6].reason
+    assert any("write [clock] into session.toml" in reason for reason in unsure.verdict.reasons)
     edge, known = (found.edges["flange_from_cam"] for found in (dense, plain))
     # Beyond 16.8 is a chi-square of six degrees of freedom in 1 % of sessions.
     assert error_of(cell, dense) < 16.8

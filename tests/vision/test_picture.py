@@ -15,6 +15,7 @@ from visioncal.simulation import project as simulated_px
 from visioncal.vision.boards import NotFound, find_target
 from visioncal.vision.boards.picture import kept_picture, unfit
 from visioncal.vision.camera import project
+from visioncal.vision.dense import find_densely
 from visioncal.vision.printing.drawing import to_pdf
 from visioncal.vision.targets import corner_positions, load_target, target_from_document
 
@@ -73,6 +74,30 @@ def test_a_simulated_cell_shows_the_picture(target):
         # A part of it is beyond the image's end, and a texel of the sheet is nearly a pixel wide.
         assert len(found.ids) > 40
         assert np.median(np.abs(found.px - simulated_px(cell.camera().camera, places))) < 0.05
+
+
+@pytest.mark.parametrize(
+    "look",
+    [Look(disc_px=8.0), Look(twist=(0.012, 0.006, 0.002, 0.001, 0.002, 0.005), covered=0.1)],
+    ids=["defocus", "motion"],
+)
+def test_blurred_pictures_whose_pose_is_known_to_millimetres_are_registered(target, look):
+    rng, middle = np.random.default_rng(2), np.array([0.15, 0.11, 0.0])
+    pose = pose_at(0.45, 20.0, middle, rng)
+    image = photographed(poster(), 0.3, CAMERA, pose, look)
+    assert isinstance(find_target(image, target), NotFound)
+    start = pose.copy()
+    start[:3, 3] += (0.002, -0.002, 0.004)
+    found = find_densely(image, target, (CAMERA, start))
+    off = found.px - project(
+        CAMERA, corner_positions(target)[found.ids] @ pose[:3, :3].T + pose[:3, 3]
+    )
+    assert len(found.ids) > 40
+    # A hundredth of the blur, and within the sigmas.
+    assert np.median(np.abs(off)) < 0.1
+    assert 0.1 < np.mean((off / found.sigma_px[:, None]) ** 2) < 2.0
+    travel_px = 0.0 if look.disc_px else 457.1 * np.linalg.norm(look.twist[:2]) / 0.45
+    assert found.motion_px == pytest.approx(travel_px, abs=2.0)
 
 
 def test_other_pictures_are_not_found_and_mirrored_ones_are_named(target):

@@ -1,17 +1,16 @@
-"""Corners of a board in a blurred image that the template refuses, by a fit to all its pixels.
+"""Corners of a flat print in a blurred image that its detector refuses, by all pixels.
 
-The board's print is drawn by its own kind and registered to the image (`register`), through a lens
-whose focal length, centre and radial distortion are free, as they are not known yet. A corner's own
-position is that of a patch around it, half way to the next corner, so that corners are independent.
-
-The start is the detector's corners where it has enough, a pose that is known otherwise, or else a
-search for the grid in reduced copies, where even the markers of a ChArUco board are blurred to grey
-squares.
+The print is drawn by its own kind and registered to the image (`register`): from a pose and a lens
+that are known otherwise, or through a lens whose focal length, centre and radial distortion are
+free, from the detector's corners where it has enough, or a search for the grid in reduced copies,
+where even the markers of a ChArUco board are blurred to grey squares. A corner's own position is
+that of a patch around it, half way to the next corner, so that corners are independent.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -48,21 +47,33 @@ class DenseCorners:
     motion_m: float  # The same at the board [m].
 
 
-def find_densely(image: Image, target: Target) -> DenseCorners | None:
-    """Corners of a flat board by all pixels of a (h, w) grey image.
+def find_densely(
+    image: Image, target: Target, known: tuple[Camera, FloatArray] | None = None
+) -> DenseCorners | None:
+    """Corners of a flat print by all pixels of a (h, w) grey image.
+
+    Args:
+        image: Grey levels.
+        target: What it shows: no rig.
+        known: The lens, and the (4, 4) pose to some millimetres, where these are known.
 
     Returns:
-        The corners; None where no start is found, or the board explains too little of the image.
+        The corners; None where no start is found, or the print explains too little of the image.
     """
     drawn, points = drawn_print(target), corner_positions(target)
-    for lens, pose in _starts(image, target):
+    side_m = min(target.square_m, float(pdist(points).min()))
+    # A lens that is known needs no columns of its own, as patches have their own shifts.
+    first = [] if known is None else [(*known, None)]
+    for lens, pose, lens_sigma in chain(first, _starts(image, target)):
         depth_m = float(drawn.middle_at(pose)[2])
-        side_px = _TEXELS * drawn.texel_m * float(lens.matrix[:2].mean()) / depth_m
+        side_px = side_m * float(lens.matrix[:2].mean()) / depth_m
         factor = max(1, round(side_px / _SQUARE_PX))
+        # A few pixels of a pose that is known from elsewhere are few of the coarsest copy.
+        factors = (4 * factor, 2 * factor, factor)[lens_sigma is not None :]
         fits = [
             register(
-                image, drawn, lens, Seen(pose), lens_sigma=usual_sigma(lens), moving=moving,
-                factors=(2 * factor, factor), rough=True,
+                image, drawn, lens, Seen(pose), moving=moving, factors=factors, rough=True,
+                lens_sigma=lens_sigma,
             )
             for moving in (False, True)
         ]  # fmt: skip
@@ -75,33 +86,34 @@ def find_densely(image: Image, target: Target) -> DenseCorners | None:
         ]
         best = fits[int(np.argmin(left))]
         if best is not None and min(left) < 1.0 - _EXPLAINED:
-            corners = _corners(best, target, drawn, points)
+            corners = _corners(best, target, drawn, points, side_m / 2)
             if corners is not None:
                 return corners
     return None
 
 
 def _corners(
-    found: Registered, target: Target, drawn: Print, points: FloatArray
+    found: Registered, target: Target, drawn: Print, points: FloatArray, half_m: float
 ) -> DenseCorners | None:
-    ids, px, sigma_px = places_of(found, points, float(pdist(points).min()) / 2)
+    ids, px, sigma_px = places_of(found, points, half_m)
     if len(ids) < min(kind_of(target).fewest, len(points)):
         return None
     seen, level = found.seen, found.look.level
     motion_px = moved_px(level.camera, drawn, seen)
     width_px = np.sqrt(seen.gauss_px**2 + seen.disc_px**2 / 4 + motion_px**2 / 12)
     depth_m = drawn.middle_at(seen.cam_from_target)[2]
-    motion_m = motion_px * depth_m / (level.camera.matrix[:2].mean() + seen.lens[0])
+    motion_m = motion_px * depth_m / (level.camera.matrix[:2].mean() + sum(seen.lens[:1]))
     return DenseCorners(ids, px, sigma_px, float(width_px), motion_px, float(motion_m))
 
 
-def _starts(image: Image, target: Target) -> Iterator[tuple[Camera, FloatArray]]:
-    """Possible lenses and poses (4, 4); the likeliest first."""
+def _starts(image: Image, target: Target) -> Iterator[tuple[Camera, FloatArray, FloatArray]]:
+    """Possible lenses, poses (4, 4) and sigmas of the lenses; the likeliest first."""
     points = corner_positions(target)
     for ids, px in _pixels(image, target):
         flat, _ = cv2.findHomography(points[ids, :2], px, cv2.LMEDS)
         if flat is not None and np.linalg.matrix_rank(points[ids] - points[ids].mean(axis=0)) == 2:
-            yield started(np.asarray(flat, float), points[ids], px, usual_lens(image))
+            lens, pose = started(np.asarray(flat, float), points[ids], px, usual_lens(image))
+            yield lens, pose, usual_sigma(lens)
 
 
 def _pixels(image: Image, target: Target) -> Iterator[tuple[IntArray, FloatArray]]:

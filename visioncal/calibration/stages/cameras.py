@@ -1,6 +1,6 @@
 """Corners, intrinsics and target poses of each camera."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TypeVar
@@ -22,13 +22,12 @@ from visioncal.calibration.stages.repeats import with_stop_means, without_repeat
 from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
-from visioncal.core.types import Corners, Rejection, Target
+from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.results import CameraResult
-from visioncal.session import View, frame_name
+from visioncal.session import Session, View, frame_name
 from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
-from visioncal.vision.boards import kind_of
 from visioncal.vision.targets import first_corners
 
 T = TypeVar("T", bound=Observed)
@@ -50,8 +49,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
     Raises:
         DataError: See `detect`.
     """
-    session, boards = seen.session, seen.session.boards
-    starts = dict(zip(boards, first_corners(tuple(boards.values())).tolist(), strict=True))
+    session = seen.session
     # A single camera need not be declared.
     for name, table in (session.cameras or {"": CameraTable()}).items():
         views = [
@@ -74,22 +72,38 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                 )
             seen = replace(seen, searches={**seen.searches, **found.searches})
             seen = seen.noting((), (*other_sizes(found), *unshown_rows(session, found)))
-            if seen.dense is not None:
-                seen, found = _with_dense(seen, views, found)
             corners, resolution = found.corners, found.resolution
+            if seen.dense is not None:
+                first = seen.with_camera(
+                    frame, CameraObservations(table, _numbered(session, corners), resolution)
+                )
+                seen, found = _with_dense(seen, first, views, found)
+                corners = found.corners
             seen = seen.noting(found.rejections)
-        # The corners of several boards are numbered through.
-        numbered = {
-            view.number: replace(at, ids=at.ids + starts[session.board_of(view)])
-            for view in views
-            if (at := corners.get(view.number)) is not None
-        }
-        seen = seen.with_camera(frame, CameraObservations(table, numbered, resolution))
+        seen = seen.with_camera(
+            frame, CameraObservations(table, _numbered(session, corners), resolution)
+        )
     return with_stop_means(without_repeats(seen))
 
 
-def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple[T, Detections]:
-    """Brings in views whose images the template refuses, by all pixels of their boards."""
+def _numbered(session: Session, corners: Mapping[int, Corners]) -> dict[int, Corners]:
+    """Corners by view, those of several boards numbered through, in the session's order."""
+    firsts = first_corners(tuple(session.boards.values())).tolist()
+    starts = dict(zip(session.boards, firsts, strict=True))
+    return {
+        view.number: replace(at, ids=at.ids + starts[session.board_of(view)])
+        for view in session.views
+        if (at := corners.get(view.number)) is not None
+    }
+
+
+def _with_dense(
+    seen: T, first: Observed, views: Sequence[View], detections: Detections
+) -> tuple[T, Detections]:
+    """Brings in views whose images the template refuses, by all pixels of their boards.
+
+    `first` has the corners of the others, which tell about where these boards are.
+    """
     from visioncal.vision.dense import DenseCorners, find_densely
 
     session, rows = seen.session, {view.number: view for view in views}
@@ -98,13 +112,15 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
         for view in (rows[rejection.view] for rejection in detections.rejections)
         if not view.has_corners
         and detections.searches[view.number].size == detections.resolution
-        and kind_of(session.boards[session.board_of(view)]).is_dense
+        and not session.boards[session.board_of(view)].is_rig
     ]
     found: dict[int, DenseCorners] = {}
+    starts = _predicted(first, {view.number for view in refused})
     for count, view in enumerate(refused, start=1):
         image = image_of(session, view)
         if not isinstance(image, Rejection):
-            dense = find_densely(image, session.boards[session.board_of(view)])
+            board = session.boards[session.board_of(view)]
+            dense = find_densely(image, board, starts.get(view.number))
             found |= {} if dense is None else {view.number: dense}
         if seen.progress is not None:
             seen.progress("dense", count, len(refused))
@@ -120,17 +136,47 @@ def _with_dense(seen: T, views: Sequence[View], detections: Detections) -> tuple
         f"The corners of view {ranges(found)} are by all pixels of their images (--dense), "
         "as these are blurred."
     )
-    if (most := max(at.motion_m for at in found.values())) > _TRAVEL_M:
-        note += (
-            f" The board moves by up to {figure(1e3 * most)} mm during an exposure: the poses "
-            "of the robot must be those of mid-exposure (see [clock])."
-        )
+    lost = [rejection for rejection in detections.rejections if rejection.view not in found]
+    moving = {view: at.motion_m for view, at in found.items() if at.motion_m > _TRAVEL_M}
+    if moving:
+        most_mm = figure(1e3 * max(moving.values()))
+        note += f" The board moves by up to {most_mm} mm during an exposure"
+        if {"clock", "clocks"} & session.document.keys():
+            note += ": stamps and [clock] have to be those of mid-exposure."
+        else:
+            why = (
+                "its board moves during the exposure, and of which moment the robot's pose is, is "
+                "not known: it serves the lens alone"
+            )
+            lost += [Rejection(view, why) for view in moving]
+            note += (
+                f", so that view {ranges(moving)} serves the lens alone. Where the robot's poses "
+                "are of mid-exposure, write [clock] into session.toml, and they count."
+            )
     dense_seen = replace(seen, dense={**(seen.dense or {}), **found}, notes=(*seen.notes, note))
     return dense_seen, replace(
         detections,
         corners={view.number: corners[view.number] for view in views if view.number in corners},
-        rejections=tuple(lost for lost in detections.rejections if lost.view not in found),
+        rejections=tuple(lost),
     )
+
+
+def _predicted(first: Observed, views: Collection[int]) -> dict[int, tuple[Camera, FloatArray]]:
+    """Lenses and (4, 4) poses of boards in some views, where a fit of the others tells them."""
+    if not views:
+        return {}
+    try:
+        fit = solve_session(first).fit
+    except VisioncalError:
+        return {}
+    found, stops = {}, {station: at for at, station in enumerate(fit.cell.stations)}
+    for row in first.timed.observations:
+        if row.view.number in views and row.station in stops:
+            moments = fit.cell.moments.take(np.array([stops[row.station]]))
+            (pose,) = fit.predict(row.seer, row.seen, moments).poses
+            if np.isfinite(pose).all():
+                found[row.view.number] = fit.camera(row.seer), pose
+    return found
 
 
 def estimate_lenses(seen: T) -> T:
