@@ -181,7 +181,7 @@ def test_places_are_within_their_sigmas_whatever_the_lens_does():
         ids, px, sigma_px = places_of(found, points, WIDTH_M / 24)
         assert len(ids) > 50
         off = px - project(CAMERA, points[ids] @ pose[:3, :3].T + pose[:3, 3])
-        # A sigma is that along which a patch tells least: along the other it errs by less, down to
-        # a third. Bent images leave 10 and more.
-        assert 0.15 < np.mean((off / sigma_px[:, None]) ** 2) < 2.0
+        # Of 100 coordinates or more. Bent images leave 10 and more; where the shifts by the wrong
+        # lens counted as noise, a quarter was left.
+        assert 0.5 < np.mean((off / sigma_px[:, None]) ** 2) < 1.6
         assert np.median(sigma_px) < 0.05

@@ -9,6 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
 
 from visioncal.core.types import Camera, FloatArray, Image, IntArray
 from visioncal.vision.camera import normalise, project
@@ -25,7 +26,7 @@ def places_of(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Places of square patches in the image.
 
-    What their shifts scatter by beyond their noise counts in their sigmas.
+    What shifts of neighbours differ by beyond their noise counts in their sigmas.
 
     Args:
         found: The registered print.
@@ -33,8 +34,8 @@ def places_of(
         half_m: Half of a patch's side [m].
 
     Returns:
-        (m,) indices of the patches that are seen, (m, 2) their pixels, and (m,) the standard
-        deviation of a coordinate, along which a patch determines least [px].
+        (m,) indices of the patches that are seen, (m, 2) their pixels, and (m,) standard deviations
+        of a coordinate, the root mean square of both [px].
     """
     look, level = found.look, found.look.level
     light = look.drawn.light
@@ -59,16 +60,18 @@ def places_of(
         _, block = np.unique(blocks[taken], return_inverse=True)
         scores = np.stack([np.bincount(block, row) for row in own * weights * rest])
         ratio = float(np.sum((inverse @ scores)[:2] ** 2) / (variance * np.trace(inverse[:2, :2])))
-        worst = variance * float(np.linalg.eigvalsh(inverse[:2, :2])[1])
-        rows.append((number, solved[:2], worst, ratio))
-    if not rows:
+        rows.append((number, solved[:2], variance * np.trace(inverse[:2, :2]) / 2, ratio))
+    if len(rows) < 2:
         return np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0)
     ids, shifts, variances, ratios = (np.array(column) for column in zip(*rows, strict=True))
     # Errors of neighbouring pixels go together alike in all patches.
     variances = variances * max(float(np.median(ratios)), 1.0)
-    # The median of a squared length of two coordinates is 2 log 2 variances.
-    scatter = float(np.median(np.sum(shifts**2, axis=1))) / (2 * np.log(2.0))
-    sigma = np.sqrt(variances + max(scatter - float(np.median(variances)), 0.0))
+    # Neighbours are shifted alike by what the lens lacks. The median of a squared length of two
+    # coordinates is 2 log 2 variances.
+    by = cKDTree(points_m[ids]).query(points_m[ids], 2)[1][:, -1]
+    apart = np.sum((shifts - shifts[by]) ** 2, axis=1) / (variances + variances[by])
+    beyond = max(float(np.median(apart)) / (2 * np.log(2.0)) - 1.0, 0.0)
+    sigma = np.sqrt(variances + beyond * float(np.median(variances)))
     # Farther, a shift is beyond its linearisation: something else is there.
     kept = (np.linalg.norm(shifts, axis=1) < 1.0) & (sigma < 0.5)
     px = level.pixels_of(found.seen, points_m[ids]) + level.factor * shifts
