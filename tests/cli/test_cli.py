@@ -491,11 +491,10 @@ def test_next_steps_keep_the_views_that_were_typed(tmp_path):
     cell, out = tmp_path / "cell", tmp_path / "out"
     visioncal("simulate", cell, "--no-images").good()
     document = (cell / "session.toml").read_text()
-    assert "914.2, 913.6" in document
-    (cell / "session.toml").write_text(document.replace("914.2, 913.6", "928.2, 927.6"))
+    (cell / "session.toml").write_text(document.replace("eye-in-hand", "eye-to-hand"))
     quick = ("--no-report", "--no-recording")
     done = visioncal("calibrate", cell, "-o", out, "--views", "0-14", *quick)
-    assert f"visioncal calibrate {cell} -o {out} --views 0-14" in done.out
+    assert f"visioncal calibrate {cell}-fixed -o {out} --views 0-14" in done.out
 
 
 def test_a_bad_result_has_status_3_and_is_used_by_force_alone(pairs, tmp_path):
