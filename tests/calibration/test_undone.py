@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.cells import pairs_session
 from support.commands import visioncal as typed
 from support.following import follow
@@ -151,6 +152,18 @@ def test_poses_that_are_misread_and_rows_apart_are_mended_one_after_the_other(
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
+def test_poses_that_are_there_twice_hide_no_misread_rotations(mount):
+    robot, boards = poses_of(mount)
+    angles = Rotation.from_matrix(robot[:, :3, :3]).as_euler("xyz")
+    read = compose(Rotation.from_rotvec(angles).as_matrix(), robot[:, :3, 3])
+    for view in (5, 12, 13, 20):
+        read[view] = read[view - 1]
+    cause = visioncal.calibrate(pairs_session(mount, read, boards)).verdict.causes[0]
+    assert cause.kind == "misread_poses"
+    assert "Euler angles xyz about fixed axes in radians, which were taken for" in cause.words
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize("column", ["", "rail_m", "rail_mm"])
 def test_a_rail_that_is_in_no_pose_is_named_and_added_from_its_column(
     tmp_path, monkeypatch, mount, column
@@ -176,6 +189,23 @@ def test_a_rail_that_is_in_no_pose_is_named_and_added_from_its_column(
         mended = visioncal.calibrate(tmp_path / "cell-fixed")
         for name, edge in sound.edges.items():
             np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=1e-6)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize(("axis", "unit", "per_m"), [("z", "mm", 1e3), ("x", "inch", 1 / 0.0254)])
+def test_one_axis_in_another_unit_is_no_rail(tmp_path, monkeypatch, mount, axis, unit, per_m):
+    monkeypatch.chdir(tmp_path)
+    robot, boards = poses_of(mount)
+    sound = visioncal.calibrate(pairs_session(mount, robot, boards))
+    logged = robot.copy()
+    logged[:, "xyz".index(axis), 3] *= per_m
+    pairs_session(mount, logged, boards).save(tmp_path / "cell")
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert f"Most likely: The robot's {axis} is in {unit}, its other" in followed.runs[0].said
+    assert followed.last.status == 0
+    mended = visioncal.calibrate(tmp_path / "cell-fixed")
+    for name, edge in sound.edges.items():
+        np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=1e-6)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -289,15 +289,17 @@ def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> No
 
 
 @pytest.mark.parametrize(
-    ("step_mm", "step_deg", "words"),
+    ("step_mm", "step_deg", "noise_mm", "words"),
     [
-        (1.0, 0.0, "their positions to 1 mm:"),
-        (1.0, 1.0, "their positions to 1 mm and angles to 1 deg:"),
-        (0.1, 0.0, ""),
+        (1.0, 0.0, 0.03, "their positions to 1 mm: this alone puts the flange off by 0.29 mm an"),
+        (1.0, 1.0, 0.03, "their positions to 1 mm and angles to 1 deg:"),
+        (0.1, 0.0, 0.03, ""),
+        # Rounding is the smaller part of it.
+        (1.0, 0.0, 0.6, ""),
     ],
 )
-def test_poses_with_too_few_digits_are_the_cause(step_mm, step_deg, words) -> None:
-    cell = simulate(CellOptions(views=20))
+def test_poses_with_too_few_digits_are_the_cause(step_mm, step_deg, noise_mm, words) -> None:
+    cell = simulate(CellOptions(views=20, robot_sigma_m=1e-3 * noise_mm))
     flanges = cell.robot.base_from_flange.copy()
     flanges[:, :3, 3] = np.round(flanges[:, :3, 3] * 1e3 / step_mm) * step_mm * 1e-3
     if step_deg:

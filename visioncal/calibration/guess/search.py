@@ -80,8 +80,11 @@ class Recording:
 
     @cached_property
     def common_rows(self) -> IntArray:
-        """The rows with a pose of both sides."""
-        return np.flatnonzero(self.robot.present & self.camera.present)
+        """The rows with a pose of both sides, without those that repeat the robot's of before."""
+        rows = np.flatnonzero(self.robot.present & self.camera.present)
+        numbers = np.hstack([self.robot.positions, self.robot.rotations])[rows]
+        others = rows[np.append(True, np.any(np.diff(numbers, axis=0) != 0.0, axis=1))]
+        return others if len(others) >= FEWEST_ROWS else rows
 
     def is_likely(self, tried: Hypothesis) -> bool:
         """Whether the unit of the camera's positions puts the target at a likely distance."""
@@ -216,8 +219,8 @@ def search(recording: Recording) -> list[Candidate]:
             break
     near = _near([*labels], scores)
     refined = [declared, *(reading for reading in near if reading != declared)]
-    if min(scores) > CLOSING_SCORE and mismatch(declared) > _TURNS_AGREE_RAD:
-        for change in _unwrapped(recording):
+    if min(scores) > CLOSING_SCORE and (away := mismatch(declared)) > _SLACK:
+        for change in _unwrapped(recording, keep_turns=away < _TURNS_AGREE_RAD):
             reading = change.of(declared)
             labels[reading] = (reading,)
             refined.append(reading)
@@ -228,14 +231,15 @@ def search(recording: Recording) -> list[Candidate]:
     return [first, *others]
 
 
-def _unwrapped(recording: Recording) -> Iterator[Change]:
+def _unwrapped(recording: Recording, *, keep_turns: bool) -> Iterator[Change]:
     """The reading of rotations whose numbers were taken for others and lost whole turns."""
     rows, declared = recording.common_rows, recording.declared
     numbers = recording.robot.rows(rows)
     poses = declared.robot.poses(numbers)
     seen = declared.camera.poses(recording.camera.rows(rows))
     there = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2))
-    found = unwrapped(poses[there, :3, :3], poses[there, :3, 3], seen[there], recording.mount)
+    sides = poses[there, :3, :3], poses[there, :3, 3], seen[there]
+    found = unwrapped(*sides, recording.mount, keep_turns=keep_turns)
     if found is None:
         return
     (taken, form), rotations = found

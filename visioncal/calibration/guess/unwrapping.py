@@ -7,7 +7,6 @@ the last axis of Euler angles are turns of the tool, and stay open.
 """
 
 from collections.abc import Iterator
-from itertools import product
 
 import numpy as np
 
@@ -22,20 +21,31 @@ _TURN = 2.0 * np.pi
 _ALIKE_RAD, _CHECKED, _WRONG = 0.5, 8, 2
 
 
-def _forms() -> Iterator[tuple[str, str]]:
-    """Names of forms that robots write, after those which they are taken for."""
+def _forms(*, keep_turns: bool) -> Iterator[tuple[str, str]]:
+    """Names of forms that robots write, after those which they are taken for.
+
+    Those of another unit, which lose whole turns, unless these are kept.
+    """
     orders = {form.rotation.split("-")[1] for form in POSE_FORMS.values() if "eul" in form.rotation}
     # Angles about fixed axes are those about moving ones in reverse order.
     moving = {order if order.isupper() else order[::-1].upper() for order in orders}
-    yield "rotation-vector", "rotation-vector-deg"
+    if not keep_turns:
+        yield "rotation-vector", "rotation-vector-deg"
     for angles in ("euler-xyz-rad", "euler-ZYX-rad", "euler-XYZ-rad"):
         yield from ((angles, "rotation-vector"), ("rotation-vector", angles))
+    if keep_turns:
+        return
     # Roll, pitch and yaw first: they are the most common.
     yield from ((f"euler-{order}-rad", f"euler-{order}-deg") for order in sorted(moving)[::-1])
 
 
 def unwrapped(
-    recorded: FloatArray, positions: FloatArray, camera: FloatArray, mount: Mount
+    recorded: FloatArray,
+    positions: FloatArray,
+    camera: FloatArray,
+    mount: Mount,
+    *,
+    keep_turns: bool = False,
 ) -> tuple[tuple[str, str], FloatArray] | None:
     """Rotations before their numbers were taken for others, after the names of both forms.
 
@@ -44,15 +54,27 @@ def unwrapped(
         positions: (n, 3) its positions.
         camera: (n, 4, 4) `cam_from_target`.
         mount: How the camera is mounted.
+        keep_turns: Whether they are too nearly right to have lost whole turns.
     """
     if len(camera) <= _CHECKED:
         return None
     turned = _turned_as_seen(positions, invert(camera) if mount == "eye-in-hand" else camera)
-    for forms, first in product(_forms() if len(turned) else (), range(_WRONG + 1)):
-        rotations = _with_turns(recorded, turned, first, forms)
-        if rotations is not None:
-            return forms, rotations
-    return None
+    best: tuple[tuple[str, str], FloatArray] | None = None
+    least = np.inf
+    for forms in _forms(keep_turns=keep_turns) if len(turned) else ():
+        found = (_with_turns(recorded, turned, first, forms) for first in range(_WRONG + 1))
+        rotations = next((each for each in found if each is not None), None)
+        if rotations is None:
+            continue
+        # Small angles of one form are nearly those of another.
+        tools = np.swapaxes(turned, 1, 2) @ rotations
+        away = float(np.median(rotation_angle(tools[0].T @ tools)))
+        if away < least:
+            best, least = (forms, rotations), away
+        # Those of the right form differ by noise.
+        if least < 0.03:
+            break
+    return best
 
 
 def _turned_as_seen(positions: FloatArray, seen: FloatArray) -> FloatArray:

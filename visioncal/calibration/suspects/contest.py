@@ -66,8 +66,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
             without_it=f"Applied and refitted, it leaves noise of {after} an axis; else it is "
             f"{before}.",
             is_proven=bool(finding.mahalanobis_sq) and _proves(run, trial),
-            # Without evidence of its own, it stands for what it removes alone.
-            explains=1.0 if finding.mahalanobis_sq else share,
+            # Without evidence of its own, or where most remains, it stands for what it removes.
+            explains=1.0 if finding.mahalanobis_sq and share > 0.5 else share,
         )
 
 

@@ -128,13 +128,14 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
     except VisioncalError:
         # Too little to guess from; the calibration's own error says so.
         return
-    if guess.stands_out:
+    # What merely comes nearer, as other units may, is not before what closes the chain.
+    unknown = [] if guess.best.fit.closes else [*_unrecorded(run)]
+    if guess.stands_out and not any(hint.do != _UNRECORDED for hint in unknown):
         robot = guess.best.hypothesis.robot
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
         step = _MIRRORED if robot.mirrored else step
         yield Finding("misread_poses", guess.sentence, step)
-    elif not guess.declared.fit.closes:
-        yield from _unrecorded(run)
+    yield from unknown
 
 
 def _unrecorded(run: RunState) -> Iterator[Finding]:

@@ -1,6 +1,6 @@
 """An axis that moved the robot and is in no pose, as a rail under its base."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -66,12 +66,27 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
         else "Write poses that contain this axis, or calibrate views at one place of it."
     )
     by_view = dict(zip(views.tolist(), motion.tolist(), strict=True))
-    for column, factor in _columns(run, by_view, away_m):
+    every = ranges([view.number for view in run.session.views])
+    for _, factor in _columns(run, by_view, away_m, [POSE[axis]] if is_axis else []):
+        if (unit := _unit_of(1.0 + factor)) and unit != "m":
+            words = (
+                f"The robot's {name} is in {unit}, its other positions in m: so read, robot and "
+                f"camera agree to {figure(1e3 * away_m)} mm."
+            )
+            mended = (f"{UNITS_M[unit]:g}*{at}" if at == name else at for at in "xyz")
+            do = mending("all of them are in m", f"--positions {every}:{','.join(mended)}")
+            yield Finding("misread_poses", words, do)
+            return
+    # Those that no stage reads.
+    columns = [column for column in run.session.columns if column not in _KNOWN]
+    for column, factor in _columns(run, by_view, away_m, columns):
+        if not (unit := _unit_of(abs(factor))):
+            continue
+        size = np.copysign(UNITS_M[unit], factor)
         terms = ",".join(
-            f"{at}{factor * part:+g}*{column}" if abs(part) > np.sin(_ALONG_RAD) else at
+            f"{at}{size * part:+g}*{column}" if abs(part) > np.sin(_ALONG_RAD) else at
             for at, part in zip("xyz", np.round(direction, 3 if not is_axis else 0), strict=True)
         )
-        every = ranges([view.number for view in run.session.views])
         words += f" Column {column} of views.csv has it."
         do = mending("it is added to the positions", f"--positions {every}:{terms}")
         break
@@ -120,12 +135,13 @@ def _line(both: FloatArray, mount: Mount) -> tuple[FloatArray, FloatArray, float
     return *best, fit.angle
 
 
-def _columns(run: RunState, motion: dict[int, float], away_m: float) -> Iterator[tuple[str, float]]:
-    """Columns that have this motion [m], with their factors."""
+def _columns(
+    run: RunState, motion: dict[int, float], away_m: float, names: Iterable[str]
+) -> Iterator[tuple[str, float]]:
+    """Columns that this motion [m] follows, with their factors."""
     rows = {view.number: view for view in run.session.views if view.number in motion}
     along = np.array([motion[view] for view in rows])
-    # Those that no stage reads.
-    for column in (name for name in run.session.columns if name not in _KNOWN):
+    for column in names:
         try:
             values = np.array([float(view.cell(column)) for view in rows.values()])
         except ValueError:
@@ -134,8 +150,11 @@ def _columns(run: RunState, motion: dict[int, float], away_m: float) -> Iterator
             continue
         factor, _ = np.polyfit(values, along, 1)
         left = along - factor * values
-        if np.median(np.abs(left - np.median(left))) > max(3.0 * away_m, 1e-4):
-            continue
-        for unit_m in UNITS_M.values():
-            if abs(abs(factor) / unit_m - 1.0) < _UNIT:
-                yield column, float(np.copysign(unit_m, factor))
+        if np.median(np.abs(left - np.median(left))) <= max(3.0 * away_m, 1e-4):
+            yield column, float(factor)
+
+
+def _unit_of(factor: float) -> str:
+    """The unit that a factor stands for; empty for none."""
+    near = (unit for unit, size_m in UNITS_M.items() if abs(factor / size_m - 1.0) < _UNIT)
+    return next(near, "")

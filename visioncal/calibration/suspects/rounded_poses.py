@@ -8,7 +8,6 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS
-from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
@@ -40,15 +39,17 @@ def rounded(run: RunState, robot: str, noise_mm: float, noise_deg: float) -> Fin
     step_mm, (step_deg, form) = _step(1e3 * poses[:, :3]), _angle_step(poses[:, 3:])
     sigmas, noise = np.array([step_mm, step_deg]) / np.sqrt(12.0), np.array([noise_mm, noise_deg])
     counts = (np.array(REPEATABILITY) < sigmas) & (sigmas < noise / _SHOWN)
-    counts &= noise < CLEAR_RATIO * sigmas
+    # It is not the cause where another one is greater.
+    counts &= noise < np.sqrt(2.0) * sigmas
     if not counts.any():
         return None
     words = (f"positions to {figure(step_mm)} mm", f"{form} to {figure(step_deg)} deg")
-    parts = " and ".join(part for part, is_so in zip(words, counts, strict=True) if is_so)
+    offs = (f"{figure(sigmas[0])} mm", f"{figure(sigmas[1])} deg")
+    parts, off = (" and ".join(each[at] for at in np.flatnonzero(counts)) for each in (words, offs))
     return Finding(
         "rounded_poses",
         f"The robot's poses are rounded, their {parts}: this alone puts the flange off by "
-        f"{mm_and_deg(*sigmas.tolist())} an axis from stop to stop (the fit finds "
+        f"{off} an axis from stop to stop (the fit finds "
         f"{mm_and_deg(noise_mm, noise_deg)}).",
         Remedy(
             "Read the poses from the controller's interface, not from its display, with 0.01 mm "
