@@ -256,7 +256,7 @@ def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
     tilt = fitted[:2] @ decentring
     rad = float(np.linalg.norm(tilt))
     # No sensor is mounted so: this is decentring with hardly any radial distortion.
-    if rad > np.deg2rad(5.0):
+    if rad > np.deg2rad(3.0):
         return None
     if lens.covariance is None or rad == 0.0:
         return SensorTilt(rad, 0.0)

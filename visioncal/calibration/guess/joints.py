@@ -108,7 +108,8 @@ def _with_zero(robot: Robot, joint: int, zero_rad: float) -> JointReading:
         declared_reading(robot),
         zeros=np.where(np.arange(robot.joint_count) == joint, zero_rad, 0.0),
         words=f"the zero of {name} (q{joint + 1}_rad) moved by {degrees:.2f} deg",
-        fix=f"Home {name} anew, or add {degrees:.2f} deg to q{joint + 1}_rad.",
+        fix=f"Home {name} anew, or add {zero_rad:.5f} to q{joint + 1}_rad in all rows; the poses "
+        "x_m to qw, where there are any, were computed by the same zero: empty them.",
         columns=(joint,),
         # A fitted number explains more by chance.
         cost=1.5,

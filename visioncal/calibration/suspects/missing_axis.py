@@ -68,12 +68,17 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
     by_view = dict(zip(views.tolist(), motion.tolist(), strict=True))
     every = ranges([view.number for view in run.session.views])
     for _, factor in _columns(run, by_view, away_m, [POSE[axis]] if is_axis else []):
-        if (unit := _unit_of(1.0 + factor)) and unit != "m":
+        share = 1.0 + factor
+        if (unit := _unit_of(share)) != "m" and abs(np.log(abs(share))) > _UNIT:
+            # A wrong power of ten, or what the motion tells.
+            ten = float(np.copysign(10.0 ** np.round(np.log10(abs(share))), share))
+            size = UNITS_M.get(unit, ten if abs(share / ten - 1.0) < _UNIT else round(share, 4))
             words = (
-                f"The robot's {name} is in {unit}, its other positions in m: so read, robot and "
-                f"camera agree to {figure(1e3 * away_m)} mm."
+                f"The robot's {name} is in {unit or 'another unit'}, its other positions in m: "
+                f"multiplied by {size:g}, it lets robot and camera agree to "
+                f"{figure(1e3 * away_m)} mm."
             )
-            mended = (f"{UNITS_M[unit]:g}*{at}" if at == name else at for at in "xyz")
+            mended = (f"{size:g}*{at}" if at == name else at for at in "xyz")
             do = mending("all of them are in m", f"--positions {every}:{','.join(mended)}")
             yield Finding("misread_poses", words, do)
             return

@@ -376,7 +376,10 @@ def _shifted(
     apart = counted(abs(by), "row")
     rows = f"{apart} {'later' if by > 0 else 'earlier'}"
     when = f"From view {first} on" if side[-1] else f"Up to view {last}"
-    lost = [str(view) for view, pair in zip(views, pairs[by][side], strict=True) if pair < 0]
+    # A pose is of one image.
+    partners = set(record.rows[side].tolist())
+    both = zip(views, pairs[by][side].tolist(), strict=True)
+    lost = [str(view) for view, pair in both if pair not in partners]
     dropped = f" No row is left for view {some_of(lost)}." if lost else ""
     yield Undoing(
         EVIDENCE * (log - base) + _MISTAKE - float(np.log(2.0 * count * len(_SHIFTS))),

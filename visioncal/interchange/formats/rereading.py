@@ -584,14 +584,16 @@ def _chosen_views(session: Session, views: Sequence[int], option: str) -> list[i
 def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
     """Gives some views the robot's columns of so many rows later, or earlier where negative.
 
-    Views whose row there is none are dropped, and `corrected` names them. Raises DataError.
+    Views whose row there is none, or another view's that stays, are dropped, and `corrected` names
+    them. Raises DataError.
     """
     moved, rows = set(_chosen_views(session, views, "--shift")), session.views
+    places = {at for at, view in enumerate(rows) if view.number in moved}
     kept = {*_OBSERVED, *_MUST_AGREE, "view", "role"}
     cells, dropped = list[dict[str, str]](), list[int]()
     for at, view in enumerate(rows):
-        source = at + by if view.number in moved else at
-        if not 0 <= source < len(rows):
+        source = at + by if at in places else at
+        if at in places and source not in places:
             dropped.append(view.number)
             continue
         cells.append(
