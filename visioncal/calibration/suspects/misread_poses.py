@@ -128,7 +128,7 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
     except VisioncalError:
         # Too little to guess from; the calibration's own error says so.
         return
-    # What merely comes nearer, as other units may, is not before what closes the chain.
+    # Units that merely bring both sides nearer do not precede an axis that closes the chain.
     unknown = [] if guess.best.fit.closes else [*_unrecorded(run)]
     if guess.stands_out and not any(hint.do != _UNRECORDED for hint in unknown):
         robot = guess.best.hypothesis.robot
