@@ -523,7 +523,7 @@ def test_stops_without_a_view_end_in_status_2(planned, cell, tmp_path):
     ("more", "words"),
     [
         ((), "guide the arm by hand: --follow and --target"),
-        (("--target", "charuco_9x6_30mm"), "an arm is driven by a plan"),
+        (("--target", "charuco_9x6_30mm"), "needs a plan to drive an arm"),
         (("--plan", "PLAN", "--mount", "eye-to-hand"), "the plan says that already"),
         (("--plan", "PLAN", "--speed", "9"), "up to 1.5 rad/s"),
         (("--plan", "PLAN", "--follow", "--dry-run"), "a guided arm is not driven"),
