@@ -156,6 +156,23 @@ def test_a_tilted_sensor_is_a_condition_with_its_size(tilted_cell, tilted):
     assert tilt.rad == pytest.approx(np.deg2rad(error_deg), abs=within)
 
 
+def test_decentring_behind_hardly_any_radial_distortion_is_no_tilt(tilted):
+    """Its p1 and p2 are those of any lens; by the radial distortion they would be many degrees."""
+    lens = tilted.camera
+    distortion = np.array([0.0095, -0.0075, 0.00003, -0.00057, -0.0058])
+    weak = replace(lens, camera=replace(lens.camera, distortion=distortion))
+    tilt = sensor_tilt(weak)
+    assert np.rad2deg(tilt.rad) > 1.5
+    assert replace(tilted, camera=weak).conditions == ()
+
+
+def test_a_stated_lens_and_a_bad_result_have_no_such_condition(tilted):
+    held = replace(tilted, camera=replace(tilted.camera, estimated=False))
+    assert held.conditions == ()
+    bad = replace(tilted, verdict=replace(tilted.verdict, status="bad"))
+    assert bad.conditions == ()
+
+
 def test_every_output_carries_it(tilted, tmp_path):
     (condition,) = tilted.conditions
     write_certificate(tmp_path / "page.html", tilted, None, {})

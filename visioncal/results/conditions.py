@@ -51,16 +51,22 @@ def conditions_of(calibration: "Calibration") -> Iterator[Condition]:
     cell = calibration.by_name
     for name, arm in cell.robots.items():
         yield from _of_arm(arm, calibration.verdict, name)
-    for name, lens in cell.cameras.items():
+    # A bad result holds nowhere.
+    for name, lens in cell.cameras.items() if calibration.verdict.status != "bad" else ():
         yield from _of_lens(lens, name)
 
 
 def _of_lens(lens: CameraResult, camera: str) -> Iterator[Condition]:
     tilt = sensor_tilt(lens)
-    if tilt is None or tilt.rad < max(math.radians(_PARALLEL_DEG), 3.0 * tilt.sigma_rad):
+    # A lens that was stated is the receiving program's own. Behind one without much radial
+    # distortion, any decentring passes for a tilt of many degrees.
+    if tilt is None or not lens.estimated:
+        return
+    sigma_rad = math.hypot(tilt.sigma_rad, tilt.own_rad)
+    if tilt.rad < max(math.radians(_PARALLEL_DEG), 3.0 * sigma_rad):
         return
     of, deg = f"{camera}: " if camera else "", math.degrees(tilt.rad)
-    sigma = f" (sigma {figure(math.degrees(tilt.sigma_rad))})" if tilt.sigma_rad else ""
+    sigma = f" (sigma {figure(math.degrees(sigma_rad))})"
     yield Condition(
         "own-lens",
         f"{of}The camera's transform holds only with its own lens (matrix and distortion): p1 and "

@@ -23,6 +23,8 @@ from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian
 
 # Places of p1 and p2 among Brown's intrinsics.
 _DECENTRING = (6, 7)
+# What p1 and p2 of a lens are whose elements are centred as well as makers can (sigma).
+_OWN_DECENTRING = 5e-4
 
 # Steps of central differences [rad], whose truncation is their square.
 _STEP = 1e-5
@@ -213,6 +215,8 @@ class SensorTilt:
 
     rad: float  # Angle between the optical axes of the lens model and of one with a tilted sensor.
     sigma_rad: float  # Its standard deviation by that of the decentring; 0 for a given lens.
+    # Tilt that a lens's own decentring passes for, whose sensor is parallel to it (sigma).
+    own_rad: float = 0.0
 
 
 def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
@@ -258,10 +262,13 @@ def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
     # No sensor is mounted so: this is decentring with hardly any radial distortion.
     if rad > np.deg2rad(3.0):
         return None
-    if lens.covariance is None or rad == 0.0:
+    if rad == 0.0:
         return SensorTilt(rad, 0.0)
     along = tilt @ fitted[:2] / rad
-    return SensorTilt(rad, float(np.sqrt(along @ lens.covariance[6:8, 6:8] @ along)))
+    own_rad = _OWN_DECENTRING * float(np.linalg.norm(along))
+    if lens.covariance is None:
+        return SensorTilt(rad, 0.0, own_rad)
+    return SensorTilt(rad, float(np.sqrt(along @ lens.covariance[6:8, 6:8] @ along)), own_rad)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
