@@ -107,6 +107,11 @@ def breathing(cell):
     return zoomed(cell, 0.01 * (far / far.mean() - 1.0))
 
 
+def zoomed_once(share):
+    """A lens that is longer by a share from the tenth view on."""
+    return lambda cell: zoomed(cell, share * (np.arange(len(cell.corners)) >= 9))
+
+
 def wavy(cell):
     """Corners that are displaced by a smooth field of 0.25 px, which no lens model has."""
     rng = np.random.default_rng(cell.options.seed)
@@ -239,7 +244,7 @@ WORLDS: dict[str, World] = {
         OPEN,
         zoomed_midway,
         causes=("focus",),
-        words=("^The lens changes its focal length by",),
+        words=("^The lens changed at once.*: from view 7 on, its focal length is",),
     ),
     "lens hit midway": World(
         OPEN,
@@ -288,6 +293,19 @@ WORLDS: dict[str, World] = {
     # Lenses beyond their models.
     "wavy lens": World(replace(FINE, robot_sigma_m=1e-5), wavy, kinds=("lens_field",), of=PLACE),
     "focus follows the distance": World(FINE, breathing, kinds=("focus",)),
+    "lens zoomed once": World(
+        FINE,
+        zoomed_once(0.03),
+        status="check",
+        causes=("focus",),
+        words=("from view 9 on, its focal length is 3 % longer",),
+    ),
+    "lens refocused once": World(
+        FINE,
+        zoomed_once(-0.005),
+        causes=("focus",),
+        words=(r"from view 9 on, its focal length is 0.5 % shorter",),
+    ),
     # Boards that are not as drawn, or not as large as stated.
     "bent board": World(
         replace(FINE, board_bow_m=3e-4), joints=True, words=("not flat",), of=(0, 6)

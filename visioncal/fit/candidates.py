@@ -29,6 +29,7 @@ from visioncal.model.effects import (
     Effect,
     FocusJitter,
     Heat,
+    LensSteps,
     MountCreeps,
     MountSteps,
     Play,
@@ -37,8 +38,8 @@ from visioncal.model.effects import (
     Weight,
 )
 
-# Most stops after which a frame may have been moved.
-_STEPS = 12
+# Most stops after which a frame may have been moved, and a lens.
+_STEPS, _ZOOMS = 12, 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ def opened(
 
 def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """All that are not open yet, with their scores."""
-    yield from scored(fit, effects_of_lenses(fit), sole_flange(fit))
+    yield from beside_zooms(fit, scored(fit, effects_of_lenses(fit), sole_flange(fit)))
     yield from of_arms(fit, pairs)
     for flange in fit.unknowns.erring:
         yield from scored(fit, effects_of_frames(fit, flange), flange)
@@ -114,7 +115,8 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
 def of_stops(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """Those that differ from stop to stop."""
     yield from of_arms(fit, pairs)
-    yield from scored(fit, [one for one in effects_of_lenses(fit) if isinstance(one, FocusJitter)])
+    jitters = [one for one in effects_of_lenses(fit) if isinstance(one, FocusJitter)]
+    yield from beside_zooms(fit, scored(fit, jitters))
 
 
 def of_arms(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
@@ -150,6 +152,7 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
     for effect, size, gain in found:
         # When something was moved is a free choice.
         choices = np.log(_STEPS) if isinstance(effect, BaseSteps | MountSteps) else 0.0
+        choices += np.log(_ZOOMS) if isinstance(effect, LensSteps) else 0.0
         yield Candidate(gain - choices, starting_at(random_effect(effect), size), effect)
 
 
@@ -213,6 +216,24 @@ def steps(fit: Fit, flange: str) -> Iterator[Effect]:
     for at in (evenly(len(progress) - 3, _STEPS) + 1).tolist():
         yield BaseSteps(flange, float(progress[at]))
         yield MountSteps(flange, float(progress[at]))
+
+
+def beside_zooms(fit: Fit, changes: Iterable[Candidate]) -> Iterator[Candidate]:
+    """Candidates that change a lens, and beside clear ones that it changed at once."""
+    clear = set[str]()
+    for one in changes:
+        yield one
+        if 2.0 * one.gain >= SIGNIFICANT:
+            clear.add(one.lens)
+    yield from scored(fit, (step for camera in clear for step in zooms(fit, camera)))
+
+
+def zooms(fit: Fit, camera: str) -> Iterator[Effect]:
+    """Changes of a lens at once: rivals to what grows, and to what differs from stop to stop."""
+    grams = [(gram.stops, fit.used[gram.rows]) for gram in fit.grams if gram.pair[0] == camera]
+    stops = np.unique(np.concatenate([own[used] for own, used in grams]))
+    for at in (evenly(len(stops) - 3, _ZOOMS) + 2).tolist():
+        yield LensSteps(camera, fit.unknowns.lenses[camera], int(stops[at]))
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:

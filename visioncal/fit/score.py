@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from visioncal.core.types import FloatArray
 from visioncal.fit.fit import Fit
@@ -50,8 +51,7 @@ class Score:
         pull = sigmas * self.pull
         within = np.eye(len(pull)) + np.outer(sigmas, sigmas) * self.information
         square = float(pull @ np.linalg.solve(within, pull))
-        student = -0.5 * self.freedom * np.log1p(-min(square / self.freedom, 0.999))
-        return float(student - 0.5 * np.linalg.slogdet(within)[1])
+        return float(self._student(square) - 0.5 * np.linalg.slogdet(within)[1])
 
     def best(self, sigmas: FloatArray, low: float, high: float) -> tuple[float, float]:
         """The most likely of some sizes of columns with (c,) relative sigmas, and its gain."""
@@ -79,10 +79,16 @@ class Score:
     def _gains(self, values: FloatArray, pull: FloatArray, sizes: FloatArray) -> FloatArray:
         within = 1.0 + sizes[:, None] ** 2 * np.maximum(values, 0.0)
         squares = np.sum(sizes[:, None] ** 2 * pull**2 / within, axis=1)
-        gains = 0.5 * squares
-        if np.isfinite(self.freedom):
-            gains = -0.5 * self.freedom * np.log1p(-np.minimum(squares / self.freedom, 0.999))
-        return np.asarray(gains - 0.5 * np.log(within).sum(axis=1))
+        return np.asarray(self._student(squares) - 0.5 * np.log(within).sum(axis=1))
+
+    def _student(self, squares: npt.ArrayLike) -> FloatArray:
+        """Log-likelihood that some squares gain, with the level of the noise integrated out."""
+        if not np.isfinite(self.freedom):
+            return 0.5 * np.asarray(squares)
+        # Of two that explain next to all, the one that explains more is likelier.
+        share = np.asarray(squares) / self.freedom
+        beyond = np.maximum(share - 0.999, 0.0)
+        return np.asarray(0.5 * self.freedom * (beyond - np.log1p(beyond - share)))
 
 
 @dataclass(frozen=True, eq=False)

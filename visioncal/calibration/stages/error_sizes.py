@@ -15,7 +15,7 @@ from visioncal.fit.held import doubted_boards
 from visioncal.fit.solve import CellFit, solve
 from visioncal.fit.unknowns import Key
 from visioncal.model import Reported, Swept, read_cell
-from visioncal.model.effects import Effect, LensGrows
+from visioncal.model.effects import Effect, LensGrows, LensSteps
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import first_corners
@@ -32,6 +32,14 @@ class FoundEffect:
     gain: float  # Twice the gain in log-likelihood.
 
 
+@dataclass(frozen=True)
+class Zoom:
+    """A lens whose focal length changed at once."""
+
+    station: int  # The first after it.
+    share: float  # Of the focal length by which it is longer from there on.
+
+
 @dataclass(frozen=True, eq=False)
 class ErrorSizes:
     """Sizes of errors; none of a lens or a board that is absent."""
@@ -41,6 +49,9 @@ class ErrorSizes:
     lenses: Mapping[str, FloatArray] = field(default_factory=dict)
     boards: Mapping[str, BoardSizes] = field(default_factory=dict)  # By the session's name.
     grown: tuple[FoundEffect, ...] = ()  # Lenses that grow.
+    # Lenses that changed at once, by camera: the fit has them as lenses that vary from view to
+    # view, since what is linear at one lens is not so at another.
+    zoomed: Mapping[str, Zoom] = field(default_factory=dict)
     opened: tuple[Effect, ...] = ()  # Of frames that move.
     # Whether boards keep their stated sizes: errors of arms are confounded with them.
     holds_scales: bool = False
@@ -81,8 +92,20 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
         own = abs(float(found.values[0])) / (4.0 * _noise_px(fit, name))
         jitter = float(np.hypot(levels[name].jitter, own))
         levels[name] = replace(levels[name], jitter=jitter)
+    zoomed = dict[str, Zoom]()
+    for effect in fit.unknowns.effects:
+        if isinstance(effect, LensSteps) and _size(fit, effect.name):
+            name, others = effect.frame, levels[effect.frame]
+            share = -float(fit.state.values["effect", effect.name][0])
+            stops = np.array([one.stop for one in fit.cell.sightings if one.seer == name])
+            before = float(np.mean(stops < effect.stop))
+            jitter = abs(share) * np.sqrt(before * (1.0 - before)) / _noise_px(fit, name)
+            gains = (*others.gains[:2], max(others.gains[2], _gain(fit, effect.name)))
+            jitter = float(np.hypot(others.jitter, jitter))
+            levels[name] = replace(others, jitter=jitter, gains=gains)
+            zoomed[name] = Zoom(fit.cell.stations[effect.stop], share)
     effects = (at for at in fit.unknowns.effects if at.place == "edge" and _size(fit, at.name))
-    return ErrorSizes(levels, lenses, boards, grown, tuple(effects), held)
+    return ErrorSizes(levels, lenses, boards, grown, zoomed, tuple(effects), held)
 
 
 def solve_session(observed: Observed) -> CellFit:

@@ -176,7 +176,17 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             for percent, words, gain in zip(percents, when, changes, strict=True)
             if gain > SIGNIFICANT
         ]
-        if how:
+        if (zoom := run.cell_fit.sizes.zoomed.get(name)) is not None:
+            way, cell = "longer" if zoom.share > 0.0 else "shorter", run.cell_fit.cell
+            yield Finding(
+                "focus",
+                f"{of} changed at once, as where it was zoomed, refocused or hit: "
+                f"{cell.start_words(zoom.station)}, its focal length is "
+                f"{figure(100.0 * abs(zoom.share))} % {way}. The result counts it as scatter.",
+                cell.or_separately("Fix zoom and focus", zoom.station),
+                mahalanobis_sq=changes[1],
+            )
+        elif how:
             yield Finding(
                 "focus",
                 f"{of} changes its focal length {' and '.join(how)}. The result counts it.",

@@ -17,6 +17,7 @@ from visioncal.model.effects.effect import Stood as Stood
 from visioncal.model.effects.focus_jitter import FocusJitter as FocusJitter
 from visioncal.model.effects.heat import Heat as Heat
 from visioncal.model.effects.lens_grows import LensGrows as LensGrows
+from visioncal.model.effects.lens_steps import LensSteps as LensSteps
 from visioncal.model.effects.links import Links as Links
 from visioncal.model.effects.play import Play as Play
 from visioncal.model.effects.posture import BaseTilts as BaseTilts

@@ -1,0 +1,29 @@
+"""A lens that was zoomed, refocused or hit once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.types import FloatArray
+from visioncal.model.arm import Moments
+from visioncal.model.effects.effect import LensEffect
+
+
+@dataclass(frozen=True, eq=False)
+class LensSteps(LensEffect):
+    """What focal lengths and centre were, less what they are from a stop on, as `LensGrows` has it.
+
+    The picks come after the session: there it is zero.
+    """
+
+    kind, bounds, count = "lens steps", (1e-2, 1e-6, 0.3), 3
+    stop: int  # The first stop after it.
+
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """See `Effect`."""
+        del distances
+        found, focal = self.none(moments), self.lens.matrix[:2]
+        before = (moments.stops >= 0) & (moments.stops < self.stop)
+        found[before, :2, 0] = focal
+        found[before, 2, 1] = found[before, 3, 2] = np.mean(focal)
+        return found
