@@ -10,7 +10,7 @@ tests of residuals alone. Another engine stands behind the same door if it gives
     seen, measured, expected, closure     sightings, and their forward model
     by_noise, beside, shift               covariances by source; what held values would have moved
     absorbed, equations, with_columns     score tests of further unknowns
-    bias                                  the fit's response to what it takes for noise
+    bias, beside_lasting                  the response to what it takes for noise, or estimates last
 
 Everything else here follows from these.
 """
@@ -275,11 +275,34 @@ class Fit:
             return np.zeros(self.problem.size)
         return np.asarray(-self.by_noise @ np.where(held, self.equations[1], 0.0))
 
+    def beside_lasting(self, robot: str, errors: ArmErrors) -> "Fit":
+        """The same with an arm's errors that last in time among the unknowns, before a step.
+
+        Its noise is what is left beside them.
+        """
+        in_time, index = errors.basis[:, :, errors.is_time_correlated], self.robots.index(robot)
+        noise = self.noise if errors.white is None else self.noise.with_robot(index, errors.white)
+        own = replace(errors, basis=in_time, time_correlated_count=in_time.shape[2])
+        wide = self.with_columns(own.effect(robot, "lasting errors"))
+        return replace(wide, solution=replace(wide.solution, noise=noise))
+
+    def step_to(self, wide: "Fit") -> FloatArray:
+        """(p,) step of the unknowns to those of a fit with more unknowns or other noise."""
+        information, gradient = wide.equations
+        step = -covariance_among(information, wide.problem.moving) @ gradient
+        return np.asarray(step[: self.problem.size])
+
     def bias(self, robot: str, errors: ArmErrors) -> FloatArray:
-        """(p, q) Jacobian of the estimates by q errors of an arm that the fit takes for noise."""
-        information, size = self.with_columns(errors.effect(robot)).equations[0], self.problem.size
-        fitted = covariance_among(information[:size, :size], self.problem.moving)
-        return np.asarray(fitted @ information[:size, size:])
+        """(p, q) Jacobian of the estimates by q errors of an arm that the fit takes for noise.
+
+        It is none by errors that last in time, which are estimated.
+        """
+        size, last = self.problem.size, errors.is_time_correlated
+        fit = self.beside_lasting(robot, errors) if last.any() else self
+        information = fit.with_columns(errors.effect(robot)).equations[0]
+        first = fit.problem.size
+        fitted = covariance_among(information[:first, :first], fit.problem.moving)
+        return np.asarray((fitted @ information[:first, first:])[:size] * ~last)
 
     def covariance(self, *unknowns: tuple[str, str]) -> FloatArray:
         """(c, c) covariance of some unknowns from all sources, in their order."""

@@ -94,13 +94,29 @@ def misfit_covariance(fit: Fit, robot: str, errors: ArmErrors) -> FloatArray:
     """Covariance (p, p) that arm errors add to a fit that takes them for white noise.
 
     Where the white noise beside the errors is known, the fit was weighted with too much noise; the
-    excess is subtracted.
+    excess is subtracted. Errors that last in time are estimated; see `with_lasting_errors`.
     """
-    response = errors.sigma * fit.bias(robot, errors)
-    covariance = response @ response.T
+    response, wide, size = errors.sigma * fit.bias(robot, errors), fit, fit.problem.size
+    if errors.time_correlated_count:
+        wide = fit.beside_lasting(robot, errors)
+    covariance = response @ response.T + (wide.by_noise[:size, :size] - fit.by_noise)
     if errors.white is not None:
-        covariance += less_noise(fit.problem, fit.state, fit.noise, robot, errors.white)
+        less = less_noise(wide.problem, wide.state, wide.noise, robot, errors.white)
+        covariance += less[:size, :size]
     return np.asarray(covariance)
+
+
+def with_lasting_errors(fit: Fit, arms: Mapping[str, RobotArm]) -> Fit:
+    """The fit at what its unknowns are beside errors of arms that last in time.
+
+    What lasts is alike at neighbouring stops: their mean says less than their number suggests. Its
+    noise stays that of the stops one by one.
+    """
+    step = np.zeros(fit.problem.size)
+    for robot, arm in arms.items():
+        if arm.errors is not None and arm.errors.time_correlated_count:
+            step += fit.step_to(fit.beside_lasting(robot, arm.errors))
+    return fit.at(fit.state.moved(step)) if step.any() else fit
 
 
 def change_each(

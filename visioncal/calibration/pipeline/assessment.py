@@ -12,6 +12,7 @@ from visioncal.calibration.pipeline.arm_results import (
     covariance_from_other_sources,
     joint_offsets,
     with_errors_beside_step,
+    with_lasting_errors,
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
@@ -159,7 +160,7 @@ def assess_fit(
         arms = with_errors_beside_step(cell_fit.arms, fit, steps)
         cell_fit = replace(cell_fit, arms=arms)
     beside = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)
-    fit = replace(fit, beside=beside)
+    fit = replace(with_lasting_errors(fit, cell_fit.arms) if is_fit else fit, beside=beside)
     held_out = left_out(cell_fit)
     (faults, reasons), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
     return FitAssessment(

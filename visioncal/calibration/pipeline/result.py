@@ -293,8 +293,9 @@ def _fit_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
         return parts[0], parts[1]
     jacobian = fit.bias(arm.robot, errors)[columns]
     size, variance = jacobian.shape[1], errors.sigma**2
-    lasting = jacobian[:, errors.is_time_correlated]
-    parts[1] += variance * lasting @ lasting.T
+    if errors.time_correlated_count:
+        by_noise = fit.beside_lasting(arm.robot, errors).by_noise
+        parts[1] = by_noise[np.ix_(columns, columns)]
     if not errors.of_links:
         return parts[0], parts[1]
     # The fit deviates by its Jacobian times the errors; the truth deviates from it the other way.

@@ -2,8 +2,8 @@
 
 The errors of such an arm depend on its posture, or persist in time: residuals are no white noise,
 and their mean converges more slowly than their number suggests. Processes by posture and by time
-are averaged by their restricted likelihood, as in `fit.processes`. The solution stays that of white
-noise; its covariance is the average of the models'.
+are averaged by their restricted likelihood, as in `fit.processes`. The solution is that beside what
+lasts in time (`Fit.beside_lasting`); its covariance is the average of the models'.
 """
 
 from collections.abc import Sequence
@@ -31,8 +31,7 @@ _FAINT, _MOST_COMBINED = 0.1, 96
 def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -> ArmErrors | None:
     """Errors of an arm without joint angles, and noise beside them, averaged over all models.
 
-    The solution is that of white noise; the noise of sensors and other robots is kept. None for too
-    few stops.
+    The noise of sensors and other robots is kept. None for too few stops.
     """
     observed = stops_of(problem, robot)
     if len(observed) < FEWEST_STOPS:
