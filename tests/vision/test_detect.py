@@ -437,3 +437,20 @@ def test_check_refuses_what_is_no_image_and_no_size(photo, tmp_path):
     assert "a page of a PDF" in run(tmp_path / "print.pdf").said
     for size_mm in (30000, "nan", "inf", -3):
         assert f"--square-mm is {size_mm}" in run(photo, "--square-mm", size_mm).said
+
+
+@pytest.mark.parametrize("surround", [90, 235])
+def test_a_checkerboard_cut_within_its_outermost_squares_is_found(surround):
+    """As a print that fills its sheet: the cut squares are 0.45 of the others."""
+    image = np.full((480, 640), surround, dtype=np.uint8)
+    squares = 225 * (np.indices((5, 7)).sum(axis=0) % 2) + 20
+    cut = np.kron(squares, np.ones((60, 60)))[33:-33, 33:-33]
+    image[100 : 100 + len(cut), 120 : 120 + cut.shape[1]] = cut
+    image = cv2.GaussianBlur(image, (0, 0), 1.0)
+    board = checkerboard_of(6, 4)
+    found = kind_of(board).search(image, board)
+    rows, columns = np.indices((4, 6))
+    true = np.stack([146.5 + 60 * columns, 126.5 + 60 * rows], axis=-1).reshape(-1, 2)
+    # From one end or the other, by the dark corner.
+    away = [np.abs(found.px - order).max() for order in (true, true[::-1])]
+    assert min(away) < 0.2

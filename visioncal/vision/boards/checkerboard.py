@@ -1,5 +1,6 @@
 """Checkerboards: inner corners of plain squares."""
 
+from collections.abc import Iterator
 from typing import ClassVar, Literal
 
 import cv2
@@ -26,6 +27,8 @@ _MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
 # Counts that the search for any count begins at: a smaller one finds more small boards, and more
 # parts of larger ones.
 _FEWEST = ((4, 4), (3, 3))
+_BY_OUTLINES = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+_SETTLED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 # Shares of a square at which its grey levels are compared, and their range in units of contrast
 # from which on it is not plain: light and noise leave a tenth.
 _INSIDE, _MARKS = (0.25, 0.4, 0.6, 0.75), 0.4
@@ -105,20 +108,12 @@ class Checkerboard(Board):
                 f"(up to {_MOST_PIXELS / 1e6:.0f} million pixels; a ChArUco board is found in "
                 "larger ones)"
             )
-        fine = cv2.CALIB_CB_ACCURACY
-        thorough = fine | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-        for flags in (0,) if quick else (fine, thorough):
-            found, px = cv2.findChessboardCornersSB(
-                image, (target.columns, target.rows), flags=flags
-            )
-            if not found:
-                continue
-            grid = px.reshape(target.rows, target.columns, 2).astype(np.float64)
+        for grid in _grids(image, (target.columns, target.rows), quick=quick):
             if _is_checkered(image, grid):
                 x, y = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-                grid = grid if x[0] * y[1] - x[1] * y[0] > 0 else grid[:, ::-1]
-                grid = _dark_corner_first(image, grid)
-                return DetectedCorners(np.arange(target.columns * target.rows), grid.reshape(-1, 2))
+                turned = grid if x[0] * y[1] - x[1] * y[0] > 0 else grid[:, ::-1]
+                px = _dark_corner_first(image, turned).reshape(-1, 2)
+                return DetectedCorners(np.arange(target.columns * target.rows), px)
         return NotFound(
             f"no board: no checkerboard of {target.columns} x {target.rows} inner corners is seen"
         )
@@ -141,6 +136,29 @@ class Checkerboard(Board):
         return None
 
 
+def _grids(image: Image, size: tuple[int, int], *, quick: bool) -> Iterator[FloatArray]:
+    """(rows, columns, 2) grids of corners that one search after the other takes for the board."""
+    fine, (columns, rows) = cv2.CALIB_CB_ACCURACY, size
+    thorough = fine | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+    for flags in (0,) if quick else (fine, thorough):
+        found, px = cv2.findChessboardCornersSB(image, size, flags=flags)
+        if found:
+            yield px.reshape(rows, columns, 2).astype(np.float64)
+    if quick:
+        return
+    # By the outlines of squares, some boards are found whose corners the other search loses.
+    found, px = cv2.findChessboardCorners(image, size, flags=_BY_OUTLINES)
+    if found:
+        grid = px.reshape(rows, columns, 2)
+        sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
+        half = max(int(min(sides) / 4), 2)
+        yield (
+            cv2.cornerSubPix(image, px, (half, half), (-1, -1), _SETTLED)
+            .reshape(rows, columns, 2)
+            .astype(np.float64)
+        )
+
+
 def square_corners(target: Target, inset: int) -> FloatArray:
     """(n, 3) corners [m] of a board's squares, row by row, from `inset` squares inside on."""
     rows, columns = np.mgrid[inset : target.rows, inset : target.columns]
@@ -161,7 +179,8 @@ def _is_checkered(image: Image, grid: FloatArray) -> bool:
 
     For small boards OpenCV sometimes skips a row and takes the board's edge as the last one.
     """
-    levels = _levels(image, _extended(grid))
+    # Prints are often cut within their outermost squares.
+    levels = _levels(image, _extended(grid, 0.5))
     diagonal = np.stack([levels[:-1, :-1], levels[1:, 1:]])
     antidiagonal = np.stack([levels[:-1, 1:], levels[1:, :-1]])
     gap = np.maximum(
@@ -174,11 +193,12 @@ def _is_checkered(image: Image, grid: FloatArray) -> bool:
     return all(bool(np.all(meet.mean(axis=axis) >= 0.5)) for axis in (0, 1))
 
 
-def _extended(grid: FloatArray) -> FloatArray:
-    """A (rows, columns, 2) grid with the outer corners of its outermost squares."""
+def _extended(grid: FloatArray, share: float = 1.0) -> FloatArray:
+    """A (rows, columns, 2) grid with points a share of a square outside of its outermost ones."""
     for axis in (0, 1):
         first, last = np.take(grid, [0], axis), np.take(grid, [-1], axis)
-        before, after = 2 * first - np.take(grid, [1], axis), 2 * last - np.take(grid, [-2], axis)
+        before = first + share * (first - np.take(grid, [1], axis))
+        after = last + share * (last - np.take(grid, [-2], axis))
         grid = np.concatenate([before, grid, after], axis=axis)
     return grid
 
