@@ -392,5 +392,5 @@ def test_a_payload_is_counted_where_joints_bend(stored, result):
     # The table's digits, and what three looks at a bent arm leave.
     assert stands == pytest.approx(poses, abs=1e-5)
     run("correct", table, "-c", stored, "--payload-kg", "-1", "--seed-joints", SEED).refused(
-        "payload of -1 kg"
+        "payload is -1 kg"
     )

@@ -192,4 +192,11 @@ def with_errors_beside_step(
     is_modelled = all(arm.is_modelled for arm in arms.values())
     if not steps or steps[0].kind not in (FRAME, SIZE) or is_modelled:
         return arms
-    return with_pose_errors(arms, Fit(*with_step(fit.problem, fit.solution, steps[0])))
+    found = with_pose_errors(arms, Fit(*with_step(fit.problem, fit.solution, steps[0])))
+    # No frame is estimated beside what lasts in time, which would take the step for that.
+    return {
+        name: arm
+        if arm.errors is None
+        else replace(arm, errors=replace(arm.errors, time_correlated_count=0))
+        for name, arm in found.items()
+    }

@@ -11,7 +11,7 @@ from visioncal.model.effects.effect import LensEffect
 
 @dataclass(frozen=True, eq=False)
 class LensSteps(LensEffect):
-    """What focal lengths and centre were, less what they are from a stop on, as `LensGrows` has it.
+    """Focal lengths and centre before a stop, less those from there on, in `LensGrows`' units.
 
     The picks come after the session: there it is zero.
     """
