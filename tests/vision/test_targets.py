@@ -19,7 +19,7 @@ from support.rendered import Shot, photograph
 from visioncal.calibration.run import calibrate, run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
-from visioncal.interchange.formats.intrinsics import read_target_description
+from visioncal.interchange.formats.intrinsics import read_target_description, target_named
 from visioncal.present.recording.board import picture
 from visioncal.results import Calibration
 from visioncal.session import Session
@@ -493,3 +493,14 @@ def test_centres_are_exact_and_rightly_numbered(dots, camera):
         # The centre of an ellipse would be off by 0.05 px and more where it is seen aslant.
         assert np.sqrt(np.mean(error**2)) < 0.015
     assert isinstance(find_target(np.full((400, 600), 200, np.uint8), dots), NotFound)
+
+
+def test_a_grid_of_circles_needs_no_diameter():
+    """It is found in each image; until then, circles cover as much as is usual."""
+    described = {"kind": "circles", "columns": 7, "rows": 11, "square_m": 0.02}
+    assert target_from_document(described, "circles").diameter_m == pytest.approx(0.01)
+    staggered = target_from_document({**described, "asymmetric": True}, "circles")
+    assert staggered.diameter_m == pytest.approx(0.01 * np.sqrt(2.0))
+    assert target_named("circles_7x11_20mm_asymmetric") == replace(
+        staggered, name="circles_7x11_20mm_asymmetric"
+    )

@@ -24,12 +24,13 @@ _READ: Mapping[str, Callable[[str], object]] = {
     **dict.fromkeys(("square_m", "marker_m", "size_m"), lambda mm: metres(float(mm))),
     "dictionary": str,
     "spacing": float,
-    "legacy": bool,
+    **dict.fromkeys(("legacy", "asymmetric"), bool),
 }
 FORMS = (
     "charuco_5x7_36.2mm_18.3mm_DICT_6X6_250 (squares, side of a square and of a marker), "
     "checkerboard_9x6_23.6mm (inner corners), aprilgrid_6x6_88mm_0.3 (tags, their side, the white "
-    "between them as a share of it), marker_DICT_APRILTAG_36h11_10_48mm (id)"
+    "between them as a share of it), circles_7x11_20mm and circles_4x11_20mm_asymmetric (circles, "
+    "distance of rows), marker_DICT_APRILTAG_36h11_10_48mm (id)"
 )
 
 
@@ -45,7 +46,8 @@ def read_target_description(words: str) -> Mapping[str, Any]:
     for kind, match in matches.items():
         if match is not None:
             groups = match.groupdict().items()
-            document = {"kind": kind, **{name: _READ[name](text) for name, text in groups}}
+            read = {name: _READ[name](text) for name, text in groups if text is not None}
+            document = {"kind": kind, **read}
     if document is None:
         if not words.lower().endswith(".toml") and words not in target_names():
             raise DataError(

@@ -14,6 +14,8 @@ from visioncal.core.types import FloatArray, Image, IntArray, Target, chosen_row
 from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.imaging import shrunk
 from visioncal.vision.boards.kind import (
+    COUNTS,
+    MM,
     BoardRequest,
     DetectedCorners,
     NotFound,
@@ -54,17 +56,21 @@ class CircleGrid(Board):
     noun = "grid of circles"
     options = "--columns --rows --square-mm --diameter-mm --asymmetric --name"
     keys = f"{Board.keys} diameter_m asymmetric"
+    in_a_word = rf"{COUNTS}_(?P<square_m>{MM})mm(?P<asymmetric>_asymmetric)?"
     sides, unit = "a distance of rows", "distance"
     symmetric: ClassVar[Literal["", "squares", "places"]] = "places"
 
     def read(self, table: DocumentTable, name: str) -> Target:
-        """Reads columns, rows, square_m, square_sigma_m, diameter_m and asymmetric."""
+        """Reads columns, rows, square_m, square_sigma_m, asymmetric and diameter_m.
+
+        The diameter is found in each image: it may be left out.
+        """
         columns, rows = counts_of(table)
         square_m = size_of(table, "square_m")
         asymmetric = table.flag("asymmetric", default=False)
-        diameter_m = table.number("diameter_m", positive=True)
         # Distance of the nearest circles.
         spacing_m = square_m * np.sqrt(2.0) if asymmetric else square_m
+        diameter_m = table.number("diameter_m", _USUAL_DIAMETER * spacing_m, positive=True)
         if diameter_m >= _WIDEST * spacing_m:
             needed = f"less than {_WIDEST:g} of the distance of neighbours, {spacing_m:g} m"
             raise table.refuse("diameter_m", diameter_m, needed)
