@@ -712,7 +712,7 @@ def test_entries_without_a_pose_are_named_and_ragged_ones_refused(rows, third):
 
     source = rows(fields)
     if isinstance(third, list):
-        raised(DataError, "entry 3: robot is no regular list", read_foreign, source, HAND)
+        raised(DataError, "entry 3: robot must be a list or matrix", read_foreign, source, HAND)
         return
     notes = " ".join(assemble(read_foreign(source, HAND)).warnings)
     assert "have no pose of the robot: log.json, entry 3" in notes
@@ -784,3 +784,15 @@ def test_files_of_the_kernel_are_not_read():
         pytest.skip("there is no /proc")
     assert file.read_text()
     assert head(file) == ""
+
+
+def test_a_list_of_corners_that_is_absent_in_one_record_is_left_aside(rows):
+    """Its numbers are no pose, though its name is of the board."""
+
+    def fields(at):
+        corners = [[1.5 * at, 2.0]] * 20 if at != 3 else []
+        pose = BASE_FROM_FLANGE[at].tolist()
+        return {"gripper_pose": pose, "board_detection": {"imgpts2d": corners}}
+
+    notes = " ".join(read_foreign(rows(fields), HAND).notes)
+    assert "board_detection.imgpts2d" in notes

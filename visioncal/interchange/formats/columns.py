@@ -148,7 +148,8 @@ def _recordings(
         unstated["robot"] |= {"images"}
     columns = _further(fields, columns, used, pairing)
     foreign = ForeignRecording(
-        name=fields.name,
+        # Files that are called by numbers alone are those of their folder.
+        name=fields.name or fields.folder.resolve().name,
         robot=poses["robot"],
         camera=poses.get("camera"),
         images=pairing.images,

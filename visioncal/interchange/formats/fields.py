@@ -32,6 +32,14 @@ def named_by(place: str) -> str:
     return "columns" if ", line " in place else "key"
 
 
+@dataclass(frozen=True)
+class ShapeFault:
+    """A field whose rows differ in shape."""
+
+    words: str  # Which row differs, and how.
+    count: int  # Numbers that most rows have.
+
+
 @dataclass(frozen=True, eq=False)
 class Fields:
     """Named values of n rows."""
@@ -45,8 +53,8 @@ class Fields:
     views: tuple[int, ...] = ()  # (n,) the rows' numbers, where their files' names have them.
     # (n,) names of the rows' files without their ending, or of a program's points.
     stems: tuple[str, ...] = ()
-    # Error messages of fields whose rows differ in shape, by name.
-    shape_errors: Mapping[str, str] = field(default_factory=dict)
+    # Faults of fields whose rows differ in shape, by name.
+    shape_errors: Mapping[str, "ShapeFault"] = field(default_factory=dict)
     form: str = ""  # A name among `POSE_FORMS` where the rows state the form of the robot's poses.
 
     def __len__(self) -> int:
@@ -87,7 +95,7 @@ class Fields:
         """The numbers of a field, (n, k); raises DataError."""
         full = self.find(name)
         if full in self.shape_errors:
-            raise DataError(self.shape_errors[full], culprits=[full])
+            raise DataError(self.shape_errors[full].words, culprits=[full])
         if full not in self.numbers:
             cells = zip(self.places, self.texts[full], strict=True)
             odd = ((place, word) for place, word in cells if word and not is_number(word))
@@ -139,7 +147,7 @@ def fields_of_records(
     """
     numbers: dict[str, FloatArray] = {}
     texts: dict[str, tuple[str, ...]] = {}
-    ragged: dict[str, str] = {}
+    ragged: dict[str, ShapeFault] = {}
     for key in dict.fromkeys(name for record in records for name in record):
         values = [record.get(key) for record in records]
         arrays = sum(isinstance(value, np.ndarray) and value.ndim > 0 for value in values)
@@ -156,9 +164,10 @@ def fields_of_records(
         shape = shapes.most_common(1)[0][0] if shapes else ()
         for place, value in zip(places, values, strict=True):
             if value is not None and getattr(value, "shape", None) != shape:
-                ragged[key] = (
-                    f"{place}: {key} is no regular list or matrix of numbers of the shape {shape}, "
-                    "as most rows have."
+                ragged[key] = ShapeFault(
+                    f"{place}: {key} must be a list or matrix of numbers of the shape {shape}, as "
+                    "in most rows.",
+                    int(np.prod(shape)),
                 )
                 break
         else:
@@ -471,7 +480,8 @@ def _by_category(fields: Fields) -> list[Fields]:
 def _merged(
     members: Sequence[tuple[Fields, IntArray]], name: str, folder: Path, *, prefixed: bool
 ) -> Fields:
-    numbers, texts, ragged = dict[str, FloatArray](), dict[str, tuple[str, ...]](), dict[str, str]()
+    numbers, texts = dict[str, FloatArray](), dict[str, tuple[str, ...]]()
+    ragged = dict[str, ShapeFault]()
     places: list[list[str]] = [[] for _ in members[0][1]]
     for part, rows in members:
         known = {*numbers, *texts}

@@ -64,6 +64,8 @@ _SIDE_WORDS = {
 # With these words between two frames the child is named first; otherwise second.
 _CHILD_FIRST = {"2", "to", "in", "wrt"}
 # Numbers of poses' sizes that are none, and poses that were not reached but asked for.
+# How many numbers a pose has, or its position or its rotation.
+_OF_POSES = (16, 12, 9, 7, 6, 4, 3)
 _NO_POSE = re.compile(
     r"joint|axis|axes|angles|wrench|speed|force|torque|twist|vel|accel|effort|corner|intrins"
 )
@@ -330,7 +332,11 @@ def pose_names(
     if first:
         return first[0].names if len(first) == 1 else ()
     # A field whose rows are irregular is refused by its row.
-    ragged = (PoseFields((name,), tuple(words_of(name))) for name in fields.shape_errors)
+    ragged = (
+        PoseFields((name,), tuple(words_of(name)))
+        for name, fault in fields.shape_errors.items()
+        if fault.count in _OF_POSES
+    )
     return next(
         (
             item.names
