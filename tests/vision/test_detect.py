@@ -454,3 +454,16 @@ def test_a_checkerboard_cut_within_its_outermost_squares_is_found(surround):
     # From one end or the other, by the dark corner.
     away = [np.abs(found.px - order).max() for order in (true, true[::-1])]
     assert min(away) < 0.2
+
+
+@pytest.mark.parametrize("asymmetric", [False, True])
+def test_a_blob_that_continues_a_grid_of_circles_is_none_of_it(asymmetric):
+    """A screw where the next circle would be."""
+    board = circles(7, 6, asymmetric=asymmetric)
+    places = kind_of(board).corners(board)[:, :2] / board.square_m * 36.0 + 70.0
+    beside = places[-1] + (places[1] - places[0])
+    image = np.full((400, 640), 220, dtype=np.uint8)
+    for at in (*places, beside):
+        cv2.circle(image, np.rint(at).astype(int).tolist(), 9, 30, -1, cv2.LINE_AA)
+    found = kind_of(board).search(image, board)
+    assert found.px == pytest.approx(np.rint(places), abs=0.3)

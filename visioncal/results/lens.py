@@ -23,7 +23,7 @@ from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian
 
 # Places of p1 and p2 among Brown's intrinsics.
 _DECENTRING = (6, 7)
-# What p1 and p2 of a lens are whose elements are centred as well as makers can (sigma).
+# Sigma of p1 and p2 of lenses whose elements are centred as well as makers can.
 _OWN_DECENTRING = 5e-4
 
 # Steps of central differences [rad], whose truncation is their square.

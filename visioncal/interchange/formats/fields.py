@@ -36,7 +36,7 @@ def named_by(place: str) -> str:
 class ShapeFault:
     """A field whose rows differ in shape."""
 
-    words: str  # Which row differs, and how.
+    words: str  # The first row that differs, and how.
     count: int  # Numbers that most rows have.
 
 

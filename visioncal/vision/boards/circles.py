@@ -359,11 +359,24 @@ def _grown(blobs: Blobs, tree: cKDTree, seed: int, steps: FloatArray) -> dict[tu
 
 
 def _order(places: IntArray, px: FloatArray, target: Target) -> IntArray | None:
-    """Order of points whose (n, 2) coordinates fill the target's grid, right-handed; else None."""
-    order = np.lexsort((places[:, 0], places[:, 1]))
+    """Order of those points that fill the target's grid, right-handed; None for another grid.
+
+    (n, 2) places are coordinates of all points.
+    """
     expected = circle_places(target.columns, target.rows, asymmetric=target.asymmetric)
-    if not np.array_equal(places[order] - places.min(axis=0), expected):
+    wider = np.ptp(places, axis=0) - np.ptp(expected, axis=0)
+    # A screw or a hole beside a grid may continue it.
+    if not 0 <= len(places) - len(expected) <= len(expected) // 10 or (wider < 0).any():
         return None
+    at = {place: index for index, place in enumerate(map(tuple, places.tolist()))}
+    found = [
+        [at.get(place, -1) for place in map(tuple, (expected + places.min(axis=0) + by).tolist())]
+        for by in product(*(range(each + 1) for each in wider.tolist()))
+    ]
+    orders = [order for order in found if min(order) >= 0]
+    if len(orders) != 1:
+        return None
+    order = np.array(orders[0])
     x = px[order[target.columns - 1]] - px[order[0]]
     y = px[order[-target.columns]] - px[order[0]]
     return order if x[0] * y[1] - x[1] * y[0] > 0 else None
