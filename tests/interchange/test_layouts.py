@@ -22,6 +22,7 @@ from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.registry import read_foreign
 from visioncal.interchange.formats.sources import describe
 from visioncal.session import Session
+from visioncal.session.depth import ply_of, read_depth
 from visioncal.vision.boards.charuco import charuco_board
 from visioncal.vision.targets import target_document
 
@@ -968,6 +969,34 @@ def sections(folder):
     write(folder / "HandEye.ini", text.replace("\n", "\r\n"))
 
 
+def table_of(folder: Path) -> None:
+    rows = [f"color_{at:03d},{','.join(map(repr, map(float, seven(pose))))}"
+            for at, pose in enumerate(world()[0])]  # fmt: skip
+    write(folder / "poses.csv", "\n".join(["name,x_m,y_m,z_m,qx,qy,qz,qw", *rows]))
+
+
+def named_with_depth(folder):
+    """A table that names the images, and depth pictures of their numbers in another folder."""
+    shoot(folder / "rgb", "color_{:03d}.png")
+    for at in range(len(world()[0])):
+        (folder / "depth").mkdir(exist_ok=True)
+        cv2.imwrite(
+            str(folder / f"depth/depth_{at:03d}.png"), np.full((400, 640), 900 + at, np.uint16)
+        )
+    table_of(folder)
+
+
+def named_with_clouds(folder):
+    """The same with organised clouds of the images' names."""
+    shoot(folder / "rgb", "color_{:03d}.png")
+    for at in range(len(world()[0])):
+        (folder / "clouds").mkdir(exist_ok=True)
+        (folder / f"clouds/color_{at:03d}.ply").write_bytes(
+            ply_of(np.full((400, 640, 3), 0.9 + 0.001 * at))
+        )
+    table_of(folder)
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -987,6 +1016,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         tf_echo, tf2_echo, tf_echo_each,
         job, within_braces, elements, nested_elements, sections,
         lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
+        named_with_depth, named_with_clouds,
     )
 }  # fmt: skip
 
@@ -1015,12 +1045,18 @@ def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
     if make is stems_with_depth:
         assert [Path(view.depth).name for view in session.views][1] == "1.png"
         assert session.images.read(session.views[1].depth).startswith(b"\x89PNG")
-        assert "depth pictures #.png (9 files)" in done.err
+        assert "The depth #.png (9 files) is of the same images" in done.err
         assert "Left aside, as rows differ in their shape: joints" in done.err
     if make is two_folders:
         assert "Left out of the images: rgb/frame_#_corners.png (9 files)" in done.err
+    if make in (named_with_depth, named_with_clouds):
+        for at, view in zip(shown, session.views, strict=True):
+            depth = read_depth(session.images.read(view.depth), view.depth, (640, 400))
+            # Of single precision.
+            assert np.ptp(depth) == 0.0
+            assert depth[0, 0] == pytest.approx(0.9 + 0.001 * at, abs=1e-6)
     if make is among_measurements:
-        assert "they are the views' depth" in done.err
+        assert "it is the views' depth" in done.err
     if make in (sixes, blanks, inverted):
         assert "Found by the images: With the robot's" in done.err
     if make is rapid_with_a_home:

@@ -23,7 +23,7 @@ from visioncal.robot import Robot
 from visioncal.robot.files import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session import ImageStore, Session, Stream
 from visioncal.session import columns as session_columns
-from visioncal.session.images import ListedImages
+from visioncal.session.images import CLOUD_ENDINGS, ListedImages
 from visioncal.vision.boards.imaging import image_size, looks_like_image
 from visioncal.vision.targets import target_name
 
@@ -44,7 +44,8 @@ class FileImages(ListedImages[Path]):
         """Reads the bytes of one image file."""
         data = read_bytes(place, MOST_IMAGE_BYTES)
         # A failed camera leaves empty files, which are kept; else what is no image is refused.
-        if data and not looks_like_image(data):
+        is_cloud = place.suffix.lower() in CLOUD_ENDINGS
+        if data and not is_cloud and not looks_like_image(data):
             raise DataError(
                 f"{place} is no image (png, jpg, tif, bmp, webp).",
                 culprits=[str(place)],

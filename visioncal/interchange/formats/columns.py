@@ -27,6 +27,7 @@ from visioncal.interchange.formats.file_search import (
     images_named,
     images_of,
     paired,
+    with_depth,
 )
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -263,12 +264,15 @@ def _images(
     taken: Collection[str],
 ) -> tuple[Pairing, str]:
     """Pairs the rows with images, and names the field that names them."""
-    groups = found if asked is None else asked
+    every = found if asked is None else asked
+    groups = [group for group in every if group.is_images]
     name = fields.find(column) if column else _image_name(fields, groups, taken)
     if name in fields.texts:
         cells = _with_folders(fields, name, groups)
-        return Pairing(images_named(cells, fields.folder, found, asked)), name
-    return paired(fields, groups) if groups else Pairing(()), ""
+        named = None if asked is None else groups
+        pairing = Pairing(images_named(cells, fields.folder, groups, named))
+        return with_depth(pairing, every), name
+    return with_depth(paired(fields, groups), every) if groups else Pairing(()), ""
 
 
 def _with_folders(fields: Fields, name: str, groups: Sequence[FileGroup]) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -27,7 +27,7 @@ from visioncal.interchange.formats.fields import (
     number_in,
 )
 from visioncal.interchange.formats.reading import ENDINGS
-from visioncal.session.images import IMAGE_ENDINGS
+from visioncal.session.images import CLOUD_ENDINGS, IMAGE_ENDINGS
 
 # Endings of texts with numbers that are none of a recording.
 _NO_DATA = (".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg")
@@ -108,8 +108,13 @@ class FileGroup:
 
     @property
     def is_depth(self) -> bool:
-        """Whether they are depth pictures."""
-        return self.image is not None and self.image.is_depth
+        """Whether they are depth pictures or clouds."""
+        return self.is_clouds or (self.image is not None and self.image.is_depth)
+
+    @property
+    def is_clouds(self) -> bool:
+        """Whether they are clouds by their names."""
+        return len(self.files) > 1 and self.label.lower().endswith(CLOUD_ENDINGS)
 
     def taken(self, rows: IntArray) -> tuple[Path | None, ...]:
         """The files of some rows; None of -1."""
@@ -230,8 +235,8 @@ def head(path: Path) -> str:
 
 
 def images_of(source: Path) -> tuple[FileGroup, ...]:
-    """The groups of images in a source."""
-    return tuple(group for group in groups_in(source) if group.is_images)
+    """The groups of images in a source, and those of clouds."""
+    return tuple(group for group in groups_in(source) if group.is_images or group.is_clouds)
 
 
 def image_groups(folder: Path) -> tuple[FileGroup, ...]:
@@ -242,7 +247,7 @@ def image_groups(folder: Path) -> tuple[FileGroup, ...]:
     """
     found = images_of(folder.parent if folder.is_file() else folder)
     found = tuple(group for group in found if folder.is_dir() or folder in group.files)
-    if not found:
+    if not any(group.is_images for group in found):
         raise DataError(
             f"{folder} has no images (png, jpg, tif, bmp, webp), or is no folder.",
             culprits=[str(folder)],
@@ -304,20 +309,19 @@ class Pairing:
     """The images of n rows."""
 
     images: tuple[Path | None, ...]  # (n,) the image of each row; None in a row without.
-    depths: tuple[Path | None, ...] = ()  # (n,) its depth picture likewise; empty without any.
     notes: tuple[str, ...] = ()  # Pairs, and files that were left out.
     # (n,) images in other orders, where no names pair them, and what they are called.
     others: tuple[tuple[str, tuple[Path | None, ...]], ...] = ()
     is_open: bool = False  # Whether what the images show says which of these is right.
     doubt: DataError | None = None  # The error where nothing else says it.
+    depths: tuple[Path | None, ...] = ()  # (n,) the depth of each row likewise; empty without any.
 
 
 def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     """Pairs rows with one kind of image: by equal names or numbers, else in natural order.
 
     Where one side has more, numbers may differ by a constant, which the images determine if several
-    fit. Depth pictures of the rows are kept beside; raises DataError where nothing fits, or several
-    kinds do.
+    fit. Raises DataError where nothing fits, or several kinds do.
     """
     matches, steps = list[tuple[FileGroup, Match]](), dict[str, list[Match]]()
     for group in groups:
@@ -355,28 +359,41 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         )
     (chosen, match), how = ranked[0], ranked[0][1].how
     images = chosen.taken(match.rows)
-    depth = next((item for item in ranked[1:] if item[0].is_depth), None)
     both = [(place, file.name) for place, file in zip(fields.places, images, strict=True) if file]
     ends = ", ".join(f"{place} with {name}" for place, name in dict.fromkeys((both[0], both[-1])))
     hint = "; --image-column names a column that names each row's image" * (how == HOW[-1])
     notes = [f"Rows and images are paired by {how}: {ends}{hint}."]
-    left = [group.listed() for group in groups if group is not chosen]
+    left = [group.listed() for group in groups if not (group is chosen or group.is_depth)]
     left += [file.name for file in sorted({*chosen.files}.difference(images), key=natural)]
-    if depth is not None:
-        left.remove(depth[0].listed())
-        notes.append(
-            f"The depth pictures {depth[0].listed()} are of the same rows: they are the views' "
-            "depth, in millimetres unless [camera] depth_unit_m says otherwise."
-        )
     if left:
         notes.append(f"Left out of the images: {some_of(left)}.")
-    depths = () if depth is None else depth[0].taken(depth[1].rows)
     others = steps.get(chosen.label, [])
     orders = _orders(fields, chosen, match, others).items()
     rest = tuple((words, each) for words, each in orders if each and each != images)
     is_sure = len(others) < 2 or match is not others[0]
     doubt = None if is_sure else _unpaired(fields, chosen)
-    return Pairing(images, depths, tuple(notes), rest, bool(others), doubt)
+    return Pairing(images, tuple(notes), rest, bool(others), doubt)
+
+
+def with_depth(pairing: Pairing, groups: Sequence[FileGroup]) -> Pairing:
+    """The pairing with the depth pictures or clouds of its images, by names or numbers."""
+    images = tuple(dict.fromkeys(filter(None, pairing.images)))
+    numbers = tuple(at for file in images if (at := number_in(file.name)) is not None)
+    keys = FileGroup("", images, numbers * (len({*numbers}) == len(images))).keys
+    notes, depths = list(pairing.notes), pairing.depths
+    for group in (one for one in groups if one.is_depth and not {*one.files} & {*images}):
+        found = matched(keys, group.keys)
+        if depths or found is None or found.how == HOW[-1]:
+            notes.append(f"The depth {group.listed()} is left out.")
+            continue
+        of = dict(zip(images, group.taken(found.rows), strict=True))
+        depths = tuple(file and of[file] for file in pairing.images)
+        unit = ", in millimetres unless [camera] depth_unit_m says otherwise"
+        notes.append(
+            f"The depth {group.listed()} is of the same images: it is the views' depth"
+            f"{'' if group.is_clouds else unit}."
+        )
+    return replace(pairing, depths=depths, notes=tuple(notes))
 
 
 def _orders(

@@ -67,8 +67,9 @@ class Source:
 
     @property
     def images(self) -> tuple[FileGroup, ...]:
-        """The groups of images."""
-        return tuple(part.group for part in self.parts if part.group.is_images)
+        """The groups of images, and those of clouds."""
+        groups = (part.group for part in self.parts)
+        return tuple(group for group in groups if group.is_images or group.is_clouds)
 
     def lens(self) -> tuple[Mapping[str, Any] | None, tuple[str, ...]]:
         """The only lens, or that of the colour camera, and where it is from; None without."""
