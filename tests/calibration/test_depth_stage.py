@@ -20,6 +20,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.frames.locate import cloud_in_base
 from visioncal.results import Calibration
+from visioncal.results.depth import bending
 from visioncal.session import MemoryImages
 from visioncal.session.depth import npy_of, read_cloud
 from visioncal.simulation import DepthOptions
@@ -347,6 +348,19 @@ def test_a_cloud_is_flat_and_in_place_in_the_base(tmp_path):
     # Floats of the file.
     assert again_there == pytest.approx(there[np.isfinite(there[:, 2])], abs=1e-6)
     assert pose.shape == (4, 4)
+
+
+def test_a_cloud_is_corrected_where_the_lens_distorts():
+    depth = made()[1].calibration.camera.depth
+    lens = replace(SMALL, distortion=np.array([-0.3, 0.1, 0.0, 0.0, 0.0]))
+    px = np.array([[2.0, 2.0], [637.0, 200.0], [320.0, 398.0]])
+    rays = simulation.rays(lens, px)
+    true = np.full(3, 0.8)
+    measured = depth.scale * true + bending(px, lens.resolution) @ depth.values[1:]
+    placed, where = depth.corrected(rays / rays[:, 2:] * measured[:, None], lens)
+    # 4 mm of a bowl would be off by 1 at the pixels without distortion; rounding.
+    assert placed[:, 2] == pytest.approx(true, abs=1e-8)
+    assert where == pytest.approx(px, abs=1e-4)
 
 
 def test_a_pixel_is_located_by_the_depth_of_its_view(tmp_path):

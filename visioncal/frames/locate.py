@@ -23,6 +23,7 @@ from visioncal.frames.camera_chain import (
     point_jacobian,
 )
 from visioncal.results import Calibration
+from visioncal.results.depth import DepthResult
 from visioncal.session.selecting import EYE, Choice
 from visioncal.vision.camera import normalise, project
 from visioncal.vision.targets import load_target
@@ -160,33 +161,22 @@ def locate_by_depth(
             f"locate: the distances are {measured.tolist()}, but must be metres above 0.",
             next_step="Take a pixel at which the sensor measured one.",
         )
-    model, found = eye.lens.depth, list[Located]()
+    model, found, unread = eye.lens.depth, list[Located](), ""
+    if model is None:
+        model = DepthResult.exact()
+        unread = "The calibration's views had no depth: it is taken as it was measured."
+    # The depth is by the camera of depth, in whose pixels the model is.
+    by, beside = (eye.camera if model.by is None else model.by.camera), model.beside
+    cross = np.zeros((5, len(eye.covariance)))
+    if model.with_calibration is not None:
+        # Between the camera's edge and the lens is the board's.
+        cross = np.delete(model.with_calibration, np.s_[6:12], axis=1)
     for at, ray, metres in zip(px, rays, measured, strict=True):
-        depth, noise_m = metres, 0.0
-        by_depth, covariance = np.zeros((0, 1)), np.zeros((0, 0))
-        cross = np.zeros((0, len(eye.covariance)))
-        warnings = ["The calibration's views had no depth: it is taken as it was measured."]
-        along = 1.0
-        if model is not None:
-            warnings = []
-            along = float(np.linalg.norm(ray)) if model.of == "ray" else 1.0
-            size, where = eye.camera.resolution, at[None]
-            if model.by is None:
-                (true,) = model.true_m(metres[None], where, size)
-                depth = true / along
-            else:
-                # The depth is by the other camera, in whose pixels the model is.
-                size, beside = model.by.resolution, model.by.cam_from_depth
-                point = apply(invert(beside), (metres / along * ray)[None])
-                placed, where = model.corrected(point, model.by.camera)
-                (depth,) = apply(beside, placed)[:, 2]
-                true = depth * along
-            noise_m = model.noise_at(true) / along
-            by_depth = -model.by_values(true[None], where, size).T / along
-            covariance = model.covariance
-            if model.with_calibration is not None:
-                # Between the camera's edge and the lens is the board's.
-                cross = np.delete(model.with_calibration, np.s_[6:12], axis=1)
+        along = float(np.linalg.norm(ray)) if model.of == "ray" else 1.0
+        placed, where = model.corrected(apply(invert(beside), (metres / along * ray)[None]), by)
+        (depth,) = apply(beside, placed)[:, 2]
+        noise_m = model.noise_at(depth * along) / along
+        by_depth = -model.by_values(depth[None] * along, where, by.resolution).T / along
         # The first ray is for the mean distance, as in `_on_plane`.
         unit = np.append(normalise(eye.camera, eye.lens.in_model(at[None], depth))[0], 1.0)
         point_cam = depth * unit
@@ -198,10 +188,10 @@ def locate_by_depth(
             "depth": _mapped(by_noise, np.eye(1)),
             **_camera_parts(
                 *(eye, cam_pose, cam_pose.camera_jacobian(point_cam), by_cam @ by_lens),
-                (np.outer(by_cam @ unit, by_depth), covariance, cross),
+                (np.outer(by_cam @ unit, by_depth), model.covariance, cross),
             ),
         }
-        warnings += _distance_warning(eye, point_cam)
+        warnings = (*filter(None, [unread]), *_distance_warning(eye, point_cam))
         found.append(_located(eye, cam_pose.point(point_cam), parts, warnings))
     return tuple(found)
 
@@ -228,7 +218,7 @@ def seen_distances(calibration: Calibration, depth_m: FloatArray, px: FloatArray
     own = normalise(model.by.camera, np.column_stack([columns, rows]).astype(float))
     rays = np.column_stack([own, np.ones(len(own))])
     lengths = np.linalg.norm(rays, axis=1, keepdims=True) if model.of == "ray" else 1.0
-    points = apply(model.by.cam_from_depth, rays * depth_m[rows, columns][:, None] / lengths)
+    points = apply(model.beside, rays * depth_m[rows, columns][:, None] / lengths)
     distances = np.linalg.norm(points, axis=1) if model.of == "ray" else points[:, 2]
     seen, found = project(eye.camera, points), np.full(len(px), np.nan)
     # One and a half pixels of the depth picture.
@@ -267,7 +257,7 @@ def cloud_in_base(
     if model is not None:
         by = eye.camera if model.by is None else model.by.camera
         points_cam = model.corrected(points_cam.reshape(-1, 3), by)[0].reshape(points_cam.shape)
-        pose = pose if model.by is None else pose @ model.by.cam_from_depth
+        pose = pose @ model.beside
     return np.asarray(points_cam @ pose[:3, :3].T + pose[:3, 3])
 
 

@@ -1,12 +1,13 @@
 """Depth of a result: how a camera's distances deviate from the true ones, and their correction."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 
 from visioncal.core.codec import Array, Matrix, Vector
 from visioncal.core.types import Camera, CameraKind, FloatArray
+from visioncal.vision.camera import project
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,6 +54,19 @@ class DepthResult:
     # The camera that u and v are of; None where depth is aligned to the image.
     by: DepthCamera | None = None
 
+    @classmethod
+    def exact(cls) -> Self:
+        """The model of distances that are taken as they were measured."""
+        return cls(
+            scale=1.0, offset_m=0.0, tilt_m=(0.0, 0.0), bowl_m=0.0, covariance=np.zeros((5, 5)),
+            noise_m=(0.0, 0.0), view_m=0.0, distances_m=(0.0, np.inf),
+        )  # fmt: skip
+
+    @property
+    def beside(self) -> FloatArray:
+        """(4, 4) pose of the camera that measures depth, in that of the images."""
+        return np.eye(4) if self.by is None else self.by.cam_from_depth
+
     def true_m(self, measured_m: FloatArray, px: FloatArray, size: tuple[int, int]) -> FloatArray:
         """(n,) true distances of (n,) measured ones at (n, 2) pixels of an image of a size [m]."""
         bent = bending(px, size) @ self.values[1:]
@@ -65,10 +79,10 @@ class DepthResult:
             points_m: (n, 3) as measured, in the frame of the camera that measures depth [m].
             camera: It.
         """
-        z = points_m[:, 2]
-        # Tilt and bowl change so slowly that distortion moves no pixel far enough to matter.
-        px = points_m[:, :2] / z[:, None] * camera.matrix[:2] + camera.matrix[2:]
-        measured = np.linalg.norm(points_m, axis=1) if self.of == "ray" else z
+        # In parts that stay in the cache, several times as fast.
+        parts = np.array_split(points_m, 1 + len(points_m) // 50_000)
+        px = np.concatenate([project(camera, part) for part in parts])
+        measured = np.linalg.norm(points_m, axis=1) if self.of == "ray" else points_m[:, 2]
         share = self.true_m(measured, px, camera.resolution) / measured
         return points_m * share[:, None], px
 
