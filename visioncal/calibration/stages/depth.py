@@ -326,10 +326,12 @@ def with_depth(
     verdict = replace(verdict, findings=(*verdict.findings[:1], *findings, *verdict.findings[1:]))
     calibration = replace(calibration, verdict=verdict)
     if calibration.cell is not None:
-        cameras = dict(calibration.cell.cameras)
-        for name, one in found.items():
-            depth = replace(one, with_calibration=None)
-            cameras[name] = replace(cameras[name], depth=depth)
+        # The pairs' transforms are others than the cell's.
+        depths = {name: replace(one, with_calibration=None) for name, one in found.items()}
+        cameras = {
+            name: replace(one, depth=depths.get(name))
+            for name, one in calibration.cell.cameras.items()
+        }
         calibration = replace(calibration, cell=replace(calibration.cell, cameras=cameras))
     elif found and calibration.camera is not None:
         camera_result = replace(calibration.camera, depth=next(iter(found.values())))
@@ -520,11 +522,9 @@ def _judged(
 ) -> Finding:
     """Whether a depth is true, or what it was before, in mm at the distances of the views."""
     true = np.concatenate([cells.true_m for cells in found])
-    known, covariance = np.array([1.0, 0.0, 0.0, 0.0, 0.0]), result.covariance
-    if before is not None:
-        known, covariance = before.values, covariance + before.covariance
-    away = result.values - known
-    statistic = float(away @ np.linalg.solve(covariance, away))
+    known = before or DepthResult.exact()
+    away = result.values - known.values
+    statistic = float(away @ np.linalg.solve(result.covariance + known.covariance, away))
     middle, sigma = float(np.median(true)), np.sqrt(np.diag(result.covariance))
     px = np.concatenate([cells.px for cells in found])
     off = 1e3 * np.column_stack([true, bending(px, size)]) @ away
@@ -532,24 +532,25 @@ def _judged(
     centre = 1e3 * (away[0] * middle + away[1])
     figures = (
         f"scale {result.scale:.5f} +- {sigma[0]:.5f}, offset {1e3 * result.offset_m:.2f} +- "
-        f"{1e3 * sigma[1]:.2f} mm, bowl {1e3 * result.bowl_m:.2f} +- {1e3 * sigma[4]:.2f} mm"
+        f"{1e3 * sigma[1]:.2f} mm, bowl {1e3 * result.bowl_m:.2f} +- {1e3 * sigma[4]:.2f} mm."
     )
-    ink = f" Black reads {1e3 * result.ink_m:.1f} mm deeper than white." if result.ink_m else ""
-    if before is not None:
-        words = (
-            f"The camera's depth is {'' if is_true else 'not '}what it was: at {middle:.2f} m it "
-            f"reads {centre:+.1f} mm in the image's middle, and {off.min():+.1f} to "
-            f"{off.max():+.1f} mm over the board, beside what it did; {figures}.{ink}{further}"
-        )
-        step = "Look at the sensor's window, warmth and settings, or calibrate again."
-        return Finding(NOTE, words) if is_true else Finding(DEPTH_CHANGED, words, Remedy(step))
+    if result.ink_m:
+        figures += f" Black reads {1e3 * result.ink_m:.1f} mm deeper than white."
+    span = f"{off.min():.1f} to {off.max():.1f} mm"
     if is_true:
-        words = f"The camera's depth is true at {middle:.2f} m: {figures}.{ink}{further}"
-        return Finding(NOTE, words)
-    return Finding(
-        "depth_scale",
-        f"The camera's depth is {abs(centre):.1f} mm too {'long' if centre > 0 else 'short'} at "
-        f"{middle:.2f} m in the image's middle, and over the board from {off.min():.1f} to "
-        f"{off.max():.1f} mm: {figures}.{ink}{further}",
-        Remedy("Correct it: visioncal locate applies camera.depth of calibration.json."),
+        what = "true" if before is None else "what it was"
+        words = f"The camera's depth is {what} at {middle:.2f} m"
+        return Finding(NOTE, f"{words}: {figures}{further}")
+    if before is None:
+        words = (
+            f"The camera's depth is {abs(centre):.1f} mm too {'long' if centre > 0 else 'short'} "
+            f"at {middle:.2f} m in the image's middle, and over the board from {span}"
+        )
+        step = "Correct it: visioncal locate applies camera.depth of calibration.json."
+        return Finding("depth_scale", f"{words}: {figures}{further}", Remedy(step))
+    words = (
+        f"The camera's depth is not what it was: at {middle:.2f} m it reads {centre:+.1f} mm in "
+        f"the image's middle beside what it did, and over the board {span}"
     )
+    step = "Look at the sensor's window, warmth and settings, or calibrate again."
+    return Finding(DEPTH_CHANGED, f"{words}: {figures}{further}", Remedy(step))
