@@ -201,7 +201,7 @@ def test_the_arm_stops_where_the_computer_that_moves_it_dies(controller):
 @pytest.mark.usefixtures("patient")
 def test_a_wrong_motion_is_refused_before_it_is_sent(controller):
     with closing(UrArm(controller.host)) as arm:
-        with pytest.raises(DriverError, match="A UR has six joints"):
+        with pytest.raises(DriverError, match="must have six joint angles"):
             arm.start_move(np.zeros(7), speed=1.0, acceleration=1.0)
         raised(DriverError, "at 9 rad/s", arm.start_move, np.zeros(6), speed=9.0, acceleration=1.0)
     arm.close()
