@@ -335,6 +335,10 @@ def test_corners_are_numbered_back_and_views_without_partner_go():
     assert moved.views[2].cell("x_m") == session.views[3].cell("x_m")
     np.testing.assert_array_equal(moved.corners[2].px, session.corners[2].px)
     assert "3 had none there and were dropped" in moved.declaration.corrected[0]
+    # View 1 keeps its pose, which view 2 would have as well.
+    earlier = shift_views(session, [2, 3], -1)
+    assert [view.number for view in earlier.views] == [0, 1, 3]
+    assert earlier.views[2].cell("x_m") == session.views[2].cell("x_m")
 
 
 @pytest.mark.parametrize(

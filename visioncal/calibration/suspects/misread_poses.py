@@ -35,7 +35,7 @@ _MIRRORED = Remedy(
     "Look at an image first: where it is mirrored (a flip in the camera's driver, a mirror before "
     "the lens), turn the images back, and find the corners anew (in a corners.csv, u_px counts to "
     "the right and v_px down), and calibrate anew. Only where the robot's frame is left-handed, "
-    "convert with --guess --mirror-poses."
+    "convert with --guess --yes --mirror-poses."
 )
 _LOST_TURNS = Remedy(
     "Where the poses were made of the robot's angles, convert these to radians first (np.deg2rad, "
