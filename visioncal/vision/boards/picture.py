@@ -165,8 +165,11 @@ class Picture(BoardKind):
         ids, px, sigma_px = places_of(found, self.corners(target), half_m)
         if len(ids) < self.fewest:
             return NotFound(f"too little of the picture is free: {len(ids)} patches of it")
-        typical = float(np.median(sigma_px))
-        return DetectedCorners(ids, px, typical / sigma_px, blur_px=found.seen.gauss_px)
+        weights = float(np.median(sigma_px)) / sigma_px
+        # A patch of less than half the usual information is known along one direction alone, which
+        # no weight says: lens and noise suffer by more than it tells.
+        clear = weights**2 > 0.5
+        return DetectedCorners(ids[clear], px[clear], weights[clear], blur_px=found.seen.gauss_px)
 
 
 def kept_picture(path: Path) -> str:
