@@ -179,10 +179,8 @@ def _of_ply(data: bytes) -> FloatArray:
     points = _columns(
         body, names, [ends[form] + kind for kind in kinds], count, is_text=not ends[form]
     )
-    height, width = (
-        size.get("num_rows", size.get("height", 0)),
-        size.get("num_cols", size.get("width", 0)),
-    )
+    height = size.get("num_rows", size.get("height", 0))
+    width = size.get("num_cols", size.get("width", 0))
     return points.reshape(height, width, 3) if height * width == count else points
 
 
@@ -195,16 +193,12 @@ def _of_pcd(data: bytes) -> FloatArray:
     lines = (line.split() for line in head[0].decode("ascii").splitlines() if line.strip())
     fields = {words[0]: words[1:] for words in lines}
     width, height = int(fields["WIDTH"][0]), int(fields["HEIGHT"][0])
-    counts = [int(count) for count in fields.get("COUNT", ["1"] * len(fields["FIELDS"]))]
-    kinds = [
-        f"{kind.lower()}{size}" for kind, size in zip(fields["TYPE"], fields["SIZE"], strict=True)
-    ]
-    names = [
-        f"{name}.{at}" if count > 1 else name
-        for name, count in zip(fields["FIELDS"], counts, strict=True)
-        for at in range(count)
-    ]
-    kinds = [kind for kind, count in zip(kinds, counts, strict=True) for _ in range(count)]
+    counts = map(int, fields.get("COUNT", ["1"] * len(fields["FIELDS"])))
+    columns = zip(fields["FIELDS"], fields["TYPE"], fields["SIZE"], counts, strict=True)
+    names, kinds = list[str](), list[str]()
+    for name, kind, size, count in columns:
+        names += [name] if count == 1 else [f"{name}.{at}" for at in range(count)]
+        kinds += [f"{kind.lower()}{size}"] * count
     points = _columns(data[head.end() :], names, kinds, width * height, is_text=head[1] == b"ascii")
     return points.reshape(height, width, 3) if height > 1 else points
 
