@@ -121,7 +121,7 @@ def run(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> R
     held_out = state.assessment.held_out
     residuals = zip(held_out.residual_m.tolist(), held_out.rms_px.tolist(), strict=True)
     left_out = dict(zip(state.used, residuals, strict=True))
-    searches = state.searches if state.dense is None else {}
+    searches = {} if state.dense else state.searches
     result = _with_depth(state) if _has_depth(state) else (result_of(state), view_evidence(state))
     return Run(*result, left_out, searches)
 

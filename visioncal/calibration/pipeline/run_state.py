@@ -124,7 +124,7 @@ def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOpti
         session if isinstance(session, Session) else Session.load(session),
         asked.get("progress"),
         threads or 0,
-        dense={} if asked.get("dense") else None,
+        dense=asked.get("dense", False),
         pictures=asked.get("pictures", False),
         solver=solver,
         level=asked.get("level", "auto"),

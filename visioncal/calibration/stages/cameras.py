@@ -73,7 +73,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
             seen = replace(seen, searches={**seen.searches, **found.searches})
             seen = seen.noting((), (*other_sizes(found), *unshown_rows(session, found)))
             corners, resolution = found.corners, found.resolution
-            if seen.dense is not None:
+            if seen.dense:
                 first = seen.with_camera(
                     frame, CameraObservations(table, _numbered(session, corners), resolution)
                 )
@@ -153,8 +153,7 @@ def _with_dense(
                 f", so that view {ranges(moving)} serves the lens alone. Where the robot's poses "
                 "are of mid-exposure, write [clock] into session.toml, and they count."
             )
-    dense_seen = replace(seen, dense={**(seen.dense or {}), **found}, notes=(*seen.notes, note))
-    return dense_seen, replace(
+    return replace(seen, notes=(*seen.notes, note)), replace(
         detections,
         corners={view.number: corners[view.number] for view in views if view.number in corners},
         rejections=tuple(lost),

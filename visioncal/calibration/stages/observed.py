@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from visioncal.calibration.stages.clock_offset import ClockedViews, ClockPair
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -18,9 +18,6 @@ from visioncal.results import HELD_BACK, CameraResult
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.document import CameraTable
-
-if TYPE_CHECKING:
-    from visioncal.vision.dense import DenseCorners
 
 # Views of one reason that are listed.
 _LISTED = 40
@@ -58,9 +55,7 @@ class Observed:
     clocks: Mapping[ClockPair, ClockedViews] = field(default_factory=dict)
     warnings: tuple[Finding, ...] = ()  # Findings for the user.
     notes: tuple[str, ...] = ()  # Remarks that are no reason for doubt.
-    # Corners by all pixels of images that the template refuses, by view; None where these are not
-    # asked for.
-    dense: "Mapping[int, DenseCorners] | None" = None
+    dense: bool = False  # Whether prints are fitted to all pixels of refused images.
     pictures: bool = False  # Whether faint copies of the images are kept.
     searches: Mapping[int, Searched] = field(default_factory=dict)  # Of each image, by view.
     # How robots' poses are misread, so that they determine nothing of lenses and boards; None where
