@@ -288,6 +288,15 @@ def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> No
     assert "late_poses" not in {found.kind for found in sound.findings}
 
 
+@pytest.mark.parametrize(("off_mm", "named"), [(2.0, []), (30.0, [(7,)])])
+def test_doctor_calls_no_view_wrong_for_what_an_arm_may_err_by(off_mm, named) -> None:
+    cell = simulate(CellOptions(views=20))
+    flanges = cell.robot.base_from_flange.copy()
+    flanges[7, 0, 3] += 1e-3 * off_mm
+    found = doctor(session_of(cell, flanges)).findings
+    assert [each.views for each in found if each.kind == "wrong_views"] == named
+
+
 @pytest.mark.parametrize(
     ("step_mm", "step_deg", "noise_mm", "words"),
     [

@@ -17,6 +17,7 @@ from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.stages.other_board import OtherBoardError
+from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.judged import Findings, JudgedArm, Sensor
 from visioncal.calibration.suspects.limits import few_stops
 from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards, with_undone
@@ -163,7 +164,11 @@ def _motion(run: RunState) -> Iterator[Finding]:
     except VisioncalError as error:
         yield _refused("motion", error, more_views(error, run))
         return
-    views = tuple(cell.rows[at].view for at in np.flatnonzero(~inliers.used).tolist())
+    # Errors that arms, lenses and prints have are weighed by calibrate alone.
+    away_m, away_rad = pose_residuals(problem, inliers.fit.state)
+    most_mm, most_deg = CalibrationLimits().arm_errors
+    is_far = (1e3 * away_m > most_mm) | (np.rad2deg(away_rad) > most_deg)
+    views = tuple(cell.rows[at].view for at in np.flatnonzero(~inliers.used & is_far).tolist())
     if views:
         yield Finding(
             "wrong_views",
