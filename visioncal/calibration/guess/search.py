@@ -83,7 +83,8 @@ class Recording:
         """The rows with a pose of both sides, without those that repeat the robot's of before."""
         rows = np.flatnonzero(self.robot.present & self.camera.present)
         numbers = np.hstack([self.robot.positions, self.robot.rotations])[rows]
-        others = rows[np.append(True, np.any(np.diff(numbers, axis=0) != 0.0, axis=1))]
+        changed = np.any(np.diff(numbers, axis=0) != 0.0, axis=1)
+        others = rows[np.append(np.ones(min(len(rows), 1), dtype=bool), changed)]
         return others if len(others) >= FEWEST_ROWS else rows
 
     def is_likely(self, tried: Hypothesis) -> bool:
