@@ -271,6 +271,11 @@ def test_intrinsics_of_numpy_and_of_a_fisheye(tmp_path):
     matrix = [[500.5, 0, 320], [0, 501, 240], [0, 0, 1]]
     np.savez(tmp_path / "lens.npz", cameraMatrix=matrix, distCoeffs=[[-0.25, 0.125, 0, 0, 0.5]])
     assert read_intrinsics(tmp_path / "lens.npz")[0]["distortion"] == [-0.25, 0.125, 0, 0, 0.5]
+    # A matrix alone, and numbers alone.
+    np.save(tmp_path / "k.npy", matrix)
+    assert read_intrinsics(tmp_path / "k.npy")[0]["matrix"] == [500.5, 501, 320, 240]
+    np.savetxt(tmp_path / "k.txt", np.ravel([*np.ravel(matrix), -0.25, 0.125, 0, 0, 0.5]))
+    assert read_intrinsics(tmp_path / "k.txt")[0]["distortion"] == [-0.25, 0.125, 0, 0, 0.5]
     text = LENSES["kalibr.yaml"].replace("radtan", "equidistant")
     (tmp_path / "fisheye.yaml").write_text(text)
     assert read_intrinsics(tmp_path / "fisheye.yaml")[0]["model"] == "fisheye"

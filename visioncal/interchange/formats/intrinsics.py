@@ -14,6 +14,7 @@ from visioncal.core.documents.structured import read_opencv, read_xml
 from visioncal.core.documents.tables import is_number
 from visioncal.core.documents.values import as_numbers, mapping, number
 from visioncal.core.errors import DataError
+from visioncal.core.files import read_text
 from visioncal.core.types import FloatArray, Target
 from visioncal.vision.boards import KINDS
 from visioncal.vision.boards.kind import metres
@@ -111,14 +112,23 @@ def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Reads the intrinsics of a camera; raises DataError.
 
     Supports ROS camera_info (YAML), OpenCV's FileStorage (YAML, XML, JSON), Kalibr's camchain,
-    ViSP's camera XML, ROS-Industrial's fx, fy, cx, cy, and .npz or JSON with a matrix under one of
-    the usual names.
+    ViSP's camera XML, ROS-Industrial's fx, fy, cx, cy, .npz or JSON with a matrix under one of the
+    usual names, a matrix alone as .npy, and a text of nothing but its nine numbers and the
+    coefficients.
 
     Returns:
         model, matrix, distortion, and resolution where the file has it; and notes on assumptions.
     """
-    if path.suffix.lower() == ".npz":
-        return intrinsics_from(read_arrays(path), str(path))
+    if path.suffix.lower() in (".npz", ".npy"):
+        arrays = read_arrays(path)
+        is_alone = path.suffix.lower() == ".npy"
+        return intrinsics_from({"K": arrays["matrix"]} if is_alone else arrays, str(path))
+    if path.suffix.lower() in (".txt", ".csv"):
+        numbers = re.split(r"[\s,;]+", read_text(path).strip())
+        if len(numbers) in (9, 13, 14, 17) and all(map(is_number, numbers)):
+            values = [float(text) for text in numbers]
+            lens = {"K": np.reshape(values[:9], (3, 3)), "D": values[9:]}
+            return intrinsics_from(lens, str(path))
     if path.suffix.lower() == ".xml":
         root = read_xml(path)
         if root.find("camera") is not None:

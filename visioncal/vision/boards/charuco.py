@@ -197,13 +197,18 @@ def marked_squares(target: Target) -> IntArray:
 @lru_cache(maxsize=64)
 def charuco_board(target: Target) -> "cv2.aruco.CharucoBoard":
     """OpenCV's board for a ChArUco target."""
-    board = cv2.aruco.CharucoBoard(
-        (target.columns, target.rows),
-        target.square_m,
-        target.marker_m,
-        aruco_dictionary(target.dictionary),
-        np.arange(target.columns * target.rows // 2, dtype=np.int32) + max(target.marker_id, 0),
-    )
+    # It warns of markers that nearly fill their squares, once for each image.
+    logged = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    try:
+        board = cv2.aruco.CharucoBoard(
+            (target.columns, target.rows),
+            target.square_m,
+            target.marker_m,
+            aruco_dictionary(target.dictionary),
+            np.arange(target.columns * target.rows // 2, dtype=np.int32) + max(target.marker_id, 0),
+        )
+    finally:
+        cv2.utils.logging.setLogLevel(logged)
     board.setLegacyPattern(target.legacy)
     return board
 
