@@ -75,24 +75,26 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
             corners, resolution = found.corners, found.resolution
             if seen.dense:
                 first = seen.with_camera(
-                    frame, CameraObservations(table, _numbered(session, corners), resolution)
+                    frame, CameraObservations(table, _numbered(session, views, corners), resolution)
                 )
                 seen, found = _with_dense(seen, first, views, found)
                 corners = found.corners
             seen = seen.noting(found.rejections)
         seen = seen.with_camera(
-            frame, CameraObservations(table, _numbered(session, corners), resolution)
+            frame, CameraObservations(table, _numbered(session, views, corners), resolution)
         )
     return with_stop_means(without_repeats(seen))
 
 
-def _numbered(session: Session, corners: Mapping[int, Corners]) -> dict[int, Corners]:
-    """Corners by view, those of several boards numbered through, in the session's order."""
+def _numbered(
+    session: Session, views: Sequence[View], corners: Mapping[int, Corners]
+) -> dict[int, Corners]:
+    """Corners of some views, those of several boards numbered through."""
     firsts = first_corners(tuple(session.boards.values())).tolist()
     starts = dict(zip(session.boards, firsts, strict=True))
     return {
         view.number: replace(at, ids=at.ids + starts[session.board_of(view)])
-        for view in session.views
+        for view in views
         if (at := corners.get(view.number)) is not None
     }
 
