@@ -525,6 +525,10 @@ def test_a_right_arm_stays_nominal_and_without_joints_no_level_can_be_asked_for(
     known, asked = calibrated(right), calibrated(right, level="kinematics")
     assert known.robot_arm.kinematics.level == asked.robot_arm.kinematics.level == "nominal"
     assert any("The arm stays as stated" in reason for reason in asked.verdict.reasons)
+    # Of an arm that is off and does not bend.
+    rigid = calibrated(simulate(replace(WRONG_LINKS, seed=3)), level="elastic")
+    assert rigid.robot_arm.kinematics.level != "nominal"
+    assert any("No joint was found to bend" in reason for reason in rigid.verdict.reasons)
     assert known.robot_arm.model is None
     assert [level.level for level in known.robot_arm.kinematics.result.levels] == ["nominal"]
     cell = simulate(replace(WRONG_LINKS, views=12))

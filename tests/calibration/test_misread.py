@@ -376,6 +376,10 @@ SLIPS = {
         "q3_rad and q5_rad exchanged",
     ),
     "a joint's sign": ({"joints": Q * [1, 1, -1, 1, 1, 1]}, "q3_rad of the opposite sign"),
+    "two joints from another zero": (
+        {"joints": Q - np.pi / 2 * np.array([0, 1, 0, -1, 0, 0])},
+        "+90 deg added to q2_rad and -90 deg added to q4_rad",
+    ),
     "base_link for base": (
         {"poses": np.diag([-1.0, -1.0, 1.0, 1.0]) @ POSES},
         "base_link was taken for base",

@@ -8,7 +8,7 @@ A reading of the joints is right where this holds for most rows.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -83,6 +83,22 @@ def joint_readings(robot: Robot) -> Iterator[JointReading]:
     for at, name in enumerate(robot.joint_names):
         fix = f"Negate q{at + 1}_rad, or turn the axis of {name} in the robot's model."
         yield entry(f"q{at + 1}_rad of the opposite sign", fix, np.diag(1.0 - 2.0 * same[at]), at)
+    # Zeros of DH tables and of makers differ by quarter turns; those of the first joint and the
+    # last hide in the constants, and a single one is sought with all zeros.
+    inner = (np.flatnonzero(~robot.chain.prismatic[1:-1]) + 1).tolist()
+    for quarters in product((0, 1, -1), repeat=len(inner)):
+        moved = [(at, quarter) for at, quarter in zip(inner, quarters, strict=True) if quarter]
+        if len(moved) not in (2, 3):
+            continue
+        zeros = np.zeros(count)
+        zeros[[at for at, _ in moved]] = [0.5 * np.pi * quarter for _, quarter in moved]
+        words = " and ".join(
+            f"{90 * quarter:+d} deg added to q{at + 1}_rad" for at, quarter in moved
+        )
+        adds = " and ".join(f"{zeros[at]:+.6f} to q{at + 1}_rad" for at, _ in moved)
+        fix = f"Add {adds} in all rows: these joints are counted from another zero."
+        columns = tuple(at for at, _ in moved)
+        yield JointReading(robot, same, zeros, words, fix, columns, cost=1.2)
     other = other_convention(robot)
     if other is not None:
         table, convention = other
@@ -150,7 +166,8 @@ class JointGuess:
 
         Of joints with parallel axes it is the more likely one: only a fit of all determines which.
         """
-        return self.best.reading if all(one.zeros.any() for one in self._readings) else None
+        is_zero = all(one.zeros.any() and len(one.columns) == 1 for one in self._readings)
+        return self.best.reading if is_zero else None
 
     @property
     def _readings(self) -> tuple[JointReading, ...]:

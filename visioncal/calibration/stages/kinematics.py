@@ -111,7 +111,7 @@ class SelectedArmLevel:
 
     nominal: LevelFit  # The fit of the nominal arm.
     fit: LevelFit  # The fit with the errors; the nominal one where none explain more than chance.
-    was_asked: bool  # Whether the user named the level.
+    asked: str  # The level that was asked for.
     views: tuple[int, ...] = ()  # (m,) the view of each residual of these.
 
     @property
@@ -196,7 +196,7 @@ def select_errors(
             return None
         nominal = LevelFit.of(problem, state, robot, noise, None)
         fit = fitted(sizes)
-    return SelectedArmLevel(nominal, fit, asked not in ("auto", "thermal"))
+    return SelectedArmLevel(nominal, fit, asked)
 
 
 def check_level(asked: str) -> None:
@@ -230,10 +230,16 @@ def check_level_is_possible(asked: str, *, can: bool, misread: str = "") -> None
 
 def findings(kinematics: SelectedArmLevel) -> Iterator[str]:
     """States the chosen level, for the verdict."""
-    if kinematics.level == NOMINAL and kinematics.was_asked:
+    if kinematics.level == NOMINAL and kinematics.asked not in ("auto", "thermal"):
         yield (
             "The arm stays as stated: what was asked to be found of it explains the views no "
             "better than chance, or there are too few stops to show it."
+        )
+    elif kinematics.asked == "elastic" and not {COMPLIANCE, WEIGHT} & kinematics.fit.errors.keys():
+        yield (
+            "No joint was found to bend under load, as asked: what else the arm errs by explains "
+            "the views as well. State payload_kg in views.csv, and record stops with and "
+            "without it."
         )
     result = kinematics.result
     if result.is_calibrated:

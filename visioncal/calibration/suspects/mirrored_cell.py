@@ -44,9 +44,6 @@ def _found(run: RunState) -> Iterator[Finding]:
             until_mm=0.0,
         )
         return
-    if any(found.kind == "misread_poses" for found in run.misread or ()):
-        # Where the frames are is then an effect of that.
-        return
     edge = run.assessment.last_edges[carried]
     depth_m, (*_, along_z) = -edge.matrix[2, 3], edge.matrix[:3, :3] @ edge.covariance[3:, 3:]
     sigma_m = float(np.sqrt(max(along_z @ edge.matrix[2, :3], 0.0)))
