@@ -358,7 +358,7 @@ def test_the_calibrated_arm_stands_where_the_real_one_does_under_any_load(carryi
     # A load that was never seen moves the flange by some millimetres, told to a hundredth.
     assert np.abs(real).max() > 3e-3
     assert np.abs(loaded_m - free_m - real).max() < 0.03 * np.abs(real).max()
-    raised(DataError, "payload of -1 kg", result.base_from_flange, q, payload_kg=-1.0)
+    raised(DataError, "payload is -1 kg", result.base_from_flange, q, payload_kg=-1.0)
     # Files of others say that they hold no springs.
     words = "its joints bend under its own weight, and under a load"
     written = document(result, "robot-dh")

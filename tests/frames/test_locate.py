@@ -531,7 +531,7 @@ def test_the_tip_comes_as_near_as_predicted(proved, located):
         np.testing.assert_allclose(step[:3, 3], [0.0, 0.0, -0.05], atol=1e-12)
     assert evaluate_gaps(points, away_mm).passed
     assert not evaluate_gaps(points, [5.0] * 5).passed
-    raised(DataError, "5 of 0 mm and more", evaluate_gaps, points, [0.1])
+    raised(DataError, "5 of 0 mm or more", evaluate_gaps, points, [0.1])
 
 
 def test_no_target_brings_what_the_flange_carries_into_the_board(proved, known):

@@ -225,7 +225,9 @@ def test_a_checkerboard_of_another_count_is_named(tmp_path, monkeypatch):
     assert "checkerboard of 11 x 8 inner corners" in said
     assert "Write columns = 11 and rows = 8" in said
     # Nothing more is said of the board; how the source writes its rotations is another matter.
-    assert len(followed.done) == 1
+    board, *rotations = followed.done
+    assert "columns = 11" in board
+    assert all("convert cell cell-fixed --guess" in words for words in rotations)
     assert "checkerboard" not in followed.last.said
 
 

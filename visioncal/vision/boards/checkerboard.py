@@ -27,8 +27,6 @@ _MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
 # Counts that the search for any count begins at: a smaller one finds more small boards, and more
 # parts of larger ones.
 _FEWEST = ((4, 4), (3, 3))
-_BY_OUTLINES = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-_SETTLED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 # Shares of a square at which its grey levels are compared, and their range in units of contrast
 # from which on it is not plain: light and noise leave a tenth.
 _INSIDE, _MARKS = (0.25, 0.4, 0.6, 0.75), 0.4
@@ -147,16 +145,15 @@ def _grids(image: Image, size: tuple[int, int], *, quick: bool) -> Iterator[Floa
     if quick:
         return
     # By the outlines of squares, some boards are found whose corners the other search loses.
-    found, px = cv2.findChessboardCorners(image, size, flags=_BY_OUTLINES)
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    found, px = cv2.findChessboardCorners(image, size, flags=flags)
     if found:
         grid = px.reshape(rows, columns, 2)
         sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
         half = max(int(min(sides) / 4), 2)
-        yield (
-            cv2.cornerSubPix(image, px, (half, half), (-1, -1), _SETTLED)
-            .reshape(rows, columns, 2)
-            .astype(np.float64)
-        )
+        settled = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
+        fine_px = cv2.cornerSubPix(image, px, (half, half), (-1, -1), settled)
+        yield fine_px.reshape(rows, columns, 2).astype(np.float64)
 
 
 def square_corners(target: Target, inset: int) -> FloatArray:
