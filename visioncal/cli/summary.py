@@ -1,6 +1,6 @@
 """Summaries of results, and their comparison with a simulated truth."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -90,13 +90,16 @@ def print_summary(
         print_table(solvers.titles, [row.cells for row in solvers.rows])
 
 
-def _not_in_verdict(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResult]:
-    """Views left out for a reason that the verdict does not state."""
+def _not_in_verdict(verdict: Verdict, views: Sequence[ViewResult]) -> Iterator[ViewResult]:
+    """Views left out, but those of a finding that states the reasons of all its views."""
     findings = [finding for finding in verdict.findings if finding.without_it]
+    reasons = {view.view: view.reason for view in views}
     for view in views:
         of_view = [finding for finding in findings if view.view in finding.views]
         if not any(
-            finding.kind != "wrong_views" or view.reason in finding.words for finding in of_view
+            finding.kind != "wrong_views"
+            or all(reasons.get(at, "") in finding.words for at in finding.views)
+            for finding in of_view
         ):
             yield view
 
