@@ -539,6 +539,13 @@ def test_each_doubt_has_its_sentence(changes, status, words):
         assert len(verdict.reasons) == count + (not verdict.has_accuracy)
 
 
+@pytest.mark.parametrize(("sigma_mm", "status"), [(0.3, "check"), (4.0, "bad")])
+def test_an_arm_that_is_unsure_elsewhere_is_bad_where_views_place_no_better(sigma_mm, status):
+    verdict = judge(changed(SOUND, workspace_mm=4.0, picks=(of_size(sigma_mm),)))
+    assert verdict.status == status
+    assert any("All over the workspace" in reason for reason in verdict.reasons)
+
+
 @pytest.mark.parametrize(
     ("changes", "causes"),
     [

@@ -228,6 +228,7 @@ def _place(judged: Findings) -> Iterator[Finding]:
 def _workspace(judged: Findings) -> Iterator[Finding]:
     """Findings on the accuracy of calibrated arms over their workspace."""
     check, bad = _LIMITS.sigma_mm
+    placed_mm = float(np.hypot(*_uncertainty_mm(judged)))
     for arm in judged.arms:
         if arm.workspace_mm is None or arm.workspace_mm <= check:
             continue
@@ -241,7 +242,8 @@ def _workspace(judged: Findings) -> Iterator[Finding]:
                 "Add views with other postures of the arm, all over the workspace.",
                 " --for kinematics",
             ),
-            is_fatal=arm.workspace_mm > bad,
+            # Where the views look, the arm may be as sure as it is not elsewhere.
+            is_fatal=min(arm.workspace_mm, placed_mm) > bad,
             until_mm=0.0,
         ).of(arm.name)
 
