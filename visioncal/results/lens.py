@@ -259,8 +259,8 @@ def sensor_tilt(lens: CameraResult) -> SensorTilt | None:
     fitted = np.linalg.lstsq(columns / scale, decentred, rcond=1e-8)[0] / scale[:, None]
     tilt = fitted[:2] @ decentring
     rad = float(np.linalg.norm(tilt))
-    # No sensor is mounted so: this is decentring with hardly any radial distortion.
-    if rad > np.deg2rad(3.0):
+    # An axis beside the image is no lens's: decentring with hardly any radial distortion.
+    if rad > np.hypot(*camera.resolution) / 2.0 / focal.min():
         return None
     if rad == 0.0:
         return SensorTilt(rad, 0.0)

@@ -369,14 +369,12 @@ def _order(places: IntArray, px: FloatArray, target: Target) -> IntArray | None:
     if not 0 <= len(places) - len(expected) <= len(expected) // 10 or (wider < 0).any():
         return None
     at = {place: index for index, place in enumerate(map(tuple, places.tolist()))}
-    found = [
-        [at.get(place, -1) for place in map(tuple, (expected + places.min(axis=0) + by).tolist())]
-        for by in product(*(range(each + 1) for each in wider.tolist()))
-    ]
-    orders = [order for order in found if min(order) >= 0]
-    if len(orders) != 1:
+    first = expected + places.min(axis=0)
+    tried = (first + by for by in product(*(range(each + 1) for each in wider.tolist())))
+    grids = [grid for grid in tried if all(tuple(place) in at for place in grid.tolist())]
+    if len(grids) != 1:
         return None
-    order = np.array(orders[0])
+    order = np.array([at[tuple(place)] for place in grids[0].tolist()])
     x = px[order[target.columns - 1]] - px[order[0]]
     y = px[order[-target.columns]] - px[order[0]]
     return order if x[0] * y[1] - x[1] * y[0] > 0 else None
