@@ -151,7 +151,7 @@ def raised_kinds():
 
 # Findings that no contest ranks: of other verdicts, and of what is compared after a calibration's.
 OF_OTHERS = (
-    *("calibration/verification/", "calibration/recovery.py", "calibration/loaded.py", "frames/"),
+    *("verification/", "verification/recovery.py", "verification/loaded.py", "frames/"),
     *("calibration/pipeline/checkup.py", "calibration/stages/depth.py", "dynamics/"),
 )
 

@@ -18,7 +18,6 @@ from visioncal.core.version import __version__
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline.checkup import Checkup, doctor
     from visioncal.calibration.run import calibrate
-    from visioncal.calibration.verification import Guard, Look, verify
     from visioncal.core.errors import (
         ConvergenceError,
         DataError,
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
     from visioncal.interchange.formats import convert
     from visioncal.live.capture.from_python import record
     from visioncal.live.drivers.protocols import ArmState
-    from visioncal.live.planning.plan import make_plan
+    from visioncal.planning.plan import make_plan
     from visioncal.present.report.page import write_report
     from visioncal.results import Calibration, Verdict
     from visioncal.results.compare import compare
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from visioncal.robot.thermal import OnlineCompensator
     from visioncal.session import Session
     from visioncal.simulation import CellOptions, simulate, write_session
+    from visioncal.verification import Guard, Look, verify
     from visioncal.vision.boards.identify import identify
     from visioncal.vision.targets import load_target
 
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "calibration.pipeline.checkup": "Checkup doctor",
     "calibration.run": "calibrate",
-    "calibration.verification": "Guard Look verify",
+    "verification": "Guard Look verify",
     "core.errors": "ConvergenceError DataError DegenerateError DriverError VisioncalError",
     "frames.camera_chain": "Plane",
     "frames.fixture": "touched_fixture",
@@ -68,7 +68,7 @@ _HOMES = {
     "interchange.formats": "convert",
     "live.capture.from_python": "record",
     "live.drivers.protocols": "ArmState",
-    "live.planning.plan": "make_plan",
+    "planning.plan": "make_plan",
     "present.report.page": "write_report",
     "results": "Calibration Verdict",
     "results.compare": "compare",

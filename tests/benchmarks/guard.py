@@ -25,11 +25,11 @@ from support.later import ANYHOW, FITTED
 from support.wrong_arms import target_in_camera
 
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.verification.guard import Guard, Look
-from visioncal.calibration.verification.guard_detector import LookRows
 from visioncal.core.transforms import exp, invert, log
 from visioncal.simulation import SimulatedCell, project, simulate
 from visioncal.simulation.boards import corners_m
+from visioncal.verification.guard import Guard, Look
+from visioncal.verification.guard_detector import LookRows
 
 YEARS, A_DAY, POSTURES = wished(300), 4, few(40, 8)
 STATED = {1000.0: 1, 10_000.0: 5}  # Looks to a false alarm, and the factor of the years.

@@ -15,7 +15,7 @@ import numpy as np
 from results import few, write_section
 from support.scenes import CAMERA, Scene, disturbed, turned
 
-from visioncal.calibration.verification.scene_guard import SceneWatch
+from visioncal.verification.scene_guard import SceneWatch
 from visioncal.vision.camera import normalise, project
 from visioncal.vision.scene import register
 

@@ -10,13 +10,11 @@ from dataclasses import replace
 import numpy as np
 from results import few, write_section
 
-from visioncal.calibration.loaded import calibrate_loaded
 from visioncal.calibration.run import calibrate
-from visioncal.calibration.verification.iso9283 import performance
 from visioncal.core.transforms import compose, invert
-from visioncal.live.planning.cell import TYPICAL_NOISE, InstrumentCell
-from visioncal.live.planning.instrument import plan_for_instrument
-from visioncal.live.planning.purposes import purpose_of
+from visioncal.planning.cell import TYPICAL_NOISE, InstrumentCell
+from visioncal.planning.instrument import plan_for_instrument
+from visioncal.planning.purposes import purpose_of
 from visioncal.robot import load_robot
 from visioncal.session.kinds import Instrument
 from visioncal.simulation import CellOptions, cell_session, simulate
@@ -27,6 +25,8 @@ from visioncal.simulation.instrument_session import (
     session_of,
     tracked,
 )
+from visioncal.verification.iso9283 import performance
+from visioncal.verification.loaded import calibrate_loaded
 
 ARM = "generic-6r-1800"
 STIFF = np.array([3e6, 1.4e6, 9e5, 3e5, 3e5, 2e5])

@@ -9,13 +9,13 @@ from results import few, wished, write_section
 from support.later import ANYHOW, FITTED, Change, again, knock
 
 from visioncal import calibrate
-from visioncal.calibration.recovery import BASE, MOUNT, causes_found, moved_along, parted, recover
-from visioncal.calibration.verification import verify
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.live.capture.gate import travel_s
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.results.compensation.correction import CalibratedArm, correct
 from visioncal.simulation import cell_session, simulate
+from visioncal.verification import verify
+from visioncal.verification.recovery import BASE, MOUNT, causes_found, moved_along, parted, recover
 
 PICKS = few(40, 8)
 ARMS = {

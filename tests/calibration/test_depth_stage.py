@@ -15,7 +15,6 @@ from support.depth_cells import SMALL, TRUE, calibrated, picks
 
 from visioncal import simulation
 from visioncal.calibration.stages.depth import with_depth
-from visioncal.calibration.verification import verdict_of, verify
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.frames.locate import cloud_in_base
@@ -24,6 +23,7 @@ from visioncal.results.depth import bending
 from visioncal.session import MemoryImages
 from visioncal.session.depth import npy_of, read_cloud
 from visioncal.simulation import DepthOptions
+from visioncal.verification import verdict_of, verify
 from visioncal.vision.camera import project
 
 FALSE = DepthOptions(boxed=0.5)

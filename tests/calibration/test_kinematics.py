@@ -34,8 +34,8 @@ from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.estimation.solve import Solution
 from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports import document
-from visioncal.live.planning.information import stop_factors
-from visioncal.live.planning.purposes import PURPOSES
+from visioncal.planning.information import stop_factors
+from visioncal.planning.purposes import PURPOSES
 from visioncal.results import to_document
 from visioncal.results.arm import FUNCTIONS, ArmLevel, ArmResult
 from visioncal.robot import Loads, Robot, load_robot

@@ -19,16 +19,15 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import calibrate, run
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.stages.distance_scale import distance_scale
-from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, Target
 from visioncal.core.verdict import NOTE
 from visioncal.frames.session_observations import detect_session_target
 from visioncal.interchange.outputs import write_outputs
-from visioncal.live.planning.information import predict_worlds
-from visioncal.live.planning.purposes import PURPOSES
-from visioncal.live.planning.recorded import start_from_session
+from visioncal.planning.information import predict_worlds
+from visioncal.planning.purposes import PURPOSES
+from visioncal.planning.recorded import start_from_session
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (
@@ -41,6 +40,7 @@ from visioncal.simulation import (
     write_session,
 )
 from visioncal.simulation.records import cell_session
+from visioncal.verification.calibration_prior import CalibrationPrior
 
 FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
 # Simulated boards have exactly their size.

@@ -13,8 +13,6 @@ from support.slopes import twists
 
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.thermal import inputs_of
-from visioncal.calibration.verification import verify
-from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert, log
 from visioncal.estimation.workspace import postures
@@ -35,6 +33,8 @@ from visioncal.simulation import (
 )
 from visioncal.simulation.arms import Heat, Warming, heated_poses
 from visioncal.simulation.optics import CAMERAS
+from visioncal.verification import verify
+from visioncal.verification.calibration_prior import CalibrationPrior
 
 # What 100 minutes are to predict: the rest of five hours [s].
 TRAINED_S, END_S = 6000.0, 18000.0

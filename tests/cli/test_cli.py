@@ -39,7 +39,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import Mount
 from visioncal.dynamics.excitation import ExcitationRequest
-from visioncal.live.planning.purposes import PURPOSES
+from visioncal.planning.purposes import PURPOSES
 from visioncal.results import Calibration
 from visioncal.results.history import History
 from visioncal.session import Session

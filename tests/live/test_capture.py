@@ -41,10 +41,10 @@ from visioncal.live.capture.recording import (
     motion_summary,
 )
 from visioncal.live.capture.take import image_motion_px
-from visioncal.live.planning.cell import Box
-from visioncal.live.planning.plan import PlanRequest, make_plan
-from visioncal.live.planning.plan_file import plan_document, read_plan
-from visioncal.live.planning.purposes import purpose_of
+from visioncal.planning.cell import Box
+from visioncal.planning.plan import PlanRequest, make_plan
+from visioncal.planning.plan_file import plan_document, read_plan
+from visioncal.planning.purposes import purpose_of
 from visioncal.session import Session
 
 

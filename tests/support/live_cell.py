@@ -12,11 +12,11 @@ from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.problem_parts import Noise
 from visioncal.live.drivers.protocols import ArmState, Frame, Safety
-from visioncal.live.planning.cell import Limits, PlanCell
-from visioncal.live.planning.plan import Stop
-from visioncal.live.planning.plan_file import PlanFile
-from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.simulated.controller import Motion
+from visioncal.planning.cell import Limits, PlanCell
+from visioncal.planning.plan import Stop
+from visioncal.planning.plan_file import PlanFile
+from visioncal.planning.purposes import purpose_of
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions, simulate
 from visioncal.vision.boards.charuco import charuco_board

@@ -12,7 +12,7 @@ from visioncal.live.capture.journal import CaptureFacts, Journal
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.recording import CaptureEvent, record
 from visioncal.live.capture.take import TakenView
-from visioncal.live.planning.plan_file import PlanFile
+from visioncal.planning.plan_file import PlanFile
 
 # A UR repeats to 0.03 to 0.05 mm; what stands within is where it was told to be.
 REPEATABILITY_M = 5e-5

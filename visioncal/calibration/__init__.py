@@ -1,1 +1,1 @@
-"""From a session to a result: its stages, the driver, the reading of poses, verification."""
+"""From a session to a result: its stages, the driver, the reading of poses."""

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import typer
 
-from visioncal.calibration.verification.scene_audit import SceneMove, assumed_camera, scene_moves
 from visioncal.cli.console import EXIT_BAD, answer, print_json
 from visioncal.cli.result_options import AuditOptions
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, figure
 from visioncal.interchange.formats.episodes import read_episodes
 from visioncal.interchange.result_files import load_calibration
+from visioncal.verification.scene_audit import SceneMove, assumed_camera, scene_moves
 from visioncal.vision.boards.imaging import read_image
 
 

@@ -67,7 +67,7 @@ def calibrate_command(options: CalibrateOptions) -> None:
 def _calibrate_loaded(options: CalibrateOptions, loaded: Session, against: Path) -> None:
     """Adds the stiffness of a loaded session to an earlier calibration, in another folder."""
     # Few sessions have loads.
-    from visioncal.calibration.loaded import calibrate_loaded
+    from visioncal.verification.loaded import calibrate_loaded
 
     if options.out.absolute() == (against if against.is_dir() else against.parent).absolute():
         raise DataError(

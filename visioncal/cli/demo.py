@@ -25,11 +25,11 @@ from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.journal import CaptureFacts, Journal
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.recording import CaptureEvent
-from visioncal.live.planning.messages import summary_of
-from visioncal.live.planning.plan import PlanRequest, make_plan
-from visioncal.live.planning.plan_file import PlanFile, plan_document, read_plan
-from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.simulated.cell import Bench
+from visioncal.planning.messages import summary_of
+from visioncal.planning.plan import PlanRequest, make_plan
+from visioncal.planning.plan_file import PlanFile, plan_document, read_plan
+from visioncal.planning.purposes import purpose_of
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, Truth, read_truth, simulate, truth_path, write_session

@@ -48,7 +48,7 @@ from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.interchange.outputs import Written, write_dynamics, write_motions
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.planning.messages import plan_words
+from visioncal.planning.messages import plan_words
 from visioncal.present.torques import torque_table
 from visioncal.present.words import said
 from visioncal.robot import load_robot

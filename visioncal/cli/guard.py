@@ -13,8 +13,6 @@ import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration.verification.guard import Guard, Look
-from visioncal.calibration.verification.scene_guard import scene_looks
 from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, say
 from visioncal.cli.result_options import GuardOptions
 from visioncal.core.documents.jsons import parse_json, parse_stored
@@ -25,6 +23,8 @@ from visioncal.core.types import Corners, FloatArray
 from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
 from visioncal.session import Session
+from visioncal.verification.guard import Guard, Look
+from visioncal.verification.scene_guard import scene_looks
 from visioncal.vision.boards.imaging import read_image
 
 

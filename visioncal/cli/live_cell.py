@@ -14,8 +14,8 @@ from visioncal.live.capture.devices import open_arm, open_camera
 from visioncal.live.capture.journal import RecordedCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.drivers.protocols import Arm, DeviceSetup, MovingArm, RequestingArm
-from visioncal.live.planning.cell import PlanCell
-from visioncal.live.planning.plan_file import PlanFile
+from visioncal.planning.cell import PlanCell
+from visioncal.planning.plan_file import PlanFile
 from visioncal.robot import load_robot
 
 

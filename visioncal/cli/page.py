@@ -37,10 +37,10 @@ from visioncal.live.drivers.uvc import without_password
 from visioncal.live.page.outcome import Light
 from visioncal.live.page.station import PageText, Setup, Station, Task
 from visioncal.live.page.suggestion import NextPose
-from visioncal.live.planning.cell import PlanCell, seen_from
-from visioncal.live.planning.path import short_order
-from visioncal.live.planning.plan_file import PlanFile, read_plan
-from visioncal.live.planning.repeated import stops_to_repeat
+from visioncal.planning.cell import PlanCell, seen_from
+from visioncal.planning.path import short_order
+from visioncal.planning.plan_file import PlanFile, read_plan
+from visioncal.planning.repeated import stops_to_repeat
 from visioncal.robot.files import robot_names
 from visioncal.vision.targets import target_from_document, target_names
 

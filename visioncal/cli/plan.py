@@ -23,7 +23,7 @@ from visioncal.estimation.problem_parts import Noise
 from visioncal.interchange.formats.intrinsics import read_intrinsics, target_named
 from visioncal.interchange.outputs import BOARD, write_plan, write_stops
 from visioncal.interchange.result_files import content_of, load_calibration
-from visioncal.live.planning.cell import (
+from visioncal.planning.cell import (
     TYPICAL_NOISE,
     TYPICAL_PX,
     Box,
@@ -31,13 +31,13 @@ from visioncal.live.planning.cell import (
     PlanCell,
     cell_of_calibration,
 )
-from visioncal.live.planning.messages import summary_of
-from visioncal.live.planning.pick_probability import words_of
-from visioncal.live.planning.plan import Plan, PlanRequest, make_plan
-from visioncal.live.planning.plan_file import plan_document
-from visioncal.live.planning.purposes import purpose_of
-from visioncal.live.planning.recorded import SessionStart, calibrate_partially, start_from_session
-from visioncal.live.planning.repeated import stops_to_repeat
+from visioncal.planning.messages import summary_of
+from visioncal.planning.pick_probability import words_of
+from visioncal.planning.plan import Plan, PlanRequest, make_plan
+from visioncal.planning.plan_file import plan_document
+from visioncal.planning.purposes import purpose_of
+from visioncal.planning.recorded import SessionStart, calibrate_partially, start_from_session
+from visioncal.planning.repeated import stops_to_repeat
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.robot.conversion import has_ur_axes
@@ -117,7 +117,7 @@ def plan_command(options: PlanOptions, session: Path | None = None) -> str:
 def _plan_cube(options: PlanOptions, source: Source, limits: Limits) -> str:
     """Plans the cycles of ISO 9283 for an arm, and writes their table."""
     # Few plans are by the standard.
-    from visioncal.live.planning.cube import largest_cube
+    from visioncal.planning.cube import largest_cube
 
     found = source.calibration
     robot = robot_of(options, source, found, "cube cannot be found")

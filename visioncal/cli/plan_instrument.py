@@ -19,15 +19,15 @@ from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.frames.touches import robot_noise
 from visioncal.interchange.outputs import PLAN, PROGRAM, write_stops
-from visioncal.live.planning.cell import TYPICAL_NOISE, InstrumentCell
-from visioncal.live.planning.instrument import (
+from visioncal.planning.cell import TYPICAL_NOISE, InstrumentCell
+from visioncal.planning.instrument import (
     STABLE,
     InstrumentPlan,
     plan_for_instrument,
 )
-from visioncal.live.planning.plan import Stop
-from visioncal.live.planning.plan_file import ur_program
-from visioncal.live.planning.purposes import purpose_of
+from visioncal.planning.plan import Stop
+from visioncal.planning.plan_file import ur_program
+from visioncal.planning.purposes import purpose_of
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION

@@ -14,7 +14,7 @@ from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.interchange.outputs import CALIBRATION
 from visioncal.interchange.result_files import content_of, load_stored
-from visioncal.live.planning.cell import (
+from visioncal.planning.cell import (
     Box,
     Limits,
 )

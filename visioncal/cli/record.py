@@ -28,7 +28,7 @@ from visioncal.live.capture.recording import (
     record,
 )
 from visioncal.live.drivers.protocols import RequestingArm
-from visioncal.live.planning.plan_file import PlanFile, read_plan
+from visioncal.planning.plan_file import PlanFile, read_plan
 
 
 def record_command(options: RecordOptions) -> None:

@@ -13,10 +13,7 @@ from typing import Annotated, Any, Literal, NoReturn
 import numpy as np
 import typer
 
-from visioncal.calibration import recovery
-from visioncal.calibration.recovery import causes_found, moved_along, parted, recover
 from visioncal.calibration.run import Run
-from visioncal.calibration.verification import Check, verdict_of, verify
 from visioncal.cli.console import (
     EXIT_BAD,
     EXIT_NO_RESULT,
@@ -46,6 +43,8 @@ from visioncal.present.recording.timeline import record_check
 from visioncal.results import Calibration, select_matching
 from visioncal.results.history import entries_of
 from visioncal.session import Session
+from visioncal.verification import Check, recovery, verdict_of, verify
+from visioncal.verification.recovery import causes_found, moved_along, parted, recover
 
 _ACT, _TABLE, _TARGETS = "recover.json", "views.csv", "targets.csv"
 

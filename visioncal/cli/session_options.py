@@ -35,7 +35,7 @@ from visioncal.core.choices import (
 )
 from visioncal.live.capture.devices import CAMERAS
 from visioncal.live.capture.options import Stillness
-from visioncal.live.planning.purposes import PURPOSES
+from visioncal.planning.purposes import PURPOSES
 
 # Options by their headings in the help.
 _what = partial(option, panel="What is planned")

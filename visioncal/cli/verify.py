@@ -5,7 +5,6 @@ import sys
 
 import typer
 
-from visioncal.calibration.verification import to_document, triggers_of, verdict_of, verify
 from visioncal.cli.console import EXIT_BAD, answer, report_written
 from visioncal.cli.history import enter
 from visioncal.cli.progress import shown_progress
@@ -21,6 +20,7 @@ from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
 from visioncal.results.history import entry_of_check
 from visioncal.session import Session
+from visioncal.verification import to_document, triggers_of, verdict_of, verify
 
 # Headings of the triggers by state, with their styles.
 _TRIGGERED = {
@@ -100,7 +100,7 @@ def verify_command(options: VerifyOptions) -> None:
 def _verify_performance(options: VerifyOptions) -> None:
     """Measures the arm's performance by ISO 9283; without a need it neither passes nor fails."""
     # Few checks are by the standard.
-    from visioncal.calibration.verification.iso9283 import performance
+    from visioncal.verification.iso9283 import performance
 
     loaded, calibration = select_matching(
         Session.load(options.session), load_result(options.against), options.choice

@@ -57,7 +57,7 @@ class ArmErrors:
             return None
         if fit is None or not calibration.arm_is_calibrated:
             return None
-        from visioncal.calibration.verification.calibration_prior import fitted_model
+        from visioncal.verification.calibration_prior import fitted_model
 
         model = fitted_model(calibration.calibrated_robot, fit.arm)
         if fit.arm is None or model is None or calibration.camera is None:

@@ -8,7 +8,6 @@ import numpy as np
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.stages.reported_poses import RobotReport, reported_poses
-from visioncal.calibration.verification.prediction import check_robot
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Progress, Target
@@ -21,6 +20,7 @@ from visioncal.robot import Robot
 from visioncal.session import Session, View
 from visioncal.session.selecting import EYE, Choice
 from visioncal.session.table import loads_of, reported_matrices
+from visioncal.verification.prediction import check_robot
 
 _NO_IMAGE = "it has no image"
 

@@ -15,14 +15,14 @@ from visioncal.core.generations import write_generation
 # Imported late, so that writing one kind of result does not import all the others.
 if TYPE_CHECKING:
     from visioncal.calibration.run import Run as Calibrated
-    from visioncal.calibration.verification import Check, Trigger
-    from visioncal.calibration.verification.iso9283 import Performance
     from visioncal.core.choices import ImagesKept
     from visioncal.core.verdict import Verdict
     from visioncal.dynamics.plan_files import MotionPlan
     from visioncal.dynamics.run import Run
-    from visioncal.live.planning.plan import Plan
+    from visioncal.planning.plan import Plan
     from visioncal.session import Session
+    from visioncal.verification import Check, Trigger
+    from visioncal.verification.iso9283 import Performance
 
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
 VERIFY, PERFORMANCE = "verify.json", "iso9283.json"
@@ -158,14 +158,14 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
     """
 
     def draw(path: Path) -> None:
-        from visioncal.live.planning.preview import preview_of
+        from visioncal.planning.preview import preview_of
         from visioncal.present.recording.preview import write_preview
         from visioncal.present.viewer.layout import plan_blueprint
 
         preview = preview_of(plan, f"plan for {plan.cell.robot.name}, {plan.cell.target.name}")
         write_preview(path, preview, plan_blueprint(preview))
 
-    from visioncal.live.planning.plan_file import program_of, stops_table
+    from visioncal.planning.plan_file import program_of, stops_table
 
     texts = {PLAN: json_text(document), STOPS: stops_table(plan)}
     if program := program_of(plan):
@@ -193,7 +193,7 @@ def write_motions(
     """
 
     def draw(path: Path) -> None:
-        from visioncal.live.planning.preview import motion_preview
+        from visioncal.planning.preview import motion_preview
         from visioncal.present.recording.preview import write_motion_preview
         from visioncal.present.viewer.layout import motion_blueprint
 

@@ -1,1 +1,1 @@
-"""At the cell: planning of stops, drivers of devices, capture, and a simulated cell to record."""
+"""At the cell: drivers of devices, capture, and a simulated cell to record."""

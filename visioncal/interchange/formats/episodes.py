@@ -6,13 +6,13 @@ from pathlib import Path
 
 import cv2
 
-from visioncal.calibration.verification.scene_audit import Episode
 from visioncal.core.errors import DataError
 from visioncal.core.files import natural
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Image
 from visioncal.interchange.formats.lerobot import LEROBOT, FrameImages, episode_frames
 from visioncal.session.images import IMAGE_ENDINGS
+from visioncal.verification.scene_audit import Episode
 from visioncal.vision.boards.imaging import decode_image, read_image
 
 # Endings of videos; lists of other files, which FFmpeg would follow out of the folder, have others.

@@ -12,9 +12,9 @@ from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import distances, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Mask, Target
 from visioncal.live.drivers.protocols import ArmState
-from visioncal.live.planning.design import Accuracy
-from visioncal.live.planning.information import predict_worlds
-from visioncal.live.planning.plan_file import PlanFile
+from visioncal.planning.design import Accuracy
+from visioncal.planning.information import predict_worlds
+from visioncal.planning.plan_file import PlanFile
 from visioncal.robot import Robot
 
 # Greatest deviation of a controller's calibrated arm from the nominal model [m, rad].

@@ -13,8 +13,8 @@ from visioncal.core.types import FloatArray
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.drivers.protocols import MovingArm
-from visioncal.live.planning.cell import PlanCell
-from visioncal.live.planning.path import order_stops
+from visioncal.planning.cell import PlanCell
+from visioncal.planning.path import order_stops
 from visioncal.robot import Robot
 
 # Largest joint error at the end of a motion [rad]; an arm that was stopped nearer to its goal gives

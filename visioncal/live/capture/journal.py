@@ -24,8 +24,8 @@ from visioncal.core.version import __version__
 from visioncal.live.capture.cell import LiveCell
 from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.protocols import ArmState
-from visioncal.live.planning.cell import PlanCell
-from visioncal.live.planning.plan_file import PlanFile
+from visioncal.planning.cell import PlanCell
+from visioncal.planning.plan_file import PlanFile
 from visioncal.robot import Robot, load_robot
 from visioncal.robot.files import robot_file, robot_names
 from visioncal.session import Session, View

@@ -19,9 +19,9 @@ from visioncal.live.capture.journal import Journal, state_of
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.take import Missed, TakenView, take, why_arm_moves
 from visioncal.live.drivers.protocols import ArmState, MovingArm, RequestingArm
-from visioncal.live.planning.design import Accuracy
-from visioncal.live.planning.plan import Stop
-from visioncal.live.planning.plan_file import PlanFile
+from visioncal.planning.design import Accuracy
+from visioncal.planning.plan import Stop
+from visioncal.planning.plan_file import PlanFile
 from visioncal.robot import Robot
 from visioncal.session import View
 from visioncal.vision.boards.imaging import decode_image

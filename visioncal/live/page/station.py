@@ -35,7 +35,7 @@ from visioncal.live.drivers.protocols import (
 from visioncal.live.page.drawing import coverage_svg, live_picture
 from visioncal.live.page.outcome import Light, Outcome, ask_command
 from visioncal.live.page.suggestion import NextPose, near, next_view
-from visioncal.live.planning.cell import PlanCell, flange_at
+from visioncal.planning.cell import PlanCell, flange_at
 from visioncal.session import View
 from visioncal.vision.boards.imaging import decode_image, grey_of
 

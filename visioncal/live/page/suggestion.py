@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import apply, compose, distances, invert, rotation_angle
 from visioncal.core.types import Camera, FloatArray, Mask, Target
-from visioncal.live.planning.visibility import FieldOfView
+from visioncal.planning.visibility import FieldOfView
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import extent_m, outline
 

@@ -10,7 +10,6 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from visioncal.calibration.verification import Check
 from visioncal.core.files import replacing_file
 from visioncal.core.number_format import percent
 from visioncal.core.transforms import apply
@@ -20,6 +19,7 @@ from visioncal.present.recording import colours, paths
 from visioncal.present.recording.notes import markdown
 from visioncal.present.recording.recorder import Recorder
 from visioncal.results.history import Entry
+from visioncal.verification import Check
 from visioncal.vision.camera import project
 
 _FIGURES, _LOG, _NOTE = "/figures", "/log", "/note"

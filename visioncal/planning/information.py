@@ -1,0 +1,378 @@
+"""Predicted information of candidate stops, with the estimator's own Jacobians and priors.
+
+A stop's corners are predicted, compressed as detected ones are, and combined with the robot's
+noise; the result is the information that the joint fit would get from the stop.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from visioncal.core.errors import DataError
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.transforms import invert, skew
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.appearance import (
+    SCALE,
+    Appearance,
+    LensBoardParameters,
+    compress,
+    shape_basis,
+    stated_board_sigma,
+)
+from visioncal.estimation.arm import ArmErrors, link_basis
+from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
+from visioncal.estimation.armpair import ArmPair
+from visioncal.estimation.chain import chain
+from visioncal.estimation.corners import CornerStack, floored_sigma_px
+from visioncal.estimation.fit import Fit
+from visioncal.estimation.linalg import covariance_from, gram
+from visioncal.estimation.mixed import PriorInformation
+from visioncal.estimation.normal_equations import fisher_information
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.workspace import postures
+from visioncal.planning.cell import AnyCell, PlanCell, seen_from
+from visioncal.planning.purposes import Purpose
+from visioncal.robot import Robot
+from visioncal.vision.camera import project
+from visioncal.vision.targets import corner_positions, is_seen_in_part
+
+# Number of cells over which a plan is averaged: the guess, and draws from its uncertainty.
+WORLDS = 4
+# A calibration does not use the guesses. This weak prior on the edges only keeps the information
+# invertible [rad and m] in directions that the stops do not determine.
+WEAK_SIGMA = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedStops:
+    """Stops that were recorded already."""
+
+    fit: Fit  # Their fit, without errors of the arm. Its first effect is lens and boards.
+    # Edges of the fit: the camera's, the planned board's, then further boards'.
+    edges: FloatArray
+    free: LensBoardParameters  # Free parameters of lens and boards.
+    q: FloatArray | None  # (s, n) joint angles of the stops [rad]; None where they are not known.
+    first_corner: int = 0  # Number of the first corner of the planned board.
+    # Posture-dependent errors of the arm at the stops; None where the stops show none.
+    arm: ArmErrors | None = None
+    # (12, c) root of the covariance of the edges' further errors, those of an arm without joint
+    # angles. More stops do not reduce them.
+    edge_error_root: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
+    # (k, c) gradient at shared parameters that a fit holds. Further stops are expected to add
+    # nothing but noise to it.
+    held: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def shared(self) -> FloatArray:
+        """(k, k) information on what the views share, from corners and priors."""
+        return _effect_information(self.fit.problem)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Information of k candidates on p unknowns, for one possible cell.
+
+    The unknowns are x, z, free parameters of lens and board, and errors of the arm, in this order.
+
+    Attributes:
+        factors: (k, 6, p) whitened Jacobian F of each stop; F^T F is its information.
+        prior: (p, p) prior information.
+        recorded: (p, p) information of the recorded stops.
+        objective: (p, p) weight W such that trace(W C) is the variance to be minimised with a
+            covariance C: of a position, as a mean over where it matters [m^2].
+        position: (p, p) the same for the position whose accuracy is reported [m^2].
+        rotation: (p, p) the same for the rotation [rad^2].
+        unestimated: (k, 6, a) whitened Jacobian of each stop in parameters that a fit does not
+            estimate: arm errors that it treats as noise, in their sigmas, and held parameters of
+            lens and boards.
+        gradient: (p, a) the same of the recorded stops' gradient.
+    """
+
+    factors: FloatArray
+    prior: FloatArray
+    recorded: FloatArray
+    objective: FloatArray
+    position: FloatArray
+    rotation: FloatArray
+    unestimated: FloatArray
+    gradient: FloatArray
+
+    def of_candidates(self, rows: IntArray) -> "World":
+        """Returns the same world with some of the candidates."""
+        return replace(self, factors=self.factors[rows], unestimated=self.unestimated[rows])
+
+    def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
+        """Covariance (p, p) of the unknowns from some candidates and the recorded stops."""
+        taken = self.factors[rows]
+        fitted = covariance_from(self.prior + self.recorded + gram(taken, taken))
+        bias = fitted @ (self.gradient + gram(taken, self.unestimated[rows]))
+        return np.asarray(fitted + bias @ bias.T)
+
+    def variances(self, covariance: FloatArray) -> tuple[float, float]:
+        """Variances of the reported position [m^2] and rotation [rad^2] with a covariance."""
+        place, turn = (np.sum(square * covariance) for square in (self.position, self.rotation))
+        return float(place), float(turn)
+
+
+def predict_worlds(
+    cells: Sequence[PlanCell],
+    purpose: Purpose,
+    q: FloatArray,
+    *,
+    recorded: RecordedStops | None = None,
+) -> tuple[World, ...]:
+    """Predicts the information of candidates with joints (k, n) [rad] in each possible cell.
+
+    Raises:
+        DataError: Joint angles of recorded stops are needed and not known.
+    """
+    with one_blas_thread():
+        return tuple(_world(cell, purpose, q, recorded) for cell in cells)
+
+
+def stop_factors(
+    cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: RecordedStops | None = None
+) -> FloatArray:
+    """Whitened Jacobian F (k, 6, p + a) of stops with joints (k, n) [rad]; F^T F is information.
+
+    It is zero where the board is not seen. Errors of the arm that a fit treats as noise come last.
+    Lens and board are those of the recorded stops; without any, the stated ones, with the stated
+    uncertainty of the board's size.
+    """
+    free = stated(cell) if recorded is None else recorded.free
+    poses = cell.cam_from_target(q)
+    stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
+    information = free.information if recorded is None else recorded.shared
+    # The other shared parameters do not affect a stop at which the arm stands still.
+    others = np.zeros((int(seen.sum()), 6, len(information) - len(free.columns)))
+    factors = np.zeros((len(q), 6, 12 + len(information) + arm_size(cell.robot, purpose, recorded)))
+    if seen.any():
+        compressed = compress(stack, free.basis, free.appearance, poses[seen])
+        flange = cell.robot.base_from_flange(q[seen])
+        jacobian = np.concatenate([compressed.by_shared[:, :, free.columns], others], axis=2)
+        prior = PriorInformation(information, np.zeros(len(information)))
+        problem = chain(
+            cell.mount,
+            flange,
+            poses[seen],
+            floored_sigma_px(cell.pixel_px) ** 2 * covariance_from(compressed.information),
+            effects=[Effect.free("lens and boards", prior, jacobian)],
+        )
+        arm = None if recorded is None else recorded.arm
+        if arm is not None:
+            arm = replace(arm, basis=link_basis(cell.robot, q[seen]))
+        problem = with_arm_errors(cell, purpose, problem, q[seen], arm)
+        state = State(np.stack([cell.x, cell.z]), problem.start_values)
+        linear = problem.linear(state, ideal=True)
+        root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise))
+        factors[seen] = np.linalg.solve(root, linear.jacobian)
+    return factors
+
+
+def stated(cell: PlanCell) -> LensBoardParameters:
+    """Stated lens and board; the board's size is free within its stated uncertainty."""
+    positions = corner_positions(cell.target)
+    shape = stated_board_sigma(cell.target)
+    look = Appearance(cell.camera, np.zeros(len(shape)))
+    # The positions of a rig's points are taken as exact.
+    sized = np.array([] if cell.target.is_rig else [SCALE], dtype=np.int64)
+    return LensBoardParameters(
+        look,
+        shape_basis(cell.target),
+        positions,
+        len(look.values) - len(shape) + sized,
+        np.ones(len(sized), dtype=bool),
+        np.diag(shape[sized] ** -2.0),
+        np.zeros(len(sized)),
+    )
+
+
+def _world(
+    cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: RecordedStops | None
+) -> World:
+    shared = stated(cell).information if recorded is None else recorded.shared
+    factors = stop_factors(cell, purpose, q, recorded)
+    shared_count, sigma = len(shared), arm_sigma(purpose)
+    arm = arm_size(cell.robot, purpose, recorded)
+    if recorded is not None and not purpose.blocks and recorded.arm is not None:
+        # Errors that a fit treats as noise are not unknowns.
+        arm *= recorded.arm.is_estimated
+    weak = np.full(12, max(WEAK_SIGMA, cell.sigma_rad, cell.sigma_m) ** -2.0)
+    prior = block_diag(np.diag(weak), shared, sigma**-2.0 * np.eye(arm))
+    size, all_columns = len(prior), factors.shape[2]
+    recorded_information = np.zeros((all_columns, all_columns))
+    if recorded is not None:
+        recorded_information = _recorded_information(cell, purpose, recorded)
+    middle = corner_positions(cell.target).mean(axis=0)
+    if purpose.judged == "sight":
+        # Half the camera's position, half the points that it observes. An observed point is off by
+        # the error of the offset and by that of the rotation times the point's distance, at any
+        # posture of the arm.
+        observed = cell.cam_from_target(q) @ [*middle, 1.0]
+        position, rotation, point = (np.zeros((len(q), 3, 12 + arm)) for _ in range(3))
+        position[:, :, 3:6] = point[:, :, 3:6] = rotation[:, :, :3] = np.eye(3)
+        point[:, :, :3] = -skew(observed[:, :3])
+    else:
+        position, rotation = workspace_jacobian(cell, purpose, middle)
+        point = position
+    # Zeros for lens and board follow the edges.
+    at = np.full(shared_count, 12)
+    place, turn, spot = (
+        np.insert(np.insert(mean_square(part), at, 0.0, axis=0), at, 0.0, axis=1)
+        for part in (position, rotation, point)
+    )
+    misfit, gradient = factors[:, :, size:], recorded_information[:size, size:]
+    if recorded is not None and not purpose.blocks:
+        error_root, held = recorded.edge_error_root, recorded.held.shape[1]
+        held_gradient = np.zeros((size, held))
+        held_gradient[12 : 12 + len(recorded.held)] = -recorded.held
+        edge_gradient = (prior + recorded_information[:size, :size])[:, :12] @ error_root
+        gradient = np.hstack([gradient, edge_gradient, held_gradient])
+        zeros = np.zeros((*factors.shape[:2], held))
+        misfit = np.concatenate([misfit, factors[:, :, :12] @ error_root, zeros], axis=2)
+    return World(
+        factors[:, :, :size],
+        prior,
+        recorded_information[:size, :size],
+        (place + spot) / 2,
+        place,
+        turn,
+        misfit,
+        gradient,
+    )
+
+
+def workspace_jacobian(
+    cell: AnyCell, purpose: Purpose, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of what the arm carries all over its workspace, by the edges and the arm's errors.
+
+    Returns:
+        (w, 3, 12 + a) of the position of a point `at` (3,) of the observed frame, relative to what
+        is fixed in the base, and (w, 3, 12 + a) of its rotation.
+    """
+    q = postures(cell.robot)
+    flange = cell.robot.base_from_flange(q)
+    problem = chain(cell.mount, flange[:1], seen_from(cell.mount, cell.x, cell.z, flange[:1]))
+    start = State(np.stack([cell.x, cell.z]), np.zeros(0))
+    pair = ArmPair.of(problem, start, problem.robots[0])
+    basis = np.zeros((len(q), 6, 0))
+    if purpose.blocks:
+        basis = arm_model(cell.robot, purpose).basis(q)
+    poses, jacobian = pair.jacobian(flange, basis)
+    return pair.place_jacobian(poses, jacobian, at), jacobian[:, :3]
+
+
+def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedStops) -> FloatArray:
+    """Information (p + a, p + a) of recorded stops and hand measurements, without priors."""
+    q = recorded.q
+    if q is None and purpose.blocks:
+        raise DataError(
+            f"stops for {purpose.name} cannot be added: the recorded views have no joint angles.",
+            culprits=["q1_rad"],
+            next_step="Record q1_rad ..., or plan without the recorded session.",
+        )
+    stops = len(next(iter(recorded.fit.flanges.values())))
+    joints = np.zeros((stops, cell.robot.joint_count)) if q is None else q
+    problem = with_arm_errors(cell, purpose, recorded.fit.problem, joints, recorded.arm)
+    # Further boards keep their pose relative to the planned one.
+    boards = cell.z @ invert(recorded.edges[1]) @ recorded.edges[1:]
+    state = State(np.concatenate([cell.x[None], boards]), problem.start_values)
+    information = fisher_information(problem, state, recorded.fit.noise)
+    edges = 6 * len(problem.unknown)
+    information[edges:, edges:] -= _effect_information(problem)
+    # Schur complement: the poses of further boards are eliminated.
+    further = slice(12, edges)
+    cross = np.delete(information[further], further, axis=1)
+    eliminated = cross.T @ np.linalg.solve(information[further, further], cross)
+    return np.delete(np.delete(information, further, axis=0), further, axis=1) - eliminated
+
+
+def with_arm_errors(
+    cell: AnyCell,
+    purpose: Purpose,
+    problem: Problem,
+    q: FloatArray,
+    arm: ArmErrors | None = None,
+) -> Problem:
+    """Adds errors of the arm to a problem: the purpose's, or those that the stops show."""
+    if purpose.blocks:
+        basis = arm_model(cell.robot, purpose).basis(q)
+        arm = ArmErrors(basis, arm_sigma(purpose), 0.0, of_links=True)
+    elif arm is not None:
+        arm = replace(arm, basis=arm.sigma * arm.basis, sigma=1.0)
+    if arm is None:
+        return problem
+    return problem.with_effects([*problem.effects, arm.effect(problem.robots[0])])
+
+
+def _effect_information(problem: Problem) -> FloatArray:
+    """Prior information (k, k) of a problem's effects."""
+    priors = (effect.prior.information for effect in problem.effects)
+    return np.asarray(block_diag(np.zeros((0, 0)), *priors))
+
+
+def arm_model(robot: Robot, purpose: Purpose) -> ArmModel:
+    """The nominal arm with the unknown errors of a purpose; raises DataError."""
+    sigma = arm_sigma(purpose)
+    weights = {name: block / sigma for name, block in purpose.blocks.items()}
+    model = ArmModel(robot, np.eye(4), weights, np.zeros(arm_size(robot, purpose)))
+    if COMPLIANCE not in weights:
+        return model
+    if robot.masses is None:
+        raise DataError(
+            f"stops for {purpose.name} cannot be planned: the model of {robot.name} does not state "
+            "the masses of its links, and their weight is what bends it.",
+            culprits=[robot.name],
+            next_step="Add mass_kg and com_m to each [[joint]] of its table, or take its URDF.",
+        )
+    return model.loaded(postures(robot))
+
+
+def arm_sigma(purpose: Purpose) -> float:
+    """Unit of the arm's unknowns: the first block's prior sigma [rad]."""
+    return next(iter(purpose.blocks.values()), 1.0)
+
+
+def arm_size(robot: Robot, purpose: Purpose, recorded: RecordedStops | None = None) -> int:
+    """Number of errors of the arm that `with_arm_errors` adds."""
+    if purpose.blocks or recorded is None or recorded.arm is None:
+        return sum(block_size(name, robot.joint_count) for name in purpose.blocks)
+    return int(recorded.arm.basis.shape[2])
+
+
+def _predicted_corners(
+    cell: PlanCell, poses: FloatArray, first_corner: int
+) -> tuple[CornerStack, Mask]:
+    """Predicted corners at (k, 4, 4) poses, and the mask of poses that show the board."""
+    positions = corner_positions(cell.target)
+    points = positions @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    px = project(cell.camera, points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
+    size = np.array(cell.camera.resolution)
+    visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
+    in_part = is_seen_in_part(cell.target)
+    # A partly visible ChArUco board is detected by six corners.
+    fewest = min(6, len(positions)) if in_part else len(positions)
+    shows = visible.sum(axis=1) >= fewest
+    view, corner = np.nonzero(visible[shows])
+    counts = visible[shows].sum(axis=1)
+    stack = CornerStack(
+        tuple(np.flatnonzero(shows).tolist()),
+        (0.0,) * len(counts),
+        np.cumsum(counts) - counts,
+        view,
+        first_corner + corner,
+        positions[corner],
+        px[shows][view, corner],
+    )
+    return stack, shows
+
+
+def mean_square(jacobian: FloatArray) -> FloatArray:
+    """Mean over m of J^T J: (m, 3, p) to (p, p)."""
+    rows = jacobian.reshape(-1, jacobian.shape[2])
+    return np.asarray(rows.T @ rows / len(jacobian))

@@ -1,0 +1,232 @@
+"""Start of a plan that adds stops to a session: what the session determines already."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import STAGES
+from visioncal.calibration.stages.cell_fit import CellFit
+from visioncal.calibration.stages.refine import free_parameters_of_camera
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.number_format import counted
+from visioncal.core.threads import one_blas_thread
+from visioncal.core.types import FloatArray, Mount, Progress
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.fit import Fit
+from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.normal_equations import fisher_information
+from visioncal.estimation.problem_parts import Noise
+from visioncal.estimation.solve import Solution
+from visioncal.estimation.unknowns import EDGE
+from visioncal.planning.cell import Box, Limits, PlanCell
+from visioncal.planning.information import RecordedStops
+from visioncal.session import Session, frame_name
+from visioncal.vision.targets import extent_m, first_corners
+
+# Lower bound of a robot's noise; few stops may show less by chance [rad and m].
+_LEAST_NOISE = Noise.of_robot(2e-5, 1e-5)
+
+
+@dataclass(frozen=True, eq=False)
+class SessionStart:
+    """A session to which stops are added."""
+
+    cell: PlanCell  # The cell as far as the session determines it.
+    recorded: RecordedStops  # The session's information.
+    refusal: str  # Why the session alone gives no result; empty where it does.
+    views: tuple[int, ...]  # Number of the first view of each stop.
+
+
+def calibrate_partially(
+    session: Session, *, progress: Progress | None = None
+) -> tuple[RunState, str]:
+    """Calibrates the hand-eye level of a session as far as it goes; raises DataError.
+
+    Returns:
+        The run, and why it ended early; empty where it did not.
+    """
+    run = RunState(session, progress, level="hand-eye")
+    for index, stage in enumerate(STAGES):
+        if progress is not None:
+            progress(stage.name, index, len(STAGES))
+        try:
+            run = stage.run(run)
+        except DegenerateError as error:
+            return run, error.message
+    return run, ""
+
+
+def start_from_session(
+    run: RunState,
+    refusal: str = "",
+    *,
+    limits: Limits | None = None,
+    boxes: tuple[Box, ...] = (),
+) -> SessionStart:
+    """Prepares a session as the start of a plan.
+
+    In directions that the stops leave undetermined, the edges are those with the mounted camera or
+    board nearest to the flange.
+
+    Args:
+        run: The session, calibrated as far as it goes.
+        refusal: Why that ended early; empty where it did not.
+        limits: Limits of the added stops.
+        boxes: Obstacles in the cell.
+
+    Raises:
+        DataError: The session lacks a robot's model, a camera or a board, or has too few
+            usable views for a fit.
+    """
+    robot, targets = run.robot, tuple(run.session.boards.values())
+    if robot is None or not targets or run.pixel_px is None or not run.scenes:
+        raise _missing_input_error(run)
+    if run.cell_fit_or_none is None:
+        raise _too_vague_error(run)
+    fit = _of_stops(run, run.cell_fit_or_none)
+    with one_blas_thread():
+        edges, covariance = _posterior_edges(fit, run.session.mount)
+    sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
+    # Too uncertain to plan stops [rad, m].
+    if sigmas[0] > 0.5 or sigmas[1] > 0.5:
+        raise _too_vague_error(run)
+    # Up to the frame of the reported poses, calibrated where possible.
+    first = np.unique(fit.seen.stops, return_index=True)[1]
+    arm = run.robot_arm.at(np.unique(run.cell_fit.fit.seen.stops))
+    if arm.model is not None:
+        robot = arm.model.robot
+    elif arm.joints_rad is not None:
+        robot = ArmModel.of(robot, arm.joints_rad, arm.poses).robot
+    _, board, *_ = fit.frames
+    planned = [frame_name("target", name) for name in run.session.boards].index(board)
+    free = free_parameters_of_camera(fit.linearised)
+    cell = PlanCell(
+        run.session.mount,
+        robot,
+        free.appearance.camera,
+        targets[planned],
+        edges[0],
+        edges[1],
+        float(sigmas[0]),
+        float(sigmas[1]),
+        fit.noise,
+        run.pixel_px,
+        limits or Limits(),
+        boxes,
+        covariance,
+    )
+    # Least and greatest distance at which stops show the planned board.
+    of_board = fit.seen.stops[np.array(fit.seen.observed) == board]
+    flange = next(iter(fit.flanges.values()))[of_board]
+    low, high = extent_m(cell.target)
+    poses, centre = cell.seen_from(flange), np.append(0.5 * (low + high), 0.0)
+    distance = np.linalg.norm(poses[:, :3, :3] @ centre + poses[:, :3, 3], axis=1)
+    cell = replace(cell, observed_distances_m=(float(distance.min()), float(distance.max())))
+    first_corner = int(first_corners(targets)[planned])
+    # With few stops, error sizes that noise alone explains are mostly chance.
+    is_likely = arm.is_modelled and arm.errors is not None and arm.errors.is_likely
+    errors = arm.errors if is_likely else None
+    recorded = RecordedStops(fit, edges, free, arm.joints_rad, first_corner, errors)
+    if run.assessment_or_none is not None:
+        recorded = _with_errors(recorded, run.assessment.fit, has_joints=arm.is_modelled)
+    return SessionStart(cell, recorded, refusal, tuple(run.used[at] for at in first.tolist()))
+
+
+def _with_errors(recorded: RecordedStops, fit: Fit, *, has_joints: bool) -> RecordedStops:
+    """Recorded stops with what a fit holds, and with errors of an arm without joint angles."""
+    # Gradient at held parameters of lens and boards.
+    gradient = fit.equations[1] * (fit.problem.counted & ~fit.unknowns.moved)
+    columns = [fit.problem.effect_columns[effect.name] for effect in recorded.fit.problem.effects]
+    held = np.concatenate([np.zeros(0), *(gradient[part] for part in columns)])
+    recorded = replace(recorded, held=held[:, None])
+    by_arm = fit.beside.get("arm")
+    if has_joints or by_arm is None:
+        return recorded
+    index = fit.unknowns.columns(*recorded.fit.unknowns.all_of(EDGE)[:2])
+    values, vectors = np.linalg.eigh(by_arm[np.ix_(index, index)])
+    root = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0]
+    return replace(recorded, edge_error_root=root)
+
+
+def _of_stops(run: RunState, cell_fit: CellFit) -> Fit:
+    """The fit of the stops without errors of the arm, even if it leaves a direction undetermined.
+
+    The planned board, which is in the most views, comes first.
+    """
+    if cell_fit.linearised_corners is None:
+        raise _missing_input_error(run)
+    part, arm = cell_fit.fit.problem, run.robot_arm
+    observed = part.observations.observed
+    planned = max(dict.fromkeys(observed), key=observed.count)
+    stops, of = np.unique(part.observations.stops, return_inverse=True)
+    # Errors of the arm are added again with the purpose's priors.
+    bare = part.with_effects(
+        [effect for effect in part.effects if effect.name != f"arm of {arm.robot}"]
+    )
+    kept_stops = np.isin(np.arange(len(arm.has_pose)), stops)
+    camera, *boards = part.unknown
+    order = [branch for branch in part.tree.branches if branch not in part.unknown]
+    order += [camera, planned, *(board for board in boards if board != planned)]
+    problem = replace(
+        bare,
+        tree=replace(part.tree, branches={name: part.tree.branches[name] for name in order}),
+        poses={name: pose[stops] for name, pose in part.poses.items()},
+        observations=replace(part.observations, stops=of),
+        effects=tuple(effect.of_stops(kept_stops) for effect in bare.effects),
+    )
+    noise = replace(cell_fit.noise, robots=np.maximum(cell_fit.noise.robots, _LEAST_NOISE.robots))
+    state = problem.start(cell_fit.fit.frames)
+    return Fit(problem, Solution(state, noise), cell_fit.linearised_corners)
+
+
+def _posterior_edges(fit: Fit, mount: Mount) -> tuple[FloatArray, FloatArray]:
+    """Posterior edges with the prior, and the covariance (12, 12) of camera and planned board."""
+    prior, problem = np.full((2, 2, 3), 1e-6), fit.problem
+    # The mounted camera or board is within some 0.1 m of the flange.
+    prior[0 if mount == "eye-in-hand" else 1, 1] = 0.1**-2.0
+    weights = np.zeros((problem.size, problem.size))
+    weights[:12, :12] = np.diag(prior.ravel())
+    # The problem is nearly linear.
+    for _ in range(20):
+        information, gradient = fit.equations
+        # Twists from the prior to the edges.
+        distance, edges = np.zeros(problem.size), fit.state.edges
+        distance[3:6], distance[9:12] = (edge[:3, :3].T @ edge[:3, 3] for edge in edges[:2])
+        step = -covariance_among(information + weights, problem.moving) @ (
+            gradient + weights @ distance
+        )
+        # Shared parameters have converged before; they are marginalised, but not moved.
+        step[6 * len(edges) :] = 0.0
+        fit = fit.at(fit.state.moved(step))
+    information = fisher_information(problem, fit.state, fit.noise) + weights
+    return fit.state.edges, covariance_among(information, problem.counted)[:12, :12]
+
+
+def _missing_input_error(run: RunState) -> DataError:
+    session, missing = run.session, []
+    if run.robot is None:
+        missing.append("a model of its robot, which says where the arm reaches")
+    if not session.boards:
+        missing.append("a board (target)")
+    if run.pixel_px is None or not run.scenes:
+        missing.append("images of the board")
+    return DataError(
+        f"session {session.name!r}: stops cannot be added to it without {' and '.join(missing)}.",
+        culprits=[f"session {session.name!r}"],
+        next_step="Name the arm in session.toml ([robot] model), or by --robot; that of a whole "
+        "cell in its own table, as model in [robots.a]."
+        if run.robot is None
+        else "",
+    )
+
+
+def _too_vague_error(run: RunState) -> DataError:
+    posed = [view for view in run.poses if view in run.base_from_flange]
+    return DataError(
+        f"session {run.session.name!r}: its {counted(len(posed), 'usable stop')} of "
+        "the robot do not show where camera and board are, not even roughly.",
+        culprits=[f"session {run.session.name!r}"],
+        next_step="Plan without it, from rough guesses of both, in mm and degrees: visioncal plan "
+        "ROBOT --cam 'X Y Z RX RY RZ' --board 'X Y Z RX RY RZ'.",
+    )

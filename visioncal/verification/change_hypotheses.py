@@ -1,0 +1,140 @@
+"""Hypotheses on what changed in a cell since its calibration, which a check compares."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.transforms import adjoint, invert, log, mean_transform
+from visioncal.core.types import FloatArray
+from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.model_evidence import TURN_PER_M, ChangeHypothesis
+from visioncal.verification.calibration_prior import CalibrationPrior
+from visioncal.verification.prediction import PredictedStops
+
+CAMERA, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW = (
+    "camera",
+    "board",
+    "camera_and_board",
+    "board_size",
+    "board_replaced",
+    "joint",
+    "arm_length",
+    "robot_noise",
+    "view",
+)
+# Two simultaneous changes.
+PAIRS = (BOTH, REPLACED)
+# Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
+_OTHER_SIZE_PER_M = 10.0
+# Units of a twist, for a change of one metre.
+MOTION_UNITS: FloatArray = np.repeat([TURN_PER_M, 1.0], 3)
+
+
+def causes_of(
+    predicted: PredictedStops, prior: CalibrationPrior, *, board_placed_anew: bool
+) -> tuple[ChangeHypothesis, ...]:
+    """The changes that a check of these stops compares.
+
+    Args:
+        predicted: The stops.
+        prior: The calibration as a prior.
+        board_placed_anew: Whether the board was moved on purpose, so that its pose is not checked.
+    """
+    measured, away = predicted.problem.observations.measured, predicted.away(prior)
+    changes = log(away)
+    # The camera's edge: a twist on its right, transformed to the target's side.
+    moved = adjoint(invert(measured))
+    # Steps from zero do not reach half a turn, and logarithms near it have no mean.
+    undoing = log(mean_transform(measured @ invert(away) @ invert(measured)))
+    camera = ChangeHypothesis(CAMERA, MOTION_UNITS, moved, start=undoing)
+    # A board that is larger by a share is seen nearer by the same share.
+    nearer = np.zeros((len(measured), 6, 1))
+    nearer[:, 3:, 0] = np.einsum("nji,nj->ni", measured[:, :3, :3], measured[:, :3, 3])
+    causes, names = [camera], tuple(prior.targets) or ("",)
+    for at, index in enumerate(prior.boards):
+        shown = predicted.boards == at
+        if not shown.any():
+            continue
+        by_size = np.where(shown[:, None, None], nearer, 0.0)
+        size = ChangeHypothesis(f"{SIZE} {names[index]}".strip(), np.ones(1), by_size, at=at)
+        causes.append(size)
+        if board_placed_anew:
+            continue
+        # The board's edge: a twist on its right.
+        by_place = np.where(shown[:, None, None], -np.eye(6), 0.0)
+        start, name = log(mean_transform(away[shown])), f"{BOARD} {names[index]}".strip()
+        place = ChangeHypothesis(name, MOTION_UNITS, by_place, start=start, at=at)
+        other = replace(size, units=np.array([_OTHER_SIZE_PER_M]))
+        causes += [place, _simultaneous(REPLACED, place, other)]
+        # Camera and board together fit any two stops.
+        if len(prior.boards) == 1 and predicted.stops >= FEWEST_VIEWS:
+            causes.append(_simultaneous(BOTH, camera, place))
+    causes += _joints(predicted, prior)
+    if predicted.stops > 1:
+        # The robot's noise may have grown by 2 to 32 times.
+        factors = tuple((2.0 ** np.arange(1, 6)).tolist())
+        causes.append(ChangeHypothesis(NOISE, np.zeros(0), noise_factors=factors))
+        causes += _views(predicted, prior, changes)
+    return tuple(causes)
+
+
+def _simultaneous(kind: str, one: ChangeHypothesis, other: ChangeHypothesis) -> ChangeHypothesis:
+    """Two simultaneous changes of the sensor's side."""
+    start = np.zeros(len(one.units)) if one.start is None else one.start
+    parts = [part.by_sensor for part in (one, other) if part.by_sensor is not None]
+    return ChangeHypothesis(
+        f"{kind} {other.name.partition(' ')[2]}".strip(),
+        np.concatenate([one.units, other.units]),
+        np.concatenate(parts, axis=2),
+        start=np.concatenate([start, np.zeros(len(other.units))]),
+        at=other.at,
+    )
+
+
+def nominal_model(predicted: PredictedStops, prior: CalibrationPrior) -> ArmModel | None:
+    """The nominal arm, where none was calibrated; None where the robot is unknown."""
+    robot, matched = prior.calibration.calibrated_robot, predicted.observed.reported.matched
+    reported = np.eye(4) if matched is None else matched.flange_from_reported
+    return None if robot is None else ArmModel(robot, reported, {}, np.zeros(0))
+
+
+def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[ChangeHypothesis]:
+    """An offset of each joint, and a common scale of all lengths."""
+    model = prior.model or nominal_model(predicted, prior)
+    observed = predicted.observed
+    q = observed.arm_at(observed.first_of_stops(observed.used)).joints_rad
+    if model is None or q is None:
+        return
+    offsets, arm = model.columns("offsets", q), model.robot
+    for joint in range(arm.joint_count):
+        unit = np.array([1.0 if arm.chain.prismatic[joint] else TURN_PER_M])
+        by_flange = offsets[:, :, joint : joint + 1]
+        name = f"{JOINT} {joint + 1}"
+        yield ChangeHypothesis(name, unit, flange_jacobian=by_flange, at=joint)
+    # All lengths by a share: a placement's offset is in the frame before it, its twist after it.
+    placements = arm.chain.placements
+    twists = np.zeros((len(placements), 6))
+    twists[:, 3:] = np.einsum("nji,nj->ni", placements[:, :3, :3], placements[:, :3, 3])
+    stretch = arm.placement_jacobian(q) @ twists.reshape(-1, 1)
+    yield ChangeHypothesis(LENGTH, np.ones(1), flange_jacobian=stretch)
+
+
+def _views(
+    predicted: PredictedStops, prior: CalibrationPrior, changes: FloatArray
+) -> Iterator[ChangeHypothesis]:
+    """Each stop alone: its image belongs to another pose, or something slipped meanwhile."""
+    boards = prior.state.edges[1:][predicted.boards]
+    for stop in range(predicted.stops):
+        at_stop = predicted.problem.observations.stops == stop
+        first = int(np.argmax(at_stop))
+        # All boards of a stop move together.
+        transform = adjoint(invert(boards) @ boards[first])
+        yield ChangeHypothesis(
+            f"{VIEW} {predicted.views[first]}",
+            MOTION_UNITS,
+            np.where(at_stop[:, None, None], -transform, 0.0),
+            start=changes[first],
+            at=int(predicted.boards[first]),
+        )

@@ -1,0 +1,366 @@
+"""Verdict of a check in sentences, and as verify.json."""
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from visioncal.core.limits import CONTRADICTION, CheckLimits
+from visioncal.core.number_format import counted, figure, listed
+from visioncal.core.transforms import exp, inverse_right_jacobian, skew
+from visioncal.core.types import FloatArray
+from visioncal.core.verdict import (
+    AGAIN,
+    AGREEMENT,
+    CALIBRATE_ANEW,
+    DEPTH_CHANGED,
+    PLAN,
+    Finding,
+    Remedy,
+    Verdict,
+)
+from visioncal.estimation.identifiability import joint_words
+from visioncal.estimation.observability import axis_words
+from visioncal.verification.change_hypotheses import (
+    BOARD,
+    BOTH,
+    CAMERA,
+    JOINT,
+    LENGTH,
+    NOISE,
+    REPLACED,
+    SIZE,
+    VIEW,
+)
+from visioncal.verification.check import Check, PossibleChange
+from visioncal.verification.triggers import Trigger
+from visioncal.vision.targets import corner_positions
+
+# Thermal expansion of aluminium and steel, in shares a kelvin.
+_ALUMINIUM, _STEEL = 23e-6, 12e-6
+# Changes of a smaller probability are not listed.
+_LISTED_SHARE = 1e-3
+_ANEW = "calibrate again; these stops make a first result, and more a good one."
+_SIZE_WORDS = (
+    "the {board} is {percent} % {larger} (sigma {sigma}) than it was: it was printed again or "
+    "exchanged"
+)
+_ANOTHER_BOARD = Remedy(
+    "Verify with the board that was calibrated with; or measure the squares of this one, and "
+    f"{_ANEW}",
+    CALIBRATE_ANEW,
+)
+_OTHER_POSES = Remedy(
+    "Nothing in a cell moves by metres unseen: look whether the poses of these stops have the unit "
+    "and the convention of the calibrated ones, which doctor finds.",
+    "visioncal doctor SESSION",
+)
+# Words for each kind of change, a part of a sentence, and the advice on it.
+_KINDS = {
+    CAMERA: ("the camera {moved}", Remedy(f"Fasten the camera, and {_ANEW}", CALIBRATE_ANEW)),
+    BOARD: (
+        "the {name} {moved}",
+        Remedy(
+            "Put the board back; if it was moved on purpose, verify without its place.",
+            f"{AGAIN} --board-moved",
+        ),
+    ),
+    BOTH: (
+        "the camera {moved}; the board {other}",
+        Remedy(f"Fasten both, and {_ANEW}", CALIBRATE_ANEW),
+    ),
+    SIZE: (_SIZE_WORDS, _ANOTHER_BOARD),
+    REPLACED: (_SIZE_WORDS + "; its middle {moved}", _ANOTHER_BOARD),
+    JOINT: (
+        "{joint} off by {offset} from what it reads: its encoder slipped, or its zero was lost",
+        Remedy(
+            "Look whether the joint keeps its zero (a coupling that slips does so again), then "
+            f"{_ANEW}",
+            CALIBRATE_ANEW,
+        ),
+    ),
+    LENGTH: (
+        "all lengths of the arm are {percent} % {longer} (sigma {sigma}), as by {aluminium:.0f} K "
+        "of aluminium or {steel:.0f} K of steel",
+        Remedy(
+            "Let the arm come to the temperature at which it was calibrated, or calibrate it at "
+            "the one at which it works."
+        ),
+    ),
+    NOISE: (
+        "the robot scatters about {factor:.0f} times as much as it did",
+        Remedy(
+            "Look for play in mounts and joints, and whether the robot stood still at each image; "
+            "then verify again.",
+            AGAIN,
+        ),
+    ),
+    VIEW: (
+        "{name} alone contradicts the calibration: its board {moved}",
+        Remedy(
+            "Take that stop again, whose image and pose do not belong together; then verify again.",
+            AGAIN,
+        ),
+    ),
+}
+
+
+def verdict_of(check: Check) -> Verdict:
+    """Verdict of a check: whether the calibration holds, what changed, and what to do."""
+    bad, few = list[Finding](), list[Finding]()
+    if check.calibration.verdict.status == "bad":
+        words = f"The calibration itself is bad: {check.calibration.verdict.top[0]}"
+        step = Remedy("Correct that first, and calibrate again: changes from it say little.")
+        bad.append(Finding("bad_calibration", words, step))
+    if check.predicted.stops < CheckLimits.stops:
+        words = f"{_stops(check)} can hardly tell one change from another."
+        step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
+        few.append(Finding("few_stops", words, step))
+    if not check.named:
+        findings = (Finding(AGREEMENT, _agreement(check)), *check.depth, *bad, *few)
+        if not check.passed:
+            # The change comes first.
+            order = sorted(findings, key=lambda found: found.kind != DEPTH_CHANGED)
+            return Verdict("bad", tuple(order))
+        return Verdict("check" if bad or few else "good", findings)
+    likeliest, *others = check.named
+    kind, words = likeliest.cause.kind, _sentence(change_words(check, likeliest))
+    # Where something else has changed, too, its probability among those compared says little.
+    share, is_alone = likeliest.probability, check.explained
+    found, step = _estimates(check, likeliest), _runnable(check, _KINDS[kind][1])
+    # No camera or board moves farther; poses in another unit seem to.
+    if found.get(CAMERA, found).get("moved_mm", 0.0) > 5e3:
+        step = _OTHER_POSES
+    reasons = [Finding(kind, words, step, probability=share, by_limit=not is_alone)]
+    if others:
+        reasons.append(_rivals(check, likeliest, others))
+    if not check.explained:
+        words = "Alone it does not explain the stops: something else has changed too."
+        anew = _runnable(check, Remedy(_sentence(_ANEW), CALIBRATE_ANEW))
+        reasons.append(Finding("unexplained", words, anew))
+    return Verdict("bad", (*bad, *reasons, *check.depth, *(few if others else ())))
+
+
+def _runnable(check: Check, step: Remedy) -> Remedy:
+    """Drops a remedy's command where these stops do not allow it."""
+    session, stops = check.predicted.observed.session, check.predicted.stops
+    of_images = any(view.image for view in session.views)
+    is_lens_known = session.camera is not None or not of_images
+    allowed = {
+        CALIBRATE_ANEW: stops >= CheckLimits.stops and is_lens_known,
+        # Three stops locate camera and board roughly, so that more can be planned.
+        PLAN: of_images and is_lens_known and stops >= 3 and check.calibration.robot is not None,
+    }
+    return step if allowed.get(step.command, True) else Remedy(step.words)
+
+
+def _rivals(check: Check, best: PossibleChange, others: Sequence[PossibleChange]) -> Finding:
+    """Finding on the changes that cannot be distinguished from the likeliest."""
+    named = listed([change_words(check, other) for other in others])
+    robot = check.calibration.calibrated_robot
+    if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
+        # A rotation of the base about the first axis, or of the tool about the last, is equivalent.
+        return Finding("rivals", f"No stops separate that from {named}.", Remedy("Look at both."))
+    step = _runnable(check, Remedy("Verify with stops all over the workspace.", PLAN))
+    return Finding("rivals", f"{_stops(check)} cannot separate that from {named}.", step)
+
+
+def change_words(check: Check, change: PossibleChange) -> str:
+    """A change with its estimates, as a part of a sentence."""
+    found, robot = _estimates(check, change), check.calibration.calibrated_robot
+    share, sigma = found.get("share", 0.0), found.get("sigma", 0.0)
+    facts = {
+        "name": change.name,
+        "board": f"board {change.name.partition(' ')[2]}".strip(),
+        "moved": _moved_words(found.get(CAMERA, found)),
+        "other": _moved_words(found.get(BOARD, {})),
+        "larger": "larger" if share > 0.0 else "smaller",
+        "longer": "longer" if share > 0.0 else "shorter",
+        "percent": figure(1e2 * abs(share)),
+        "sigma": figure(1e2 * sigma),
+        "aluminium": abs(share) / _ALUMINIUM,
+        "steel": abs(share) / _STEEL,
+        "factor": found.get("noise_factor", 1.0),
+    }
+    if change.cause.kind == JOINT:
+        unit = "mm" if "offset_mm" in found else "deg"
+        offset, sigma = found[f"offset_{unit}"], found[f"sigma_{unit}"]
+        sign = "+" if offset > 0.0 else "-"
+        facts |= {
+            "joint": change.name if robot is None else joint_words(change.cause.at, robot),
+            "offset": f"{sign}{figure(abs(offset))} {unit} (sigma {figure(sigma)})",
+        }
+    return _KINDS[change.cause.kind][0].format(**facts)
+
+
+def _moved_words(move: Mapping[str, Any]) -> str:
+    """The significant parts of a motion, in words."""
+    if "moved_mm" not in move:
+        return ""
+    (is_shifted, shift), (is_turned, turn) = (
+        (size > CONTRADICTION * sigma, f"by {figure(size)} {unit} (sigma {figure(sigma)}) {way}")
+        for size, sigma, unit, way in (
+            (move["moved_mm"], move["sigma_mm"], "mm", f"along {move['along']}"),
+            (move["turned_deg"], move["sigma_deg"], "deg", f"about {move['about']}"),
+        )
+    )
+    parts = [f"moved {shift}"] * (is_shifted or not is_turned) + [f"turned {turn}"] * is_turned
+    return " and ".join(parts)
+
+
+def _estimates(check: Check, change: PossibleChange) -> dict[str, Any]:
+    """Estimates of a change for verify.json: millimetres, degrees, shares."""
+    kind, explained = change.cause.kind, change.explained
+    if kind == NOISE:
+        return {"noise_factor": explained.noise_factor}
+    if kind == BOTH:
+        return {CAMERA: _motion(check, change, 0), BOARD: _motion(check, change, 6)}
+    value, sigma = float(explained.values[-1]), float(np.sqrt(explained.covariance[-1, -1]))
+    if kind == JOINT:
+        robot = check.calibration.calibrated_robot
+        is_prismatic = robot is not None and robot.chain.prismatic[change.cause.at]
+        unit, scale = ("mm", 1e3) if is_prismatic else ("deg", float(np.rad2deg(1.0)))
+        return {f"offset_{unit}": scale * value, f"sigma_{unit}": scale * sigma}
+    share = {"share": value, "sigma": sigma} if kind in (LENGTH, SIZE, REPLACED) else {}
+    return share | (_motion(check, change, 0) if kind not in (LENGTH, SIZE) else {})
+
+
+def _motion(check: Check, change: PossibleChange, first: int) -> dict[str, Any]:
+    """Estimated motion of a camera or board, by the six values of a change from `first` on."""
+    cause, explained, edges = change.cause, change.explained, check.prior.state.edges
+    part, targets = slice(first, first + 6), [*check.prior.targets.values()]
+    is_camera, point = cause.kind in (CAMERA, BOTH) and first == 0, np.zeros(3)
+    if targets and not is_camera:
+        # A board's motion is that of its middle.
+        point = corner_positions(targets[check.prior.boards[cause.at]]).mean(axis=0)
+    rotation = edges[0 if is_camera else 1 + cause.at, :3, :3]
+    parent = "tool" if (check.calibration.mount == "eye-in-hand") == is_camera else "base"
+    twist, covariance = explained.values[part], explained.covariance[part, part]
+    grown = float(explained.values[6]) if cause.kind == REPLACED else 0.0
+    moved = exp(twist)
+    shift = moved[:3, :3] @ point * (1.0 + grown) + moved[:3, 3] - point
+    # Jacobian of the point with respect to the twist, through its right perturbation.
+    right = np.linalg.inv(inverse_right_jacobian(twist))
+    jacobian = moved[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1) @ right
+    metres, sigma_m, along = _length(shift, jacobian @ covariance @ jacobian.T, rotation)
+    rad, sigma_rad, about = _length(twist[:3], covariance[:3, :3], rotation)
+    return {
+        "moved_mm": 1e3 * metres,
+        "sigma_mm": 1e3 * sigma_m,
+        "along": f"the {parent}'s {along}",
+        "turned_deg": float(np.rad2deg(rad)),
+        "sigma_deg": float(np.rad2deg(sigma_rad)),
+        "about": f"the {parent}'s {about}",
+    }
+
+
+def _length(
+    vector: FloatArray, covariance: FloatArray, rotation: FloatArray
+) -> tuple[float, float, str]:
+    """Length of a (3,) vector, its standard deviation, and its direction in the parent frame."""
+    length = float(np.linalg.norm(vector))
+    unit = vector / length if length > 0.0 else np.full(3, 1.0 / np.sqrt(3.0))
+    sigma = float(np.sqrt(max(float(unit @ covariance @ unit), 0.0)))
+    return length, sigma, signed_axis(rotation @ unit)
+
+
+def signed_axis(unit: FloatArray) -> str:
+    """Names a direction with its sign: `-x`, or `direction (-0.71, 0.71, 0.00)`."""
+    words = axis_words(unit)
+    if len(words) == 1:
+        return words if unit["xyz".index(words)] > 0.0 else f"-{words}"
+    return "direction ({:.2f}, {:.2f}, {:.2f})".format(*unit)
+
+
+def _agreement(check: Check) -> str:
+    turn, shift = np.sqrt(np.mean(np.sum(check.residuals.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
+    # Nearly every check detects twice as many sigmas as a part of a motion is mentioned from.
+    sure = 2.0 * CONTRADICTION * check.camera_sigma
+    off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
+    again = f" ({check.repeated} of them where the calibration's stood)" if check.repeated else ""
+    verb = "agrees" if check.predicted.stops == 1 else "agree"
+    return (
+        f"{_stops(check)}{again} {verb} with the calibration: off by {off_mm} mm and {off_deg} deg "
+        f"(rms); by chance alone it is more in {figure(100 * check.p_value)} % of checks. A camera "
+        f"that had moved by {figure(1e3 * float(sure[3:].max()))} mm or "
+        f"{figure(float(np.rad2deg(sure[:3].max())))} deg would have shown."
+    )
+
+
+def _stops(check: Check) -> str:
+    return counted(check.predicted.stops, "stop")
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
+def to_document(
+    check: Check, triggers: Sequence[Trigger], verdict: Verdict | None = None
+) -> dict[str, Any]:
+    """Converts a check to a JSON document; unknown values are absent.
+
+    Args:
+        check: The check.
+        triggers: Evaluation of the reasons to calibrate again.
+        verdict: Its verdict, with the paths of the run; that of `verdict_of` where None.
+    """
+    calibration, observed = check.calibration, check.predicted.observed
+    verdict = verdict or verdict_of(check)
+    others = [change for change in listed_changes(check) if change not in check.named]
+    return {
+        "schema": 1,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "passed": check.passed,
+        "status": verdict.status,
+        "calibration": {
+            "session": calibration.session_name,
+            "sha256": calibration.session_sha256,
+            "created": calibration.created,
+        },
+        "session": {"name": observed.session.name, "sha256": observed.session.digest()},
+        "sentences": list(verdict.reasons),
+        "next": [vars(step) for step in verdict.next_steps],
+        "changes": [_change(check, change) for change in check.named],
+        "others": [_change(check, change) for change in others],
+        "explained": check.explained,
+        "misfit": check.unchanged.misfit,
+        "degrees_of_freedom": check.unchanged.freedom,
+        "p_value": check.p_value,
+        "repeated_stops": check.repeated,
+        "camera_sigma": {
+            "rotation_deg": np.rad2deg(check.camera_sigma[:3]).tolist(),
+            "translation_mm": (1e3 * check.camera_sigma[3:]).tolist(),
+        },
+        "stops": [
+            {
+                "views": [view],
+                "off_mm": 1e3 * float(np.linalg.norm(away[3:])),
+                "off_deg": float(np.rad2deg(np.linalg.norm(away[:3]))),
+                "left_mm": 1e3 * float(np.linalg.norm(left[3:])),
+                "left_deg": float(np.rad2deg(np.linalg.norm(left[:3]))),
+            }
+            for view, away, left in zip(
+                check.predicted.views, check.residuals, check.remaining, strict=True
+            )
+        ],
+        "not_used": [
+            {"view": view, "reason": reason} for view, reason in sorted(observed.reasons.items())
+        ],
+        "warnings": list(check.predicted.warnings),
+        "recalibrate": any(trigger.state == "fired" for trigger in triggers),
+        "triggers": [trigger.document for trigger in triggers],
+    }
+
+
+def listed_changes(check: Check) -> tuple[PossibleChange, ...]:
+    """Changes to list: those that are named, and others that are not unlikely."""
+    others = (change for change in check.compared if change not in check.named)
+    return (*check.named, *(other for other in others if other.probability > _LISTED_SHARE))
+
+
+def _change(check: Check, change: PossibleChange) -> dict[str, Any]:
+    """A change for the JSON document, with its estimates."""
+    estimates = _estimates(check, change)
+    return {"cause": change.name, "probability": change.probability, **estimates}
