@@ -20,7 +20,8 @@ from visioncal.calibration.run import calibrate, run
 from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.stages.distance_scale import distance_scale
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Camera, Target
 from visioncal.core.verdict import NOTE
 from visioncal.frames.session_observations import detect_session_target
@@ -550,3 +551,18 @@ def test_an_arm_is_not_accused_of_more_than_arms_err_by(mm, deg, is_accused):
     if not is_accused:
         assert verdict.causes[0].kind == "unexplained"
         assert "the arm's own errors" not in " ".join(verdict.reasons)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("off", [0.0, 3e-4])
+def test_a_size_of_measured_distances_competes_with_the_lengths_of_an_arm(mount, off) -> None:
+    """Both stay in the covariance: neither becomes an error of the frames."""
+    errors = {"dh_sigma_m": off, "dh_sigma_rad": off, "offset_sigma_rad": off}
+    options = CellOptions(mount=mount, views=20, board_scale=1.004, seed=2, **errors)
+    truth = simulate(options)
+    found = calibrate(cell_session(truth, "measured", seen="poses"))
+    assert found.verdict.causes[0].kind == "board_size"
+    assert "takes the robot's scale" in found.verdict.causes[0].words
+    for name, edge in found.edges.items():
+        away = log(invert(edge.matrix) @ truth.transforms[name])
+        assert away @ np.linalg.solve(edge.covariance, away) < chi2_limit(1e-3, 6)

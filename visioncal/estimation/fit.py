@@ -32,7 +32,7 @@ from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.problem_parts import Effect, Noise, Observations, State
 from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.estimation.tree import Tree
-from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, Unknown, Unknowns
+from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, SIZE, Unknown, Unknowns
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +203,7 @@ class Fit:
             poses = replace(part, observations=there).predicted(self.state) @ poses
             part = replace(part, observations=seen, points=frozenset(), with_repeats=False)
             carry = adjoint(poses)
-        effects, at, boards = [], 6 * len(self.frames), self.unknowns.of_kinds(BOARD)
+        effects, at, boards = [], 6 * len(self.frames), self.unknowns.of_kinds(BOARD, SIZE)
         for effect in part.effects:
             of_boards = np.isin(np.arange(at, at := at + len(effect)), boards)
             by_sensor = effect.by_sensor

@@ -5,7 +5,7 @@ parameters; the closure of the frame chains over all stops is fitted with the fr
 Relinearising at the solution until convergence is Gauss-Newton's method on the whole problem.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -26,7 +26,8 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import covariance_of, fit_problem
-from visioncal.estimation.unknowns import BOARD, LENS
+from visioncal.estimation.unknowns import BOARD, LENS, SIZE
+from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA
 
 # Values that change by less than this share of their sigma have converged.
 _SETTLED = 0.02
@@ -175,7 +176,7 @@ def measured_scale(
     Its views alone cannot determine it: a larger target farther away looks the same. `name` is that
     of the target in the session, and `frame` its frame.
     """
-    widened = fitted.with_columns(target_sizes(fitted.problem, [frame]))
+    widened = fitted.with_columns(target_sizes(fitted.problem, {frame: np.inf}))
     widened = replace(widened, problem=widened.problem.sized_at(widened.state))
     covariance, (_, gradient) = widened.absorbed, widened.equations
     board, total, scale, stated = (BOARD, name), np.zeros(len(gradient)), 0.0, 0.0
@@ -189,12 +190,23 @@ def measured_scale(
     return MeasuredScale(scale, (UNEVEN_LINKS if model.has_links else 1.0) * sigma, stated)
 
 
+def size_of_measured(model: FrameModel, fitted: Fit) -> MeasuredScale | None:
+    """The same of the first target whose poses a program measured; None where it is no unknown."""
+    for effect in fitted.problem.effects:
+        if effect.name == SIZE:
+            scale, total = fitted.values((SIZE, ""))[0], fitted.sigmas((SIZE, ""))[0] ** -2.0
+            by_motion = max(float(total - effect.prior.information[0, 0]), 1e-12)
+            sigma = (UNEVEN_LINKS if model.has_links else 1.0) * by_motion**-0.5
+            return MeasuredScale(float(scale * total) / by_motion, sigma, DEFAULT_RELATIVE_SIGMA)
+    return None
+
+
 def scale_by_stated_arms(fitted: Fit, stated: Problem, frame: str) -> MeasuredScale | None:
     """Measures the scale of an exact target with nominal arms; None where errors are likelier.
 
     Longer links explain a larger target as well, but one scale is simpler than many link errors.
     """
-    widened = stated.with_effects([*stated.effects, target_sizes(stated, [frame])])
+    widened = stated.with_effects([*stated.effects, target_sizes(stated, {frame: np.inf})])
     fit = fit_problem(widened, State(fitted.state.edges, widened.start_values))
     pairs = ((fitted.problem, fitted.solution), (widened, fit))
     calibrated, sized = (robot_likelihood(at, by.state, by.noise).white[1] for at, by in pairs)
@@ -204,15 +216,16 @@ def scale_by_stated_arms(fitted: Fit, stated: Problem, frame: str) -> MeasuredSc
     return MeasuredScale(float(fit.state.values[-1]), sigma, 0.0)
 
 
-def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf) -> Effect:
-    """Effect of targets' scales, which change their measured distances, with a prior sigma."""
+def target_sizes(problem: Problem, sigmas: Mapping[str, float]) -> Effect:
+    """Effect of targets' scales, which change their measured distances, with sigmas by frame."""
     # A target that was moved has a frame for each of its locations, named with a suffix.
     observed = np.array([name.partition("@")[0] for name in problem.observations.observed])
-    of_frames = (observed[:, None] == np.array(frames))[:, None]
+    of_frames = (observed[:, None] == np.array([*sigmas]))[:, None]
     jacobian = by_size(problem.observations.measured)[:, :, None] * of_frames
-    prior = PriorInformation(sigma**-2.0 * np.eye(len(frames)), np.zeros(len(frames)))
-    effect = Effect.free("sizes of targets", prior, jacobian)
-    return replace(effect, sizes=np.arange(len(frames)))
+    information = np.diag(np.array([*sigmas.values()]) ** -2.0)
+    prior = PriorInformation(information, np.zeros(len(sigmas)))
+    effect = Effect.free(SIZE, prior, jacobian)
+    return replace(effect, sizes=np.arange(len(sigmas)))
 
 
 def moved_mahalanobis_sq(fitted: Fit, columns: IntArray) -> float:

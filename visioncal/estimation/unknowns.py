@@ -6,6 +6,7 @@ An unknown is named by its kind and by what it is of, as `("lens", "cam_left")`:
                            (rotation [rad], translation [m]); of a mere point the rotation is exact
     lens         a camera  fx, fy, cx, cy [px], and distortion
     board        a target  shape of a printed board (`BOARD_NAMES`), or (3 k,) points of a rig [m]
+    size                   relative sizes of targets whose poses a program measured in images
     lens errors  a camera  errors of the lens beyond its model, in units of their size
     arm          a robot   errors of the arm: those of its model, or twists of its links [rad]
     temperature  a robot   growth of the arm with its temperature
@@ -26,6 +27,7 @@ import numpy as np
 from visioncal.core.types import IntArray, Mask
 
 EDGE, LENS, BOARD, LENS_ERRORS, ARM = "edge", "lens", "board", "lens errors", "arm"
+SIZE = "size"
 
 
 class Unknown(NamedTuple):

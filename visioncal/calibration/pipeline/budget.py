@@ -15,7 +15,7 @@ from visioncal.estimation.budget import Sources, covariance_by_source, point_cov
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.solve import solve_without
-from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS
+from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, SIZE
 from visioncal.results.sections import UncertaintyResult
 from visioncal.session import Session, frame_name
 from visioncal.vision.targets import corner_positions
@@ -24,7 +24,7 @@ from visioncal.vision.targets import corner_positions
 _SOURCES = {"temperature", "arm", *KINDS}
 
 # Sources of lenses and boards, in the order of a budget.
-_OPTICAL = {LENS_ERRORS: "lens_field", LENS: "intrinsics", BOARD: "board"}
+_OPTICAL = {LENS_ERRORS: "lens_field", LENS: "intrinsics", BOARD: "board", SIZE: "board"}
 
 
 def left_out(cell_fit: CellFit) -> HeldOutResiduals:
@@ -157,5 +157,5 @@ def middle_jacobians(fit: Fit, session: Session) -> dict[str, FloatArray]:
         values = fit.unknowns.values_of((BOARD, name))
         jacobian = np.zeros((3, len(fit.whole)))
         jacobian[:, fit.unknowns[BOARD, name]] = shape_basis(target).mean(axis=0)[:, values]
-        jacobians[frame_name("target", plate)] = jacobian[:, fit.unknowns.of_kinds(BOARD)]
+        jacobians[frame_name("target", plate)] = jacobian[:, fit.unknowns.of_kinds(BOARD, SIZE)]
     return jacobians

@@ -18,13 +18,13 @@ from visioncal.calibration.stages.arms import RobotArm, arm_effects, check_arms,
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
-from visioncal.calibration.stages.error_sizes import estimate_error_sizes
+from visioncal.calibration.stages.error_sizes import estimate_error_sizes, measured_sizes
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions, without_most_contradicted
-from visioncal.calibration.stages.random_effects import of_random_effects, random_effects
+from visioncal.calibration.stages.random_effects import random_effects
 from visioncal.calibration.stages.refine import PRINTED_SCALE, refine_jointly
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
@@ -119,7 +119,13 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         cell_fit = _fit_with_inliers(with_effects, observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
-    cell_fit, noise = _calibrate_arms(cell_fit, observed, final)
+    nominal = cell_fit
+    cell_fit, noise = _calibrate_arms(nominal, observed, final)
+    is_measured = not observed.scenes and any(arm.model for arm in cell_fit.arms.values())
+    if is_measured and (sigmas := measured_sizes(observed)):
+        # Boards of another size look as other lengths of an arm do.
+        nominal = _with_sizes(nominal, sigmas)
+        cell_fit, noise = _calibrate_arms(_fit_with_inliers(nominal, observed), observed, None)
     if level != "hand-eye":
         # The many unknowns of functions of the joints would slow each update of the inliers down.
         arms = _choose_levels(cell_fit, noise, functions=True)
@@ -127,6 +133,16 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
             cell_fit = _converge_arms(replace(cell_fit, arms=arms))
     cell_fit = replace(cell_fit, inlier_fit=with_repeats(cell_fit.inlier_fit))
     return replace(cell_fit, arms=with_pose_errors(cell_fit.arms, cell_fit.fit))
+
+
+def _with_sizes(cell_fit: CellFit, sigmas: Mapping[str, float]) -> CellFit:
+    """The fit beside sizes of targets, whose poses a program measured."""
+    inliers = cell_fit.inlier_fit
+    sizes = target_sizes(inliers.problem, sigmas)
+    problem = inliers.problem.with_effects([*inliers.problem.effects, sizes])
+    values = np.append(inliers.fit.state.values, sizes.values)
+    sized = problem.sized_at(State(inliers.fit.state.edges, values)).effects[-1]
+    return replace(cell_fit, other_effects=(*cell_fit.other_effects, sized))
 
 
 def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
@@ -205,8 +221,10 @@ def _calibrate_arms(
         if cell_fit.level != "hand-eye":
             arms = _choose_levels(cell_fit, noise)
             erring = [name for name, arm in arms.items() if arm.has_free_errors]
-            clock_errors = clock_effects(cell_fit.cell, observed.clocks, erring)
-            effects = (*clock_errors, *of_random_effects(cell_fit.other_effects))
+            clocks = clock_effects(cell_fit.cell, observed.clocks, erring)
+            names = {effect.name for effect in clocks}
+            others = (effect for effect in cell_fit.other_effects if effect.name not in names)
+            effects = (*clocks, *others)
             cell_fit = _converge_arms(replace(cell_fit, arms=arms, other_effects=effects))
         before = cell_fit.inlier_fit
         # The arms are calibrated with the last inliers.
@@ -273,11 +291,11 @@ def _fit_lenses_and_frames(cell_fit: CellFit, observed: Observed) -> CellFit:
         views = _views_by_camera(observed, cell_fit.poses)
         return refine_jointly(cell_fit, cell_fit.stated_parameters(observed.scenes, views))
     cell_fit = replace(cell_fit, linearised_corners=None)
-    if drifts := tuple(arm_effects(cell_fit.arms)):
-        cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, drifts))
+    if known := (*cell_fit.other_effects, *arm_effects(cell_fit.arms)):
+        cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, known))
     arms = with_link_errors(cell_fit.arms, cell_fit.fit)
     cell_fit = replace(cell_fit, arms=arms)
-    if effects := (*cell_fit.other_effects, *arm_effects(arms)):
+    if len(effects := (*cell_fit.other_effects, *arm_effects(arms))) > len(known):
         cell_fit = replace(cell_fit, inlier_fit=_with_effects(cell_fit.inlier_fit, effects))
     return cell_fit
 
@@ -356,10 +374,11 @@ def initial_inliers(start: Start) -> InlierFit:
     problem = _with_camera_levels(cell, start.poses, problem)
     # Targets whose corners were seen: other poses have no known covariance.
     pairs = zip(observations.observed, observations.sensors.tolist(), strict=True)
-    printed = list(dict.fromkeys(target for target, sensor in pairs if sensor < 0 and movable))
+    printed = [target for target, sensor in pairs if sensor < 0 and movable]
     if printed:
         # Otherwise all observations of a board of another size would be outliers.
-        problem = problem.with_effects([target_sizes(problem, printed, PRINTED_SCALE)])
+        sizes = target_sizes(problem, dict.fromkeys(printed, PRINTED_SCALE))
+        problem = problem.with_effects([sizes])
         state = State(state.edges, problem.start_values)
     if not cell.priors:
         inliers = inliers_and_moves(problem, state, movable)

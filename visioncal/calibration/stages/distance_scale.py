@@ -36,14 +36,18 @@ def distance_scale(
     if not is_determined or CLEAR_RATIO**2 * misfit > unscaled_misfit:
         return None
     scale = 1.0 / float(solution[6])
-    share = scale - 1.0
     variance = scale**4 * misfit / (3 * count - 7) * np.linalg.pinv(a.T @ a)[6, 6]
+    return other_size(scale - 1.0, variance)
+
+
+def other_size(share: float, variance: float, beside: str = "") -> Finding:
+    """The finding on a board that is larger by a share of some variance, with words beside it."""
     short, size = ("short", "larger") if share > 0.0 else ("long", "smaller")
     percent = f"{figure(100 * abs(share))} % (sigma {figure(100 * variance**0.5)} %)"
     return Finding(
         "board_size",
         f"By the robot's motion the board is {percent} {size} than the program was told that "
-        f"measured the poses: all distances in them (cft_) are too {short}.",
+        f"measured the poses: all distances in them (cft_) are too {short}.{beside}",
         Remedy(
             "Measure the board with a caliper, and measure the poses again with its true size; or "
             f"multiply cft_x_m, cft_y_m and cft_z_m by {1.0 + share:.5g}."

@@ -14,7 +14,7 @@ from visioncal.fit.fit import Fit
 from visioncal.fit.held import doubted_boards
 from visioncal.fit.solve import CellFit, solve
 from visioncal.fit.unknowns import Key
-from visioncal.model import Reported, Swept, read_cell
+from visioncal.model import MeasuredPose, Reported, Swept, read_cell
 from visioncal.model.effects import Effect, LensGrows, LensSteps
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics
@@ -106,6 +106,20 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
             zoomed[name] = Zoom(fit.cell.stations[effect.stop], share)
     effects = (at for at in fit.unknowns.effects if at.place == "edge" and _size(fit, at.name))
     return ErrorSizes(levels, lenses, boards, grown, zoomed, tuple(effects), held)
+
+
+def measured_sizes(observed: Observed) -> dict[str, float]:
+    """Sigmas of the sizes of boards whose poses a program measured in images, by frame."""
+    try:
+        fit = solve_session(observed).fit
+    except VisioncalError:
+        return {}
+    boards = [
+        one.seen
+        for one in fit.cell.sightings
+        if isinstance(one.evidence, MeasuredPose) and one.evidence.is_of_board
+    ]
+    return {name: fit.sizes[f"scale {name}"] for name in boards if f"scale {name}" in fit.sizes}
 
 
 def solve_session(observed: Observed) -> CellFit:

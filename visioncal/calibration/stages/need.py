@@ -45,7 +45,7 @@ from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.fit import Closure, Fit
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
-from visioncal.estimation.unknowns import BOARD
+from visioncal.estimation.unknowns import BOARD, SIZE
 from visioncal.results import NeedMet, Picker
 from visioncal.session.frames import object_name
 
@@ -241,7 +241,7 @@ def _picks(
     errors = None if arm is None or calibrated else arm.errors
     as_noise = None if bias is None else errors
     whole = calibrated or (as_noise is not None and (as_noise.of_links or as_noise.is_significant))
-    boards = fit.unknowns.of_kinds(BOARD)
+    boards = fit.unknowns.of_kinds(BOARD, SIZE)
     if whole:
         # The whole chain, in the targets' frames, includes the noise of its flanges.
         unmoved = np.zeros((3, len(boards)))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.distance_scale import distance_scale
+from visioncal.calibration.stages.distance_scale import distance_scale, other_size
 from visioncal.calibration.stages.other_board import board_correction
 from visioncal.calibration.suspects.lens import has_changed
 from visioncal.calibration.suspects.suspect import Suspect
@@ -18,7 +18,12 @@ from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation.appearance import ASPECT, SCALE, SHEAR, shaped_corners
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.joint import MeasuredScale, measured_scale, scale_by_stated_arms
+from visioncal.estimation.joint import (
+    MeasuredScale,
+    measured_scale,
+    scale_by_stated_arms,
+    size_of_measured,
+)
 from visioncal.estimation.unknowns import BOARD, LENS
 from visioncal.session import Session
 from visioncal.session.frames import frame_name
@@ -104,6 +109,12 @@ def _of_measured_poses(run: RunState) -> Iterator[Finding]:
     poses = np.array([run.base_from_flange[view] for view in views])
     seen = np.array([run.poses[view].cam_from_target[0] for view in views])
     parent = poses if run.mount == "eye-in-hand" else invert(poses)
+    if (measured := size_of_measured(run.cell_fit, run.assessment.fit)) is not None:
+        if measured.is_another and measured.contradicts:
+            words = " The result takes the robot's scale, beside errors of the arm's lengths."
+            beside = words if run.cell_fit.has_links else " The result takes the robot's scale."
+            yield other_size(measured.scale, measured.sigma**2, beside)
+        return
     # The camera may have a name.
     (edge,) = (edge for name, edge in run.assessment.last_edges.items() if name.startswith("cam"))
     if (finding := distance_scale(parent, seen, edge.matrix)) is not None:

@@ -28,7 +28,7 @@ from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.steps import with_step
-from visioncal.estimation.unknowns import BOARD
+from visioncal.estimation.unknowns import BOARD, SIZE
 from visioncal.robot.model import REPEATABILITY
 
 _LIMITS = CalibrationLimits()
@@ -123,9 +123,11 @@ def _of_growth(run: RunState, kind: str) -> Trial:
 def _of_board(run: RunState, kind: str) -> Trial:
     """Of sizes or shapes of boards; of measured poses, of other distances."""
     fit = run.assessment.fit
+    if sizes := fit.unknowns.all_of(SIZE):
+        return _held(run, fit.unknowns.columns(*sizes))
     if fit.corners is None:
         targets = [name for name in fit.frames if name.startswith("target")]
-        wide = fit.with_columns(target_sizes(fit.problem, targets))
+        wide = fit.with_columns(target_sizes(fit.problem, dict.fromkeys(targets, np.inf)))
         return Trial(
             (fit.problem, fit.solution),
             (wide.problem, fit_problem(wide.problem, wide.state)),
