@@ -1,6 +1,7 @@
 """Commands as a user runs them: exit status, messages, streams, and advice that is typed."""
 
 import csv
+import dataclasses
 import gzip
 import io
 import json
@@ -11,8 +12,9 @@ import shutil
 import subprocess
 import sys
 import time
+import types
 from contextlib import chdir, nullcontext, redirect_stderr, redirect_stdout
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 from typing import get_args
 from unittest.mock import patch
@@ -32,6 +34,7 @@ from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.kinematics import ASKED
 from visioncal.cli import dynamics, progress
 from visioncal.cli.app import app, main
+from visioncal.cli.libraries import SmallLibraries
 from visioncal.cli.summary import truth_rows
 from visioncal.core.choices import SIMULATED_ARMS, SIMULATED_CELLS, Convention, SolverName
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
@@ -389,6 +392,50 @@ def test_files_and_columns_that_are_missing_are_named_at_once(tmp_path):
         "a column point", "x_mm, y_mm, z_mm"
     )
     visioncal("plan", "ur5e").refused("--target, --camera, --cam, --board", "plan --example")
+
+
+RECORDS = """
+from dataclasses import dataclass, field
+
+@dataclass(frozen=True, order=True)
+class Whole:
+    "One with all methods."
+    a: int
+    b: list = field(default_factory=list, hash=False)
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Part(Whole):
+    "One that inherits."
+    c: float = 1.0
+
+    def __post_init__(self):
+        if self.c < 0:
+            raise ValueError(self.c)
+"""
+
+
+def test_records_of_a_command_are_those_of_the_library():
+    made, small = {}, SmallLibraries()
+    for late in (True, False):
+        module = types.ModuleType("visioncal.planted")
+        with small if late else nullcontext(), patch.dict(sys.modules, {module.__name__: module}):
+            exec(RECORDS, vars(module))
+        whole, part = module.Whole(1, [2]), module.Part(a=3, c=4.0)
+        seen = [repr(whole), repr(part), hash(whole), whole == module.Whole(1, [2]),
+                whole < module.Whole(2), part == replace(part), replace(part, c=5.0).c]  # fmt: skip
+        for broken in (
+            lambda one=whole: setattr(one, "a", 2),
+            lambda one=part: delattr(one, "c"),
+            module.Whole,
+            lambda module=module: module.Part(3, [], 4.0),
+            lambda module=module: module.Part(a=3, c=-4.0),
+        ):
+            with pytest.raises((TypeError, ValueError, FrozenInstanceError)) as refused:
+                broken()
+            seen.append((type(refused.value), str(refused.value)))
+        made[late] = seen
+    assert made[True] == made[False]
+    assert not hasattr(dataclasses, "exec")
 
 
 LOADING = """

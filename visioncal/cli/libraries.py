@@ -1,7 +1,9 @@
 """Libraries as commands need them: none loads what no command uses, and none before its use."""
 
+import dataclasses
 import sys
 from collections import defaultdict
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
@@ -13,7 +15,8 @@ class SmallLibraries:
 
     Arrow would import pandas, where installed, to check for arrays of it. SciPy parses and rewrites
     hundreds of docstrings as it is imported, and loads all parts of NumPy. Many modules import
-    OpenCV for what few commands do.
+    OpenCV for what few commands do. Dataclasses compile methods for every class as it is defined,
+    of which a command calls a few.
     """
 
     def find_spec(self, fullname: str, path: object, target: object = None) -> None:
@@ -30,11 +33,52 @@ class SmallLibraries:
 
     def __enter__(self) -> None:
         sys.meta_path.insert(0, self)
+        vars(dataclasses)["exec"] = _define_late
         if "cv2" not in sys.modules:
             sys.modules["cv2"] = _Postponed("cv2")
 
     def __exit__(self, *_: object) -> None:
         sys.meta_path.remove(self)
+        vars(dataclasses).pop("exec", None)
+
+
+def _define_late(text: str, scope: dict[str, Any], made: dict[str, Any]) -> None:
+    """Takes the place of `exec` in `dataclasses`: methods of our classes are compiled when called.
+
+    `text` defines a function `__create_fn__` of some names, which returns one method or a tuple.
+    """
+    returned = text.rpartition("\n return ")[2]
+    names = [name for name in returned.strip("()").split(",") if name]
+    if not str(scope.get("__name__")).startswith("visioncal.") or not all(
+        name.startswith("__") and name.isidentifier() for name in names
+    ):
+        exec(text, scope, made)
+        return
+
+    def create(**local: object) -> object:
+        compiled: dict[str, Any] = {}
+
+        def late(name: str) -> Callable[..., object]:
+            def method(self: object, *args: object, **kwargs: object) -> object:
+                if not compiled:
+                    own: dict[str, Any] = {}
+                    exec(text, scope, own)
+                    methods = own["__create_fn__"](**local)
+                    methods = methods if "," in returned else [methods]
+                    compiled.update(zip(names, methods, strict=True))
+                compiled[name].__qualname__ = method.__qualname__
+                for owner in type(self).__mro__:
+                    if vars(owner).get(name) is method:
+                        setattr(owner, name, compiled[name])
+                return compiled[name](self, *args, **kwargs)
+
+            method.__name__ = name
+            return method
+
+        methods = tuple(map(late, names))
+        return methods if "," in returned else methods[0]
+
+    made["__create_fn__"] = create
 
 
 class _Undocumented(defaultdict[str, list[object]]):
