@@ -269,6 +269,16 @@ WORLDS: dict[str, World] = {
         figure=(1.0, 0.25),
         of=NONE,
     ),
+    # A size that is off by no more than stated is held, and no other cause is its residuals'.
+    **{
+        f"board within its stated size, {seed}": World(
+            CellOptions(views=24),
+            printed([1e-3, 0.0], [0.0, 1e-3]),
+            seed=seed,
+            never=frozenset({"board_changed", "lens", "moved_at_once", *ARM}),
+        )
+        for seed in (1, 5)
+    },
     # Of unlike parts, the views of the smaller one are left out.
     "board exchanged for the last views": World(
         replace(OPEN, views=19),

@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell, robot_key
+from visioncal.calibration.stages.likely_steps import with_free_sizes
 from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.calibration.stages.random_effects import random_effect_rms
 from visioncal.calibration.stages.reported_poses import RobotReport
@@ -173,11 +174,18 @@ def with_pose_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotA
 
     def found(name: str) -> ArmErrors | None:
         errors = find_pose_errors(fit.problem, fit.state, fit.noise, name)
-        if errors is None or errors.white is None:
+        if errors is None or (white := errors.white) is None:
             return errors
+        # Residuals of a board whose size is held follow the posture, too: beside its size, such
+        # errors are to be significant.
+        sized = with_free_sizes(fit) if errors.is_significant else fit
+        if sized is not fit:
+            beside = find_pose_errors(sized.problem, sized.state, sized.noise, name)
+            gain = errors.gain if beside is None else min(errors.gain, beside.gain)
+            errors = replace(errors, gain=gain)
         # Errors that grow with time, reach or gravity are others at a pick, and in another session.
         varies = random_effect_rms(fit.problem, fit.state, name)
-        return replace(errors, white=np.hypot(errors.white, varies))
+        return replace(errors, white=np.hypot(white, varies))
 
     return {
         name: arm if arm.is_modelled else replace(arm, errors=found(name))

@@ -21,7 +21,7 @@ from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clock_offset import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
-from visioncal.calibration.stages.likely_steps import likely_steps
+from visioncal.calibration.stages.likely_steps import steps_of
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
@@ -156,7 +156,8 @@ def assess_fit(
     steps: tuple[Step, ...] = ()
     if not observed.misread:
         converged = fit.solution if is_fit else fit_problem(fit.problem, fit.state)
-        steps = likely_steps(fit.problem, converged, errors, joint_offsets(cell_fit.arms))
+        offsets = joint_offsets(cell_fit.arms)
+        steps = steps_of(replace(fit, solution=converged), errors, offsets)
         arms = with_errors_beside_step(cell_fit.arms, fit, steps)
         cell_fit = replace(cell_fit, arms=arms)
     beside = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)

@@ -8,9 +8,13 @@ import numpy as np
 from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.types import FloatArray
+from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.arm import ArmErrors, stops_of
+from visioncal.estimation.fit import Fit
+from visioncal.estimation.joint import target_sizes
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import Solution
+from visioncal.estimation.problem_parts import Effect
+from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.steps import (
     DRIFT,
     Step,
@@ -21,11 +25,59 @@ from visioncal.estimation.steps import (
     joints_of,
     sizes_of,
 )
+from visioncal.estimation.unknowns import BOARD, SIZE
 
 # Most steps that are fitted.
 _MOST_FITTED = 6
 # Log-likelihood ratio, doubled, by which one step is clearly likelier: odds of a hundred to one.
 _CLEARLY = 2.0 * float(np.log(100.0))
+
+
+def steps_of(
+    fit: Fit, errors: Mapping[str, ArmErrors], offsets: Mapping[str, FloatArray]
+) -> tuple[Step, ...]:
+    """The likeliest steps of a fit, as `likely_steps`, beside boards of any size.
+
+    A board whose size is held, since errors of an arm are confounded with it, leaves residuals by
+    distance. The first views may be nearer than the rest, and a change from then on explains these.
+    """
+    found = likely_steps(fit.problem, fit.solution, errors, offsets)
+    sized = with_free_sizes(fit)
+    if not found or sized is fit:
+        return found
+    beside = dict[str, ArmErrors]()
+    for robot, one in errors.items():
+        own = find_pose_errors(sized.problem, sized.state, sized.noise, robot)
+        beside[robot] = one if own is None else own
+    size = fit.problem.size
+    return tuple(
+        replace(step, spread=step.spread[:size, :size])
+        for step in likely_steps(sized.problem, sized.solution, beside, offsets)
+    )
+
+
+def with_free_sizes(fit: Fit) -> Fit:
+    """A fit that estimates the sizes of boards that it holds; itself where it holds none."""
+    if fit.corners is None:
+        targets = [name for name in fit.frames if name.startswith("target")]
+        free = dict.fromkeys(targets, np.inf)
+        is_held = bool(targets) and SIZE not in fit.problem.effect_columns
+        wide = fit.with_columns(target_sizes(fit.problem, free)) if is_held else fit
+    else:
+        scales = [
+            fit.unknowns.columns(board)[fit.unknowns.values_of(board) == SCALE]
+            for board in fit.unknowns.all_of(BOARD)
+        ]
+        at = np.concatenate([np.zeros(0, dtype=np.int64), *scales])
+        at, effects = at[~fit.problem.moving[at]], list[Effect]()
+        for effect in fit.problem.effects:
+            own = fit.problem.effect_columns[effect.name]
+            freed = np.isin(np.arange(own.start, own.stop), at)
+            effects.append(replace(effect, held=effect.held & ~freed))
+        wide = replace(fit, problem=fit.problem.with_effects(effects)) if len(at) else fit
+    if wide is fit:
+        return fit
+    return replace(wide, solution=fit_problem(wide.problem, wide.state, wide.noise))
 
 
 def likely_steps(

@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import joint_offsets
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.likely_steps import likely_steps
+from visioncal.calibration.stages.likely_steps import likely_steps, with_free_sizes
 from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.suspects.suspect import STEPS
@@ -96,7 +96,7 @@ def _proves(run: RunState, trial: Trial) -> bool:
 
 
 def _of_step(run: RunState, _: str) -> Trial:
-    fit = run.assessment.fit
+    fit = with_free_sizes(run.assessment.fit)
     own = fit.problem, fit.solution
     return Trial(own, with_step(*own, run.assessment.steps[0]), is_in_fit=False)
 

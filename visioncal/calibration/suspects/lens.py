@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
+from visioncal.calibration.stages.likely_steps import with_free_sizes
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CONTRADICTION
@@ -91,11 +92,13 @@ def _of_camera(fitted: Fit, camera: str) -> Iterator[Finding]:
             moved = f"the distortion, {names}, moved corners by up to {figure(bent_px)} px; {moved}"
         is_wrong = problem.scene.matrix_sigma_px is None
         is_wrong |= bool(np.any(np.abs(moves) > CONTRADICTION * sigmas_px))
+        # Beside a board whose size is held, the lens explains residuals by distance.
+        is_wrong &= has_changed(with_free_sizes(fitted), columns)
         if is_wrong and moved_px > _LEAST_MOVE_PX:
             words = f"The given intrinsics do not fit these images and were refined: {moved}"
             yield Finding("lens", words, _NEW_LENS)
         else:
-            allowed = "within what is stated, or by less than images show"
+            allowed = "within what is stated, or no more than images or a board's size explain"
             yield Finding(NOTE, f"The given intrinsics were refined {allowed}: {moved}")
     if not moving.all():
         held = problem.scene.camera
