@@ -24,7 +24,7 @@ from visioncal.calibration.guess.joints import guess_joints
 from visioncal.calibration.guess.readings import changes
 from visioncal.calibration.guess.search import in_one_turn
 from visioncal.calibration.run import STAGES
-from visioncal.core.conventions import Reading
+from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS
@@ -180,6 +180,16 @@ def misread(rotation, unit, declared):
     return make
 
 
+def stored(rotation, taken):
+    """The same, and kept as the quaternions of what was read."""
+
+    def make(poses):
+        read = numbers(poses.true_robot, rotation, "m").read_as(Reading(taken))
+        return replace(poses, robot=PoseNumbers.of_poses(read.poses(), read.places))
+
+    return make
+
+
 def few(poses):
     return sound(poses.true_robot[:4], poses.camera.poses()[:4], poses.mount)
 
@@ -204,6 +214,8 @@ PLANTED = [
         for seed in (0, 1, 2, 11, 12)
     ),
     (misread("euler-ZYX-deg", "mm", Reading("euler-xyz-rad")), MOUNTS[0], 14),
+    # KUKA's angles taken for FANUC's turn as the right ones do.
+    *((stored("euler-ZYX-deg", "euler-xyz-deg"), mount, 14) for mount in MOUNTS),
     # Fewer than eleven rows are alike in several orders, which are no readings of their own.
     *(
         (misread("quaternion-wxyz", unit, Reading("quaternion-xyzw")), MOUNTS[0], 8)

@@ -60,6 +60,13 @@ def short(cell):
     return reporting(cell, base_from_flange=cell.robot.base_from_flange @ exp(left))
 
 
+def onwards(cell):
+    """Poses that are read when the arm is a two-hundredth of the way to its next stop."""
+    there = cell.robot.base_from_flange
+    away = np.append(log(invert(there[:-1]) @ there[1:]), np.zeros((1, 6)), axis=0)
+    return reporting(cell, base_from_flange=there @ exp(5e-3 * away))
+
+
 def tilted(cell):
     """In proportion to reach."""
     reach = np.linalg.norm(cell.robot.base_from_flange[:, :2, 3], axis=1, keepdims=True)
@@ -431,6 +438,7 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
         (bent_bracket, "bracket_bends", None),
         (warmed, "lens_grows", np.array([1.5e-3, 0.0, 0.0])),
         (short, "stops_short", None),
+        (onwards, "moves_on", None),
     ],
 )
 def test_what_grows_is_named_recovered_and_in_the_budget(change, kind, true):

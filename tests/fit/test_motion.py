@@ -129,12 +129,13 @@ def test_a_sweep_by_a_rolling_shutter_is_calibrated(mount):
     assert away @ np.linalg.solve(fit.covariance(("edge", "cam")), away) < 27.9
 
 
-def stopping(seed, share):
-    """A cell whose arm stands beyond what it reports by a share of its last motion."""
+def stopping(seed, share, *, onwards=False):
+    """A cell whose arm stands beyond what it reports by a share of its last motion, or its next."""
     small = made(seed, stops=16)
     reported = small.cell.arms["flange"].poses.copy()
-    for stop in range(1, 16):
-        motion = log(invert(reported[stop - 1]) @ reported[stop])
+    for stop in range(14, -1, -1) if onwards else range(1, 16):
+        first = stop if onwards else stop - 1
+        motion = log(invert(reported[first]) @ reported[first + 1])
         # Its own share of the share is a ten-thousandth.
         reported[stop] = reported[stop] @ exp(-share * motion)
     arms = {"flange": replace(small.cell.arms["flange"], poses=reported)}
@@ -142,19 +143,20 @@ def stopping(seed, share):
     return replace(small, cell=replace(small.cell, arms=arms, moments=moments))
 
 
-def test_an_arm_that_stops_short_is_found_and_one_that_arrives_does_not():
+@pytest.mark.parametrize("kind", ["stops short", "moves on"])
+def test_an_arm_that_moves_between_pose_and_image_is_found_and_one_that_stands_does_not(kind):
     squares = []
     for seed in range(8):
-        small = stopping(seed, -0.01)
+        small = stopping(seed, -0.01, onwards=kind == "moves on")
         fit = solve(small.cell).fit
-        (short,) = (effect for effect in fit.unknowns.effects if effect.kind == "stops short")
+        (short,) = (effect for effect in fit.unknowns.effects if effect.kind == kind)
         moved = short.twists(small.cell.moments, fit.state.values["effect", short.name])
         true = -0.01 * short.columns(small.cell.moments, np.ones(16))[:, :, 0]
         # Motions of 0.3 m and more, where a tenth of a millimetre is noise.
         assert moved == pytest.approx(true, abs=6e-4)
         squares.append(squares_of(small, fit, {})[0])
         sound = solve(stopping(seed, 0.0).cell).fit
-        assert "stops short" not in {effect.kind for effect in sound.unknowns.effects}
+        assert kind not in {effect.kind for effect in sound.unknowns.effects}
     assert np.mean(squares) < chi2.ppf(0.999, 48) / 8
     other = replace(small.cell.moments, stops=np.full(16, -1))
     assert not short.columns(other, np.ones(16)).any()

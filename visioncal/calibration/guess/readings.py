@@ -225,8 +225,10 @@ def rewritten(robot: PoseNumbers) -> Iterator[Change]:
     form = ROTATION_FORMS[robot.reading.rotation]
     if form.size == 3:
         return
-    used = {form.rotation.split("-")[1] for form in POSE_FORMS.values() if "euler" in form.rotation}
-    orders = sorted({*map(str.upper, used), *map(str.lower, used)})
+    forms = [form.rotation.split("-") for form in POSE_FORMS.values()]
+    used = sorted({form[1] for form in forms if form[0] == "euler"}, key=str.swapcase)[::-1]
+    # Those that makers use come first: others are the same numbers in another order.
+    orders = dict.fromkeys([*used, *map(str.upper, used), *map(str.lower, used)])
     degrees = [f"euler-{order}-deg" for order in orders]
     pairs = [*product(degrees, degrees)]
     rotations = form.read(robot.rotations)
@@ -234,8 +236,12 @@ def rewritten(robot: PoseNumbers) -> Iterator[Change]:
     if turned.max(initial=0.0) < _RADIANS_AS_DEGREES_RAD:
         radians = [name.replace("-deg", "-rad") for name in degrees]
         pairs += [*product(radians, degrees), ("rotation-vector", "rotation-vector-deg")]
+    known = [rotations]
     for name, written in pairs:
-        if name != written:
+        tried = SideReading(name, written=written).rotations(robot)
+        # Other names of the same numbers in another order are the same mistake.
+        if not any(np.allclose(tried, other, atol=1e-9, equal_nan=True) for other in known):
+            known.append(tried)
             words = (
                 f"the robot's rotations as {ROTATION_FORMS[name].words}, which were taken for "
                 f"{ROTATION_FORMS[written].words}"

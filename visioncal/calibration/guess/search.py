@@ -204,14 +204,16 @@ def search(recording: Recording) -> list[Candidate]:
     rows, declared = thinned(recording.common_rows), recording.declared
     mismatch = _mismatch(recording, rows)
     plain = [*changes(declared, recording.is_measured, len(recording.robot))]
-    tried = _undone(declared, [*product((None,), plain), *combinations(plain, 2)])
-    # Rewritten rotations are tried where no other reading is sure.
-    for strange in ([], [*rewritten(recording.robot.rows(rows))]):
-        tried += _undone(declared, product((None, *plain), strange))
-        likely = [*filter(recording.is_likely, tried)]
-        likely = _near(likely, [*map(mismatch, likely)]) if likely else []
+    near = list[Hypothesis]()
+    # Rewritten rotations are tried where no other reading is sure; all may turn by the same angles.
+    for pairs in (
+        [*product((None,), plain), *combinations(plain, 2)],
+        product((None, *plain), [*rewritten(recording.robot.rows(rows))]),
+    ):
+        likely = [*filter(recording.is_likely, _undone(declared, pairs))]
+        near += _near(likely, [*map(mismatch, likely)]) if likely else []
         classes: dict[Hashable, list[Hypothesis]] = {}
-        for reading in sorted([declared, *likely], key=lambda item: item.cost):
+        for reading in sorted([declared, *near], key=lambda item: item.cost):
             of_class = classes.setdefault((reading.chain_class, recording.is_likely(reading)), [])
             of_class.append(reading)
         labels = {of_class[0]: tuple(of_class) for of_class in classes.values()}

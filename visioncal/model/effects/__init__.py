@@ -25,6 +25,7 @@ from visioncal.model.effects.posture import BracketBends as BracketBends
 from visioncal.model.effects.rolling import Rolling as Rolling
 from visioncal.model.effects.springs import Springs as Springs
 from visioncal.model.effects.springs import Weight as Weight
+from visioncal.model.effects.stops_short import MovesOn as MovesOn
 from visioncal.model.effects.stops_short import StopsShort as StopsShort
 from visioncal.model.effects.zeros import Zeros as Zeros
 
@@ -36,4 +37,5 @@ NAMED: tuple[type[Named], ...] = (
     BracketBends,
     LensGrows,
     StopsShort,
+    MovesOn,
 )

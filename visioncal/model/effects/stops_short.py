@@ -1,5 +1,6 @@
-"""A robot whose poses are read before it has arrived, or that are commanded and not reached."""
+"""A robot whose poses are read while it moves, or that are commanded and not reached."""
 
+from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,18 +16,14 @@ from visioncal.model.effects.effect import Effect, Named, Stood
 
 
 @dataclass(frozen=True, eq=False)
-class StopsShort(Effect, Named):
-    """Where the arm stands along its last motion: by a share of it, and by as much of each.
+class _AlongMotion(Effect, Named):
+    """Where the arm stands along a motion: by a share of it, and by as much of each.
 
     The latter as a share of a motion of 0.3 m, with turns at a lever. At other moments than the
-    cell's stops it has arrived.
+    cell's stops the poses are right.
     """
 
-    kind, count, bounds, most = "stops short", 2, (1e-2, 1e-6, 0.1), 5e-2
-    do = (
-        "Wait until the arm stands still before each image, and log the poses that the controller "
-        "measures, not those that it was sent to."
-    )
+    count, bounds, most = 2, (1e-2, 1e-6, 0.1), 5e-2
     poses: FloatArray  # (s, 4, 4) `base_from_flange` at the cell's stops; NaN where unknown.
 
     @classmethod
@@ -34,6 +31,36 @@ class StopsShort(Effect, Named):
         """See `Named`."""
         if not stood.is_swept:
             yield cls(flange, stood.poses)
+
+    @staticmethod
+    @abstractmethod
+    def motions(poses: FloatArray) -> FloatArray:
+        """(n, 6) motions at stops of (n, 4, 4) poses."""
+
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """See `Effect`."""
+        del distances
+        return np.where(moments.stops[:, None, None] >= 0, self._of_stops[moments.stops], 0.0)
+
+    @cached_property
+    def _of_stops(self) -> FloatArray:
+        stood, found = np.isfinite(self.poses[:, 0, 0]), np.zeros((len(self.poses), 6, 2))
+        motion = self.motions(self.poses[stood])
+        length = np.linalg.norm(motion * np.repeat([LEVER_M, 1.0], 3), axis=1)
+        even = motion * (0.3 / np.maximum(length, 1e-6))[:, None]
+        found[stood] = np.stack([motion, even], axis=2)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class StopsShort(_AlongMotion):
+    """An arm that stands short of its poses, along its last motion."""
+
+    kind = "stops short"
+    do = (
+        "Wait until the arm stands still before each image, and log the poses that the controller "
+        "measures, not those that it was sent to."
+    )
 
     @classmethod
     def says(cls, values: FloatArray) -> str:
@@ -45,17 +72,31 @@ class StopsShort(Effect, Named):
             f"{figure(1e3 * abs(off))} mm after one of 0.3 m. The result counts it."
         )
 
-    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
-        """See `Effect`."""
-        del distances
-        return np.where(moments.stops[:, None, None] >= 0, self._of_stops[moments.stops], 0.0)
+    @staticmethod
+    def motions(poses: FloatArray) -> FloatArray:
+        """See `_AlongMotion`."""
+        return np.append(np.zeros((1, 6)), log(invert(poses[:-1]) @ poses[1:]), axis=0)
 
-    @cached_property
-    def _of_stops(self) -> FloatArray:
-        stood = np.flatnonzero(np.isfinite(self.poses[:, 0, 0]))
-        motion, found = np.zeros((len(stood), 6)), np.zeros((len(self.poses), 6, 2))
-        motion[1:] = log(invert(self.poses[stood[:-1]]) @ self.poses[stood[1:]])
-        length = np.linalg.norm(motion * np.repeat([LEVER_M, 1.0], 3), axis=1)
-        even = motion * (0.3 / np.maximum(length, 1e-6))[:, None]
-        found[stood] = np.stack([motion, even], axis=2)
-        return found
+
+@dataclass(frozen=True, eq=False)
+class MovesOn(_AlongMotion):
+    """An arm that moves on to its next stop between pose and image."""
+
+    kind = "moves on"
+    do = "Log pose and image of each stop while the arm stands still, before it is sent on."
+
+    @classmethod
+    def says(cls, values: FloatArray) -> str:
+        """See `Named`."""
+        off = 0.3 * float(values.sum())
+        first, then = ("image", "pose") if off < 0.0 else ("pose", "image")
+        return (
+            f"The arm had moved on towards the next stop between {first} and {then}, of which the "
+            f"{then} is the later: by {figure(1e3 * abs(off))} mm of a motion of 0.3 m. The result "
+            "counts it."
+        )
+
+    @staticmethod
+    def motions(poses: FloatArray) -> FloatArray:
+        """See `_AlongMotion`."""
+        return np.append(log(invert(poses[:-1]) @ poses[1:]), np.zeros((1, 6)), axis=0)
