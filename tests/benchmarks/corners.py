@@ -97,7 +97,7 @@ def compared(target: Target, words: str, shot: Shot) -> Row | None:
         for name, px in peers(image, target, seen, shot.square_px):
             errors.setdefault(name, []).append(px - truth)
         refined = kind_of(target).refine(image, target, seen.ids, seen.px)
-        fitted = np.array([not reason for reason in refined.reasons])
+        fitted = refined.fitted
         core.append(refined.px[fitted] - truth[fitted])
         scaled.append(core[-1] / refined.sigma_px[fitted, None])
         left.extend(~fitted)

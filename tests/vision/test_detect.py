@@ -96,6 +96,29 @@ def test_steep_views_keep_their_corners():
     assert ours[0] >= 20
 
 
+def test_a_board_that_the_image_cuts_needs_no_thorough_search(charuco, monkeypatch):
+    cell, images = charuco
+    target, searches = cell.options.target, []
+    kind = type(kind_of(target))
+    search = kind.search
+
+    def counted(self, image, target, *, quick=False):
+        searches.append(quick)
+        return search(self, image, target, quick=quick)
+
+    monkeypatch.setattr(kind, "search", counted)
+    whole = find_target(images[0], target)
+    left, within = (int(at) for at in np.quantile(whole.px[:, 0], (0.0, 0.3)))
+    cut = find_target(np.ascontiguousarray(images[0][:, within:]), target)
+    shown = whole.ids[whole.px[:, 0] > within + 5]
+    assert searches == [True, True]
+    assert len(np.setdiff1d(shown, cut.ids)) <= 0.2 * len(shown)
+    covered = images[0].copy()
+    covered[:, left - 40 : within] = 255
+    find_target(covered, target)
+    assert searches == [True, True, True, False]
+
+
 def test_markers_alone(charuco):
     _, images = charuco
     target = Target("m", "marker", 1, 1, 0.022, 1e-5, dictionary="DICT_5X5_100", marker_id=3)

@@ -4,18 +4,21 @@ from abc import abstractmethod
 from dataclasses import replace
 from typing import ClassVar
 
+import cv2
 import numpy as np
 
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.imaging import blur_at_corners, shrunk
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
-from visioncal.vision.boards.template import Print, Refined, refine
+from visioncal.vision.boards.template import MIN_CORNERS, Print, Refined, refine
 
 # Corners that the template does not fit are dropped, as detectors err there by up to a pixel. If
 # too few fit, all corners of the detector are used, with a tenth of the weight: their accuracy
 # relative to the template's in the median.
 DETECTED_WEIGHT = 0.1
+# From a corner through the squares around it [sides].
+_DIAGONALS = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
 
 
 class Board(BoardKind):
@@ -47,13 +50,13 @@ class Board(BoardKind):
         return refine(image, self.around(target, ids, squares), squares, px)
 
     def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
-        """Corners by a quick search, or in a reduced copy if that finds the whole board."""
+        """Corners by a quick search, or in a reduced copy if that finds all that are shown."""
         sides = max(image.shape), min(image.shape)
         factors = [by for by in (4, 2) if sides[0] > by // 2 * self.long_side_px and sides[1] >= by]
         for factor in [*factors, 1] if self.has_quick_search else factors:
             small = image if factor == 1 else shrunk(image, factor)
             seen = self.search(small, target, quick=self.has_quick_search)
-            if isinstance(seen, DetectedCorners) and len(seen.ids) == len(self.corners(target)):
+            if isinstance(seen, DetectedCorners) and self._is_all(small, target, seen):
                 # From pixel centres of the small image to those of the large one.
                 px = factor * seen.px + (factor - 1) / 2
                 refined = self._refined(image, target, DetectedCorners(seen.ids, px))
@@ -61,6 +64,21 @@ class Board(BoardKind):
                     return refined
         seen = self.search(image, target)
         return seen if isinstance(seen, NotFound) else self._refined(image, target, seen)
+
+    def _is_all(self, image: Image, target: Target, seen: DetectedCorners) -> bool:
+        """Whether these are all corners that the (h, w) image shows, of a board that it may cut."""
+        board = self.corners(target)[:, :2]
+        missing = np.delete(np.arange(len(board)), seen.ids)
+        if not missing.size or len(seen.ids) < max(MIN_CORNERS, len(missing)):
+            return not missing.size
+        px_from_board = np.asarray(cv2.findHomography(board[seen.ids], seen.px)[0], float)
+        if px_from_board.shape != (3, 3):
+            return False
+        # One that is not shown has a part of the squares around it outside.
+        around = board[missing, None] + self.unit_m(target) * _DIAGONALS
+        px = cv2.perspectiveTransform(around.reshape(1, -1, 2), px_from_board)
+        inside = ((px > 0) & (px < np.array(image.shape[::-1]) - 1.0)).all(axis=2)
+        return not inside.reshape(-1, len(_DIAGONALS)).all(axis=1).any()
 
     def _refined(self, image: Image, target: Target, seen: DetectedCorners) -> DetectedCorners:
         refined = self.refine(image, target, seen.ids, seen.px)

@@ -1,7 +1,7 @@
 """Maps from pixels to the board around each corner, determined by its neighbours."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import cv2
@@ -22,6 +22,8 @@ class OpticalAxis:
 
     px: FloatArray  # (2,) centre of the image, near which it is [px].
     reach_px: float  # Half the image's diagonal [px].
+    # (4,) distortion from which the search begins: coefficients, and the axis less `px` [reach].
+    lens: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     @classmethod
     def of(cls, shape: tuple[int, ...], origin: FloatArray | IntArray) -> Self:
@@ -32,7 +34,7 @@ class OpticalAxis:
 
 def maps_about(
     board: FloatArray, px: FloatArray, good: Mask, chosen: IntArray, axis: OpticalAxis | None = None
-) -> tuple[Callable[[FloatArray], FloatArray], IntArray, FloatArray]:
+) -> tuple[Callable[[FloatArray], FloatArray], IntArray, FloatArray, OpticalAxis | None]:
     """Maps around m chosen corners: a common homography, and a cubic polynomial for each.
 
     Args:
@@ -45,14 +47,14 @@ def maps_about(
 
     Returns:
         Function that maps pixels (m, k, 2) to the board relative to each corner; (m, k) neighbours
-        of each corner; and the linear operators (m, 10, k) from their values to polynomial
-        coefficients.
+        of each corner; the linear operators (m, 10, k) from their values to polynomial
+        coefficients; and the axis with the distortion that was found.
 
     Raises:
         numpy.linalg.LinAlgError: The corners do not form a board.
     """
     undistorted = None if axis is None else _undistorted(px[good], board[good], axis)
-    flatten = undistorted or _homography(px, board)
+    flatten, axis = undistorted or (_homography(px, board), axis)
     origin = flatten(px[chosen])[:, None]
     distances, neighbours = cKDTree(board).query(board[chosen], min(25, len(px)))
     offsets = flatten(px)[neighbours] - origin
@@ -69,7 +71,7 @@ def maps_about(
         offsets = flatten(places) - origin
         return np.asarray(offsets + _terms(offsets) @ coefficients)
 
-    return on_board, neighbours, smoother
+    return on_board, neighbours, smoother, axis
 
 
 def _homography(places: FloatArray, board: FloatArray) -> Callable[[FloatArray], FloatArray]:
@@ -84,11 +86,12 @@ def _homography(places: FloatArray, board: FloatArray) -> Callable[[FloatArray],
 
 def _undistorted(
     px: FloatArray, board: FloatArray, axis: OpticalAxis
-) -> Callable[[FloatArray], FloatArray] | None:
+) -> tuple[Callable[[FloatArray], FloatArray], OpticalAxis] | None:
     """As `_homography`, after removal of radial distortion; None if that is not determined.
 
     A point o relative to the axis, at distance r, maps to o / (1 + a r^2 + b r^4) (Fitzgibbon
-    2001). Each Gauss-Newton step of a, b and the axis is followed by a least-squares homography.
+    2001). Each Gauss-Newton step of a, b and the axis is followed by a least-squares homography;
+    the first begins at those that are given, and the axis is returned with what was found.
     """
     if len(px) < 8:
         return None
@@ -101,7 +104,7 @@ def _undistorted(
         divisor = 1.0 + powers @ lens[:2, None]
         return offsets / divisor, powers, divisor
 
-    lens, cost, least, best = np.zeros(4), np.inf, np.inf, None
+    lens, cost, least, best = axis.lens, np.inf, np.inf, None
     for _ in range(6):
         flat, powers, divisor = undistort(px, lens)
         # The smallest divisor of the distortion model.
@@ -132,7 +135,10 @@ def _undistorted(
         system = np.concatenate([jacobian.reshape(-1, 12), prior])
         right_side = np.concatenate([residuals.ravel(), -prior[:, 8:] @ lens])
         lens = lens + np.linalg.lstsq(system, right_side)[0][8:]
-    return None if best is None else lambda points: _mapped(best[1], undistort(points, best[0])[0])
+    if best is None:
+        return None
+    lens, flat_from_places = best
+    return lambda at: _mapped(flat_from_places, undistort(at, lens)[0]), replace(axis, lens=lens)
 
 
 def _mapped(homography: FloatArray, places: FloatArray) -> FloatArray:

@@ -134,6 +134,7 @@ class _Windows:
     """Pixels around n corners, and the maps from there to the board."""
 
     px: FloatArray  # (n, 2) corner positions at which the maps were made [px].
+    axis: OpticalAxis | None  # The lens's axis with the distortion that the maps remove.
     # (n, 2, 2) Jacobian of pixels with respect to the board position [px/square].
     jacobian: FloatArray
     widths: FloatArray  # (n, 2) squares per pixel, across the lines of constant x and y.
@@ -154,10 +155,10 @@ class _Windows:
         good: Mask,
         chosen: IntArray,
         pattern: Print,
-        axis: OpticalAxis,
+        axis: OpticalAxis | None,
     ) -> Self:
         """Cuts the windows of the chosen corners; the good corners determine the maps."""
-        on_board, neighbours, smoother = maps_about(board, px, good, chosen, axis)
+        on_board, neighbours, smoother, axis = maps_about(board, px, good, chosen, axis)
         axes = np.eye(2) if pattern.axes is None else pattern.axes[chosen]
 
         def on_own(places: FloatArray) -> FloatArray:
@@ -204,6 +205,7 @@ class _Windows:
         slopes = np.linalg.inv(np.swapaxes(axes, -1, -2)) @ smoother[:, 1:3]
         return cls(
             start,
+            axis,
             jacobian,
             np.linalg.norm(jacobian_px, axis=2),
             x,
@@ -383,7 +385,7 @@ def _refine_corners(
     blur_px, grown = _estimate_blur(windows.at(sample), pattern.at(sample))
     if pattern.radii is not None:
         pattern = replace(pattern, radii=pattern.radii + grown)
-        windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, axis)
+        windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, windows.axis)
     is_lone = pattern.lone is not None
     tolerances_px, last_px = (
         (_LONE_STEP_TOLERANCES_PX, _LONE_LAST_STEP_PX)
@@ -400,7 +402,7 @@ def _refine_corners(
         good = _accepted(windows, step, refined_px - px, last_px[0])
         refined_px = np.where(good[:, None], refined_px, px)
         change_px = np.abs(refined_px - windows.px).max()
-        windows = _Windows.cut(smooth, board, refined_px, good, indices, pattern, axis)
+        windows = _Windows.cut(smooth, board, refined_px, good, indices, pattern, windows.axis)
         if change_px < 0.03:
             break
     gradients = windows.gradients(step.levels)
