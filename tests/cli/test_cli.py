@@ -446,7 +446,7 @@ try:
 finally:
     heavy = "cv2.typing jinja2 matplotlib pandas pinocchio pyarrow rerun scipy.optimize scipy.stats"
     heavy = {*heavy.split(), "scipy.io", "visioncal.calibration", "visioncal.interchange.formats"}
-    heavy |= {"numpy.f2py", "numpy.testing"}
+    heavy |= {"numpy.f2py", "numpy.testing", "rich"}
     print(len(sys.modules), *heavy & set(sys.modules), file=sys.stderr)
 """
 
@@ -462,7 +462,7 @@ finally:
         ("locate -c out --pixel 320,200 --plane z=20 --pose 0.5,0.1,0.4,0,1,0,0", 1100,
          {"cv2.typing"}),
         ("show out -o report.html", 1250, {"cv2.typing", "jinja2", "matplotlib"}),
-        ("history empty.db", 1050, set()),
+        ("history empty.db", 1050, {"rich"}),
     ],
 )  # fmt: skip
 def test_a_short_command_loads_what_it_uses(words, most, used, tmp_path):

@@ -1,6 +1,7 @@
 """Output shared by the commands: messages to stderr, results to stdout, and errors."""
 
 import json
+import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -31,8 +32,17 @@ def console(*, is_answer: bool = False) -> "Console":
     return Console(stderr=not is_answer, highlight=False, soft_wrap=True)
 
 
+def is_terminal(*, is_answer: bool = False) -> bool:
+    """Whether stderr, or stdout, shows styles, for which alone a library is loaded."""
+    stream = sys.stdout if is_answer else sys.stderr
+    return stream.isatty() or "FORCE_COLOR" in os.environ
+
+
 def say(words: str, label: str = "", style: str = "bold", *, is_answer: bool = False) -> None:
     """Prints a message, or a line of the result, as it is, after a label in a style."""
+    if not is_terminal(is_answer=is_answer):
+        typer.echo(plain(label) + plain(words), err=not is_answer)
+        return
     from rich.text import Text
 
     # No markup: names and texts of files may have brackets.

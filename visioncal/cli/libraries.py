@@ -3,14 +3,19 @@
 import dataclasses
 import sys
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
+from importlib.abc import Loader
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
+# Parts that libraries import, and most commands do without.
+_LATER = ("rerun.experimental",)
 
-class SmallLibraries:
+
+class SmallLibraries(Loader):
     """Keeps libraries small within its block, which save half the time of a short command.
 
     Arrow would import pandas, where installed, to check for arrays of it. SciPy parses and rewrites
@@ -19,9 +24,18 @@ class SmallLibraries:
     of which a command calls a few.
     """
 
-    def find_spec(self, fullname: str, path: object, target: object = None) -> None:
-        """Finds nothing, and no pandas."""
-        del path, target
+    def __init__(self) -> None:
+        self._later = set(_LATER)
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Finds no pandas, and parts of libraries that are loaded when they are first used."""
+        if fullname in self._later:
+            self._later.remove(fullname)
+            if spec := PathFinder.find_spec(fullname, path, target):
+                spec.loader = self
+            return spec
         if fullname == "pandas":
             raise ModuleNotFoundError("commands do without pandas", name=fullname)
         if fullname in {"scipy._lib._array_api", "scipy._lib._util"}:
@@ -30,6 +44,14 @@ class SmallLibraries:
             numpy = vars(import_module("numpy"))
             for part in ("ctypeslib", "f2py", "ma", "polynomial", "random", "testing"):
                 numpy.setdefault(part, _Postponed(f"numpy.{part}"))
+        return None
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """A part that is loaded later."""
+        return _Postponed(spec.name)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Loads nothing yet."""
 
     def __enter__(self) -> None:
         sys.meta_path.insert(0, self)
@@ -99,6 +121,11 @@ class _Postponed(ModuleType):
         self.__spec__ = find_spec(name)
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the module has
+        if part := sys.modules.get(f"{self.__name__}.{name}"):
+            return part
+        # Python itself looks for these as it imports.
+        if name in {"__path__", "__file__", "__cached__"}:
+            raise AttributeError(name)
         if sys.modules.get(self.__name__) is self:
             sys.modules.pop(self.__name__, None)
         # Another thread's import is waited for.

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Event, Thread
 
-from visioncal.cli.console import console
+from visioncal.cli.console import console, is_terminal, say
 
 # Descriptions of steps; other names are words already.
 WORDS = {
@@ -67,7 +67,7 @@ def shown_progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
     if quiet:
         yield steps.report
         return
-    shown = _bar if console().is_terminal else _lines
+    shown = _bar if is_terminal() else _lines
     with shown(steps) as report:
         yield report
 
@@ -93,16 +93,16 @@ def _bar(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
 def _lines(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
     start_s, over = time.monotonic(), Event()
 
-    def say() -> None:
+    def repeat() -> None:
         last, pauses = "", 0
         while not over.wait(PAUSE_S):
             pauses += 1
             # Long work is said again each minute.
             if steps.line != last or pauses % 30 == 0:
                 last = steps.line
-                console().print(f"{last} ({time.monotonic() - start_s:.0f} s)", markup=False)
+                say(f"{last} ({time.monotonic() - start_s:.0f} s)")
 
-    printer = Thread(target=say, daemon=True)
+    printer = Thread(target=repeat, daemon=True)
     printer.start()
     try:
         yield steps.report

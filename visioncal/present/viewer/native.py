@@ -16,7 +16,7 @@ from pathlib import Path
 from subprocess import Popen
 from threading import Thread
 
-from rerun.experimental import ViewerClient
+from rerun import experimental
 
 from visioncal.core.errors import DriverError
 from visioncal.core.threads import signals_as_interrupts
@@ -85,7 +85,7 @@ def _seek(process: Popen[str], port: int, row: int) -> None:
     deadline = time.monotonic() + _PATIENCE_S
     while process.poll() is None and time.monotonic() < deadline:
         try:
-            viewer = ViewerClient(f"rerun+http://{_HOST}:{port}/proxy")
+            viewer = experimental.ViewerClient(f"rerun+http://{_HOST}:{port}/proxy")
             viewer.set_time(paths.TIMELINE, sequence=row, play_state="paused")
         except (OSError, RuntimeError, ValueError):
             time.sleep(0.2)
