@@ -286,6 +286,14 @@ WORLDS: dict[str, World] = {
         )
         for seed in (1, 5)
     },
+    # Beyond an arm's repeatability, what a held size leaves is no riddle either.
+    "board two sigma from its stated size": World(
+        CellOptions(views=29, mount="eye-to-hand"),
+        printed([2e-3, 0.0], [0.0, 2e-3]),
+        causes=("unmeasured_board",),
+        never=frozenset({"board_changed", "lens", "moved_at_once", "unexplained"}),
+        of=NONE,
+    ),
     # Of unlike parts, the views of the smaller one are left out.
     "board exchanged for the last views": World(
         replace(OPEN, views=19),

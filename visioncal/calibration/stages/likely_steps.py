@@ -57,25 +57,23 @@ def steps_of(
 
 
 def with_free_sizes(fit: Fit) -> Fit:
-    """A fit that estimates the sizes of boards that it holds; itself where it holds none."""
-    if fit.corners is None:
-        targets = [name for name in fit.frames if name.startswith("target")]
-        free = dict.fromkeys(targets, np.inf)
-        is_held = bool(targets) and SIZE not in fit.problem.effect_columns
-        wide = fit.with_columns(target_sizes(fit.problem, free)) if is_held else fit
-    else:
-        scales = [
-            fit.unknowns.columns(board)[fit.unknowns.values_of(board) == SCALE]
-            for board in fit.unknowns.all_of(BOARD)
-        ]
-        at = np.concatenate([np.zeros(0, dtype=np.int64), *scales])
-        at, effects = at[~fit.problem.moving[at]], list[Effect]()
+    """A fit that estimates the sizes of boards that it holds or has exact; itself for none."""
+    boards = fit.unknowns.all_of(BOARD)
+    scales = [fit.unknowns.columns(at)[fit.unknowns.values_of(at) == SCALE] for at in boards]
+    columns = np.concatenate([np.zeros(0, dtype=np.int64), *scales])
+    held = columns[~fit.problem.moving[columns]]
+    targets = [name for name in fit.frames if name.startswith("target")]
+    if len(held):
+        effects = list[Effect]()
         for effect in fit.problem.effects:
             own = fit.problem.effect_columns[effect.name]
-            freed = np.isin(np.arange(own.start, own.stop), at)
+            freed = np.isin(np.arange(own.start, own.stop), held)
             effects.append(replace(effect, held=effect.held & ~freed))
-        wide = replace(fit, problem=fit.problem.with_effects(effects)) if len(at) else fit
-    if wide is fit:
+        wide = replace(fit, problem=fit.problem.with_effects(effects))
+    elif targets and not len(columns) and SIZE not in fit.problem.effect_columns:
+        # Of measured poses, or of points whose table is exact.
+        wide = fit.with_columns(target_sizes(fit.problem, dict.fromkeys(targets, np.inf)))
+    else:
         return fit
     return replace(wide, solution=fit_problem(wide.problem, wide.state, wide.noise))
 
