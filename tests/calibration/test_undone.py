@@ -279,6 +279,38 @@ def test_of_long_sessions_every_row_is_named():
     assert len(found.found.views) == 107
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_corners_that_are_numbered_a_column_on_get_their_own_numbers(tmp_path, monkeypatch, mount):
+    monkeypatch.chdir(tmp_path)
+    boards = poses_of(mount)[1]
+    # All of them in the image.
+    boards[:, :2, 3] = 0.3 * boards[:, :2, 3] - 0.1
+    x, z = exp(np.array([0.1, -0.2, 0.3, 0.05, 0.02, 0.1])), exp(np.array([0, 0, 0.4, 0.7, 0, 0]))
+    robot = z @ invert(boards) @ invert(x)
+    robot = robot if mount == "eye-in-hand" else invert(robot)
+    matrix = np.array([[1100.0, 0.0, 640.0], [0.0, 1100.0, 480.0], [0.0, 0.0, 1.0]])
+    rng, seen, wrong, board = np.random.default_rng(2), [], (1, 6, 12, 15), "charuco_9x6_30mm"
+    empty = [(np.arange(0), np.zeros((0, 2)))] * len(robot)
+    session = Session.from_corners(empty, robot, board, (1280, 960))
+    points = corner_positions(next(iter(session.boards.values())))
+    for view, pose in enumerate(boards):
+        px = cv2.projectPoints(points, *split(pose), matrix, None)[0][:, 0]
+        px += rng.normal(0, 0.1, px.shape)
+        # The first column is in the shade there.
+        shown = points[:, 0] > points[:, 0].min() + 0.01
+        last = points[:, 0] < points[:, 0].max() - 0.01
+        ids = np.arange(len(points))
+        seen.append((ids[last], px[shown]) if view in wrong else (ids, px))
+    Session.from_corners(seen, robot, board, (1280, 960), mount=mount).save(tmp_path / "cell")
+    cause = visioncal.calibrate(tmp_path / "cell").verdict.causes[0]
+    assert (cause.kind, cause.views) == ("turned_board", wrong), cause.words
+    assert "numbered some squares on" in cause.words
+    assert follow("calibrate", "cell", "-o", "out").last.status == 0
+    mended = visioncal.calibrate(tmp_path / "cell-fixed")
+    assert sum(view.used for view in mended.views) == len(robot)
+    assert not {"turned_board", "lost_views"} & {one.kind for one in mended.verdict.causes}
+
+
 def test_views_that_a_symmetric_board_lets_read_turned_are_said_and_turned_back(
     tmp_path, monkeypatch
 ):

@@ -400,7 +400,8 @@ class ConvertOptions(RobotPoseOptions):
         "Views whose poses stand so many rows later: 12-24:2.", parse=shift_in
     )
     turned: tuple[tuple[int, ...], tuple[float, ...]] | None = _doubt(
-        "Views whose board is read turned, by degrees about a point in mm: 3,7:180,80,60.",
+        "Views whose board is read turned, by degrees about a point in mm: 3,7:180,80,60; or, by 0 "
+        "degrees, shifted to it.",
         parse=turn_in,
     )
     positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = _doubt(

@@ -271,7 +271,8 @@ def _of_another_size(
         change = Change(f"{whose} {scale:.4g} times as large", "camera", {"scale": scale}, 2)
         scaled[change.of(item.hypothesis)] = (*map(change.of, item.labels),)
     found = fitted(recording, scaled, rows, STARTS) if scaled else []
-    return [replace(item, labels=scaled[item.hypothesis]) for item in found]
+    # Larger distances make any misfit a smaller share of them.
+    return [replace(item, labels=scaled[item.hypothesis]) for item in found if item.fit.closes]
 
 
 def _distance_scale(candidate: Candidate) -> float | None:

@@ -28,7 +28,7 @@ from visioncal.core.transforms import compose, exp, invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Rejection
 from visioncal.core.verdict import Finding, mending, or_alone
 from visioncal.estimation.chain import robot_part
-from visioncal.vision.targets import rotation_transforms
+from visioncal.vision.targets import corner_positions, rotation_transforms
 
 _SHIFTS = (0, 1, -1, 2, -2, 3, -3)
 # Share of the rows that a fit keeps, and its random starts: half of the rows may be wrong, and a
@@ -43,6 +43,8 @@ _WRONG = float(np.log(0.05)) - 6.0 * float(np.log(2.0))
 _MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
 # A turn of a board differs by less from a quarter or half one [rad]; copies of poses by less.
 _NEAR_RAD, _SAME = 0.1, 1e-9
+# Views are alike within so many medians.
+_UNEVEN = 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +56,7 @@ class _Record:
     mount: Mount
     rows: IntArray  # (m,) the rows that show the board.
     camera: FloatArray  # (m, c, 4, 4) `cam_from_target` with all rivals.
+    marks: FloatArray  # (k, 3) corners of the board [m]; empty of several and of unknown ones.
 
     @classmethod
     def of(cls, run: RunState) -> Self:
@@ -74,7 +77,8 @@ class _Record:
         padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
         mount: Mount = run.mount or "eye-in-hand"
         known, shown = robot_part(robot, mount), np.array(rows, dtype=int)
-        return cls(np.array(views), known, mount, shown, np.array(padded))
+        marks = corner_positions(*session.boards.values()) if len(turns) == 1 else np.zeros((0, 3))
+        return cls(np.array(views), known, mount, shown, np.array(padded), marks)
 
     def paired(self, order: IntArray) -> IntArray:
         """(m,) the robot's row of each view that shows the board; -1 where it has no pose."""
@@ -181,7 +185,9 @@ def likeliest(run: RunState) -> Undoing | None:
         return None
     squares = declared.of(own)
     agrees = _evidence(squares[None])[1]
-    if agrees.all() and squares.mean() < CLOSING_SCORE**2:
+    # Turns that agree do not let a few places that are off count as wrong.
+    is_even = (squares < _UNEVEN**2 * (np.median(squares, axis=0) + _LEAST**2)).all()
+    if agrees.all() and is_even and squares.mean() < CLOSING_SCORE**2:
         return None
     pairs = {by: record.paired(shifted(by, len(record.views))) for by in _SHIFTS}
     every = [declared]
@@ -307,16 +313,19 @@ def _signed(
 def _turned(
     record: _Record, edges: _Edges, own: IntArray, apart: FloatArray, base: float
 ) -> Iterator[Undoing]:
-    """Boards that were read as if they were turned in their plane."""
+    """Boards that were read as if they were turned in their plane, or some squares on in it."""
     known = np.flatnonzero(own >= 0)
     turned = edges.turned(own)
-    for degrees in (180.0, 90.0, 270.0):
+    for degrees in (180.0, 90.0, 270.0, 0.0):
         angle = np.deg2rad(degrees)
         turn = exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))[:3, :3]
         near = known[rotation_angle(turn.T @ turned[known, :3, :3]) < _NEAR_RAD]
+        middle = np.median(turned[near, :2, 3], axis=0) if len(near) else np.zeros(2)
+        if not degrees:
+            by_squares, middle = _squares_on(record.marks, turned[near, :2, 3])
+            near = near[by_squares]
         if len(near) < 2:
             continue
-        middle = np.median(turned[near, :2, 3], axis=0)
         whole = compose(turn, np.array([*middle, 0.0]))
         squares = apart.copy()
         squares[near] = edges.squares(invert(whole) @ turned[near])
@@ -327,20 +336,41 @@ def _turned(
         if len(wrong) < 2 or squares[agrees].mean() > CLOSING_SCORE**2:
             continue
         views = tuple(record.views[record.rows[wrong]].tolist())
-        centre = np.linalg.solve(np.eye(2) - turn[:2, :2], middle) * 1e3
-        about = ",".join(f"{value:g}" for value in np.round([degrees, *centre], 2).tolist())
+        centre = np.linalg.solve(np.eye(2) - turn[:2, :2], middle) if degrees else middle
+        centre = np.round(1e3 * centre, 2) + 0.0
+        about = ",".join(f"{value:g}" for value in (degrees, *centre.tolist()))
+        point = f"({centre[0]:.1f}, {centre[1]:.1f}) mm"
         short = f"the board was read turned by {degrees:.0f} deg"
+        where, back = "in its plane, about", "it is turned back"
+        if not degrees:
+            short, where = "the board's corners are numbered some squares on", "by"
+            back = "they have their own numbers"
         yield Undoing(
             odds,
             Finding(
                 "turned_board",
-                f"In {view_words(views)} {short} in its plane, about "
-                f"({centre[0]:.1f}, {centre[1]:.1f}) mm. They were left out.",
-                mending("it is turned back", f"--turned {ranges(views)}:{about}"),
+                f"In {view_words(views)} {short} {where} {point}. They were left out.",
+                mending(back, f"--turned {ranges(views)}:{about}"),
                 views,
             ),
             short,
         )
+
+
+def _squares_on(marks: FloatArray, shifts: FloatArray) -> tuple[Mask, FloatArray]:
+    """(k,) mask of (k, 2) shifts in a board's plane that are by the same squares, and this shift.
+
+    It brings most of the (n, 3) marks onto others.
+    """
+    between = (marks[:, None] - marks).reshape(-1, 3)[:, :2]
+    steps, counts = np.unique(np.round(between, 6), axis=0, return_counts=True)
+    steps = steps[(counts > 0.5 * len(marks)) & np.any(steps != 0.0, axis=1)]
+    if not len(steps):
+        return np.zeros(len(shifts), dtype=bool), np.zeros(2)
+    near_m = 0.2 * float(np.linalg.norm(steps, axis=1).min())
+    near = np.linalg.norm(shifts[:, None] - steps, axis=2) < near_m
+    most = int(near.sum(axis=0).argmax())
+    return np.asarray(near[:, most]), np.asarray(steps[most])
 
 
 def _shifted(

@@ -613,7 +613,8 @@ def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -
     Args:
         session: A session of measured poses or corners.
         views: Their numbers.
-        turn: Angle in the board's plane [deg], and the point about which it turns [mm].
+        turn: Angle in the board's plane [deg], and the point about which it turns [mm]; of no
+            angle, the shift in that plane [mm].
 
     Raises:
         DataError: There are no such views, or corners are none of the board's once turned.
@@ -622,7 +623,7 @@ def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -
     degrees, *centre = turn
     rotation = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     middle = 1e-3 * np.array([*centre, 0.0])
-    right_from_read = compose(rotation, middle - rotation @ middle)
+    right_from_read = compose(rotation, middle - (rotation @ middle if degrees else 0.0))
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     numbers = numbers_in(session, MEASURED_CAM_POSE)
     poses, is_turned = numbers.poses(), [view.number in chosen for view in session.views]
@@ -639,7 +640,8 @@ def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -
             away = np.linalg.norm(turned[:, None] - points, axis=-1)
             ids[own] = away.argmin(axis=1)
         corners = replace(corners, points=ids)
-    note = f"the board was turned back by {degrees:g} deg in views {ranges(chosen)}"
+    by = f"{degrees:g} deg" if degrees else "({:g}, {:g}) mm".format(*centre)
+    note = f"the board was turned back by {by} in views {ranges(chosen)}"
     return _with_cells(session, cells, note, corners=corners)
 
 
