@@ -304,6 +304,7 @@ ARM_FORMATS = ("robot-urdf", "robot-dh", "ur-kinematics", "robot-json")
 READERS = {
     "ros": ros,
     "ros-launch": launch,
+    "moveit": launch,
     "easy-handeye": easy_handeye,
     "easy-handeye2": ros,
     "urdf": urdf,

@@ -306,6 +306,12 @@ ROS_FORMATS = (
         write_all=_write_launch,
     ),
     _ROS_FORMAT(
+        "moveit",
+        "the launch file that MoveIt's hand-eye calibration writes, as ros-launch [m, quaternion]",
+        lambda content: _write_launch([content]),
+        write_all=_write_launch,
+    ),
+    _ROS_FORMAT(
         "easy-handeye",
         "a calibration of ROS 1's easy_handeye, YAML [m, quaternion x, y, z, w]",
         partial(_write_easy_handeye, 1),
