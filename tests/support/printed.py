@@ -12,8 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal import Session
+from visioncal.core.types import Target
 from visioncal.simulation import CAMERAS, CellOptions, simulate
-from visioncal.vision.targets import load_target
+from visioncal.vision.targets import extent_m, load_target
 
 SAMPLES = 3
 
@@ -223,17 +224,22 @@ def _inside(points, polygon):
     return (cross >= 0).all(axis=1) | (cross <= 0).all(axis=1)
 
 
-def photographed_cell(picture, described, views, seed=6, covered=0.0, **cell):
-    """A simulated cell's session whose board is a picture with its .toml, and the cell."""
+def photographed_cell(picture, described, views, seed=6, covered=0.0, paper_m=0.0, **cell):
+    """A simulated cell's session whose board is a picture, and the cell.
+
+    `described` is the target or its .toml; `paper_m` of the picture are around what it states.
+    """
     wide = CAMERAS["wide"]
     # A quarter of the pixels.
     camera = replace(wide, resolution=(640, 400), matrix=wide.matrix / 2)
-    target = load_target(described)
+    target = described if isinstance(described, Target) else load_target(described)
     options = CellOptions(views=views, seed=seed, target=target, camera=camera, **cell)
     simulated = simulate(options)
+    width_m = float(np.ptp(extent_m(target), axis=0)[0]) + 2 * paper_m
     images = [
         photographed(
-            picture, target.square_m, camera, pose, Look(covered=covered * (at % 2)), at
+            picture, width_m, camera, pose, Look(covered=covered * (at % 2)), at,
+            (-paper_m, -paper_m),
         )
         for at, pose in enumerate(simulated.cam_from_target)
     ]  # fmt: skip

@@ -100,7 +100,7 @@ def _corners(
         return None
     seen, level = found.seen, found.look.level
     motion_px = moved_px(level.camera, drawn, seen)
-    width_px = np.sqrt(seen.gauss_px**2 + seen.disc_px**2 / 4 + motion_px**2 / 12)
+    width_px = np.hypot(seen.blur_px, motion_px / np.sqrt(12))
     depth_m = drawn.middle_at(seen.cam_from_target)[2]
     motion_m = motion_px * depth_m / (level.camera.matrix[:2].mean() + sum(seen.lens[:1]))
     return DenseCorners(ids, px, sigma_px, float(width_px), motion_px, float(motion_m))

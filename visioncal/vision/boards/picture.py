@@ -35,15 +35,17 @@ if TYPE_CHECKING:
 
 # Longest side of a picture that is kept [px]: a camera resolves no more of a print in its view.
 _LONGEST_PX = 1600
-# Number of patches, features, and features that agree where the picture is seen.
-_PATCHES, _FEATURES, _FEWEST = 120, 2500, 14
+# Number of patches, features of an image and of the picture itself, whose clearest are finer than
+# an image shows, and features that agree where the picture is seen: twice those of a homography.
+_PATCHES, _FEATURES, _OWN_FEATURES, _FEWEST = 120, 2500, 20_000, 8
 # Long side of images that are searched, and pixels of a print that are registered.
 _SEARCHED_PX, _REGISTERED = 1000, 3e5
 # Correlation of a picture with itself, turned or shifted, from which on it looks the same, and the
 # least spread of its grey levels.
 _SAME, _PLAIN = 0.9, 4.0
-# Least share of the image's variance that a picture explains.
-_EXPLAINED = 0.8
+# Least share of the image's variance that a picture explains, and blur from which on its shape is
+# sought [px].
+_EXPLAINED, _BLURRED_PX = 0.8, 1.5
 
 
 @dataclass(frozen=True)
@@ -151,14 +153,13 @@ class Picture(BoardKind):
         area = cv2.contourArea(ends.astype(np.float32))
         lens, pose = started(*start, usual_lens(image))
         factor = max(1, round(float(np.sqrt(area / _REGISTERED))))
-        found = register(
-            image,
-            print_,
-            lens,
-            Seen(pose),
-            lens_sigma=usual_sigma(lens),
-            factors=(2 * factor, factor),
-        )
+        factors, sigma, found = (2 * factor, factor), usual_sigma(lens), None
+        for rough in (False, True):
+            # Of wide blurs the shape counts.
+            if found is None or found.seen.gauss_px > _BLURRED_PX * factor:
+                found = register(
+                    image, print_, lens, Seen(pose), lens_sigma=sigma, factors=factors, rough=rough
+                )
         if found is None or found.explained < _EXPLAINED:
             return NotFound("the picture is another one: features agree, and all pixels do not")
         half_m = 0.5 * target.square_m / target.columns
@@ -166,10 +167,9 @@ class Picture(BoardKind):
         if len(ids) < self.fewest:
             return NotFound(f"too little of the picture is free: {len(ids)} patches of it")
         weights = float(np.median(sigma_px)) / sigma_px
-        # A patch of less than half the usual information is known along one direction alone, which
-        # no weight says: lens and noise suffer by more than it tells.
-        clear = weights**2 > 0.5
-        return DetectedCorners(ids[clear], px[clear], weights[clear], blur_px=found.seen.gauss_px)
+        # What tells little of its place is off by errors of the model, which no weight says.
+        clear = weights**2 > 0.2
+        return DetectedCorners(ids[clear], px[clear], weights[clear], blur_px=found.seen.blur_px)
 
 
 def kept_picture(path: Path) -> str:
@@ -251,10 +251,10 @@ class _Known:
         return np.asarray(flat, float), np.pad(places, ((0, 0), (0, 1)))[near], px[near]
 
 
-def features_of(grey: Image) -> Features:
-    """Features of a (h, w) image, found in a reduced copy where it is large."""
+def features_of(grey: Image, most: int = _FEATURES) -> Features:
+    """The clearest features of a (h, w) image, found in a reduced copy where it is large."""
     shrink = min(1.0, _SEARCHED_PX / max(grey.shape))
-    points, described = cv2.SIFT.create(nfeatures=_FEATURES).detectAndCompute(
+    points, described = cv2.SIFT.create(nfeatures=most).detectAndCompute(
         _shrunk(grey, shrink), None
     )
     described = np.zeros((0, 128)) if described is None else described
@@ -271,7 +271,7 @@ def _known(target: PictureTarget) -> _Known:
 
     grey = Picture().picture(target)
     assert grey is not None
-    features = features_of(grey)
+    features = features_of(grey, _OWN_FEATURES)
     return _Known(Print.of_picture(grey, target.square_m), features, unfit(grey, len(features.px)))
 
 

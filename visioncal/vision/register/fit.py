@@ -53,6 +53,19 @@ class Look:
         inside = ((at > rim) & (at < (self.flat.size_m - rim)[:, None, None])).all(axis=0)
         return np.asarray(inside & self.level.is_sound, np.float32).ravel()
 
+    @cached_property
+    def by_px(self) -> Pixels:
+        """(2, n) derivatives of the image by a shift of this level's pixels along u and v.
+
+        Differences of the light would miss a part of what is finest.
+        """
+        by_place = -np.tensordot(
+            self.seen.cam_from_target[:3, :2].T.astype(np.float32), self.drawn.slopes[:3], 1
+        )
+        moved = (np.gradient(self.drawn.places_m, axis=axis) for axis in (2, 1))
+        slopes = np.stack([np.sum(by_place * one, axis=0) for one in moved])
+        return np.asarray(slopes.reshape(2, -1) * self.gain, np.float32)
+
     @property
     def cost(self) -> float:
         """Weighted sum of squares, and those of what is known before."""
@@ -186,9 +199,8 @@ class Fitter:
         if taken.sum() < _FEWEST:
             return look
         noise = max(1.4826 * float(np.median(np.abs(look.residuals[taken]))), _LEAST_NOISE)
-        gy, gx = np.gradient((look.gain * look.drawn.light.ravel()).reshape(shape))
         known = noise**2 + (self.misfit * float(np.median(look.gain))) ** 2
-        allowed = 4 * known + slack_px**2 * (gx**2 + gy**2).ravel()
+        allowed = 4 * known + slack_px**2 * np.sum(look.by_px**2, axis=0)
         side = (5, 5) if self.level.factor > 2 else (7, 7)
         squares, inside = look.residuals**2 / allowed * look.inside, look.inside.reshape(shape)
         local = cv2.blur(squares.reshape(shape), side) / np.maximum(cv2.blur(inside, side), 0.05)

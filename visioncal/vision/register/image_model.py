@@ -100,6 +100,11 @@ class Seen:
     # (l,) changes of fx = fy together, cx, cy and the first l - 3 coefficients of the lens.
     lens: FloatArray = field(default_factory=lambda: np.zeros(0))
 
+    @property
+    def blur_px(self) -> float:
+        """The isotropic blur as a Gaussian's sigma [px]."""
+        return float(np.hypot(self.gauss_px, self.disc_px / 2))
+
     def moved(self, step: FloatArray, moving: bool) -> Self:
         """After a step along pose (6), blur (1 or 2), twist (6 if moving) and lens."""
         pose, at = self.cam_from_target, 7 + (self.disc_px > 0.0)
