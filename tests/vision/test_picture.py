@@ -1,6 +1,10 @@
 """Pictures as targets: found, refused in words, printed and kept."""
 
+import io
+import json
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -138,6 +142,37 @@ def test_small_prints_of_alike_letters_are_found(tmp_path):
     for pose in cell.cam_from_target[[1, 6]]:
         image = photographed(label(), 0.3, CAMERA, pose)
         assert len(find_target(image, small).ids) > 50
+
+
+def test_a_guard_and_locate_look_for_the_picture_in_images(target, tmp_path, monkeypatch):
+    session, cell = photographed_cell(poster(), target, 8, seed=0)
+    monkeypatch.chdir(tmp_path)
+    calibrate(session).save(Path("calibration.json"))
+    for view in session.views:
+        Path(f"{view.number}.png").write_bytes(session.images.read(view.image))
+    cv2.imwrite("label.png", label())
+
+    def judged(pushed_m):
+        pushed = np.eye(4)
+        pushed[:3, 3] = 0.0, 0.0, pushed_m
+        lines = [
+            json.dumps({"time_s": at, "base_from_flange": (pose @ pushed).tolist(),
+                        "image": f"{view.number}.png"})
+            for at, (view, pose) in enumerate(
+                zip(session.views, cell.robot.base_from_flange, strict=True))
+        ]  # fmt: skip
+        lines.append('{"time_s": 99, "image": "label.png"}')
+        typed = "\n".join(lines).encode()
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(typed)))
+        done = visioncal("guard", "--against", ".")
+        return done.status, [json.loads(line) for line in done.out.splitlines()]
+
+    status, answers = judged(0.0)
+    assert status == 2
+    assert all(answer["holds"] for answer in answers[:-1])
+    assert "label.png: the picture is not seen" in answers[-1]["error"]["message"]
+    status, answers = judged(0.003)
+    assert (status, answers[-2]["holds"]) == (3, False)
 
 
 def test_other_pictures_are_not_found_and_mirrored_ones_are_named(target):

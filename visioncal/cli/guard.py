@@ -3,7 +3,7 @@
 import json
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from io import TextIOWrapper
 from pathlib import Path
@@ -13,18 +13,20 @@ import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
+from visioncal.calibration.stages.detect import corners_in
 from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, say
 from visioncal.cli.result_options import GuardOptions
 from visioncal.core.documents.jsons import parse_json, parse_stored
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import MOST_BYTES, read_text, write_atomically
 from visioncal.core.transforms import compose
-from visioncal.core.types import Corners, FloatArray
+from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
 from visioncal.session import Session
 from visioncal.verification.guard import Guard, Look
 from visioncal.verification.scene_guard import scene_looks
+from visioncal.vision.boards import NotFound
 from visioncal.vision.boards.imaging import read_image
 
 
@@ -116,13 +118,15 @@ def _answers(guard: Guard) -> Iterator[dict[str, Any]]:
                 guard.acknowledge()
                 yield {"acknowledged": True}
             else:
-                yield guard.update(_look(document)).document
+                yield guard.update(_look(document, guard.prior.targets)).document
         except VisioncalError as error:
             yield {"error": {"message": f"line {number}: {error.message}", "next": error.next_step}}
 
 
-def _look(document: dict[str, Any]) -> Look:
+def _look(document: dict[str, Any], targets: Mapping[str, Target]) -> Look:
     """A look of a line's JSON object, in which null is as good as absent.
+
+    In an image that it names, the target is looked for.
 
     Raises:
         DataError: It has other keys or values.
@@ -144,7 +148,26 @@ def _look(document: dict[str, Any]) -> Look:
         except (TypeError, ValueError):
             words = f"the look's {key} is {json.dumps(value)[:60]}; it has to be {needed}."
             raise DataError(words, culprits=[key]) from None
+    if "image" in content:
+        content |= {"corners": _found(content.pop("image"), content, targets)}
     return Look(**content)
+
+
+def _found(path: Path, content: Mapping[str, Any], targets: Mapping[str, Target]) -> Corners:
+    if "corners" in content:
+        raise DataError("the look has image and corners; one of both is needed.")
+    names = [content["target"]] if "target" in content else list(targets)
+    if len(names) != 1 or names[0] not in targets:
+        known = ", ".join(filter(None, targets)) or "none, or one without a name"
+        raise DataError(
+            f"the look's image shows one of the targets calibrated with, which are {known}.",
+            culprits=["target"],
+            next_step="Name it as target; where there is none, send cam_from_target.",
+        )
+    found = corners_in(read_image(path), targets[names[0]])
+    if isinstance(found, NotFound):
+        raise DataError(f"{path}: {found.reason}.", culprits=["image"])
+    return found
 
 
 def _pose(value: Any) -> FloatArray:  # noqa: ANN401 - of JSON
@@ -169,6 +192,7 @@ _KEYS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "base_from_flange": _A_POSE,
     "cam_from_target": _A_POSE,
     "corners": (_corners, "a list of [number, x, y] in pixels, each whole number once"),
+    "image": (Path, "the path of an image"),
     "joints_rad": (_numbers, "a list of radians"),
     "target": (str, "a name"),
 }

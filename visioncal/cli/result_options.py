@@ -173,10 +173,11 @@ class GuardOptions(PartOptions):
     """Say after each look of a working cell whether its calibration still holds.
 
     Looks come as JSON lines on stdin; each is answered by a JSON line. A line has time_s,
-    base_from_flange, cam_from_target or corners, joints_rad where the arm was calibrated, and
-    target where there are several; acknowledge: true ends an alarm. With --scene a look is an image
-    of the standing cell at a pose that the session shows again. Exit status 0: it holds; 3: it
-    does not; 2: a look could not be used, and the others are no reason to doubt.
+    base_from_flange, cam_from_target or corners or the path of an image, joints_rad where the arm
+    was calibrated, and target where there are several; acknowledge: true ends an alarm. With
+    --scene a look is an image of the standing cell at a pose that the session shows again. Exit
+    status 0: it holds; 3: it does not; 2: a look could not be used, and the others are no reason to
+    doubt.
     """
 
     first: ClassVar = "against state scene _example"

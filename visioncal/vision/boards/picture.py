@@ -137,18 +137,24 @@ class Picture(BoardKind):
 
     def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
         """Places of its patches in a (h, w) grey image, or why it is not found."""
-        from visioncal.vision.patches import places_of, started, usual_lens, usual_sigma
-        from visioncal.vision.register.fit import register
-        from visioncal.vision.register.image_model import Seen
-
         picture = _known(cast("PictureTarget", target))
         if picture.unfit:
             return NotFound(f"the picture {picture.unfit}")
         start = picture.matched(image)
-        if isinstance(start, str):
-            turned = picture.matched(np.ascontiguousarray(image[:, ::-1]))
-            return NotFound(start if isinstance(turned, str) else "the picture is seen mirrored")
-        print_ = picture.print_
+        found = start if isinstance(start, str) else self._registered(image, target, start)
+        if isinstance(found, DetectedCorners):
+            return found
+        turned = picture.matched(np.ascontiguousarray(image[:, ::-1]))
+        return NotFound(found if isinstance(turned, str) else "the picture is seen mirrored")
+
+    def _registered(
+        self, image: Image, target: Target, start: tuple[FloatArray, FloatArray, FloatArray]
+    ) -> DetectedCorners | str:
+        from visioncal.vision.patches import places_of, started, usual_lens, usual_sigma
+        from visioncal.vision.register.fit import register
+        from visioncal.vision.register.image_model import Seen
+
+        print_ = _known(cast("PictureTarget", target)).print_
         ends = cv2.perspectiveTransform(print_.outline_m[None, :, :2], start[0])
         area = cv2.contourArea(ends.astype(np.float32))
         lens, pose = started(*start, usual_lens(image))
@@ -161,11 +167,11 @@ class Picture(BoardKind):
                     image, print_, lens, Seen(pose), lens_sigma=sigma, factors=factors, rough=rough
                 )
         if found is None or found.explained < _EXPLAINED:
-            return NotFound("the picture is another one: features agree, and all pixels do not")
+            return "the picture is another one: features agree, and all pixels do not"
         half_m = 0.5 * target.square_m / target.columns
         ids, px, sigma_px = places_of(found, self.corners(target), half_m)
         if len(ids) < self.fewest:
-            return NotFound(f"too little of the picture is free: {len(ids)} patches of it")
+            return f"too little of the picture is free: {len(ids)} patches of it"
         weights = float(np.median(sigma_px)) / sigma_px
         # What tells little of its place is off by errors of the model, which no weight says.
         clear = weights**2 > 0.2

@@ -187,7 +187,9 @@ class Fitter:
         goal = (rooted @ (root * image)).astype(float)
         solved = np.linalg.solve(normal, goal).astype(np.float32)
         gain = solved[:9] @ level.nodes + 2 * solved[18] * light
-        return replace(blank, gain=gain, residuals=image - solved @ terms, weights=weights)
+        # Light that few pixels determine is anything where it is not seen.
+        residuals = np.clip(image - solved @ terms, -1e3, 1e3)
+        return replace(blank, gain=gain, residuals=residuals, weights=weights)
 
     def weighed(self, look: Look, slack_px: float) -> Look:
         """With weights by the residuals: of what covers the print, and of single pixels.
