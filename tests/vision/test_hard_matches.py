@@ -7,11 +7,14 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
+from support.commands import visioncal
 from support.printed import poster
 
+from visioncal.core.errors import DataError
+from visioncal.vision import hard_matches as matching
 from visioncal.vision.boards import picture
 from visioncal.vision.boards.picture import features_of
-from visioncal.vision.hard_matches import hard_matches, is_installed, light_glue
+from visioncal.vision.hard_matches import hard_matches, is_installed, light_glue, weights_in
 from visioncal.vision.register.image_model import Print
 
 needs_kornia = pytest.mark.skipif(not is_installed(), reason="kornia is not installed")
@@ -70,9 +73,45 @@ def test_weights_in_the_cache_are_used_and_others_refused(tmp_path, monkeypatch)
     grey = poster(size=(400, 300))
     ways = list(hard_matches(features_of(grey), features_of(grey)))
     assert [way.shape[1] for way in ways] == [2, 2]
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "none"))
+    assert len(list(hard_matches(features_of(grey), features_of(grey)))) == 1
+    with weights_in(folder):
+        assert len(list(hard_matches(features_of(grey), features_of(grey)))) == 2
     torch.save({"transformers.0.self_attn.Wqkv.weight": torch.zeros(3, 3)}, file)
-    with pytest.raises((ValueError, RuntimeError)):
+    with pytest.raises(DataError, match="does not have the weights"):
         light_glue(file)
+    file.write_bytes(b"no weights")
+    with pytest.raises(DataError, match="does not have the weights"):
+        light_glue(file)
+
+
+def test_weights_are_looked_for_where_they_are_named_and_nowhere_else(tmp_path, monkeypatch):
+    monkeypatch.setattr(matching, "is_installed", lambda: False)
+    with pytest.raises(DataError, match="kornia's, which is not installed"), weights_in(tmp_path):
+        pass
+    monkeypatch.setattr(matching, "is_installed", lambda: True)
+    with pytest.raises(DataError, match="has no file sift_lightglue"), weights_in(tmp_path):
+        pass
+    (tmp_path / "sift_lightglue.pth").touch()
+    with weights_in(tmp_path):
+        assert tmp_path in matching._FOLDERS
+    assert not matching._FOLDERS
+    with weights_in(None):
+        assert not matching._FOLDERS
+
+
+def test_calibrate_and_locate_take_a_folder_of_weights(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(matching, "is_installed", lambda: True)
+    visioncal("simulate", "cell", "--views", 10, "--seed", 1, "--no-images")
+    calibrated = ("calibrate", "cell", "-o", "out", "--no-report", "--no-recording")
+    assert visioncal(*calibrated).status == 0
+    cv2.imwrite("photo.png", poster())
+    located = ("locate", "photo.png", "-c", "out", "--target", "charuco_9x6_30mm", "--force")
+    for command in (calibrated, located):
+        refused = visioncal(*command, "--weights", "nowhere")
+        assert refused.status == 2
+        assert "nowhere has no file sift_lightglue" in refused.err
 
 
 def test_a_picture_is_found_by_other_matches_where_its_own_fail(monkeypatch):

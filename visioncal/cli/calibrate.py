@@ -18,6 +18,7 @@ from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import frames_to_keep, load_calibration
 from visioncal.results.history import entries_of
 from visioncal.session import Session
+from visioncal.vision.hard_matches import weights_in
 
 
 def calibrate_command(options: CalibrateOptions) -> None:
@@ -42,7 +43,8 @@ def calibrate_command(options: CalibrateOptions) -> None:
     )
     left = frames_to_keep(options.out)
     with with_run_paths(session, options.out), shown_progress(quiet=options.as_json) as progress:
-        result = run(loaded, **(asked | {"progress": progress}))
+        with weights_in(options.weights):
+            result = run(loaded, **(asked | {"progress": progress}))
         progress("write", 0, 1)
         typed = need_options(options.need_mm, options.need_deg, corrected=options.corrected)
         if options.views is not None:

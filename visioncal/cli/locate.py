@@ -34,6 +34,7 @@ from visioncal.results.selecting import targets_fixed_to_base
 from visioncal.session import Session, View
 from visioncal.session.selecting import EYE, Choice, has_several, select
 from visioncal.vision.boards.imaging import read_image
+from visioncal.vision.hard_matches import weights_in
 from visioncal.vision.targets import target_from_document
 
 _LEAD = "base_from_"
@@ -79,10 +80,11 @@ def locate_command(options: LocateOptions) -> None:
         refuse_given(needless, "it is for --pixel")
         origin_m = np.array(options.point or np.zeros(3))
         other_target = None if target is None else _target(target, result)
-        if session is not None:
-            points = _by_views(options, session, calibrated, other_target, origin_m)
-        else:
-            points = _by_image(options, calibrated, other_target, origin_m, flange)
+        with weights_in(options.weights):
+            if session is not None:
+                points = _by_views(options, session, calibrated, other_target, origin_m)
+            else:
+                points = _by_image(options, calibrated, other_target, origin_m, flange)
     _report(points, as_json=options.as_json)
 
 

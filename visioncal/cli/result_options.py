@@ -87,6 +87,10 @@ class CalibrateOptions(NeedOptions, WorkOptions, ActOptions):
     )
     corrected: bool = flag("Targets are sent corrected (visioncal correct), and judged so.")
     dense: bool = flag("Fit the board to all pixels of images that are too blurred for corners.")
+    weights: Path | None = option(
+        "Weights of LightGlue for SIFT, for pictures that are hard to find (extra kornia).",
+        metavar="FOLDER",
+    )
     as_json: bool = json_flag()
     verbose: bool = flag("Also show every solver's result.", "-v", "--verbose")
 
@@ -487,6 +491,10 @@ class LocateOptions:
     )
     robot_form: str | None = form_option()
     sigma_px: float | None = option("Noise of a feature; else that of the corners.")
+    weights: Path | None = option(
+        "Weights of LightGlue for SIFT, for pictures that are hard to find (extra kornia).",
+        metavar="FOLDER",
+    )
     force: bool = force_bad()
     as_json: bool = json_flag()
     _example: bool = example_flag("locate")

@@ -1,11 +1,13 @@
 """Matches of features where a ratio test fails, by kornia (extra `kornia`), on a GPU if present.
 
 AdaLAM (Cavalli et al. 2020) keeps matches whose neighbours move alike and needs no weights.
-LightGlue (Lindenberger et al. 2023) is used where its weights for SIFT lie in torch's own cache,
-and never fetched. Nothing else imports kornia or torch.
+LightGlue (Lindenberger et al. 2023) is used where its weights for SIFT lie in a folder of
+`weights_in` or in torch's own cache, and never fetched. Nothing else imports kornia or torch.
 """
 
+import pickle
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,11 +16,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from kornia.feature import LightGlue
     from torch import Tensor
+
+# Names that kornia and the authors give to the weights for SIFT.
+_NAMES = ("sift_lightglue_v0-1_arxiv-pth", "sift_lightglue.pth")
+# Folders of weights that are looked into before torch's cache, in all threads.
+_FOLDERS: list[Path] = []
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +43,35 @@ class Features:
 def is_installed() -> bool:
     """Whether the extra `kornia` is."""
     return find_spec("kornia") is not None
+
+
+@contextmanager
+def weights_in(folder: Path | None) -> Iterator[None]:
+    """Looks for weights of LightGlue in a folder, too, while the context lasts; None for none.
+
+    Raises:
+        DataError: The extra is not installed, or the folder has no weights for SIFT.
+    """
+    if folder is None:
+        yield
+        return
+    if not is_installed():
+        raise DataError(
+            "--weights: LightGlue is kornia's, which is not installed.",
+            culprits=["--weights"],
+            next_step="Install visioncal[kornia].",
+        )
+    if not any((folder / name).is_file() for name in _NAMES):
+        raise DataError(
+            f"--weights: {folder} has no file {' or '.join(_NAMES)}.",
+            culprits=["--weights"],
+            next_step="Put the weights of LightGlue for SIFT there; nothing is fetched.",
+        )
+    _FOLDERS.append(folder)
+    try:
+        yield
+    finally:
+        _FOLDERS.remove(folder)
 
 
 def hard_matches(seen: Features, known: Features) -> Iterator[IntArray]:
@@ -60,36 +97,40 @@ def hard_matches(seen: Features, known: Features) -> Iterator[IntArray]:
     with torch.inference_mode():
         _, pairs = match_adalam(*described, *frames, hw1=seen.shape, hw2=known.shape)
         yield pairs.cpu().numpy()
-        weights = Path(torch.hub.get_dir(), "checkpoints")
-        # Under the names that kornia and the authors give it.
-        for name in ("sift_lightglue_v0-1_arxiv-pth", "sift_lightglue.pth"):
-            if (weights / name).is_file():
-                matcher = light_glue(weights / name).to(device)
-                images = [
-                    {
-                        "keypoints": tensor(one.px)[None],
-                        "descriptors": vectors[None],
-                        "scales": tensor(one.size_px)[None],
-                        "oris": tensor(np.deg2rad(one.angle_deg))[None],
-                        "image_size": tensor(np.array(one.shape[::-1], float))[None],
-                    }
-                    for one, vectors in zip(both, described, strict=True)
-                ]
-                found = matcher({"image0": images[0], "image1": images[1]})
-                yield found["matches"][0].cpu().numpy()
-                return
+        folders = (*_FOLDERS, Path(torch.hub.get_dir(), "checkpoints"))
+        files = (folder / name for folder in folders for name in _NAMES)
+        weights = next((file for file in files if file.is_file()), None)
+        if weights is None:
+            return
+        matcher = light_glue(weights).to(device)
+        images = [
+            {
+                "keypoints": tensor(one.px)[None],
+                "descriptors": vectors[None],
+                "scales": tensor(one.size_px)[None],
+                "oris": tensor(np.deg2rad(one.angle_deg))[None],
+                "image_size": tensor(np.array(one.shape[::-1], float))[None],
+            }
+            for one, vectors in zip(both, described, strict=True)
+        ]
+        found = matcher({"image0": images[0], "image1": images[1]})
+        yield found["matches"][0].cpu().numpy()
 
 
 def light_glue(weights: Path) -> "LightGlue":
     """LightGlue for SIFT with weights from a file, whose sizes are those of the network.
 
     Raises:
-        ValueError: The weights are those of another network.
+        DataError: The file cannot be read, or has the weights of another network.
     """
     import torch
     from kornia.feature import LightGlue
 
-    state = torch.load(str(weights), map_location="cpu", weights_only=True)
+    other = DataError(f"{weights} does not have the weights of LightGlue for SIFT.")
+    try:
+        state = torch.load(str(weights), map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise other from error
     # The authors' older names: self_attn.3. in place of transformers.3.self_attn.
     state = {
         f"transformers.{name.split('.')[1]}.{name.split('.')[0]}.{name.split('.', 2)[2]}"
@@ -106,7 +147,10 @@ def light_glue(weights: Path) -> "LightGlue":
         add_scale_ori=True,
         n_layers=max(len(layers), 1),
     )
-    missing = set(network.load_state_dict(state, strict=False).missing_keys)
+    try:
+        missing = set(network.load_state_dict(state, strict=False).missing_keys)
+    except RuntimeError as error:
+        raise other from error
     if missing & {name for name, _ in network.named_parameters()}:
-        raise ValueError(f"{weights} are not the weights of LightGlue for SIFT.")
+        raise other
     return network.eval()

@@ -173,7 +173,7 @@ class Picture(BoardKind):
         if len(ids) < self.fewest:
             return f"too little of the picture is free: {len(ids)} patches of it"
         weights = float(np.median(sigma_px)) / sigma_px
-        # What tells little of its place is off by errors of the model, which no weight says.
+        # Patches that tell little of their place err by the model, which no weight says.
         clear = weights**2 > 0.2
         return DetectedCorners(ids[clear], px[clear], weights[clear], blur_px=found.seen.blur_px)
 
