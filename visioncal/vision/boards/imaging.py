@@ -120,6 +120,9 @@ def encode_png(image: Image | Image16) -> bytes:
 
 def shrunk(image: Image, factor: int) -> Image:
     """A (h, w) image reduced by a whole factor; rows and columns that are left over are cut off."""
+    # OpenCV halves an image four times as fast as it reduces it by any other factor.
+    if factor % 4 == 0:
+        return shrunk(shrunk(image, 2), factor // 2)
     height, width = (factor * (side // factor) for side in image.shape)
     size = (width // factor, height // factor)
     small = cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA)
