@@ -101,7 +101,7 @@ class _Page:
                 value = getattr(setup, name)
                 field = ui.input(label, value=value, autocomplete=[*choices]).classes("w-full")
                 # Names of folders are data: `props()` would parse them, and run what they say.
-                field.props("clearable").props["hint"] = ", ".join(choices)
+                field.props("clearable hide-bottom-space").props["hint"] = ", ".join(choices)
                 self._inputs[name] = field
             ui.button("Start", on_click=self._begin)
         self._outcome = ui.card().classes("w-full gap-1")
