@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert
 from visioncal.estimation.workspace import postures
-from visioncal.robot import Robot
+from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
 from visioncal.session.document import InstrumentTable
@@ -274,21 +274,21 @@ def test_a_joint_that_slips_between_readings_is_named():
 
 
 def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
-    joint = {"a_m": 0.4, "d_m": 0.1, "alpha_rad": 0.0}
-    model = {"schema": 1, "name": "scara", "convention": "standard", "joint": [joint] * 3}
+    scara = load_robot("generic-scara-600")
     rng, place = np.random.default_rng(1), np.array([0.06, 0.02, 0.05, 1.0])
-    q = rng.uniform(-1.5, 1.5, (20, 3))
+    q = rng.uniform(scara.lower_rad, scara.upper_rad, (20, 4))
     instrument_from_base = invert(exp(np.array([0.1, -0.2, 2.5, 2.5, -1.0, 0.4])))
-    read = instrument_from_base @ Robot.from_document(model).base_from_flange(q) @ place
+    read = instrument_from_base @ scara.base_from_flange(q) @ place
     read[:, :3] += 2e-5 * rng.normal(size=(20, 3))
-    columns = ["view", "q1_rad", "q2_rad", "q3_rad", "meas_x_m", "meas_y_m", "meas_z_m"]
+    columns = ["view", "q1_rad", "q2_rad", "q3_rad", "q4_rad", "meas_x_m", "meas_y_m", "meas_z_m"]
     numbers = np.hstack([q, read[:, :3]]).tolist()
     rows = [[str(at), *map(repr, row)] for at, row in enumerate(numbers)]
 
     def session(**more):
-        document = {"schema": 1, "name": "scara", "robot": {"model": "arm.toml"}, **more}
+        document = {"schema": 1, "name": "scara", "robot": {"model": scara.name}, **more}
         document["instrument"] = {"sigma_m": 2e-5}
-        return Session.assemble(document, columns, rows, MemoryImages({}), robot_document=model)
+        images = MemoryImages({})
+        return Session.assemble(document, columns, rows, images, robot_document=scara.document)
 
     with pytest.raises(DegenerateError) as refused:
         calibrate(session())

@@ -27,7 +27,7 @@ from visioncal.planning.path import order_stops
 from visioncal.planning.purposes import PURPOSES, Purpose
 from visioncal.planning.recorded import SessionStart, start_from_session
 from visioncal.planning.visibility import FieldOfView
-from visioncal.robot import Robot, load_robot
+from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.simulation.arms import arm_named, forward
 from visioncal.simulation.boards import Sheet, centre_m, outline_m
@@ -416,16 +416,7 @@ def _before_the_fold(camera, points):
 
 
 def test_an_arm_of_four_joints_finds_its_views_by_drawing_postures():
-    turns = {"alpha_rad": 0.0, "d_m": 0.0, "lower_deg": -150, "upper_deg": 150}
-    slides = {"type": "prismatic", "alpha_rad": 0.0, "d_m": 0.0, "lower_m": 0.0, "upper_m": 0.2}
-    rows = [
-        turns | {"name": "j1", "a_m": 0.35, "d_m": 0.4},
-        turns | {"name": "j2", "a_m": 0.3, "alpha_rad": np.pi},
-        slides | {"name": "z", "a_m": 0.0},
-        turns | {"name": "j4", "a_m": 0.0},
-    ]
-    document = {"schema": 1, "name": "scara", "convention": "standard", "joint": rows}
-    scara = Robot.from_document(document)
+    scara = load_robot("generic-scara-600")
     board = compose(np.diag([1.0, -1.0, -1.0]), np.array([0.4, 0.1, -0.25]))
     aside = compose(np.eye(3), np.array([0.06, 0.0, 0.0]))
     limits = Limits(floor_m=-0.26, joint_margin_rad=0.01)

@@ -68,8 +68,9 @@ def dh_product(document, q):
     """The textbook's product of a DH table, row by row."""
     result = given(document.get("base"))
     for row, angle in zip(document["joint"], q, strict=True):
-        theta = row.get("theta_offset_rad", 0.0) + angle
-        about_z = transform(rz(theta), [0.0, 0.0, row["d_m"]])
+        slides = row.get("type") == "prismatic"
+        theta = row.get("theta_offset_rad", 0.0) + (0.0 if slides else angle)
+        about_z = transform(rz(theta), [0.0, 0.0, row["d_m"] + (angle if slides else 0.0)])
         along_x = transform(rx(row["alpha_rad"]), [row["a_m"], 0.0, 0.0])
         if document["convention"] == "modified":
             result = result @ along_x @ about_z
@@ -198,6 +199,7 @@ _AT_ZERO = {
     # A Panda upright: 0.333 + 0.316 + 0.384 - 0.107 high, 0.088 to the front.
     "panda": (88, 0, 926),
     "irb120": (374, 0, 630),
+    "generic-scara-600": (600, 0, 350),
     "ur20": (-1590.7, -355.3, 77),
     "ur30": (-1140.7, -355.3, 77),
 }
