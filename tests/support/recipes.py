@@ -1,13 +1,16 @@
 """Reads pages, and runs what they show in the current folder as their readers would."""
 
+import os
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from support.commands import visioncal
+from support.commands import Done, visioncal
 
 FOLDER = Path(__file__).parents[1] / "cookbook"
 BLOCK = re.compile(r"^```(\w+) ?(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -37,9 +40,9 @@ def command_lines(text: str) -> Iterator[list[str]]:
 def run(page: Path) -> None:
     """Runs a page in the current folder.
 
-    A block with a name is written under it, `sh` blocks hold visioncal's commands, `python`
-    blocks share their names. An `expect` block is what the commands before it print, `...` for
-    what is left out; it begins with `exit status N` where that is not 0.
+    A block with a name is written under it, `sh` blocks hold visioncal's commands and runs of such
+    files, `python` blocks share their names. An `expect` block is what the commands before it
+    print, `...` for what is left out; it begins with `exit status N` where that is not 0.
     """
     names: dict[str, Any] = {}
     status, said = 0, ""
@@ -55,9 +58,8 @@ def run(page: Path) -> None:
         if block.language == "sh":
             said = ""
             for words in command_lines(block.text):
-                assert words[0] == "visioncal", f"{page.name}: {words}"
                 assert status == 0, f"{page.name}, before {words}: {said}"
-                done = visioncal(*words[1:])
+                done = visioncal(*words[1:]) if words[0] == "visioncal" else _shell(words)
                 status, said = done.status, said + done.out + done.err
         elif block.language == "python":
             exec(compile(block.text, f"{page.name}, block {at}", "exec"), names)
@@ -65,6 +67,15 @@ def run(page: Path) -> None:
             Path(block.name).parent.mkdir(parents=True, exist_ok=True)
             Path(block.name).write_text(block.text, encoding="utf-8")
     assert status == 0, f"{page.name}, at its end: {said}"
+
+
+def _shell(words: list[str]) -> Done:
+    """Runs a file of the page, `sh FILE` after values of its variables."""
+    assert words[-2] == "sh", words
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    variables = os.environ | dict(word.split("=", 1) for word in words[:-2]) | {"PATH": path}
+    done = subprocess.run(words[-2:], check=False, capture_output=True, text=True, env=variables)
+    return Done(done.returncode, done.stdout, done.stderr)
 
 
 def run_example(text: str, page: str) -> None:
