@@ -21,6 +21,7 @@ from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.board import scale_finding
 from visioncal.calibration.suspects.judge import in_reading_order, judge
+from visioncal.calibration.suspects.outliers import farthest_by_arms
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD, correcting
 from visioncal.core.codec import read, write
 from visioncal.core.quantiles import chi2_limit
@@ -295,6 +296,18 @@ def test_doctor_calls_no_view_wrong_for_what_an_arm_may_err_by(off_mm, named) ->
     flanges[7, 0, 3] += 1e-3 * off_mm
     found = doctor(session_of(cell, flanges)).findings
     assert [each.views for each in found if each.kind == "wrong_views"] == named
+
+
+@pytest.mark.parametrize(("off_mm", "may_err"), [(2.0, True), (30.0, False)])
+def test_the_arm_is_among_the_causes_of_a_view_that_is_off_by_what_arms_err_by(off_mm, may_err):
+    cell = simulate(CellOptions(views=20))
+    flanges = cell.robot.base_from_flange.copy()
+    flanges[7, 0, 3] += 1e-3 * off_mm
+    cause = calibrate(session_of(cell, flanges)).verdict.causes[0]
+    assert cause.views == (7,)
+    assert ("or the arm errs so there" in cause.words) == may_err
+    servo = replace(load_robot("ur10e"), repeatability=(2.0, 0.5))
+    assert farthest_by_arms([servo]) == pytest.approx((12.0, 3.0))
 
 
 @pytest.mark.parametrize(

@@ -1314,3 +1314,16 @@ def test_a_source_is_searched_and_read_once_for_all_its_readings(tmp_path, monke
     foreign = read_foreign(tmp_path / "in", requested)
     assert len(foreign.rivals) > 1
     assert sorted(done) == ["in", "poses.txt", "shots"]
+
+
+def test_joint_angles_eight_folders_deep_ask_for_their_arm(tmp_path):
+    inner = tmp_path / "in/data/2024/run1/left/poses/tables"
+    inner.mkdir(parents=True)
+    seen = [" ".join(map(str, seven(pose))) for pose in world()[0]]
+    (inner / "target_poses.txt").write_text("\n".join(seen))
+    angles = np.random.default_rng(0).uniform(-90.0, 200.0, (len(seen), 6)).round(3)
+    np.savetxt(inner / "robot_joints.txt", angles, fmt="%.3f")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    assert done.status == 2
+    assert "joint angles and no poses of the robot" in done.err
+    assert "Name the arm with --robot-model" in done.err

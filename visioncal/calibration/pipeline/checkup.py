@@ -21,6 +21,7 @@ from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.calibration.suspects.judged import Findings, JudgedArm, Sensor
 from visioncal.calibration.suspects.limits import few_stops
 from visioncal.calibration.suspects.misread_poses import misreadings, turned_boards, with_undone
+from visioncal.calibration.suspects.outliers import farthest_by_arms
 from visioncal.calibration.suspects.rounded_poses import rounded
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
@@ -166,7 +167,7 @@ def _motion(run: RunState) -> Iterator[Finding]:
         return
     # Errors that arms, lenses and prints have are weighed by calibrate alone.
     away_m, away_rad = pose_residuals(problem, inliers.fit.state)
-    most_mm, most_deg = CalibrationLimits().arm_errors
+    most_mm, most_deg = farthest_by_arms([] if run.robot is None else [run.robot])
     is_far = (1e3 * away_m > most_mm) | (np.rad2deg(away_rad) > most_deg)
     views = tuple(cell.rows[at].view for at in np.flatnonzero(~inliers.used & is_far).tolist())
     if views:

@@ -32,6 +32,7 @@ from visioncal.estimation.unknowns import BOARD, SIZE
 from visioncal.robot.model import REPEATABILITY
 
 _LIMITS = CalibrationLimits()
+_CREEPS = ("base_creeps", "mount_creeps")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,11 @@ class Trial:
 
 def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
     """Findings with what their cures leave: whether that proves them, and how much they explain."""
+    is_stepped = False
     for finding in found:
+        if is_stepped and finding.kind in _CREEPS:
+            # What was moved at once looks as if it crept.
+            continue
         if finding.kind not in _TRIALS or not finding.until_mm:
             yield finding
             continue
@@ -61,11 +66,13 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         # Turns count by what they move at a typical distance.
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
         share = max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0)
+        is_proven = bool(finding.mahalanobis_sq) and _proves(run, trial)
+        is_stepped |= is_proven and finding.kind in STEPS
         yield replace(
             finding,
             without_it=f"Applied and refitted, it leaves noise of {after} an axis; else it is "
             f"{before}.",
-            is_proven=bool(finding.mahalanobis_sq) and _proves(run, trial),
+            is_proven=is_proven,
             # Without evidence of its own, or where most remains, it stands for what it removes.
             explains=1.0 if finding.mahalanobis_sq and share > 0.5 else share,
         )

@@ -1,7 +1,7 @@
 """Messages on outliers and moved frames: exchanged or wrong observations, by cause."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
-from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, some_of, view_words
 from visioncal.core.transforms import invert, log, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
@@ -18,11 +18,15 @@ from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import TWIST_UNITS
 from visioncal.estimation.outliers import InlierFit
 from visioncal.results import Moved
+from visioncal.robot import Robot
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
 
 EXCHANGED = "exchanged_views"  # The kind of finding, which others name.
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
+_WRONG = "its pose or its reading is wrong, or something had moved"
+# By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
+_ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
 
 
 @dataclass(frozen=True)
@@ -221,6 +225,13 @@ def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFau
         yield _fault(cell_fit, EXCHANGED, pair, words, do)
 
 
+def farthest_by_arms(robots: Iterable[Robot]) -> tuple[float, float]:
+    """How far a view may be off by an arm's own errors [mm, deg]."""
+    pairs = [_ARM_ERRS, *([_REPEATS * at for at in arm.repeatability] for arm in robots)]
+    mm, deg = np.max(pairs, axis=0).tolist()
+    return mm, deg
+
+
 def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
     """Why outliers are left out, by view, given the likely cause of each."""
     inliers, alone = cell_fit.inlier_fit, cell_fit.cell.mount is not None
@@ -228,12 +239,15 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
     distance = np.sqrt(inliers.distances.squares / directions)
     limit = np.sqrt(inliers.distances.limit / directions)
     off_m, off_rad = pose_residuals(inliers.problem, inliers.fit.state)
-    reasons = dict[int, str]()
+    reasons, known = dict[int, str](), (arm.matched for arm in cell_fit.arms.values())
+    robots = [matched.robot for matched in known if matched is not None]
+    most_mm, most_deg = farthest_by_arms(robots)
     for at, cause in causes.items():
         row, mm = cell_fit.cell.rows[at], 1e3 * float(off_m[at])
-        turned = ""
+        turned, deg = "", float(np.rad2deg(off_rad[at]))
         if inliers.problem.observations.has_rotation[at]:
-            turned = f" and {figure(float(np.rad2deg(off_rad[at])))} deg"
+            turned = f" and {figure(deg)} deg"
+        may_err = cause == _WRONG and mm < most_mm and deg < most_deg
         # A view that is far away is rejected even where the prediction is uncertain.
         beyond = "many times as far as most"
         if distance[at] > limit[at]:
@@ -241,7 +255,7 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
         target = f"the {row.seen.partition('_')[0]}" if alone else row.seen.partition("@")[0]
         reasons[row.view] = (
             f"disagrees with the other views: it places {target} {figure(mm)} mm{turned} away, "
-            f"{beyond}; {cause}"
+            f"{beyond}; {cause}{', or the arm errs so there' if may_err else ''}"
         )
     return reasons
 
@@ -257,7 +271,7 @@ def _cause(
             f"it fits stop {stops[other.station]}, and view {other.view} fits stop "
             f"{stops[own.station]}: these two rows are exchanged"
         )
-    cause = "its pose or its reading is wrong, or something had moved"
+    cause = _WRONG
     of_stop = cell_fit.inlier_fit.problem.observations.stops
     mates = np.flatnonzero((of_stop == of_stop[at]) & cell_fit.inlier_fit.used)
     if len(mates):

@@ -32,7 +32,7 @@ from visioncal.session.images import CLOUD_ENDINGS, IMAGE_ENDINGS
 # Endings of texts with numbers that are none of a recording.
 _NO_DATA = (".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg")
 # Folders below a source that are looked through, and the most files in all.
-_DEPTH, _MOST_FILES = 3, 100_000
+_DEPTH, _MOST_FILES = 8, 100_000
 # Cells of rows without an image.
 _NO_IMAGE = ("", "n/a", "none", "null", "nan")
 # Words of pictures that a program drew: they are no camera's where there are others.
@@ -126,7 +126,7 @@ class FileGroup:
 
 
 def groups_in(source: Path) -> tuple[FileGroup, ...]:
-    """The files of a source, three folders deep, in groups of one kind; pure."""
+    """The files of a source, eight folders deep, in groups of one kind; pure."""
     if not source.is_dir():
         return (FileGroup(source.name, (source,)),)
     alike: dict[tuple[str, str], list[Path]] = defaultdict(list)

@@ -326,6 +326,17 @@ def _untested(
         )
     if foreign.doubt is not None:
         raise foreign.doubt
+    if foreign.joints_rad is not None and not foreign.robot.present.any():
+        raise DataError(
+            f"{foreign.name}: there are joint angles and no poses of the robot, and which arm they "
+            "belong to is not said.",
+            culprits=["--robot-model"],
+            next_step="Name the arm with --robot-model: a built-in robot, its .urdf or a DH table.",
+        )
+    joints = (
+        " Where the numbers are joint angles, name them with --joint-columns, and the arm with "
+        "--robot-model."
+    )
     for whose, free in foreign.unstated.items():
         if "rotation" in free:
             numbers = foreign.robot if whose == "robot" else foreign.camera
@@ -340,7 +351,7 @@ def _untested(
                 f"{foreign.name}: the form of the {whose}'s rotations is not said, and nothing "
                 f"determines it: {why}.",
                 culprits=[f"--{whose}-form"],
-                next_step=f"Say --{whose}-form {forms}.",
+                next_step=f"Say --{whose}-form {forms}.{joints if whose == 'robot' else ''}",
             )
     note = f"Forms of poses that the source does not state were not tested: {why}."
     return replace(foreign, notes=(*foreign.notes, note))

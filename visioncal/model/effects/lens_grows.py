@@ -21,7 +21,7 @@ class LensGrows(LensEffect, Named):
     The picks come after the session: there it is zero.
     """
 
-    kind, bounds, count, most = "lens grows", (1e-2, 1e-7, 0.1), 3, 1e-2
+    kind, bounds, count, most = "lens grows", (1e-2, 1e-7, 0.1), 3, 3e-3
     do = "Let the camera run for half an hour before it is calibrated and used."
 
     @classmethod
