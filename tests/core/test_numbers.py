@@ -14,7 +14,7 @@ from typing_extensions import TypeAliasType
 import visioncal
 from visioncal.core import transforms
 from visioncal.core.limits import CalibrationLimits, NeedLimits
-from visioncal.core.number_format import figure, rounded_up, significant
+from visioncal.core.number_format import figure, rounded_up, sigma_words, significant
 from visioncal.core.quantiles import chi2_limit, f_limit, root_of, t_chance
 from visioncal.core.types import FloatArray, scalar_of
 from visioncal.robot.model import REPEATABILITY
@@ -155,3 +155,10 @@ def test_annotations_of_arrays_are_read_in_the_form_of_newer_numpy_too(monkeypat
     alias = TypeAliasType("NDArray", declared, type_params=(scalar,))
     monkeypatch.setattr(npt, "NDArray", alias)
     assert scalar_of(alias[np.uint8]) is np.uint8
+
+
+def test_a_sigma_beyond_all_cells_is_called_not_determined():
+    assert sigma_words(0.123, "mm") == "0.12 mm"
+    assert sigma_words(3.9e12, "mm") == "not determined (mm)"
+    assert sigma_words(250.0, "deg") == "not determined (deg)"
+    assert sigma_words(float("inf"), "deg") == "not determined (deg)"

@@ -40,6 +40,12 @@ def mm_and_deg(mm: float, deg: float) -> str:
     return f"{figure(mm)} mm and {figure(deg)} deg"
 
 
+def sigma_words(sigma: float, unit: str) -> str:
+    """Formats a sigma in mm or deg; one beyond ten metres or half a turn tells nothing."""
+    most = 1e4 if unit == "mm" else 180.0
+    return f"{figure(sigma)} {unit}" if sigma < most else f"not determined ({unit})"
+
+
 def percent(probability: float) -> str:
     """Formats a probability as a percentage between `under 1 %` and `over 99 %`."""
     if probability > 0.99:

@@ -12,7 +12,7 @@ from visioncal.core.codec import Array, WrittenForm
 from visioncal.core.conventions import ROTATION_FORMS
 from visioncal.core.documents.pendants import rotation_names
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure, fixed
+from visioncal.core.number_format import fixed, sigma_words
 from visioncal.core.types import FloatArray
 
 # Largest difference between the forms of one pose, rounded to six places [m, rad].
@@ -59,8 +59,8 @@ class Edge(PoseSigmas):
     @property
     def sigma_words(self) -> str:
         """Its sigmas in words."""
-        turned = f" and {figure(self.sigma_deg)} deg" if self.oriented else ""
-        return f"sigma {figure(self.sigma_mm)} mm{turned}"
+        turned = f" and {sigma_words(self.sigma_deg, 'deg')}" if self.oriented else ""
+        return f"sigma {sigma_words(self.sigma_mm, 'mm')}{turned}"
 
     def place_words(self, decimals: int = 2) -> str:
         """Its translation in words, in millimetres with `decimals` decimals."""

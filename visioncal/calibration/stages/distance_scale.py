@@ -46,8 +46,8 @@ def other_size(share: float, variance: float, beside: str = "") -> Finding:
     percent = f"{figure(100 * abs(share))} % (sigma {figure(100 * variance**0.5)} %)"
     return Finding(
         "board_size",
-        f"By the robot's motion the board is {percent} {size} than the program was told that "
-        f"measured the poses: all distances in them (cft_) are too {short}.{beside}",
+        f"By the robot's motion the board is {percent} {size} than the size by which a program "
+        f"measured its poses: all distances in them (cft_) are too {short}.{beside}",
         Remedy(
             "Measure the board with a caliper, and measure the poses again with its true size; or "
             f"multiply cft_x_m, cft_y_m and cft_z_m by {1.0 + share:.5g}."

@@ -6,7 +6,6 @@ and beside errors of the arm by its posture; a lens that grows has its own by it
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
 
 import numpy as np
 
@@ -90,13 +89,14 @@ def random_effects(
             for kind in NAMED
             if kind is not MountCreeps or any(isinstance(at, kind) for at in opened)
         ]
-        tried = _of_flange(problem, robot, stops, kinds)
+        creeps = [at for at in opened if not isinstance(at, BaseSteps | MountSteps)]
+        tried = _of_flange(problem, robot, stops, kinds, creeps)
         chosen, value = _with_sizes(inliers, tried, nuisance)
         step = next((at for at in opened if isinstance(at, BaseSteps | MountSteps)), None)
         if step is not None:
             # A frame that moved at once looks as if it crept; the search for steps comes later.
             kinds = [kind for kind in kinds if not issubclass(kind, BaseCreeps | MountCreeps)]
-            others = _of_flange(problem, robot, stops, kinds, step)
+            others = _of_flange(problem, robot, stops, kinds, [step])
             instead, least = _with_sizes(inliers, others, nuisance)
             if value - least > _BY_CHANCE:
                 chosen = {at: instead[at] for at in of_random_effects([*instead])}
@@ -111,16 +111,19 @@ def _of_flange(
     robot: str,
     stops: IntArray,
     kinds: Sequence[type[Named]],
-    step: GrowingEffect | None = None,
+    opened: Sequence[GrowingEffect],
 ) -> dict[Effect, float]:
-    """Effects that may act on a flange, each with its largest size."""
+    """Effects that may act on a flange, each with its largest size: steps, if opened, and kinds."""
     poses = np.where(np.isfinite(problem.poses[robot]), problem.poses[robot], np.eye(4))
     stood, count = Stood(poses, stops, is_swept=False), len(poses)
     moments = Moments({robot: poses}, {}, even_progress(count), np.arange(count))
-    tried = [] if step is None else [(replace(step, frame=robot), np.inf)]
+    steps = (at for at in opened if isinstance(at, BaseSteps | MountSteps))
+    tried = list[tuple[GrowingEffect, float]]()
+    tried += [(replace(step, frame=robot), np.inf) for step in steps]
     for kind in kinds:
-        # Creeps that fade otherwise are too much alike.
-        tried += [(effect, kind.most) for effect in islice(kind.of_flange(robot, stood), 1)]
+        # Creeps that fade otherwise are too much alike: one is tried as the one likelihood has it.
+        own = (replace(effect, frame=robot) for effect in opened if isinstance(effect, kind))
+        tried += [(next(own, effect), kind.most) for effect in kind.of_flange(robot, stood)][:1]
     found = dict[Effect, float]()
     for effect, most in tried:
         columns, name = effect.columns(moments, np.ones(count)), effect.kind.replace(" ", "_")

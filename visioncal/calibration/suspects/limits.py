@@ -11,7 +11,7 @@ from visioncal.calibration.suspects.ranking import MEASURE_BOARD, add_views_reme
 from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.calibration.suspects.suspect import UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import counted, figure, mm_and_deg
+from visioncal.core.number_format import counted, figure, mm_and_deg, sigma_words
 from visioncal.core.verdict import LEAST_NEED_MM, REVIEW, Finding, Remedy, look_at, without
 from visioncal.estimation.arm import LEVER_M
 from visioncal.results import Rms, ViewResult
@@ -189,7 +189,7 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
         if direction.is_rotation:
             scale, unit, (check, bad) = float(np.rad2deg(1.0)), "deg", _LIMITS.sigma_deg
         if (sigma := direction.sigma * scale) > check:
-            weak.append(f"{direction.words} ({figure(sigma)} {unit})")
+            weak.append(f"{direction.words} ({sigma_words(sigma, unit)})")
             is_fatal |= sigma > bad
     if not weak:
         return
