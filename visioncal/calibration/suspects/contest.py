@@ -56,7 +56,7 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
     is_stepped = False
     for finding in found:
         if is_stepped and finding.kind in _CREEPS:
-            # What was moved at once looks as if it crept.
+            # A frame that was moved at once looks as if it crept.
             continue
         if finding.kind not in _TRIALS or not finding.until_mm:
             yield finding

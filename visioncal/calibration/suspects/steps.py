@@ -74,7 +74,7 @@ def _words(step: Step, run: RunState) -> str:
         )
     mount, far_mm = run.mount, pose_difference(np.eye(4), exp(step.value))[0]
     on_flange = (mount == "eye-in-hand") == step.of.startswith("cam")
-    # What stands beside a robot moves relative to its base.
+    # Things beside a robot move relative to its base.
     of_base = "" if mount is None or on_flange else ", or the robot's base,"
     words = f"{thing}{of_base} moved at once: {when}, it is {moved} from where it was"
     if mount is not None and far_mm > _LIMITS.arm_errors[0]:

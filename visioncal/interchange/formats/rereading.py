@@ -326,7 +326,9 @@ def _untested(
         )
     if foreign.doubt is not None:
         raise foreign.doubt
-    if foreign.joints_rad is not None and not foreign.robot.present.any():
+    is_armless = foreign.arm is None and foreign.robot_document is None
+    is_armless &= foreign.joints_rad is not None and not foreign.robot.present.any()
+    if is_asked and is_armless:
         raise DataError(
             f"{foreign.name}: there are joint angles and no poses of the robot, and which arm they "
             "belong to is not said.",
