@@ -19,6 +19,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.stages.other_board import OtherBoardError
+from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.documents.toml import read_toml
@@ -298,7 +299,16 @@ def _applied(
         if not (note.startswith("The ") and " taken for " in note)
         or (is_open and "positions" in note)
     )
-    notes = (f"Found by the {'images' if is_measured else 'poses'}: {guess.sentence}", *guess.notes)
+    notes = [f"Found by the {'images' if is_measured else 'poses'}: {guess.sentence}"]
+    makers = [
+        form.name
+        for form in POSE_FORMS.values()
+        if form.models and form.rotation == best.robot.rotation and not foreign.form
+    ]
+    if makers:
+        # Exports, targets and picks by poses are in the robot's own form, once that is known.
+        notes.append(f"Robots that write so: {some_of(makers)}; --robot-form says which it is.")
+    notes += guess.notes
     return replace(
         foreign,
         robot=numbers["robot"] or foreign.robot,
