@@ -239,7 +239,7 @@ def test_noise_does_not_pass_for_a_smaller_board_where_the_arm_can_follow():
     wide = PriorInformation(1e-4 * np.eye(1), np.zeros(1))
     larger = {"a": by_size(problem.poses["a"])[:, :, None]}
     arm, size = Effect.free("arm", wide, flange_jacobian=larger), 0.05
-    problem = problem.with_effects([arm, joint.target_sizes(problem, ["target_a"], size)])
+    problem = problem.with_effects([arm, joint.target_sizes(problem, {"target_a": size})])
     state = problem.start(cell.truth)
     noise = Noise(np.array([exact["a"]]), np.zeros(0))
     found, _ = solve_problem(problem.sized_at(state), state, noise)
@@ -597,7 +597,7 @@ def test_a_closure_in_the_base_is_the_derivative_of_where_things_are_seen(mount)
 
 def test_one_more_column_of_a_fit_steps_to_what_a_fit_with_it_finds():
     problem, fit = answered(False, views=8, seed=6)
-    size = joint.target_sizes(problem, ["target"], 1e-3)
+    size = joint.target_sizes(problem, {"target": 1e-3})
     widened = Fit(problem, fit).with_columns(size)
     step = -widened.absorbed @ widened.equations[1]
     state, _ = solve_problem(widened.problem, widened.state, fit.noise, is_near=True)

@@ -41,7 +41,9 @@ def is_terminal(*, is_answer: bool = False) -> bool:
 def say(words: str, label: str = "", style: str = "bold", *, is_answer: bool = False) -> None:
     """Prints a message, or a line of the result, as it is, after a label in a style."""
     if not is_terminal(is_answer=is_answer):
-        typer.echo(plain(label) + plain(words), err=not is_answer)
+        # As the stream encodes: a library's echo writes UTF-8 where that is ASCII.
+        stream = sys.stdout if is_answer else sys.stderr
+        stream.write(f"{plain(label)}{plain(words)}\n")
         return
     from rich.text import Text
 
