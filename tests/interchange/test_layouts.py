@@ -1316,6 +1316,19 @@ def test_a_source_is_searched_and_read_once_for_all_its_readings(tmp_path, monke
     assert sorted(done) == ["in", "poses.txt", "shots"]
 
 
+def test_a_disk_is_looked_through_less_deep_than_a_recording(tmp_path, monkeypatch):
+    deep = tmp_path.joinpath(*"abcde")
+    deep.mkdir(parents=True)
+    for folder in (tmp_path, deep):
+        (folder / "log.csv").write_text("x\n1\n")
+    assert [group.label for group in file_search.groups_in(tmp_path)] == [
+        "a/b/c/d/e/log.csv",
+        "log.csv",
+    ]
+    monkeypatch.setattr(file_search, "_FEW_FILES", 2)
+    assert [group.label for group in file_search.groups_in(tmp_path)] == ["log.csv"]
+
+
 def test_joint_angles_eight_folders_deep_ask_for_their_arm(tmp_path):
     inner = tmp_path / "in/data/2024/run1/left/poses/tables"
     inner.mkdir(parents=True)

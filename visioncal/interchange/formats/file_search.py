@@ -31,8 +31,9 @@ from visioncal.session.images import CLOUD_ENDINGS, IMAGE_ENDINGS
 
 # Endings of texts with numbers that are none of a recording.
 _NO_DATA = (".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg")
-# Folders below a source that are looked through, and the most files in all.
-_DEPTH, _MOST_FILES = 8, 100_000
+# Folders below a source that are looked through, and the most files in all; a source of more files
+# than a recording in folders has, such as a disk, is looked through less deep.
+_DEPTH, _FEW_FILES, _LESS_DEEP, _MOST_FILES = 8, 5_000, 3, 100_000
 # Cells of rows without an image.
 _NO_IMAGE = ("", "n/a", "none", "null", "nan")
 # Words of pictures that a program drew: they are no camera's where there are others.
@@ -126,11 +127,14 @@ class FileGroup:
 
 
 def groups_in(source: Path) -> tuple[FileGroup, ...]:
-    """The files of a source, eight folders deep, in groups of one kind; pure."""
+    """The files of a source in groups of one kind, down to `_DEPTH` folders below it; pure."""
     if not source.is_dir():
         return (FileGroup(source.name, (source,)),)
     alike: dict[tuple[str, str], list[Path]] = defaultdict(list)
-    for file in islice(_walked(source, _DEPTH), _MOST_FILES):
+    every = [*islice(_walked(source, _DEPTH), _FEW_FILES)]
+    if len(every) == _FEW_FILES:
+        every = [*islice(_walked(source, _LESS_DEEP), _MOST_FILES)]
+    for file in every:
         path = file.relative_to(source)
         stem = re.sub(r"[0-9]+", "#", path.with_suffix("").as_posix())
         alike[stem, path.suffix.lower()].append(file)
@@ -146,12 +150,19 @@ def groups_in(source: Path) -> tuple[FileGroup, ...]:
     # Of any names: images of a folder, and records that are called as images are.
     stems = {file.stem for group in groups for file in group.files if group.is_images}
     stems |= {file.stem for file in single if is_image_name(file.name)}
+    # Parts of a name are sought among the images' names: each with each would take hours of a disk.
+    lengths = {len(stem) for stem in stems} - {1}
     kinds: dict[tuple[Path, str], list[Path]] = defaultdict(list)
     for file in single:
         if file in grouped:
             continue
-        is_named = is_image_name(file.name) or file.stem in stems
-        is_named = is_named or any(each in file.stem for each in stems if len(each) > 1)
+        stem = file.stem
+        is_named = is_image_name(file.name) or stem in stems
+        is_named = is_named or any(
+            stem[at : at + length] in stems
+            for length in lengths
+            for at in range(len(stem) - length + 1)
+        )
         label = f"*{file.suffix.lower()}" if is_named else file.name
         kinds[file.parent.relative_to(source), label].append(file)
     for (folder, label), files in kinds.items():
