@@ -1,5 +1,6 @@
 """What is said of a cause is earned: its cure is applied, and leaves what its rivals do not."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -17,7 +18,7 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Verdict
-from visioncal.simulation import CAMERAS, CellOptions, simulate
+from visioncal.simulation import BOARDS, CAMERAS, CellOptions, simulate
 
 FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
 _GRID = np.stack(np.meshgrid(np.arange(7), np.arange(5)), -1).reshape(-1, 2)
@@ -64,6 +65,17 @@ def test_uneven_noise_is_no_step(mount, seed):
     """Views far away have more of it; in the first sessions several are on one side."""
     causes = visioncal.calibrate(pairs(seed, mount)).verdict.causes
     assert not {cause.kind for cause in causes} & {"moved_at_once", "board_changed"}
+
+
+def test_the_size_of_an_exact_table_of_points_is_tried_as_any_cure():
+    """A sheet of tags that is 0.2 % larger than its table: without its size, noise is more."""
+    cell = simulate(CellOptions(views=20, target=BOARDS["tags"], board_scale=1.002))
+    (cause, *_) = calibrated(cell, joints=False).verdict.causes
+    assert cause.kind == "board_size"
+    pattern = r"leaves noise of (?:under )?(\S+) mm.* else it is (\S+) mm"
+    left, without = map(float, re.search(pattern, cause.without_it).groups())
+    # The residuals by distance are some tenths of a millimetre, and the arm's noise 0.03 mm.
+    assert 2.0 * left < without
 
 
 def lifted(cell):

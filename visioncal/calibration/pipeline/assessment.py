@@ -21,7 +21,7 @@ from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clock_offset import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
-from visioncal.calibration.stages.likely_steps import steps_of
+from visioncal.calibration.stages.likely_steps import steps_of, with_free_sizes
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
@@ -109,6 +109,11 @@ class FitAssessment:
         """Standard deviations of each frame's position in its parent, by source [mm]."""
         budget = budget_mm(self.cell_fit, self.fit)
         return {self.versions[key]: sigmas for key, sigmas in budget.items()}
+
+    @cached_property
+    def sized(self) -> Fit:
+        """The fit beside boards of any size, where it holds sizes: causes are judged by it."""
+        return with_free_sizes(self.fit)
 
     @cached_property
     def intervals(self) -> FloatArray:

@@ -10,7 +10,6 @@ from visioncal.calibration.pipeline.budget import middle_jacobians, middles_of
 from visioncal.calibration.pipeline.connectivity import robot_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.likely_steps import with_free_sizes
 from visioncal.calibration.stages.need import PickInputs, predict_picks
 from visioncal.calibration.suspects.contest import contested
 from visioncal.calibration.suspects.judge import judge
@@ -224,11 +223,8 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
 
 def _arms(answer: FitAssessment) -> list[JudgedArm]:
     problem, cell_fit = answer.fit.problem, answer.cell_fit
-    # A board whose size is held leaves residuals that no flange has.
-    of_flanges = with_free_sizes(answer.fit).noise.robots / answer.fit.noise.robots
     arms = []
-    rows = zip(problem.robots, answer.intervals, np.minimum(of_flanges, 1.0), strict=True)
-    for robot, intervals, (share_rad, share_m) in rows:
+    for index, (robot, intervals) in enumerate(zip(problem.robots, answer.intervals, strict=True)):
         arm, found = cell_fit.arms[robot], answer.arms[robot].sections.arm
         accuracy = None if found is None else found.workspace_sigma_mm
         model = None if arm.matched is None else arm.matched.robot
@@ -246,6 +242,9 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
         # Of pose pairs without a stated noise, the detection's may be in the flange's.
         if not problem.is_combined and problem.observations.covariance.any():
             noise, (least_rad, least_m) = answer.sigmas[robot], intervals[:, 0].tolist()
+            # A board whose size is held leaves residuals that no flange has.
+            pair = (at.noise.robots[index] for at in (answer.sized, answer.fit))
+            share_rad, share_m = np.minimum(np.divide(*pair), 1.0).tolist()
             judged = replace(
                 judged,
                 noise_mm=share_m * noise["translation_mm"],

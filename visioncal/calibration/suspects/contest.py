@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import joint_offsets
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.likely_steps import likely_steps, with_free_sizes
+from visioncal.calibration.stages.likely_steps import likely_steps
 from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.suspects.suspect import STEPS
@@ -22,7 +22,6 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import Finding
 from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.joint import target_sizes
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
@@ -103,7 +102,7 @@ def _proves(run: RunState, trial: Trial) -> bool:
 
 
 def _of_step(run: RunState, _: str) -> Trial:
-    fit = with_free_sizes(run.assessment.fit)
+    fit = run.assessment.sized
     own = fit.problem, fit.solution
     return Trial(own, with_step(*own, run.assessment.steps[0]), is_in_fit=False)
 
@@ -128,18 +127,13 @@ def _of_growth(run: RunState, kind: str) -> Trial:
 
 
 def _of_board(run: RunState, kind: str) -> Trial:
-    """Of sizes or shapes of boards; of measured poses, of other distances."""
-    fit = run.assessment.fit
+    """Of sizes or shapes of boards; of measured poses and exact points, of other distances."""
+    fit, sized = run.assessment.fit, run.assessment.sized
     if sizes := fit.unknowns.all_of(SIZE):
         return _held(run, fit.unknowns.columns(*sizes))
-    if fit.corners is None:
-        targets = [name for name in fit.frames if name.startswith("target")]
-        wide = fit.with_columns(target_sizes(fit.problem, dict.fromkeys(targets, np.inf)))
-        return Trial(
-            (fit.problem, fit.solution),
-            (wide.problem, fit_problem(wide.problem, wide.state)),
-            is_in_fit=False,
-        )
+    if kind == "board_size" and sized.unknowns.all_of(SIZE):
+        own, cured = ((at.problem, at.solution) for at in (fit, sized))
+        return Trial(own, cured, is_in_fit=False)
     columns = [
         fit.unknowns.columns(board)[
             (fit.unknowns.values_of(board) == SCALE) == (kind == "board_size")

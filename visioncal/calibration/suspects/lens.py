@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
-from visioncal.calibration.stages.likely_steps import with_free_sizes
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CONTRADICTION
@@ -45,11 +45,12 @@ def _stated(run: RunState) -> Iterator[Finding]:
     """Stated intrinsics and noise of corners that the corners contradict."""
     fitted = run.assessment.fit
     for camera in fitted.unknowns.of(unknowns.LENS):
-        for finding in _of_camera(fitted, camera):
+        for finding in _of_camera(run.assessment, camera):
             yield finding.of("" if camera == ONLY_CAMERA else camera)
 
 
-def _of_camera(fitted: Fit, camera: str) -> Iterator[Finding]:
+def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
+    fitted = assessment.fit
     optics, seen, lens = fitted.camera_parameters, fitted.linearised, (unknowns.LENS, camera)
     problem, columns = optics.problems[camera], fitted.unknowns.columns(lens)
     moving = fitted.unknowns.moved[columns]
@@ -93,7 +94,7 @@ def _of_camera(fitted: Fit, camera: str) -> Iterator[Finding]:
         is_wrong = problem.scene.matrix_sigma_px is None
         is_wrong |= bool(np.any(np.abs(moves) > CONTRADICTION * sigmas_px))
         # Beside a board whose size is held, the lens explains residuals by distance.
-        is_wrong &= has_changed(with_free_sizes(fitted), columns)
+        is_wrong &= has_changed(assessment.sized, columns)
         if is_wrong and moved_px > _LEAST_MOVE_PX:
             words = f"The given intrinsics do not fit these images and were refined: {moved}"
             yield Finding("lens", words, _NEW_LENS)
