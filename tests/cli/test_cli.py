@@ -643,6 +643,7 @@ def test_every_command_ends_so():
     for arguments in (["calibrate", "none"], ["calibrate", "--nonsense"]):
         with full() as err:
             assert status(io.StringIO(), err, *arguments) == 2
+        assert status(None, None, *arguments) == 2
 
 
 def test_a_lens_that_is_held_has_no_ratio_of_error_and_sigma():

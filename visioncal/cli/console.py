@@ -35,7 +35,8 @@ def console(*, is_answer: bool = False) -> "Console":
 def is_terminal(*, is_answer: bool = False) -> bool:
     """Whether stderr, or stdout, shows styles, for which alone a library is loaded."""
     stream = sys.stdout if is_answer else sys.stderr
-    return stream.isatty() or "FORCE_COLOR" in os.environ
+    # None where the stream was closed before the program started.
+    return stream is not None and (stream.isatty() or "FORCE_COLOR" in os.environ)
 
 
 def say(words: str, label: str = "", style: str = "bold", *, is_answer: bool = False) -> None:
@@ -43,7 +44,9 @@ def say(words: str, label: str = "", style: str = "bold", *, is_answer: bool = F
     if not is_terminal(is_answer=is_answer):
         # As the stream encodes: a library's echo writes UTF-8 where that is ASCII.
         stream = sys.stdout if is_answer else sys.stderr
-        stream.write(f"{plain(label)}{plain(words)}\n")
+        if stream is not None:
+            # Flushed, so that a stream that fails does so here, where it is met.
+            print(plain(label) + plain(words), file=stream, flush=True)
         return
     from rich.text import Text
 
