@@ -141,6 +141,25 @@ def test_lines_of_a_pendant_are_read_by_the_names_or_as_stated(cell, maker, tmp_
     other.refused("not of 'fanuc'")
 
 
+def test_names_of_columns_say_whose_poses_they_are_once_their_turns_are_found(cell, tmp_path):
+    for maker, form in (("kuka", "kuka"), ("fanuc", "fanuc"), ("yaskawa", None)):
+        source = table_of(cell, maker, tmp_path / "log.csv")
+        folder = tmp_path / f"cell of {maker}"
+        done = visioncal("convert", source, folder, "--mount", "eye-in-hand").good()
+        session = Session.load(folder)
+        # Rx, Ry, Rz are also a Techman's, and a program's.
+        assert ("Robots that write so: fanuc, yaskawa" in done.err) == (form is None)
+        assert (session.robots[""].form, session.name) == (form, folder.name)
+
+
+def test_views_about_one_axis_are_asked_for_tilts_before_a_form(tmp_path):
+    options = CellOptions(views=10, motion="one_axis", seed=4)
+    turned = cell_session(simulate(options), "cell", seen="poses")
+    source = table_of(turned, "kuka", tmp_path / "log.csv")
+    asked = visioncal("convert", source, tmp_path / "cell", "--mount", "eye-in-hand")
+    asked.refused("All views turn about one axis", "First add 3 or more views", "--robot-form")
+
+
 def test_a_form_of_a_library_is_no_maker_s(cell, tmp_path):
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     rows = [[view.cell(name) for name in ("x_m", "y_m", "z_m", *names[3:])] for view in cell.views]
@@ -276,6 +295,14 @@ def test_the_form_is_that_of_the_model_s_maker_or_as_typed(work):
     said = visioncal(*words, "--robot-form", "abb").good().out
     assert "q1, q2, q3, q4" in said.splitlines()[0]
     visioncal(*words, "--robot-form", "kuak").refused("Did you mean kuka?")
+
+
+def test_poses_of_no_known_maker_are_nobody_s(work, tmp_path):
+    replace(work[1], robot=None, arm=None, robot_form=None).save(tmp_path / "calibration.json")
+    done = visioncal("touch-test", work[0] / "look", "-c", tmp_path, *GAUGE, "--force").good()
+    assert "Universal" not in done.said
+    assert "--robot-form (ur, kuka, fanuc, abb ...)" in done.err
+    assert "qw" in done.out
 
 
 def touches(maker, poses, path, columns):

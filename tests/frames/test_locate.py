@@ -398,7 +398,10 @@ def test_one_image_needs_a_target_and_a_pose(cell, tmp_path):
     (same,) = shown(source=session, calibration=calibration, view=31)
     assert found["image"] == "shot.png"
     np.testing.assert_allclose(found["p_base_m"], same["p_base_m"], atol=1e-9)
-    refused("name it with --target", "locate", image, calibration=calibration)
+    # The calibration knows one board, which is then looked for.
+    board = {"source": image, "calibration": calibration, "pose": pose}
+    assert shown(**board) == [found]
+    assert "--target names another" in run("locate", **board).err
     other = wanted | {"target": "aprilgrid_6x4_32mm"}
     refused(r"shot\.png: target aprilgrid", "locate", **other, pose=pose)
     if pose is not None:

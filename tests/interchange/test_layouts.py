@@ -1175,8 +1175,9 @@ def test_a_guess_needs_no_second_step_where_it_contradicts_nothing_stated(tmp_pa
     sixes(tmp_path / "in")
     said = ("--target", world()[2].document["target"], "--mount", "eye-in-hand")
     for name, more in (("plain", ()), ("guess", ("--guess",))):
-        visioncal("convert", tmp_path / "in", tmp_path / name, *said, *more).good()
-    plain, guess = (Session.load(tmp_path / name) for name in ("plain", "guess"))
+        (tmp_path / name).mkdir()
+        visioncal("convert", tmp_path / "in", tmp_path / name / "cell", *said, *more).good()
+    plain, guess = (Session.load(tmp_path / name / "cell") for name in ("plain", "guess"))
     assert guess.digest() == plain.digest()
     stated = (*said, "--robot-form", "kuka", "--guess")
     done = visioncal("convert", tmp_path / "in", tmp_path / "stated", *stated)

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.distance import pdist
 from support.commands import visioncal
 
+from visioncal.core.documents.pendants import read_pose
 from visioncal.core.transforms import exp
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
@@ -83,6 +84,11 @@ def test_the_table_opens_as_views_with_the_models_poses(planned, document):
         np.testing.assert_allclose(view.base_from_flange().as_matrix(), pose, atol=1e-8)
         np.testing.assert_allclose(view.joints_rad, stop["q"], atol=1e-9)
         assert view.text["why"] == stop["why"]
+        # Half of the last digits of a pendant: 5 um with 5e-7 rad, and of a degree.
+        shown = read_pose(view.text["pose_ur"], "the table", "ur").pose
+        np.testing.assert_allclose(shown, pose, atol=6e-7)
+        degrees = np.array(view.text["joints_deg"].split(), dtype=float)
+        np.testing.assert_allclose(np.deg2rad(degrees), view.joints_rad, atol=1e-5)
 
 
 def test_the_program_drives_to_each_stop_by_way_of_what_lies_between(planned, document):

@@ -79,6 +79,8 @@ def locate_command(options: LocateOptions) -> None:
         needless = {"--plane": options.plane, "--plane-sigma-mm": options.plane_sigma}
         refuse_given(needless, "it is for --pixel")
         origin_m = np.array(options.point or np.zeros(3))
+        if session is None and source is not None and target is None:
+            target = _only_target(result, source.name)
         other_target = None if target is None else _target(target, result)
         with weights_in(options.weights):
             if session is not None:
@@ -318,7 +320,8 @@ def _by_image(
         )
     if target is None:
         raise DataError(
-            f"{source} is one image, which does not say what to look for: name it with --target.",
+            f"{source} is one image, which does not say what to look for, and the calibration does "
+            "not know one target alone: name it with --target.",
             culprits=["--target"],
             next_step="Name the target; or give --pixel U,V and --plane.",
         )
@@ -329,9 +332,26 @@ def _by_image(
     return [(name, {"image": name}, located)]
 
 
+def _known_targets(result: Calibration) -> Mapping[str, Mapping[str, Any]]:
+    """Documents of the targets that a result was made with, by name."""
+    if result.cell is not None:
+        return result.cell.targets
+    return {} if result.joint_fit is None else result.joint_fit.targets
+
+
+def _only_target(result: Calibration, image: str) -> str | None:
+    """The target that is looked for in an image without a word of it: the only one known."""
+    known = _known_targets(result)
+    if len(known) != 1:
+        return None
+    say(f"{image}: looked for the board of the calibration; --target names another")
+    return next(iter(known))
+
+
 def _target(words: str, result: Calibration) -> Target:
-    if result.cell is not None and words in result.cell.targets:
-        return target_from_document(result.cell.targets[words], words)
+    known = _known_targets(result)
+    if words in known:
+        return target_from_document(known[words], words or "target")
     # A pixel waits for no foreign format.
     from visioncal.interchange.formats.intrinsics import target_named
 

@@ -14,6 +14,7 @@ from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.plan_source import Kept, Source, chosen_part, find_source, pose_of, robot_of
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import MOST_FOR_NEED, ClearanceOptions, PlanOptions
+from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import listed, percent, some_of
@@ -105,11 +106,14 @@ def plan_command(options: PlanOptions, session: Path | None = None) -> str:
         plan = make_plan(cell, _request(options, cell), begun=added_to, progress=progress)
         progress("write", 0, 1)
         document = plan_document(plan, {"kind": start.words})
-        written = write_plan(options.out, plan, document)
+        form = start.form or controller_form(cell.robot.name)
+        written = write_plan(options.out, plan, document, form)
     if options.as_json:
         print_json(document)
     else:
         _report(plan)
+        shown = "joints_deg" + (f" and pose_{form.name} ({form.words})" if form else "")
+        say(f"stops.csv has metres and radians, and {shown} as a pendant shows them")
     report_written(written, quiet=options.as_json)
     return ""
 
@@ -176,12 +180,12 @@ def _plan_to_verify(
         if board == "BOARD":
             say("In the command, BOARD stands for the target's name, or the path of its .toml.")
         document: dict[str, Any] = {"views": spread.views, "poses": spread.poses.tolist()}
-        written = write_stops(options.out, spread.table(), boards)
+        written = write_stops(options.out, spread.table(start.form), boards)
     else:
         arm = "ur:HOST" if has_ur_axes(plan.cell.robot) else "manual"
         record = f"--arm {arm} --plan {options.out}"
         document = plan_document(plan, {"kind": start.words})
-        written = write_plan(options.out, plan, document)
+        written = write_plan(options.out, plan, document, start.form)
     record = f"visioncal record {record} --camera uvc:0 -o {quote(str(session or 'monday'))}"
     if options.as_json:
         print_json(document)

@@ -26,7 +26,7 @@ from visioncal.planning.instrument import (
     plan_for_instrument,
 )
 from visioncal.planning.plan import Stop
-from visioncal.planning.plan_file import ur_program
+from visioncal.planning.plan_file import joints_in_degrees, ur_program
 from visioncal.planning.purposes import purpose_of
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -119,8 +119,8 @@ def _table(plan: InstrumentPlan, stops: list[Stop]) -> str:
     joints = [f"q{index + 1}_rad" for index in range(plan.cell.robot.joint_count)]
     rows: list[list[object]] = [["view", *joints, *read, "joints_deg"]]
     for stop in stops:
-        degrees = " ".join(f"{angle:.3f}" for angle in np.rad2deg(stop.q))
-        rows.append([stop.view, *(f"{q:.9f}" for q in stop.q), *[""] * len(read), degrees])
+        angles = (f"{q:.9f}" for q in stop.q)
+        rows.append([stop.view, *angles, *[""] * len(read), joints_in_degrees(stop.q)])
     return csv_text(rows)
 
 

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.cli.parsing import numbers_in
 from visioncal.cli.session_options import PlanOptions
+from visioncal.core.conventions import PoseForm, controller_form
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
@@ -35,6 +36,15 @@ class Source:
     robot: Robot | None = None
     calibration: Calibration | None = None
     session: Session | None = None
+
+    @property
+    def form(self) -> PoseForm | None:
+        """The stated form of the robot's poses, or that of its maker; None where unknown."""
+        if self.calibration is not None:
+            return self.calibration.controller()
+        robots = {} if self.session is None else self.session.robots
+        model, stated = next(((each.model, each.form) for each in robots.values()), ("", None))
+        return controller_form(model or "" if self.robot is None else self.robot.name, stated)
 
 
 def robot_of(options: PlanOptions, source: Source, found: Calibration | None, lost: str) -> Robot:

@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.cli.console import EXIT_BAD, answer, check_usable, print_json, report_written, warn
+from visioncal.cli.console import (
+    EXIT_BAD,
+    answer,
+    check_usable,
+    print_json,
+    report_written,
+    say,
+    warn,
+)
 from visioncal.cli.history import enter
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
@@ -62,14 +70,20 @@ def touch_test_command(options: TouchTestOptions) -> None:
             warn(warning)
     points = located.points
     known = controller_form("", options.robot_form) or result.controller()
-    form = known or POSE_FORMS["ur"]
+    # No pendant's angles are taken for another's where no maker is known: a quaternion.
+    form = known or POSE_FORMS["ros"]
     targets = [_target(result, located, point, 1e-3 * options.height_mm, form) for point in points]
     if options.gaps_mm is None:
-        unknown = "" if known else " (--robot-form kuka, fanuc, abb ...: as its pendant shows it)"
         if options.as_json:
             print_json({"points": targets})
             return
-        answer(f"Flange targets: {form.words}{unknown}; hover first, then touch.")
+        if known is None:
+            say(
+                "The robot's maker is not known: --robot-form (ur, kuka, fanuc, abb ...) gives "
+                "the poses as its pendant shows them."
+            )
+        words = "positions and quaternions x, y, z, w" if known is None else form.words
+        answer(f"Flange targets: {words}; hover first, then touch.")
         for point, target in zip(points, targets, strict=True):
             x, y, z = 1e3 * point.base_m
             answer(

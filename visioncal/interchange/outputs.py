@@ -15,7 +15,7 @@ from visioncal.core.generations import write_generation
 # Imported late, so that writing one kind of result does not import all the others.
 if TYPE_CHECKING:
     from visioncal.calibration.run import Run as Calibrated
-    from visioncal.core.choices import ImagesKept
+    from visioncal.core.choices import ImagesKept, PoseForm
     from visioncal.core.verdict import Verdict
     from visioncal.dynamics.plan_files import MotionPlan
     from visioncal.dynamics.run import Run
@@ -151,10 +151,13 @@ def refuse_calibration(folder: Path) -> None:
         )
 
 
-def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Written:
+def write_plan(
+    folder: Path, plan: "Plan", document: Mapping[str, Any], form: "PoseForm | None" = None
+) -> Written:
     """Writes a plan's table, program, preview and JSON into a folder; see `write_outputs`.
 
-    Robots that are not programmed like a UR get no program, and that of an earlier plan is removed.
+    The table has poses in the robot's `form`, too. Robots that are not programmed like a UR get no
+    program, and that of an earlier plan is removed.
     """
 
     def draw(path: Path) -> None:
@@ -167,7 +170,7 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
 
     from visioncal.planning.plan_file import program_of, stops_table
 
-    texts = {PLAN: json_text(document), STOPS: stops_table(plan)}
+    texts = {PLAN: json_text(document), STOPS: stops_table(plan, form)}
     if program := program_of(plan):
         texts[PROGRAM] = program
     results = {name: _text(text) for name, text in texts.items()}

@@ -7,13 +7,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+
 from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.codec import Key, Vector, read, reading, write
+from visioncal.core.conventions import PoseForm
 from visioncal.core.documents.jsons import parse_stored
+from visioncal.core.documents.pendants import pendant_words
 from visioncal.core.documents.tables import csv_text
 from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line, read_text, sha256
+from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.plan import (
@@ -31,15 +36,26 @@ from visioncal.session.columns import POSE, pose_row
 _FILE, _SCHEMA = "plan.json", 1
 
 
-def stops_table(plan: Plan) -> str:
-    """Writes the stops as a views.csv, with poses by the robot's model and names for the images."""
+def stops_table(plan: Plan, form: PoseForm | None = None) -> str:
+    """Writes the stops as a views.csv, with poses by the robot's model and names for the images.
+
+    Beside metres and radians stand degrees, and the poses in the maker's form where it is known.
+    """
     joints = [f"q{index + 1}_rad" for index in range(plan.cell.robot.joint_count)]
-    rows: list[list[object]] = [["view", "image", *joints, *POSE, "why"]]
+    shown = ["joints_deg"] + ([] if form is None else [f"pose_{form.name}"])
+    rows: list[list[object]] = [["view", "image", *joints, *POSE, "why", *shown]]
     for stop in plan.stops:
         numbers = [*stop.q.tolist(), *pose_row(stop.base_from_flange).values()]
         cells = [f"{number:.9f}" for number in numbers]
-        rows.append([stop.view, _image_of(stop), *cells, stop.words])
+        words = [joints_in_degrees(stop.q)]
+        words += [] if form is None else [pendant_words(stop.base_from_flange, form)]
+        rows.append([stop.view, _image_of(stop), *cells, stop.words, *words])
     return csv_text(rows)
+
+
+def joints_in_degrees(q: FloatArray) -> str:
+    """(n,) joint angles [rad] as a pendant shows them."""
+    return " ".join(f"{angle:.3f}" for angle in np.rad2deg(q))
 
 
 def _image_of(stop: Stop) -> str:

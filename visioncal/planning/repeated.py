@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from visioncal.core.conventions import PoseForm
+from visioncal.core.documents.pendants import pendant_words
 from visioncal.core.documents.tables import csv_text
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
@@ -23,14 +25,19 @@ class CalibratedStops:
     poses: FloatArray  # (k, 4, 4) `base_from_flange` [m].
     q: FloatArray | None  # (k, n) joint angles [rad]; None where not all were recorded.
 
-    def table(self) -> str:
-        """The stops as a table of poses and joint angles, by the views of the calibration."""
+    def table(self, form: PoseForm | None) -> str:
+        """The stops as a table of poses and joint angles, by the views of the calibration.
+
+        The poses are also in the maker's form, where it is known.
+        """
         angles = np.zeros((len(self.views), 0)) if self.q is None else self.q
         joints = [f"q{index + 1}_rad" for index in range(angles.shape[1])]
-        rows: list[list[object]] = [["view", *joints, *POSE]]
+        shown = [] if form is None else [f"pose_{form.name}"]
+        rows: list[list[object]] = [["view", *joints, *POSE, *shown]]
         for view, q, pose in zip(self.views, angles, self.poses, strict=True):
             numbers = [*q.tolist(), *pose_row(pose).values()]
-            rows.append([view, *(f"{number:.9f}" for number in numbers)])
+            words = [] if form is None else [pendant_words(pose, form)]
+            rows.append([view, *(f"{number:.9f}" for number in numbers), *words])
         return csv_text(rows)
 
 

@@ -36,6 +36,8 @@ from visioncal.core.types import MOUNTS, FloatArray, Mount
 _SHUFFLES, _MOST_SCORE = 8, 0.3
 # Log prior odds by the logarithm of the ratio of the edges' lengths, and their bound.
 _BY_LENGTH = 10.0
+# How the sentence begins where the motion leaves the reading open.
+ONE_AXIS = "All views turn about one axis"
 # Poses of two readings that differ by less than this share of the residuals are the same.
 _SAME = 0.3
 
@@ -236,10 +238,7 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
     if rivals:
         closes += f"; the next, {rivals[0].words}, to {_figures(rivals[0])}"
     if _turns_about_one_axis(declared):
-        return (
-            "The motion cannot distinguish readings: all views turn about one axis at most. As "
-            f"first read, {closes}."
-        )
+        return f"{ONE_AXIS} at most, which cannot distinguish readings. As first read, {closes}."
     if not declared.fit.closes:
         return f"No reading that was tried stands out: as first read, {closes}."
     return f"The poses fit as first read: {closes}."

@@ -119,7 +119,8 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
             next_step="Say --mount eye-in-hand or --mount eye-to-hand.",
         )
     foreign = with_observations_only(foreign)
-    document: dict[str, Any] = {"schema": 1, "name": foreign.name, "mount": mount}
+    name = foreign.title or foreign.name
+    document: dict[str, Any] = {"schema": 1, "name": name, "mount": mount}
     notes = list(foreign.notes)
     store = foreign.store
     if store is None:

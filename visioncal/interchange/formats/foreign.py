@@ -98,7 +98,7 @@ class ForeignStream:
 class ForeignRecording:
     """A recording in a foreign format: n rows, each an observation at one robot pose."""
 
-    name: str
+    name: str  # Of the source, for messages.
     robot: PoseNumbers  # `base_from_flange` of each row.
     # `cam_from_target` of each row; None where images are used instead.
     camera: PoseNumbers | None = None
@@ -124,6 +124,8 @@ class ForeignRecording:
     stream: ForeignStream | None = None
     # The form of the robot's poses, where the user or the source states a maker's.
     form: str = ""
+    # Makers' forms whose names the robot's columns have.
+    makers: tuple[str, ...] = ()
     # Further columns of views.csv with their (n,) cells.
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # Assumptions and omissions, in sentences for the user.
@@ -132,6 +134,7 @@ class ForeignRecording:
     # The same source otherwise read, the likeliest first; each with how unlikely it is beside this.
     rivals: tuple[tuple[int, "ForeignRecording"], ...] = ()
     doubt: DataError | None = None  # The error where nothing decides between these.
+    title: str = ""  # The session's name, where it is not that of the source.
 
 
 def frames_to_take(
@@ -158,7 +161,7 @@ def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:
     """Some rows of a recording, in the given order."""
     views = foreign.views or tuple(range(len(foreign.robot)))
     return replace(
-        chosen_rows(replace(foreign, views=views), rows, "notes", "rivals"),
+        chosen_rows(replace(foreign, views=views), rows, "notes", "rivals", "makers"),
         robot=foreign.robot.rows(rows),
         camera=None if foreign.camera is None else foreign.camera.rows(rows),
         columns={

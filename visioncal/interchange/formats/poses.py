@@ -491,10 +491,15 @@ def _by_rows(requested: PoseImportOptions, count: int) -> PoseImportOptions:
     return replace(requested, form=None, unit=requested.unit or (form.unit if form else None))
 
 
+def makers_of(names: Sequence[str]) -> tuple[str, ...]:
+    """Forms of poses whose rotations have the names of a pose's fields, position first."""
+    return tuple(forms_named([without_unit(name)[0].lower() for name in names[3:]]))
+
+
 def _usual_form(names: Sequence[str], usual: str | None) -> str | None:
     """The robot's own form, where names of a pose's numbers fit it; raises DataError."""
-    plain, units = zip(*map(without_unit, names), strict=True)
-    form, makers = POSE_FORMS.get(usual or ""), forms_named([name.lower() for name in plain[3:]])
+    units = [without_unit(name)[1] for name in names]
+    form, makers = POSE_FORMS.get(usual or ""), makers_of(names)
     if form is None or "ros" in makers:
         return None
     if makers and form.name not in makers:

@@ -118,9 +118,10 @@ def convert(
         # Of what nothing states, the only reading that agrees contradicts nobody.
         is_found = tested is not foreign and not tested.unstated
         if choose is None or is_found:
-            choose, session = None, assemble(_checked(foreign, tested, requested))
+            tested = replace(_checked(foreign, tested, requested), title=dest.resolve().stem)
+            choose, session = None, assemble(tested)
         else:
-            doubtful = DoubtfulSession.of(foreign)
+            doubtful = DoubtfulSession.of(replace(foreign, title=dest.resolve().stem))
     elif requested != _DEFAULTS:
         raise DataError(
             f"{source} is a session already; what describes poses and cameras is for somebody "

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration.guess import CLEAR, FEWEST_ROWS, Candidate, Guess, Hypothesis
+from visioncal.calibration.guess import CLEAR, FEWEST_ROWS, ONE_AXIS, Candidate, Guess, Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
@@ -52,6 +52,11 @@ from visioncal.vision.boards.kind import LARGEST_M
 from visioncal.vision.targets import corner_positions
 
 _IDENTITY = ("0.0", "0.0", "0.0", "1.0")
+# Advice where the motion determines neither the calibration nor the form of the poses.
+_MOVE = (
+    "First add 3 or more views in which the flange is tilted by 20 to 40 degrees about different "
+    "axes: it takes them for any result, and they show the form, too. Or "
+)
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
@@ -139,6 +144,9 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
             why = fault if tried is readings else why
             if found is not None:
                 return found
+            if why.startswith(ONE_AXIS):
+                # No order of the numbers closes the chain better than others.
+                break
     return _untested(foreign, why, other)
 
 
@@ -300,12 +308,15 @@ def _applied(
         or (is_open and "positions" in note)
     )
     notes = [f"Found by the {'images' if is_measured else 'poses'}: {guess.sentence}"]
-    makers = [
-        form.name
-        for form in POSE_FORMS.values()
-        if form.models and form.rotation == best.robot.rotation and not foreign.form
-    ]
-    if makers:
+    forms = [form for form in POSE_FORMS.values() if form.rotation == best.robot.rotation]
+    makers = [form.name for form in forms if form.models and not foreign.form]
+    # Columns A, B, C of turns about Z, Y, X are a KUKA's; roll, pitch, yaw may be any program's.
+    named = [form for form in forms if form.name in foreign.makers]
+    own = named[0].name if len(named) == 1 and named[0].name in makers else ""
+    if own:
+        by = "By the names of the columns, poses are written as"
+        notes.append(f"{by} {named[0].words}; --robot-form says another form.")
+    elif makers:
         # Exports, targets and picks by poses are in the robot's own form, once that is known.
         notes.append(f"Robots that write so: {some_of(makers)}; --robot-form says which it is.")
     notes += guess.notes
@@ -313,6 +324,7 @@ def _applied(
         foreign,
         robot=numbers["robot"] or foreign.robot,
         camera=numbers["camera"],
+        form=own or foreign.form,
         notes=(*kept, *notes),
         unstated={},
         rivals=(),
@@ -363,7 +375,8 @@ def _untested(
                 f"{foreign.name}: the form of the {whose}'s rotations is not said, and nothing "
                 f"determines it: {why}.",
                 culprits=[f"--{whose}-form"],
-                next_step=f"Say --{whose}-form {forms}.{joints if whose == 'robot' else ''}",
+                next_step=(f"{_MOVE}say" if why.startswith(ONE_AXIS) else "Say")
+                + f" --{whose}-form {forms}.{joints if whose == 'robot' else ''}",
             )
     note = f"Forms of poses that the source does not state were not tested: {why}."
     return replace(foreign, notes=(*foreign.notes, note))
