@@ -249,6 +249,15 @@ def test_copies_of_rows_change_nothing(kind, jitter_m, interleaved):
     assert originals.union(found.views) >= {view.view for view in after.views}
 
 
+def test_readings_of_one_stated_stop_are_no_copies_to_delete():
+    session = KINDS["readings"]()
+    stated = replace(session, views=tuple(replace(row, stop=row.number) for row in session.views))
+    found = calibrate(copied(stated, 1e-5, interleaved=True))
+    assert not {one.kind for one in found.verdict.findings} & {"repeated_readings"}
+    reasons = {view.reason for view in found.views if not view.used}
+    assert reasons == {"read anew at its stop, which counts once"}
+
+
 def told(poses=None, joints=None, stops=None):
     """A session of poses or joint angles or both, one row each."""
     views = []

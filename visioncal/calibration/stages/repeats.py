@@ -46,6 +46,23 @@ def without_repeats(seen: T) -> T:
     for frame, look in seen.cameras.items():
         unique = {view: px for view, px in look.corners.items() if view not in repeated}
         seen = seen.with_camera(frame, replace(look, corners=unique))
+    rows = {view.number: view for view in seen.timed.views}
+    # An instrument is read several times at a stop; its last digit may be alike.
+    anew = {
+        view
+        for view, first in repeated.items()
+        if rows[view].reading_m is not None and rows[view].stop == rows[first].stop is not None
+    }
+    repeats = {
+        view: "read anew at its stop, which counts once"
+        if view in anew
+        else f"repeats view {earlier}"
+        for view, earlier in repeated.items()
+    }
+    seen = replace(seen, repeats=repeats)
+    repeated = {view: first for view, first in repeated.items() if view not in anew}
+    if not repeated:
+        return seen
     views, originals = ranges(repeated), ranges(dict.fromkeys(repeated.values()))
     # Readings may be of another time that is not stated.
     finding = Finding(
@@ -60,8 +77,7 @@ def without_repeats(seen: T) -> T:
         tuple(repeated),
         until_mm=LEAST_NEED_MM,
     )
-    repeats = {view: f"repeats view {earlier}" for view, earlier in repeated.items()}
-    return replace(seen, repeats=repeats).noting((), (finding,))
+    return seen.noting((), (finding,))
 
 
 def with_stop_means(seen: T) -> T:
