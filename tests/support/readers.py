@@ -289,12 +289,48 @@ def mujoco(text):
     return transform(of_quaternion(*vector, w) @ turned, position)
 
 
+def fanuc_program(text):
+    """Frames that a program of a teach pendant sets: from a position to a register to a frame."""
+    body, _, rest = text.replace("\r\n", "\n").partition("/POS\n")
+    listing = body.partition("/MN\n")[2]
+    lines = re.findall(r"^ *\d+:  (.*?) *;$", listing, re.M)
+    assert len(lines) == len(listing.splitlines()) == int(re.search(r"COUNT\s*= (\d+)", body)[1])
+    positions, registers, frames = {}, {}, {}
+    for number, fields in re.findall(r"^P\[(\d+)\]\{\n(.*?)^\};", rest, re.M | re.S):
+        found = re.findall(r"([XYZWPR]) = *([-.\d]+) +(mm|deg)", fields)
+        assert "".join(name + unit for name, _, unit in found) == "XmmYmmZmmWdegPdegRdeg"
+        values = [float(value) for _, value, _ in found]
+        w, p, r = np.radians(values[3:])
+        turn = rz(r) @ ry(p) @ rx(w)
+        positions[f"P[{number}]"] = transform(turn, np.array(values[:3]) / 1000)
+    for to, _, value in (line.partition("=") for line in lines if not line.startswith("!")):
+        if to.startswith("PR["):
+            registers[to] = positions[value]
+        else:
+            frames[to] = registers[value]
+    assert rest.splitlines()[-1] == "/END"
+    return frames
+
+
+def fanuc_frame(kind):
+    """Reads the only frame that a program sets."""
+
+    def read(text):
+        ((name, pose),) = fanuc_program(text).items()
+        assert re.fullmatch(rf"{kind}\[\d+\]", name)
+        return pose
+
+    return read
+
+
 # By the format's name: every format that holds a tool, and every one that holds a fixture.
 TOOL_READERS = {"ur-tcp": ur_tcp, "abb-tooldata": abb_tooldata, "kuka-tool": kuka_frame("TOOL")}
+TOOL_READERS |= {"fanuc-utool": fanuc_frame("UTOOL")}
 FIXTURE_READERS = {
     "ur-feature": ur_feature,
     "abb-wobjdata": abb_wobjdata,
     "kuka-base": kuka_frame("BASE"),
+    "fanuc-uframe": fanuc_frame("UFRAME"),
 }
 
 # Those of an arm, which test_cell_exports.py reads.

@@ -8,7 +8,7 @@ import typer
 from visioncal.cli.console import check_usable, say, with_run_paths
 from visioncal.cli.result_options import ExportOptions
 from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, write_atomically
+from visioncal.core.files import check_free, read_text, write_atomically
 from visioncal.interchange.exports import Load, Selection, document
 from visioncal.interchange.result_files import load_exportable
 
@@ -24,7 +24,8 @@ def export_command(options: ExportOptions) -> None:
     load = None
     if options.mass_kg is not None and options.cog_mm is not None:
         load = Load(options.mass_kg, options.cog_mm)
-    given = {**vars(options), "load": load}
+    onto = None if options.onto is None else read_text(options.onto)
+    given = {**vars(options), "load": load, "onto": onto}
     selection = Selection(**{field.name: given[field.name] for field in fields(Selection)})
     with with_run_paths(options.source, options.source):
         written = document(load_exportable(options.source), options.to, selection)

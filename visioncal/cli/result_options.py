@@ -333,6 +333,7 @@ class ExportOptions(PartOptions):
         "A poorer model of the lens, refitted; what it leaves is said.",
         metavar="pinhole|radtan|plumb_bob",
     )
+    onto: Path | None = option("For oak: the device's own calibration, as depthai saves it.")
     convention: str | None = option("Of robot-dh's table.", metavar="|".join(get_args(Convention)))
     calibration_hash: str | None = option("Hash of ur_calibration, for ur-kinematics.", "--hash")
     force: bool = force_both()

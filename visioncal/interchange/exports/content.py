@@ -256,6 +256,7 @@ class Selection:
     robot: str | None = None
     target: str | None = None  # A target of a cell; likewise.
     lens: str | None = None  # A poorer model of the lens, as of `lenses.POORER`.
+    onto: str | None = None  # An existing document, all else of which is kept.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -274,6 +275,7 @@ class Content(Placement):
     optical: str = ""
     number: int | None = None  # Of the controller's tool or base.
     load: Load | None = None
+    onto: str | None = None  # An existing document, all else of which is kept.
 
     @property
     def matrix(self) -> FloatArray:

@@ -257,6 +257,7 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         optical=optical,
         number=selection.number,
         load=selection.load,
+        onto=selection.onto,
     )
 
 

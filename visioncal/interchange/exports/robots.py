@@ -100,6 +100,69 @@ def _write(language: str, statement: str, content: Content) -> str:
     return f"{comments(mark, content.notes) if mark else ''}{text}\n"
 
 
+# An ASCII program of FANUC as a controller prints its own (CrossArm, docs/fanuc_ls_format.md). It
+# cannot assign a constant: a frame goes through a position and a position register (operator's
+# manual, "frame instructions"), here the last that a controller has as delivered.
+_PROGRAM = """/PROG  SET_{short}{number}
+/ATTR
+OWNER\t\t= MNEDITOR;
+COMMENT\t\t= "visioncal";
+PROG_SIZE\t= 0;
+FILE_NAME\t= ;
+VERSION\t\t= 0;
+LINE_COUNT\t= {count};
+MEMORY_SIZE\t= 0;
+PROTECT\t\t= READ_WRITE;
+TCD:  STACK_SIZE\t= 0,
+      TASK_PRIORITY\t= 50,
+      TIME_SLICE\t= 0,
+      BUSY_LAMP_OFF\t= 0,
+      ABORT_REQUEST\t= 0,
+      PAUSE_REQUEST\t= 0;
+DEFAULT_GROUP\t= 1,*,*,*,*;
+CONTROL_CODE\t= 00000000 00000000;
+/MN
+{lines}
+/POS
+P[1]{{
+   GP1:
+\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',
+\tX ={pose[0]}  mm,\tY ={pose[1]}  mm,\tZ ={pose[2]}  mm,
+\tW ={pose[3]} deg,\tP ={pose[4]} deg,\tR ={pose[5]} deg
+}};
+/END
+"""
+
+
+def _write_program(what: str, content: Content) -> str:
+    """Writes a program that sets UTOOL[n] or UFRAME[n] when it runs; raises DataError without n."""
+    if content.number is None:
+        raise DataError(
+            f"fanuc-{what.lower()} sets {what}[n] of the controller, and n is not said.",
+            culprits=["--number"],
+            next_step="Name it with --number: what stands there is overwritten.",
+        )
+    edge = content.edge
+    turn = f" and {edge.sigma_deg:.2g} deg" if content.oriented else ", no rotation"
+    words = (
+        content.name,
+        f"verdict {content.verdict.status}",
+        f"sigma {edge.sigma_mm:.2g} mm{turn}",
+    )
+    # A remark has 32 characters; the first register is padded as a controller does.
+    lines = [f"!{line[:31]}" for line in (*words, "PR[100] is overwritten")]
+    lines += ["PR[100]=P[1]   ", f"{what}[{content.number}]=PR[100]"]
+    pose = [f"{fixed(value, 6):>13}" for value in write_pose(content.matrix, POSE_FORMS["fanuc"])]
+    text = _PROGRAM.format(
+        short=what[:2],
+        number=content.number,
+        count=len(lines),
+        lines="\n".join(f"{number:>4}:  {line} ;" for number, line in enumerate(lines, 1)),
+        pose=pose,
+    )
+    return text.replace("\n", "\r\n")
+
+
 def _warn_of_load(content: Content) -> Iterable[str]:
     if content.load is None:
         yield (
@@ -153,5 +216,19 @@ ROBOTS = (
         for name, holds, statement, words in (
             re.split(r"\s{2,}", entry) for entry in re.split(r"\n(?! )", _FRAMES.strip())
         )
+    ),
+    ExportFormat(
+        "fanuc-utool",
+        "a tool for FANUC: a program that sets UTOOL[n], --number n [mm, deg]",
+        partial(_write_program, "UTOOL"),
+        frozenset({"number"}),
+        holds="tool",
+    ),
+    ExportFormat(
+        "fanuc-uframe",
+        "a fixture for FANUC: a program that sets UFRAME[n], --number n [mm, deg]",
+        partial(_write_program, "UFRAME"),
+        frozenset({"number"}),
+        holds="fixture",
     ),
 )

@@ -7,6 +7,7 @@ UR's `base_link` by 180 degrees about z. Our camera frame, z forward and x right
 optical frame.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
+from visioncal.core.number_format import known_name
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import AGAIN
 from visioncal.interchange.exports.content import (
@@ -127,8 +129,50 @@ def _write_zivid(content: Content) -> str:
     return version + yaml_text({"FloatMatrix": {"Data": rows(matrix_mm)}}, short_lists=True)
 
 
+def _write_oak(content: Content) -> str:
+    """Writes the lens into an OAK's own calibration; raises DataError without it."""
+    # depthai, EepromData: one matrix a camera at one size of its sensor, from which those of other
+    # sizes follow by scaling to cover and cropping about the middle; 14 coefficients.
+    camera, names = camera_of(content), [f"CAM_{letter}" for letter in "ABCDEFGHIJ"]
+    socket = known_name("camera of an OAK", content.child, names, next_step="Name it with --child.")
+    step = "Save it with CalibrationHandler.eepromToJsonFile, and name that file with --onto."
+    try:
+        document = json.loads(content.onto or "")
+        entry = dict(document["cameraData"])[names.index(socket)]
+        size = (int(entry["width"]), int(entry["height"]))
+    except (ValueError, KeyError, TypeError) as error:
+        why = "is needed, of which all else is kept" if content.onto is None else "is none of it"
+        raise DataError(
+            f"oak: the device's own calibration with {socket} {why}.",
+            culprits=["--onto"],
+            next_step=step,
+        ) from error
+    (width, height), (wide, high) = camera.resolution, size if min(size) > 0 else camera.resolution
+    if wide / high > 1.5 > width / height:
+        raise DataError(
+            f"oak: the device's own calibration is of {wide} x {high} pixels, and this lens of "
+            f"{width} x {height}, which depthai takes for another part of the sensor.",
+            culprits=["--onto"],
+            next_step="Calibrate with pictures of the shape of the device's calibration.",
+        )
+    scale, matrix = max(width / wide, height / high), matrix_3x3(camera)
+    matrix[:2, 2] += 0.5 * np.array([wide * scale - width, high * scale - height])
+    matrix[:2] /= scale
+    padded = np.pad(camera.distortion, (0, 14 - len(camera.distortion)))
+    entry |= {"intrinsicMatrix": rows(matrix), "distortionCoeff": numbers(padded)}
+    entry |= {"width": wide, "height": high, "cameraType": int(camera.model == "fisheye")}
+    return json.dumps(document, indent=1) + "\n"
+
+
 FILES = (
     LENS_FORMAT("camera-info", "the lens as ROS's camera_info YAML [px]", _write_camera_info),
+    LENS_FORMAT(
+        "oak",
+        "the lens in an OAK's own calibration, --onto FILE; --child names the socket [px]",
+        _write_oak,
+        takes=frozenset({"lens", "onto"}),
+        frames={"cam": "CAM_A"},
+    ),
     LENS_FORMAT("kalibr", "the lens as Kalibr's camchain.yaml [px]", _write_kalibr),
     ExportFormat(
         "opencv",
