@@ -15,7 +15,7 @@ from visioncal.results import Calibration
 # Options that are named as the import's.
 _AS_TYPED = (
     *("camera_file", "mount", "target", "intrinsics"),
-    *("images", "resolution", "tip"),
+    *("images", "resolution", "tip", "instrument"),
 )
 
 

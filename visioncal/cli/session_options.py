@@ -369,7 +369,10 @@ class ConvertOptions(RobotPoseOptions):
     source: Path = argument("A session's folder, its .rrd, or somebody else's file or folder.")
     dest: Path = argument("An .rrd, or the folder to write.")
     form: str | None = _recording("Its format, by a name; a wrong one gets the list.", "--from")
-    mount: CameraMount | None = _recording("Where the camera is.")
+    mount: Mount | None = _recording("Where the camera is, or that it is an instrument.")
+    instrument: str | None = _recording(
+        "A known instrument, such as leica-at960, or its sigma in mm.", metavar="NAME|MM"
+    )
     target: str | None = _recording(f"{_BOARD}, charuco_5x7_36.2mm_18.3mm_DICT_6X6_250.")
     tip: str | None = _recording("The frame that the poses are of.")
     camera_columns: tuple[str, ...] | None = _names(

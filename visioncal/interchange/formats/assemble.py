@@ -119,8 +119,9 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
             next_step="Say --mount eye-in-hand or --mount eye-to-hand.",
         )
     foreign = with_observations_only(foreign)
-    name = foreign.title or foreign.name
-    document: dict[str, Any] = {"schema": 1, "name": name, "mount": mount}
+    document: dict[str, Any] = {"schema": 1, "name": foreign.title or foreign.name}
+    document |= {} if mount == "instrument" else {"mount": mount}
+    document |= {"instrument": dict(foreign.instrument)} if foreign.instrument else {}
     notes = list(foreign.notes)
     store = foreign.store
     if store is None:

@@ -154,6 +154,7 @@ def _recordings(
         name=fields.name or fields.folder.resolve().name,
         robot=poses["robot"],
         camera=poses.get("camera"),
+        mount="instrument" if "meas_x_m" in columns and not (points or pairing.images) else None,
         images=pairing.images,
         lens={"model": "points"} if points else None,
         joints_rad=joints,

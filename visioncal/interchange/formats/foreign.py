@@ -73,6 +73,7 @@ class ImportOptions:
     intrinsics: str | None = None  # The path of a file with intrinsics, or `estimate`.
     images: Path | None = None
     resolution: tuple[int, int] | None = None  # (width, height) [px].
+    instrument: str | None = None  # A known instrument's name, or its sigma [mm].
     robot_model: str | None = None  # A built-in robot's name, or the path of a .urdf or a DH .toml.
     tip: str | None = None  # The frame that the poses are of.
     # The words of the command, which messages repeat with what is to be added.
@@ -115,6 +116,8 @@ class ForeignRecording:
     lens: Mapping[str, Any] | None = None
     # The same of `[cameras.NAME]`, of several.
     lenses: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    # The fields of `[instrument]`.
+    instrument: Mapping[str, Any] | None = None
     # The robot's description, where the source holds it; see `Robot.from_document`.
     robot_document: Mapping[str, Any] | None = None
     # The fields of `[robot]` in session.toml, where the user names a robot.

@@ -375,8 +375,8 @@ _JOINTS = re.compile(
     r"(?:.*[._])?(?:joint_pose|joints?|joint_angles|joint_(?:positions?|values?|states?)|q)"
 )
 _JOINT_NAME = re.compile(
-    r"(?:.*\.)?(joint|axis|j|a|q)[ _]?([1-9])((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*"
-    r"(?:deg|rad|[°º])[a-z]*\W*)?)",
+    r"(?:.*\.)?(joint|axis|gelenk|achse|j|a|q)[ _]?([1-9])((?:[ _]?(?:pos|position|angle))?"
+    r"(?:[ _]*\W*(?:deg|rad|[°º])[a-z]*\W*)?)",
     re.IGNORECASE,
 )
 

@@ -10,6 +10,7 @@ from typing import TypeAlias
 from visioncal.calibration.guess import Candidate
 from visioncal.calibration.pipeline.mended_images import mend_images
 from visioncal.core.arguments import typed
+from visioncal.core.choices import MOUNTS
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
 from visioncal.core.number_format import known_name
@@ -19,6 +20,7 @@ from visioncal.interchange.formats.columns import TABLE, VIEWS
 from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.industrial import EASY_HANDEYE, HAND_EYE, KINEMATICS, MOVEIT
 from visioncal.interchange.formats.lerobot import LEROBOT
+from visioncal.interchange.formats.metrology import METROLOGY
 from visioncal.interchange.formats.poses import check_radians
 from visioncal.interchange.formats.rereading import (
     DoubtfulSession,
@@ -46,6 +48,7 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
     ZIVID,
     EASY_HANDEYE,
     MOVEIT,
+    METROLOGY,
     TABLE,
     VIEWS,
 )
@@ -171,6 +174,8 @@ def read_foreign(
     Its format is recognised; `form` selects one of several that fit.
     """
     # With a second file, both are tables, whatever the first looks like.
+    if form is None and (requested.mount == "instrument" or requested.instrument is not None):
+        form = METROLOGY.name
     form = form or (TABLE.name if requested.camera_file is not None else None)
     foreign = _foreign_format(source, form, requested).read(source, requested)
     rivals = ((rank, with_user_options(each, requested)) for rank, each in foreign.rivals)
@@ -225,7 +230,14 @@ def _foreign_format(source: Path, form: str | None, requested: ImportOptions) ->
     names = [foreign_format.name for foreign_format in FOREIGN_FORMATS]
     if form is not None:
         known_name("format", form, names)
+    # Points of an instrument that is asked for need no program's headings; a camera has others.
+    is_of_camera = requested.mount in MOUNTS or requested.target or requested.images
+    others = (METROLOGY,) * bool(is_of_camera and form is None)
     for candidate in FOREIGN_FORMATS:
-        if form in (None, candidate.name) and candidate.recognises(source):
+        if (
+            form in (None, candidate.name)
+            and candidate not in others
+            and (form == METROLOGY.name or candidate.recognises(source))
+        ):
             return candidate
     raise unknown(describe(source), requested)

@@ -1,0 +1,487 @@
+"""Tables of measured points, as SpatialAnalyzer, PolyWorks, CAM2 and their like write them.
+
+Columns are recognised by the words of their headings, in any order: `X [mm]`, `Meas. Z`, `U95 X`,
+`Rx (deg)`, `Load [kg]`. A text export without headings has the names of collection, group and
+target, x, y, z and, if asked for, three uncertainties (SpatialAnalyzer's manual, "Exporting ASCII
+formatted points"), by default one standard deviation ("Confidence interval"). The robot's joint
+angles or poses stand in the same rows, or in a table of their own beside it.
+"""
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from visioncal.core.conventions import UNITS_M, PoseNumbers
+from visioncal.core.documents.tables import is_number
+from visioncal.core.errors import DataError
+from visioncal.core.limits import FAR_M
+from visioncal.core.number_format import counted, figure, some_of
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.interchange.formats.assemble import pose_cells
+from visioncal.interchange.formats.fields import HOW, Fields, Keys, is_headerless, matched
+from visioncal.interchange.formats.file_search import files_in, groups_in, head
+from visioncal.interchange.formats.foreign import (
+    ForeignFormat,
+    ForeignRecording,
+    ImportOptions,
+    Side,
+    Unstated,
+    rows_of,
+)
+from visioncal.interchange.formats.poses import joint_names, joints_from, pose_names, poses_from
+from visioncal.interchange.formats.reading import ENDINGS, read_rows
+from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION
+from visioncal.session.kinds import known_instruments
+
+_Words: TypeAlias = frozenset[str]
+
+
+def _set(words: str) -> _Words:
+    return frozenset(words.split())
+
+
+# Words of headings, in small letters.
+_MEASURED = _set("meas measured act actual ist gemessen tracker probe medido mesuré")
+_UNCERTAIN = _set("u u95 u99 unc uncertainty unsicherheit sigma std stdev sd s incertidumbre")
+_TURNS, _FORCE = _set("r rot rotation"), _set("f force kraft fuerza")
+_PAYLOAD = _set("payload load last nutzlast mass masse weight gewicht carga")
+_CENTRE = _set("cog com centre center schwerpunkt")
+_OTHER = _TURNS | _FORCE | _UNCERTAIN | _PAYLOAD | _CENTRE
+_OTHER |= _set("robot roboter tcp flange base programmed prog cmd commanded controller")
+_OTHER |= _set("nom nominal soll ref reference design cad d dev deviation delta diff error tol")
+_OTHER |= _set("tolerance upper lower n normal rms offset abweichung")
+# Names of rows, the outermost first, and of the stops of the robot.
+_TARGETS = "target point name label feature punkt messpunkt punto"
+_LEVELS = (_set("collection"), _set("group gruppe grupo"), _set(_TARGETS))
+_STOP = _set("stop pose station posture stelle")
+# An axis in one word with what is measured, as in Ux, ActX, Rx.
+_PREFIX = re.compile(r"(u|u95|unc|s|sd|std|sigma|d|dev|nom|act|meas|r|f|n)([xyz])")
+_UNITS = {name: name for name in (*UNITS_M, "deg", "rad", "kg", "n")} | {
+    word: name
+    for name, words in {
+        "inch": "in inches zoll",
+        "deg": "° º degree degrees",
+        "mm": "millimeter millimeters millimetre millimetres",
+        "m": "meter meters metre metres",
+        "um": "µm μm micron microns",
+    }.items()
+    for word in words.split()
+}
+_UNIT_LINE = re.compile(r"\b(?:units?|length|einheit(?:en)?)\b[\W_]*([^\W_]+)", re.IGNORECASE)
+_LOAD = re.compile(r"(?<![0-9.,])(\d+(?:[.,]\d+)?)[ _]?(kg|N)(?![^\W_])")
+_COVERED = {
+    2.0: re.compile(r"u95|\b95(?:[.,]\d+)? ?%|k ?= ?2\b|2 ?sigma|expanded|erweitert", re.I),
+    3.0: re.compile(r"u99|\b99(?:[.,]\d+)? ?%|k ?= ?3\b|3 ?sigma", re.I),
+}
+# Instruments that read no points.
+_OF_AN_AXIS = {"xl80": "XL-80 reads a length", "xr20": "XR20-W reads the angle of one axis"}
+
+
+@dataclass(frozen=True)
+class _Heading:
+    """A column's name, taken apart."""
+
+    words: _Words  # Without axis and unit.
+    axis: str  # x, y or z; else empty.
+    unit: str  # Empty where it states none.
+
+    @classmethod
+    def of(cls, name: str) -> "_Heading":
+        spaced = re.sub(r"(?<=[a-z0-9])(?=[XYZ]\b)|(?<=[XYZ])(?=[A-Z][a-z])", " ", name)
+        words = list[str]()
+        for word in re.split(r"[\s_.,;:/()\[\]{}=%-]+", spaced.lower()):
+            joined = _PREFIX.fullmatch(word)
+            words += joined.groups() if joined else [word] * bool(word)
+        axes = [word for word in words if word in ("x", "y", "z")]
+        unit = _UNITS.get(words[-1], "") if len(words) > 1 else ""
+        others = words[: len(words) - bool(unit)]
+        return cls(frozenset(others) - {*axes}, axes[0] if len(axes) == 1 else "", unit)
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Rows of a file by their headings, and what the robot did in them."""
+
+    fields: Fields
+    title: str = ""  # Comments and lines above the rows.
+    file: str = ""
+    joints: tuple[str, ...] = ()  # Columns of joint angles.
+    poses: tuple[str, ...] = ()  # Columns of the robot's poses.
+
+    @classmethod
+    def of(cls, fields: Fields, file: Path, requested: ImportOptions) -> "_Table":
+        lines = head(file).splitlines()[:60]
+        sizes = [sum(map(is_number, re.split(r"[\s,;]+", line))) for line in lines]
+        first = next((at for at, size in enumerate(sizes) if size > 2), len(lines))
+        title = "\n".join(text for at, text in enumerate(lines) if at < first or text[:1] in "/#%")
+        fields = _side_by_side(_with_headings(fields))
+        own = {*fields.numbers, *fields.texts}
+        table = cls(fields, title, file.name)
+        taken = tuple(name for name in requested.camera.names if name in own)
+        taken = taken or next(iter(table.points().values()), ())
+        joints = tuple(name for name in requested.joints if name in own)
+        joints = joints or joint_names(fields, taken)
+        if is_headerless(fields) and "joint" in fields.name.lower():
+            joints = joints or tuple(fields.numbers)
+        given = tuple(name for name in requested.robot.names if name in own)
+        others = (*joints, *(taken if joints or table.is_measured else ()))
+        poses = pose_names(fields, given, "robot", others, by_shape=False)
+        return replace(table, joints=joints, poses=poses)
+
+    def triples(self) -> dict[_Words, tuple[str, ...]]:
+        """Columns of x, y and z that share all other words, by these."""
+        found = defaultdict[_Words, dict[str, str]](dict)
+        for name in self.fields.numbers:
+            if (heading := _Heading.of(name)).axis:
+                found[heading.words].setdefault(heading.axis, name)
+        return {words: tuple(g[a] for a in "xyz") for words, g in found.items() if len(g) == 3}
+
+    def points(self) -> dict[_Words, tuple[str, ...]]:
+        """Columns of measured places by their words, the likeliest alone where one is."""
+        free = {words: names for words, names in self.triples().items() if not words & _OTHER}
+        best = {words: names for words, names in free.items() if words & _MEASURED}
+        return best or ({_set(""): free[_set("")]} if _set("") in free else free)
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether a heading says that places are measured."""
+        return any(words & _MEASURED for words in self.points())
+
+    def named(self, kind: _Words) -> str:
+        """The first column of a kind of names or texts; empty without."""
+        return next((n for n in self.fields.texts if _Heading.of(n).words & kind), "")
+
+    def unit(self, names: Sequence[str], requested: str | None) -> tuple[str, tuple[str, ...]]:
+        """Unit of lengths in some columns, and a note where nothing states it."""
+        stated = {_Heading.of(name).unit for name in names} & {*UNITS_M}
+        above = {_UNITS.get(word.lower(), "") for word in _UNIT_LINE.findall(self.title)}
+        if requested or len(stated) == 1 or len(stated := above & {*UNITS_M}) == 1:
+            return requested or stated.pop(), ()
+        size = max(float(np.nanmax(np.abs(self.fields.column(name)))) for name in names)
+        unit = "mm" if size > FAR_M else "m"
+        note = f"{', '.join(names)} are taken for {unit}; --camera-unit names another unit."
+        return unit, (note,)
+
+
+def _with_headings(fields: Fields) -> Fields:
+    """Rows of names, x, y, z and uncertainties without headings, with these."""
+    columns = [*fields.texts]
+    names = [name for name in columns if name not in fields.numbers]
+    if not names and len(columns) in (4, 7) and not (fields.column(columns[0]) % 1).any():
+        names = columns[:1]
+    numbers = columns[len(names) :]
+    is_list = is_headerless(fields) and [*fields.numbers][-len(numbers) :] == numbers
+    if not is_list or len(names) > 3 or len(numbers) not in ((3, 6) if names else (3,)):
+        return fields
+    headings = [*["collection", "group", "target"][3 - len(names) :], *"xyz"]
+    if len(numbers) == 6:
+        # PolyWorks writes normals behind places, which are of unit length.
+        last = np.hstack([fields.column(name) for name in numbers[3:]])
+        is_normal = np.allclose(np.linalg.norm(last, axis=1), 1.0, atol=1e-3)
+        headings += [f"{'n' if is_normal else 'u'}{axis}" for axis in "xyz"]
+    known = dict(zip(columns, headings, strict=True))
+    arrays = {known[name]: fields.numbers[name] for name in numbers}
+    texts = {known[name]: cells for name, cells in fields.texts.items()}
+    return replace(fields, numbers=arrays, texts=texts)
+
+
+def _side_by_side(fields: Fields) -> Fields:
+    """Rows of several points side by side, with a row a point."""
+    measured = _Table(fields).points()
+    if len(measured) < 2:
+        return fields
+    long = fields.rows(np.repeat(np.arange(len(fields)), len(measured)).tolist())
+    columns = [name for names in measured.values() for name in names]
+    places = np.hstack([fields.column(name) for name in columns]).reshape(-1, 3)
+    units = {_Heading.of(name).unit for name in columns}
+    end = f" [{units.pop()}]" if len(units) == 1 and "" not in units else ""
+    arrays = {name: numbers for name, numbers in long.numbers.items() if name not in columns}
+    texts = {name: cells for name, cells in long.texts.items() if name not in columns}
+    labels = tuple(" ".join(sorted(words)) for words in measured) * len(fields)
+    return replace(
+        long,
+        numbers=arrays | {f"{axis}{end}": places[:, at] for at, axis in enumerate("XYZ")},
+        texts={name: cells for name, cells in texts.items() if name != "target"}
+        | {"target": labels},
+    )
+
+
+def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
+    """Reads a table of points with the robot's state, or two tables; raises DataError."""
+    files = [file for group in groups_in(path) if group.is_data for file in group.files]
+    tables = list[_Table]()
+    for file in [*files, *filter(None, [requested.camera_file])]:
+        with suppress(DataError) if path.is_dir() else nullcontext():
+            rows = read_rows(file, requested.robot.form)
+            tables += [_Table.of(fields, file, requested) for fields in rows]
+    given = {*requested.camera.names}
+    of_points = [t for t in tables if t.points() or (given and given <= {*t.fields.numbers})]
+    states = [table for table in tables if table.joints or table.poses]
+    alone = [table for table in of_points if table not in states]
+    points = next(iter(alone or sorted(of_points, key=lambda table: not table.is_measured)), None)
+    state = next((t for t in states if (t is points) != bool(alone)), None)
+    if points is None or (state is points and points.poses and not points.is_measured):
+        listed = "; ".join(table.fields.listing() for table in tables)
+        raise DataError(
+            f"{path.name}: no columns of measured points are known, as X, Y, Z or Meas X [mm]; it "
+            f"has {listed or 'no tables'}.",
+            culprits=[str(path)],
+            next_step="Name them with --camera-columns X,Y,Z, or put the table of points beside it "
+            "in one folder, and convert that.",
+        )
+    if state is None:
+        raise DataError(
+            f"{points.file}: {counted(len(points.fields), 'measured point')}, but neither joint "
+            "angles nor poses of the robot: nothing says where the arm stood.",
+            culprits=[points.fields.places[0]],
+            next_step="Add columns J1 [deg] ... J6 [deg], or Robot X [mm] ... of the flange with "
+            "--robot-form; or put a table of them, with a column of the targets' or groups' names, "
+            f"beside {points.file} in one folder, and convert that.",
+        )
+    return _recording(points, state, requested)
+
+
+def _recording(points: _Table, state: _Table, requested: ImportOptions) -> ForeignRecording:
+    """The recording of a table of points and of the robot's state at each; raises DataError."""
+    fields, robot = points.fields, state.fields
+    places, notes = _places(points, requested)
+    loads, at = _loads(points), np.arange(len(fields))
+    own = (*points.joints, *points.poses) if state is points else ()
+    stops, spots = _stops(points, loads, own)
+    if state is not points:
+        at, how = _paired(points, stops, state)
+        notes += (f"Points and the robot's states are paired by {how}.",)
+        loads = {k: tuple(v[row] for row in at) for k, v in _loads(state).items()} | loads
+    numbers = {stop: str(number) for number, stop in enumerate(dict.fromkeys(stops))}
+    used = {*next(iter(points.points().values()), ()), *own}
+    columns = {f"source_{name}": c for name, c in fields.texts.items() if name not in used} | loads
+    columns |= {"stop": tuple(numbers[stop] for stop in stops), "point": tuple(spots)}
+    for name in dict.fromkeys(name for row in places for name in row):
+        columns[name] = tuple(row.get(name, "") for row in places)
+    if (lost := np.flatnonzero(at < 0)).size:
+        left = some_of([fields.places[row] for row in lost])
+        notes += (f"Points without a state of the robot are left out: {left}.",)
+    joints, poses = None, PoseNumbers.empty(robot.places)
+    unstated = dict[Side, Unstated]()
+    if state.joints:
+        angles, more = joints_from(robot, state.joints, degrees=requested.joints_deg)
+        joints, notes = angles[at], (*notes, *more)
+    if state.poses:
+        of_robot = poses_from(robot, state.poses, requested.robot, "robot")
+        poses, more, unstated["robot"] = of_robot
+        notes = (*notes, *more)
+    instrument, more = _instrument(points, requested)
+    foreign = ForeignRecording(
+        name=fields.name,
+        robot=poses.rows(at),
+        mount="instrument",
+        joints_rad=joints,
+        form=robot.form,
+        columns=columns,
+        notes=(*notes, *more),
+        unstated=unstated,
+        instrument=instrument,
+    )
+    return rows_of(foreign, np.flatnonzero(at >= 0))
+
+
+def _places(
+    points: _Table, requested: ImportOptions
+) -> tuple[list[dict[str, str]], tuple[str, ...]]:
+    """Cells of readings by row, of places or of a probe's poses, and notes; raises DataError."""
+    fields, given = points.fields, requested.camera
+    words, names = next(iter(points.points().items()), (_set(""), ()))
+    names = tuple(map(fields.find, given.names)) or names
+    unit, notes = points.unit(names[:3], given.unit)
+    angles = {w - _TURNS: n for w, n in points.triples().items() if w & _TURNS}
+    turns = angles.get(words) or (next(iter(angles.values())) if len(angles) == 1 else ())
+    lower = {name.lower(): name for name in fields.numbers}
+    for quaternion in (("qx", "qy", "qz", "qw"), ("q0", "q1", "q2", "q3")):
+        turns = tuple(lower[name] for name in quaternion) if {*quaternion} <= {*lower} else turns
+    if len(names) == 3 and {*turns} & {*points.poses, *points.joints}:
+        turns = ()
+    if len(names) + len(turns) == 3:
+        places = UNITS_M[unit] * np.hstack([fields.column(name) for name in names])
+        cells = (
+            dict(zip(INSTRUMENT_POSITION, map(repr, at), strict=True)) for at in places.tolist()
+        )
+        return [{} if "nan" in row.values() else row for row in cells], notes
+    form = given.form
+    if form is None and len(turns) == 3:
+        form = f"euler-xyz-{'rad' if _Heading.of(turns[0]).unit == 'rad' else 'deg'}"
+        notes += (
+            f"{', '.join(turns)} are taken for turns about the fixed axes x, y, z, as "
+            "SpatialAnalyzer writes them; --camera-form names another form.",
+        )
+    asked = replace(given, names=names + turns * (len(names) == 3), form=form, unit=unit)
+    numbers, more, _ = poses_from(fields, asked.names, asked, "camera")
+    return pose_cells(numbers, INSTRUMENT_POSITION + INSTRUMENT_QUATERNION), (*notes, *more)
+
+
+def _levels(points: _Table) -> list[tuple[str, ...]]:
+    """Names of the rows: of collections, groups and targets, those in one cell (A::B::C) apart."""
+    texts = points.fields.texts
+    columns = [texts[name] for kind in _LEVELS if (name := points.named(kind))]
+    parts = ["::".join(filter(None, row)).split("::") for row in zip(*columns, strict=True)]
+    depth = max(map(len, parts), default=0)
+    return [*zip(*([""] * (depth - len(row)) + row for row in parts), strict=True)]
+
+
+def _stops(
+    points: _Table, loads: Mapping[str, Sequence[str]], held: Sequence[str]
+) -> tuple[list[object], list[str]]:
+    """The stop of each row as its load and its name, and the name of its point on the flange.
+
+    Stops end where what `held` columns have changes, where there are some. Else, of two levels of
+    names that which has fewer is the points', as of targets SMR1 to SMR3 in groups P1 to P30, or of
+    targets P1 to P30 in groups SMR1 to SMR3.
+    """
+    texts, count = points.fields.texts, len(points.fields)
+    load = [*zip(*loads.values(), strict=True)] or [()] * count
+    free = [c for c in _levels(points) if len({*c}) > 1 and not all(map(_LOAD.search, c))]
+    last = free[-1] if free and len({*free[-1]}) < count else ("",) * count
+    names, spots = texts.get(points.named(_STOP), ()), last
+    if held:
+        rows = [*zip(load, *(texts[name] for name in held), strict=True)]
+        changes = [row != before for row, before in zip(rows, [None, *rows], strict=False)]
+        names = tuple(map(str, np.cumsum(changes)))
+    elif len({*names}) < 2 and len(free) > 1 and any(last):
+        names, spots = sorted(free[-2:], key=lambda cells: -len({*cells}))
+    elif len({*names}) < 2:
+        names, spots = free[-1] if free else ("",) * count, ("",) * count
+    keys = list[object](zip(load, names, strict=True))
+    seen, times = Counter[object](), list[int]()
+    for key in keys:
+        seen[key] += 1
+        times.append(seen[key])
+    if any(spots) or max(times) == 1:
+        return keys, [*spots]
+    # Points without names are told by their order at a stop; those that return are at another one.
+    return (keys, [*map(str, times)]) if held else ([*zip(load, times, strict=True)], [*names])
+
+
+def _paired(points: _Table, stops: Sequence[object], state: _Table) -> tuple[IntArray, str]:
+    """The robot's row of each point, -1 for none, and how it was found; raises DataError."""
+    robot, keys = state.fields, [*dict.fromkeys(stops)]
+    names = [str(key[1]) for key in keys if isinstance(key, tuple) and isinstance(key[1], str)]
+    unique = [*dict.fromkeys(names)]
+    match = matched(Keys.of(len(unique), {"stop": (*unique,)}), robot.keys) if all(names) else None
+    if match is not None and unique and (match.how != HOW[-1] or len(keys) != len(robot)):
+        rows = dict(zip(unique, match.rows.tolist(), strict=True))
+        place, how = {key: rows[name] for key, name in zip(keys, names, strict=True)}, match.how
+    elif len(keys) == len(robot):
+        place, how = {key: row for row, key in enumerate(keys)}, HOW[-1]
+    else:
+        raise DataError(
+            f"{points.file}: points of {counted(len(keys), 'stop')}, but {state.file} has "
+            f"{counted(len(robot), 'state')} of the robot, and neither names nor numbers say which "
+            "belong together.",
+            culprits=[points.fields.places[0], robot.places[0]],
+            next_step="Add a column `stop` of the same names or numbers to both tables, or delete "
+            "the rows that the other has not.",
+        )
+    return np.array([place[stop] for stop in stops]), how
+
+
+def _loads(table: _Table) -> dict[str, tuple[str, ...]]:
+    """Columns of payloads [kg], their centres [m] and forces [N], by headings or by names of rows.
+
+    A force without axes pulls downwards.
+    """
+    found = dict[str, FloatArray]()
+    for name in table.fields.numbers:
+        heading = _Heading.of(name)
+        axis, unit, column = heading.axis, heading.unit, table.fields.column(name)[:, 0]
+        if axis and heading.words & _CENTRE and unit in UNITS_M:
+            found[f"payload_{axis}_m"] = UNITS_M[unit] * column
+        elif axis and heading.words & _FORCE:
+            found[f"force_{axis}_n"] = column
+        elif not axis and (unit == "n" or (heading.words & _FORCE and not unit)):
+            found |= dict.fromkeys(("force_x_n", "force_y_n"), 0 * column)
+            found["force_z_n"] = -np.abs(column)
+        elif not axis and (unit == "kg" or (heading.words & _PAYLOAD and not unit)):
+            found["payload_kg"] = column
+    for cells in [] if found else _levels(table):
+        tags = [_LOAD.search(cell) for cell in cells]
+        size = np.array([float(tag[1].replace(",", ".")) if tag else 0.0 for tag in tags])
+        if {tag[2] for tag in tags if tag} == {"kg"}:
+            found["payload_kg"] = size
+        elif any(tags):
+            found |= {"force_x_n": 0 * size, "force_y_n": 0 * size, "force_z_n": -size}
+    return {
+        name: tuple("" if np.isnan(value) else repr(value) for value in column.tolist())
+        for name, column in found.items()
+    }
+
+
+def _instrument(
+    points: _Table, requested: ImportOptions
+) -> tuple[dict[str, object], tuple[str, ...]]:
+    """The content of [instrument], and notes on it; raises DataError."""
+    column = points.named(_set("instrument device gerät messgerät"))
+    said = requested.instrument or " ".join(
+        (*points.fields.texts.get(column, ())[:1], points.title)
+    )
+    plain = re.sub(r"[\W_]+", "", said.lower())
+    if axis := next((words for name, words in _OF_AN_AXIS.items() if name in plain), ""):
+        raise DataError(
+            f"{points.file}: an {axis}, and no points.",
+            culprits=[points.fields.name],
+            next_step="Read points or poses on the flange, as with a tracker.",
+        )
+    if is_number(said):
+        return {"sigma_m": 1e-3 * float(said)}, ()
+    known = (name for name in known_instruments() if "".join(name.split("-")[1:]) in plain)
+    name = requested.instrument or next(known, "")
+    found: dict[str, object] = {"name": name} if name else {}
+    stated = (
+        names
+        for words, names in points.triples().items()
+        if words & _UNCERTAIN or {"standard", "deviation"} <= words
+    )
+    if not (names := next(stated, ())):
+        step = "Say --instrument NAME, or its sigma in mm, or add [instrument] to session.toml."
+        return found, () if found else (f"How good the readings are is not said. {step}",)
+    places = next(iter(points.points().values()), ())
+    unit = _Heading.of(names[0]).unit or points.unit(places, requested.camera.unit)[0]
+    text = "\n".join((*names, points.title))
+    factor = next((k for k, pattern in _COVERED.items() if pattern.search(text)), 1.0)
+    sigmas = UNITS_M[unit] / factor * np.hstack([points.fields.column(each) for each in names])
+    found["sigma_m"] = float(np.sqrt(np.nanmean(sigmas**2)))
+    words = "standard deviations, as nothing else is said" if factor == 1.0 else f"k = {factor:g}"
+    by_axis = ", ".join(figure(1e3 * each) for each in np.nanmedian(sigmas, axis=0))
+    note = (
+        f"{', '.join(names)} are taken for uncertainties, {words}: {by_axis} mm along x, y, z in "
+        "the median. All axes have the sigma_m of [instrument], their root mean square."
+    )
+    return found, (note,)
+
+
+def _is_of_points(path: Path) -> bool:
+    """Whether a text file begins with names or headings of such programs."""
+    for line in head(path).splitlines()[:60]:
+        cells = re.split(r"[;,\t]", line)
+        headings = [_Heading.of(cell) for cell in cells]
+        axes = {heading.axis for heading in headings if not heading.words & _OTHER}
+        words = _set("").union(*(heading.words for heading in headings))
+        if {*"xyz"} <= axes and words & (_MEASURED | _UNCERTAIN | _LEVELS[0] | _LEVELS[1]):
+            return not any(map(is_number, cells))
+        if re.search(r"\w::\w.*\d", line):
+            return True
+    return False
+
+
+METROLOGY = ForeignFormat(
+    "metrology",
+    "points that a tracker, a measuring arm or a CMM read (SpatialAnalyzer, PolyWorks, CAM2)",
+    lambda path: any(
+        file.suffix.lower() in ENDINGS and _is_of_points(file) for file in files_in(path) or (path,)
+    ),
+    _read,
+)
