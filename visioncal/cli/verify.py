@@ -25,7 +25,7 @@ from visioncal.verification import to_document, triggers_of, verdict_of, verify
 # Headings of the triggers by state, with their styles.
 _TRIGGERED = {
     "fired": ("calibrate again because of: ", "bold yellow"),
-    "quiet": ("checked, and no reason to calibrate again: ", ""),
+    "quiet": ("no reason to calibrate again; looked for: ", ""),
     "unknown": ("could not be checked: ", ""),
 }
 

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure, listed
+from visioncal.core.number_format import figure, listed, rounded_up
 from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
@@ -127,8 +127,9 @@ def touch_targets(
         located = point_covariance(frame.edge.matrix, frame.edge.covariance, at)
         covariance = located + rotation @ independent @ rotation.T
         flange = placed @ invert(tip.matrix)
-        # Reading error of a gap, by a feeler gauge or by eye over a tip [mm].
-        radius_mm = float(np.hypot(1e3 * radius95(covariance), 0.1))
+        # Reading error of a gap, by a feeler gauge or by eye over a tip [mm]. Rounded up: no gap as
+        # large as the limit that was told exceeds it.
+        radius_mm = rounded_up(float(np.hypot(1e3 * radius95(covariance), 0.1)))
         points.append(TouchPoint(name, placed[:3, 3], flange, radius_mm))
     return TouchTargets(tuple(points), frame)
 
