@@ -4,11 +4,10 @@
 `instruments.py planning`, `loads` or `iso`, with the number of seeds behind it.
 """
 
-import sys
 from dataclasses import replace
 
 import numpy as np
-from results import few, write_section
+from results import WORDS, few, write_section
 
 from visioncal.calibration.run import calibrate
 from visioncal.core.transforms import compose, invert
@@ -168,11 +167,10 @@ def _one(device, rp, seed):
 
 
 if __name__ == "__main__":
-    words = [word for word in sys.argv[1:] if not word.startswith("-")]
     parts = {"planning": (planning, 12), "loads": (loads, 12), "iso": (iso, 100)}
-    for name in words[:1] or parts:
+    for name in WORDS[:1] or parts:
         make, usual = parts[name]
-        text = make(int(words[1]) if len(words) > 1 else few(usual, 1))
+        text = make(int(WORDS[1]) if len(WORDS) > 1 else few(usual, 1))
         print(text, flush=True)
         write_section(
             f"Instruments: {name}",

@@ -5,9 +5,8 @@ mount, the number of stops and their postures; corners or measured poses, with j
 truth is the true mounting, in the flange and base of the simulated arm.
 """
 
-import sys
-
 import numpy as np
+from results import few
 from support.misfits import misfit
 
 import visioncal
@@ -40,7 +39,7 @@ def squares(seed: int, *, seen: str, exact: bool = False) -> list[float]:
 
 def main() -> None:
     """Prints the mean, and the share beyond 5 sigma, of all kinds of cells."""
-    count = 6 if "--quick" in sys.argv else 60
+    count = few(60, 6)
     for exact in (False, True):
         for seen in ("corners", "poses"):
             found = np.array(

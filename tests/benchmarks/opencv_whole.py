@@ -36,4 +36,6 @@ def calibrate(session: Path) -> None:
     print(*cv2.calibrateHandEye(turns, shifts, cam_turns, cam_shifts)[1].ravel())
 
 
+if {*sys.argv[1:]} & {"-h", "--help"}:
+    sys.exit(f"{__doc__.strip()}\n\nIts only word is the folder of a session.")
 calibrate(Path(sys.argv[1]))

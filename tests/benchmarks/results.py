@@ -1,7 +1,8 @@
 """Writes the sections of RESULTS.md, one for each benchmark script.
 
 Every script takes `--quick`: the same way with the least of everything, in some seconds, to see
-that it still runs. It measures nothing, and leaves RESULTS.md as it is.
+that it still runs. It measures nothing, and leaves RESULTS.md as it is. `--help` says what a script
+measures, and any other option is refused.
 """
 
 import datetime
@@ -15,6 +16,12 @@ from typing import TypeVar
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
 QUICK = "--quick" in sys.argv[1:]
+_OTHERS = {word for word in sys.argv[1:] if word.startswith("-")} - {"--quick"}
+# Scripts that take further options read them themselves, and do not come here.
+if _OTHERS and Path(sys.argv[0]).resolve().parent == RESULTS.parent:
+    script = sys.modules["__main__"].__doc__ or ""
+    print(f"{script.strip()}\n\n--quick: the least of everything; RESULTS.md stays as it is.")
+    sys.exit(0 if {"--help", "-h"} >= _OTHERS else f"error: no option {', '.join(_OTHERS)}")
 # What else is said behind the script's name.
 WORDS = tuple(argument for argument in sys.argv[1:] if argument != "--quick")
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,12 @@ from support.misfits import misfit
 from support.refusals import raised
 
 from visioncal import simulation
+from visioncal.calibration.run import calibrate
 from visioncal.core.choices import SIMULATED_CELLS
-from visioncal.core.errors import DataError
-from visioncal.core.transforms import invert
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.transforms import invert, log
 from visioncal.results import Calibration
+from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.depth import read_depth
 from visioncal.simulation import cell_session, read_cell, simulate
@@ -242,3 +245,36 @@ def test_depth_is_off_by_what_was_asked_for(place):
     assert abs(seen - (1.02 * middle[2] + 0.003)) < 0.004
     assert abs(np.nanmedian(depth) - (1.02 * 2.6 + 0.003)) < 0.004
     assert 0.01 < np.isnan(depth).mean() < 0.06
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand", "instrument"])
+def test_an_arm_of_four_axes_is_simulated_with_a_measured_height(mount, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    how = ("--instrument", "points") if mount == "instrument" else ("--no-images", "--mount", mount)
+    done("simulate", "cell", "--robot", "generic-scara-600", *how, "--seed", 2)
+    session, (_, edges) = Session.load("cell"), truth_of(Path("cell"))
+    # The independent chain is that of the built-in model.
+    robot = load_robot("generic-scara-600")
+    for view in session.views:
+        stated = view.base_from_flange()
+        if stated is not None:
+            found = robot.base_from_flange(view.joints_rad[None])[0]
+            np.testing.assert_allclose(found, stated.as_matrix(), atol=1e-12)
+    result = calibrate(session)
+    assert result.verdict.status == "good"
+    assert any("the views alone leave it open" in f.words for f in result.verdict.findings)
+    for name, edge in result.edges.items():
+        # Of the points on the flange no rotation is read.
+        free = slice(3 * (mount == "instrument" and name == "flange_from_probe"), 6)
+        off = log(invert(edges[name]) @ edge.matrix)[free]
+        assert off @ np.linalg.solve(edge.covariance[free, free], off) < MOST
+    bare = replace(session, document={k: v for k, v in session.document.items() if k != "prior"})
+    asked = raised(DegenerateError, "is not determined at all", calibrate, bare)
+    step = "Where the arm cannot tilt, measure that offset for [prior."
+    assert asked.next_step.startswith(step)
+
+
+def test_an_arm_of_four_axes_takes_no_option_of_those_with_six(tmp_path):
+    said = ("--robot", "generic-scara-600", "--touches", "--no-images")
+    refused = visioncal("simulate", tmp_path / "cell", *said)
+    refused.refused("--touches: simulated for arms of six joints", "take another --robot")

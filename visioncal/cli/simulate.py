@@ -159,6 +159,14 @@ def _check(asked: SimulateOptions) -> None:
         )
     kind = kinds[0] if kinds else ""
     takes = _TAKES[kind]
+    tilting = {"touches", "wrong_views", "warm_up", "torques", "stiffness_knm"} & asked.given
+    if tilting and not asked.cell and arm_named(asked.robot).is_planar:
+        named = [_option(name) for name in sorted(tilting)]
+        raise DataError(
+            f"{' and '.join(named)}: simulated for arms of six joints, and {asked.robot} has four.",
+            culprits=named,
+            next_step="Leave them out, or take another --robot.",
+        )
     if kind == "cell" and not asked.torques:
         takes = takes - {"currents"}
     for wrong in sorted(asked.given - takes - {"folder", kind}):

@@ -25,7 +25,7 @@ Criterion: TypeAlias = Literal["I", "D"]
 # Standards by which an arm is tested.
 Standard: TypeAlias = Literal["iso9283"]
 # Simulated arms, and built-in descriptions of whole cells.
-SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
+SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800", "generic-scara-600")
 SIMULATED_CELLS = ("camera-and-tracker", "two-arms", "two-cameras")
 
 # Joint speed and acceleration of a UR that drives a plan, slow enough to reach the stop button

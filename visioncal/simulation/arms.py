@@ -64,13 +64,16 @@ BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
     ),
 }
 _JOINTS = 6
+# Stroke of a joint that slides [m].
+STROKE_M = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class DhArm:
-    """A serial arm of revolute joints in standard Denavit-Hartenberg form.
+    """A serial arm in standard Denavit-Hartenberg form.
 
-    Link i is `Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i) Ry(beta_i)`. The last rotation is
+    Link i is `Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i) Ry(beta_i)`, or `Rz(offset_i)
+    Tz(d_i + q_i) ...` of a joint that slides by q_i [m]. The last rotation is
     Hayati's (1983): where two axes are nearly parallel, the other four parameters cannot represent
     their misalignment about y. It is zero in every nominal arm.
     """
@@ -86,6 +89,12 @@ class DhArm:
     waves: FloatArray
     # (k, n) further joint errors at k angles over a turn [rad]; None for none.
     beyond: FloatArray | None = None
+    slides: tuple[int, ...] = ()  # The joints that slide, from 0, over `STROKE_M`.
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether the flange turns about the vertical alone."""
+        return self.a.size < _JOINTS
 
 
 @dataclass(frozen=True)
@@ -120,7 +129,7 @@ class ArmOptions:
     # Further joint errors as arbitrary functions of the angle [rad].
     function_sigma_rad: float = 0.0
     function_length_rad: float = 0.06  # Correlation length of these functions [rad].
-    robot: str = "ur10e"  # `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
+    robot: str = "ur10e"  # A name among `SIMULATED_ARMS`.
     robot_sigma_m: float = 3e-5  # Repeatability of the flange's position, per axis [m].
     robot_sigma_rad: float = 5e-5  # Repeatability of its rotation, per axis [rad].
     # Compliance of each joint; empty for a rigid arm.
@@ -227,7 +236,7 @@ def arm_named(name: str) -> DhArm:
     Those of Universal Robots' e-Series have the manufacturer's values ("DH parameters for
     calculations of kinematics and dynamics"). `generic-6r-1800` is no actual model: round numbers
     in the proportions of a medium industrial robot of 1.8 m reach, with a shoulder offset from the
-    first axis and a spherical wrist.
+    first axis and a spherical wrist; so is `generic-scara-600`, of two arms and a quill.
 
     Raises:
         DataError: There is no arm of that name.
@@ -238,23 +247,31 @@ def arm_named(name: str) -> DhArm:
         "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
         "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
     }
-    offset = np.zeros(6)
-    if name == "generic-6r-1800":
-        a, d = (0.18, 0.8, 0.18, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.8, 0.0, 0.13)
-        quarters = (-1.0, 0.0, -1.0, 1.0, -1.0, 0.0)
-        offset[[1, 5]] = -_QUARTER, _HALF_TURN
-    elif name in published:
-        d1, a2, a3, d4, d5, d6 = published[name]
-        a, d = (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6)
-        quarters = (1.0, 0.0, 0.0, 1.0, -1.0, 0.0)
-    else:
+    if name not in SIMULATED_ARMS:
         raise DataError(
             f"simulation: the arm {name!r} is not known, only {', '.join(SIMULATED_ARMS)} are.",
             culprits=["robot"],
             next_step=did_you_mean(name, SIMULATED_ARMS) or "Name one of these.",
         )
+    a, d, quarters = [0.18, 0.8, 0.18, 0, 0, 0], [0.5, 0, 0, 0.8, 0, 0.13], [-1, 0, -1, 1, -1, 0]
+    if name in published:
+        d1, a2, a3, d4, d5, d6 = published[name]
+        a, d, quarters = [0.0, a2, a3, 0, 0, 0], [d1, 0, 0, d4, d5, d6], [1, 0, 0, 1, -1, 0]
+    elif name == "generic-scara-600":
+        a, d, quarters = [0.325, 0.275, 0, 0], [0.4, 0, 0, 0.05], [0, 2, 0, 0]
+    none = np.zeros((4, len(a)))
+    offset, slides = none[0].copy(), (2,) if len(a) < _JOINTS else ()
+    if name == "generic-6r-1800":
+        offset[[1, 5]] = -_QUARTER, _HALF_TURN
     alpha = _QUARTER * np.array(quarters)
-    return DhArm(name, np.array(a), np.array(d), alpha, np.zeros(6), offset, np.zeros((4, 6)))
+    return DhArm(name, np.array(a), np.array(d), alpha, none[0], offset, none, slides=slides)
+
+
+def drawn_postures(arm: DhArm, count: int, rng: np.random.Generator) -> FloatArray:
+    """(count, n) random postures: angles up to 2.5 rad, and strokes [m]."""
+    q = rng.uniform(-2.5, 2.5, (count, arm.a.size))
+    q[:, arm.slides] = STROKE_M * (0.5 + q[:, arm.slides] / 5.0)
+    return q
 
 
 def reach_m(arm: DhArm) -> float:
@@ -298,6 +315,8 @@ def loaded_joints(
         (m, n) equivalent angles of a rigid arm [rad].
     """
     sagged = joints
+    if arm.slides and any(compliance):
+        raise DataError(f"simulation: the joints of the {arm.name} do not bend by weight.")
     # Each changes the levers by about a hundredth.
     for _ in range(8 if any(compliance) else 0):
         sagged = joints + np.array(compliance) * load_torques(arm, sagged, payloads)
@@ -365,8 +384,10 @@ def inverse(arm: DhArm, base_from_flange: FloatArray, seeds: FloatArray) -> Reac
 
 def _link(arm: DhArm, i: int, angle: FloatArray) -> FloatArray:
     """(m, 4, 4) `link_from_next` of joint i."""
-    joint_angle = angle + arm.offset[i]
-    if arm.waves[:, i].any():
+    joint_angle, d = angle + arm.offset[i], arm.d[i]
+    if i in arm.slides:
+        joint_angle, d = np.full(angle.shape, arm.offset[i]), arm.d[i] + angle
+    elif arm.waves[:, i].any():
         phases = [np.sin(angle), np.cos(angle), np.sin(_TEETH * angle), np.cos(_TEETH * angle)]
         joint_angle = joint_angle + arm.waves[:, i] @ np.array(phases)
     if arm.beyond is not None:
@@ -379,7 +400,7 @@ def _link(arm: DhArm, i: int, angle: FloatArray) -> FloatArray:
     matrices[:, 0, 2], matrices[:, 0, 3] = sin_q * sin_a, arm.a[i] * cos_q
     matrices[:, 1, 0], matrices[:, 1, 1] = sin_q, cos_q * cos_a
     matrices[:, 1, 2], matrices[:, 1, 3] = -cos_q * sin_a, arm.a[i] * sin_q
-    matrices[:, 2, 1], matrices[:, 2, 2], matrices[:, 2, 3] = sin_a, cos_a, arm.d[i]
+    matrices[:, 2, 1], matrices[:, 2, 2], matrices[:, 2, 3] = sin_a, cos_a, d
     matrices[:, 3, 3] = 1.0
     if arm.beta[i] == 0.0:
         return matrices
@@ -397,6 +418,8 @@ def _linearise(
     axes, origins = frames[:, :-1, :3, 2], frames[:, :-1, :3, 3]
     tip = frames[:, -1]
     levers = cross(axes, tip[:, None, :3, 3] - origins)
+    slides = np.isin(np.arange(arm.a.size), arm.slides)[:, None]
+    levers, axes = np.where(slides, axes, levers), np.where(slides, 0.0, axes)
     jacobian = np.swapaxes(np.concatenate([axes, levers], axis=2), 1, 2)
     # Half the sum of the axes' cross products: zero if the rotations agree, and also at a
     # difference of half a turn, which is handled separately.

@@ -9,8 +9,8 @@ from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
-from visioncal.simulation.arms import ArmOptions, DhArm, arm_named, forward
-from visioncal.simulation.records import write_truth
+from visioncal.simulation.arms import ArmOptions, DhArm, arm_named, drawn_postures, forward
+from visioncal.simulation.records import CALIPER_M, write_truth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ def random_postures(arm: DhArm, stops: int, rng: np.random.Generator) -> FloatAr
     """Random postures over the workspace, above the table [rad]."""
     kept: list[FloatArray] = []
     while len(kept) < stops:
-        q = rng.uniform(-2.5, 2.5, (1, len(arm.offset)))
+        q = drawn_postures(arm, 1, rng)
         if forward(arm, q)[0, 2, 3] > 0.1:
             kept.append(q[0])
     return np.array(kept)
@@ -108,6 +108,10 @@ def session_of(
         noise["sigma_rad"] = options.sigma_rad
     facts = {"schema": 1, "name": "tracked", "instrument": noise}
     facts |= {"robot": {"model": options.robot}} if joints else {}
+    if shop.arm.is_planar:
+        wrong_m = CALIPER_M * np.random.default_rng([8, options.seed]).standard_normal()
+        height = {"z_m": float(shop.flange_from_probe[2, 3] + wrong_m), "sigma_m": CALIPER_M}
+        facts["prior"] = {"flange_from_probe": height}
     cells = [[str(value) for value in row.values()] for row in rows]
     return Session.assemble(facts | document, list(rows[0]), cells, MemoryImages({}))
 

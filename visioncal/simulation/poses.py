@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import apply, compose
-from visioncal.core.types import Camera, FloatArray
+from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.simulation.boards import Sheet, centre_m, corners_m, outline_m
 from visioncal.simulation.optics import rays, sees
 from visioncal.vision.targets import extent_m, is_seen_in_part
@@ -58,12 +58,14 @@ class Viewpoints:
         )
         centre = distance[:, None] * rays(self.camera, aim)
         cam_from_target = compose(rotation, centre - rotation @ centre_m(self.board))
-        outline_seen, seen = (
-            sees(self.camera, apply(cam_from_target, points), MARGIN_PX)
-            for points in (outline_m(self.board, 0.0), corners_m(self.board))
-        )
-        fits = outline_seen.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
+        seen = sees(self.camera, apply(cam_from_target, corners_m(self.board)), MARGIN_PX)
+        fits = self.shows(cam_from_target) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
         return np.asarray(cam_from_target[fits])
+
+    def shows(self, cam_from_target: FloatArray) -> Mask:
+        """(m,) whether all of the board is inside the image at (m, 4, 4) poses."""
+        places = apply(cam_from_target, outline_m(self.board, 0.0))
+        return np.asarray(sees(self.camera, places, MARGIN_PX).all(axis=1))
 
     def _rotations(self, count: int, rng: np.random.Generator) -> FloatArray:
         """(count, 3, 3) rotations: tilt about an axis in the board's plane, then roll."""

@@ -10,7 +10,15 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.session import frame_name
-from visioncal.simulation.arms import DhArm, arm_named, forward, inverse, link_frames, reach_m
+from visioncal.simulation.arms import (
+    DhArm,
+    arm_named,
+    drawn_postures,
+    forward,
+    inverse,
+    link_frames,
+    reach_m,
+)
 from visioncal.simulation.boards import Sheet, centre_m
 from visioncal.simulation.layout import (
     CELL,
@@ -85,6 +93,9 @@ def mounted_single(options: CellOptions) -> dict[str, FloatArray]:
         rotation = (Rotation.from_euler("ZX", [spin, np.pi]) * skewed).as_matrix()
         middle = np.array([0.0, 0.0, 0.06]) + rng.normal(0.0, 0.005, 3)
         direction = np.array([np.cos(front + spin), np.sin(front + spin), 0.35])
+        if arm_named(options.robot).is_planar:
+            # Its flange points downwards.
+            direction = np.array([0.1, 0.0, -1.0])
         distance_m = float(np.linalg.norm(straight[:3, 3]))
         cam = looking_at(ahead, direction / np.linalg.norm(direction), distance_m)
     target = compose(rotation, middle - rotation @ centre_m(first))
@@ -126,6 +137,11 @@ def postures_single(options: CellOptions, placed: Mapping[str, FloatArray]) -> F
                 return target @ invert(cam_from_target) @ invert(cam)
             return cam @ cam_from_target @ invert(target)
 
+        if arm.is_planar:
+            # It reaches no pose that is drawn for it, and so its joints are drawn.
+            views = _viewpoints(options, board)
+            joints[stops] = _showing(arm, views, cam, target, stops, rng, in_hand=in_hand)
+            continue
         # The arm must stay 50 mm above the table under the board, and above the robot's own.
         floor_m = min(0.0, float(target[2, 3]) if in_hand else 0.0) + 0.05
         views = _viewpoints(options, board)
@@ -150,6 +166,32 @@ def postures_single(options: CellOptions, placed: Mapping[str, FloatArray]) -> F
             )
         joints[stops] = kept[: len(stops)]
     return joints
+
+
+def _showing(
+    arm: DhArm,
+    views: Viewpoints,
+    cam: FloatArray,
+    target: FloatArray,
+    stops: IntArray,
+    rng: np.random.Generator,
+    *,
+    in_hand: bool = True,
+) -> FloatArray:
+    """(s, n) postures of an arm that cannot tilt, in which the camera sees all of the board."""
+    kept = np.zeros((0, arm.a.size))
+    for _ in range(100):
+        drawn = drawn_postures(arm, 2000, rng)
+        flange = forward(arm, drawn)
+        placed = invert(flange @ cam) @ target if in_hand else invert(cam) @ flange @ target
+        kept = np.concatenate([kept, drawn[views.shows(placed)]])
+        if len(kept) >= len(stops):
+            return kept[: len(stops)]
+    raise DataError(
+        f"simulation: {len(kept)} of {len(stops)} views found in which the {arm.name} shows the "
+        "board.",
+        next_step="Take another working distance, board or robot.",
+    )
 
 
 def _viewpoints(options: CellOptions, board: Sheet) -> Viewpoints:

@@ -36,6 +36,8 @@ Progress: TypeAlias = Callable[[float], None]
 
 # Step of finite differences, and perturbations forwards and backwards along each axis: (2, 6, 4,
 # 4).
+# Sigma of a height that is measured by hand, on arms that leave it open [m].
+CALIPER_M = 5e-4
 _STEP = 1e-6
 _STEPS = exp(_STEP * np.stack([np.eye(6), -np.eye(6)]))
 # Arrays of an arm, of any shape.
@@ -246,6 +248,12 @@ def _document(cell: SimulatedCell, name: str, seen: Seen) -> dict[str, Any]:
     if any(not camera.name for camera in layout.cameras):
         in_hand = cell.parents["cam"] == "flange"
         document["mount"] = "eye-in-hand" if in_hand else "eye-to-hand"
+    if all(robot.arm.is_planar for robot in cell.robots.values()) and "cam" in cell.mountings:
+        # An arm that cannot tilt leaves a height open, which is measured by a caliper.
+        edge = next(name for name in cell.transforms if name.startswith("flange_from_"))
+        wrong_m = CALIPER_M * cell.options.stream(RandomStream.MOUNTING, 1).standard_normal()
+        height = {"z_m": float(cell.transforms[edge][2, 3] + wrong_m), "sigma_m": CALIPER_M}
+        document["prior"] = {edge: height}
     robots = {robot.name: {"model": robot.robot, "tip": "flange"} for robot in layout.robots}
     cameras: dict[str, dict[str, Any]] = {}
     for camera in layout.cameras:

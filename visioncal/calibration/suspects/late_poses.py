@@ -12,6 +12,9 @@ from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.chain import robot_part
 
+# Poses are those of the joint angles [m, rad].
+_SAME = 1e-6
+
 
 def _found(run: RunState) -> Iterator[Finding]:
     matched = run.reported.matched
@@ -24,6 +27,9 @@ def _found(run: RunState) -> Iterator[Finding]:
     camera = np.array([seen[view].cam_from_target[0] for view in views])
     by_joints = [matched.pose(matched.joints_rad[view]) for view in views]
     poses = robot_part(np.array([[reported[view] for view in views], by_joints]), run.mount)
+    # Of an arm that cannot tilt, the same poses close by chance to any length along its axes.
+    if np.abs(poses[1] - poses[0]).max() < _SAME:
+        return
     by_report, by_angles = robust_fits(poses, np.broadcast_to(camera, poses.shape))
     if CLEAR_RATIO * by_angles.score < by_report.score:
         yield Finding(
