@@ -11,8 +11,7 @@ from support.edges import inliers_of
 from support.problems import ROBOT_SIGMAS, away, observed, pose, swung, true_state, world
 from support.slopes import jacobian
 
-from visioncal.calibration.stages.init_frames import init_network
-from visioncal.calibration.stages.pairwise import Candidates
+from visioncal.calibration.stages.init_frames import network_of
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.estimation import joint
@@ -46,6 +45,7 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.steps import find_steps, frames_of
 from visioncal.estimation.trajectory import Trajectory
+from visioncal.fit.consensus import Candidates
 from visioncal.simulation import CAMERAS, CellOptions, simulate
 from visioncal.vision.camera import intrinsics
 
@@ -72,7 +72,7 @@ def network(problem, **turned):
     shape = (len(problem.observations), 1)
     poses = problem.observations.measured[:, None]
     candidates = Candidates(poses, np.zeros(shape, dtype=np.int64), np.ones(shape, dtype=bool))
-    return init_network(problem, candidates, turned)
+    return network_of(problem, candidates, turned).connected()
 
 
 def started(problem):

@@ -44,6 +44,10 @@ def refuse_unjoined(cell: Cell, joined: Cell) -> None:
     if cell.sightings and cell.held.all():
         why = f"all {counted(len(cell.sightings), 'view')} are held out"
     elif stops >= FEWEST_VIEWS:
+        paths = [cell.tree.path(*pair) for pair in cell.pairs]
+        if cell.unknown and not any(step.robot for path in paths for step in path):
+            why, advice = _untied(cell.unknown[0])
+            raise DegenerateError(f"cell: {why}.", culprits=frames, next_step=advice)
         moved = "; ".join(filter(None, (_motion(cell, name, name) for name in cell.arms)))
         why = f"the views are too few, too much alike, or wrong{f' ({moved})' if moved else ''}"
     raise DegenerateError(
@@ -114,15 +118,20 @@ def _refuse(fit: Fit, covariance: FloatArray, *, by_motion: bool) -> None:
         why = "".join(words)
         advice = f"{_TILTED} of {_named(parent)}."
         if not why:
-            why = f"nothing ties {_named(frame)} to what is known of the cell"
-            advice = (
-                f"Let a camera see a board, one of both on {frame} or what it carries, the other "
-                "one tied, at 5 stops or more; or state where it is: [prior]."
-            )
+            why, advice = _untied(frame)
     raise DegenerateError(
         f"cell: {worst.words} {worst.fault(' at a typical noise')}: {why}.",
         culprits=[one.words for _, one in beyond],
         next_step=advice,
+    )
+
+
+def _untied(frame: str) -> tuple[str, str]:
+    """Words about a frame that no sighting ties to the rest, and advice."""
+    return (
+        f"nothing ties {_named(frame)} to what is known of the cell",
+        f"Let a camera see a board, one of both on {frame} or what it carries, the other one tied, "
+        "at 5 stops or more; or state where it is: [prior].",
     )
 
 

@@ -1,13 +1,11 @@
 """Start of a fit: lenses and boards' poses by OpenCV, edges by closed forms.
 
-Edges are joined pair by pair, the surest first; each by the nearest half of its sightings, so that
-wrong ones may be nearly as many as right ones. A flat board has two poses, and a symmetric one
-has the same image after a turn: all stay candidates until edges decide between them.
+A flat board has two poses, and a symmetric one has the same image after a turn: all stay candidates
+until edges decide between them.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -16,16 +14,7 @@ from numpy.typing import NDArray
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import counted
-from visioncal.core.transforms import (
-    apply,
-    apply_each,
-    compose,
-    invert,
-    log,
-    mean_transform,
-    nearest_rotation,
-    rotation_angle,
-)
+from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import (
     Camera,
     CameraKind,
@@ -36,21 +25,17 @@ from visioncal.core.types import (
     Target,
     evenly,
 )
-from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.poses import closed_form_poses, determines_pose
-from visioncal.fit.places import robust_carried
+from visioncal.fit.consensus import Candidates, distances_m
+from visioncal.fit.joining import Network, Relation
 from visioncal.fit.weights import by_homography, first_weighed, on_planes
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
+from visioncal.model.sightings import Evidence
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions, rotation_transforms, rotations
 
-# Images of which a lens is estimated, and pairs of poses of which a closed form is, at most.
-_IMAGES, _PAIRS = 40, 800
-# Small sets of sightings of which edges are tried; how many are refined.
-_SETS, _BEST = 200, 5
-# Rows by which poses may be shifted; a row is wrong from this multiple of the typical distance on;
-# larger distances than this [m] may be those of wrong rows.
-_SHIFTS, _FAR, _NEAR_M = (1, -1, 2, -2, 3, -3), 6.0, 0.002
+# Most images of which a lens is estimated.
+_IMAGES = 40
 # Focal lengths that lenses have, over the width, and how many are tried; ratio of both, less one.
 _FOCAL, _FOCALS, _SQUARE = (0.25, 10.0), 12, 0.05
 # The second pose of a flat board stays where it fits within this factor and addition [px].
@@ -61,7 +46,7 @@ _LEAST_PX = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class _Options:
     """Possible poses of a sighting."""
 
     poses: FloatArray  # (j, 4, 4) `seer_from_seen`.
@@ -89,25 +74,26 @@ def start_of(cell: Cell) -> Start:
     lenses = start_lenses(cell.only(np.flatnonzero(~cell.held).tolist()))
     weighed = first_weighed(cell, lenses)
     cell, sound = weighed.cell, weighed.sound & ~cell.held
-    options = candidates(cell, lenses)
+    options = _options(cell, lenses)
     kept = [at for at, option in enumerate(options) if option is not None]
     lost = dict.fromkeys(np.setdiff1d(np.arange(len(options)), kept).tolist(), _NO_POSE)
     cell, sound = cell.without(lost), sound[kept]
     known = [option for option in options if option is not None]
     # Sightings that are held out help no fit.
     own = np.flatnonzero(~cell.held).tolist()
-    places = _Places(cell.only(own))
-    places.join_all([known[at] for at in own])
-    joined = [at for at, s in enumerate(cell.sightings) if places.are_joined(*s.pair)]
+    tied = _network(cell.only(own), [known[at] for at in own]).connected()
+    joined = [at for at, s in enumerate(cell.sightings) if tied.ties(*s.pair)]
     untied = {
         at: f"nothing ties {' or '.join(sighting.pair)} to the rest of the cell"
         for at, sighting in enumerate(cell.sightings)
         if at not in joined
     }
+    seen = [at for at in own if not cell.sightings[at].is_stated]
+    wrong = {cell.sightings[seen[at]].view for at in np.flatnonzero(tied.misplaced).tolist()}
     cell, known = cell.without(untied), [known[at] for at in joined]
-    is_placed = [s.view not in places.misplaced for s in cell.sightings]
+    is_placed = [s.view not in wrong for s in cell.sightings]
     sound = sound[joined] & np.array(is_placed, bool)
-    edges = {name: places.edge(name) for name in cell.unknown}
+    edges = {name: tied.edges[name] for name in cell.unknown}
     seers = {sighting.seer for sighting in cell.sightings}
     lenses = {name: lens for name, lens in lenses.items() if name in seers}
     sightings, distances, rivals = list(cell.sightings), np.zeros(len(known)), []
@@ -116,9 +102,11 @@ def start_of(cell: Cell) -> Start:
     turnable = set(edges) - stated
     numbers = {name: rotations(cell.boards[name]) for name in pictured(cell)}
     for at, (sighting, option) in enumerate(zip(cell.sightings, known, strict=True)):
-        off = away(places.predicted(sighting), option.poses)
+        poses = {name: arm.poses[sighting.stop] for name, arm in cell.arms.items()}
+        predicted = tied.predicted(*sighting.pair, poses)
+        off = distances_m(option.poses, predicted)
         if isinstance(sighting.evidence, MeasuredPlace):
-            between = places.predicted(sighting)[:3, 3] - sighting.evidence.place_m
+            between = predicted[:3, 3] - sighting.evidence.place_m
             off = np.array([np.linalg.norm(between)])
         # A stated frame counts until sightings contradict it.
         off = off * (not sighting.is_stated)
@@ -234,15 +222,15 @@ def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:
 
     def closing(log_focal: float) -> float:
         trial = {frame: at(float(np.exp(log_focal)))}
-        options = zip(cell.sightings, candidates(cell, trial), strict=True)
+        options = zip(cell.sightings, _options(cell, trial), strict=True)
         known = [(s, option) for s, option in options if option is not None]
-        places = _Places(cell.with_sightings([sighting for sighting, _ in known]))
-        places.join_all([found for _, found in known])
-        off = [
-            float(away(places.predicted(s), found.poses).min())
-            for s, found in known
-            if places.are_joined(*s.pair)
-        ]
+        own = cell.with_sightings([sighting for sighting, _ in known])
+        tied = _network(own, [found for _, found in known]).connected()
+        off = []
+        for s, found in known:
+            poses = {name: arm.poses[s.stop] for name, arm in cell.arms.items()}
+            if tied.ties(*s.pair):
+                off.append(float(distances_m(found.poses, tied.predicted(*s.pair, poses)).min()))
         return float(np.mean(np.sort(off)[: len(off) // 2 + 1])) if off else np.inf
 
     # Imported here, as a stated lens needs none of SciPy's optimisers.
@@ -258,18 +246,18 @@ def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:
     return at(float(np.exp(found.x)))
 
 
-def candidates(cell: Cell, lenses: Mapping[str, Camera]) -> list[Candidates | None]:
+def _options(cell: Cell, lenses: Mapping[str, Camera]) -> list[_Options | None]:
     """Both poses of each flat board, in all turns of a symmetric one; None where it has none."""
-    found, planes = list[Candidates | None](), on_planes(cell, lenses)
+    found, planes = list[_Options | None](), on_planes(cell, lenses)
     turns = {name: rotation_transforms(cell.boards[name]) for name in pictured(cell)}
-    option: Candidates | None
+    option: _Options | None
     once = np.zeros(1, dtype=np.int64)
     for at, sighting in enumerate(cell.sightings):
         evidence = sighting.evidence
         if isinstance(evidence, MeasuredPose):
-            option = Candidates(evidence.matrix[None], once)
+            option = _Options(evidence.matrix[None], once)
         elif isinstance(evidence, MeasuredPlace):
-            option = Candidates(compose(np.eye(3), evidence.place_m)[None], once)
+            option = _Options(compose(np.eye(3), evidence.place_m)[None], once)
         elif at in planes:
             board, own = cell.boards[sighting.seen], turns[sighting.seen]
             option = _of_corners(lenses[sighting.seer], board, own, evidence, planes[at])
@@ -286,7 +274,7 @@ def pictured(cell: Cell) -> set[str]:
 
 def _of_corners(
     lens: Camera, board: Target, symmetries: FloatArray, corners: Corners, plane: FloatArray
-) -> Candidates | None:
+) -> _Options | None:
     px, points = corners.px, corner_positions(board)[corners.ids]
     poses = closed_form_poses(points, plane)
     off = np.array([_off_px(lens, pose, points, px) for pose in poses])
@@ -294,7 +282,7 @@ def _of_corners(
         return None
     alike = poses[off < _ALIKE * np.nanmin(off) + _ALIKE_PX]
     numbers = np.tile(np.arange(len(symmetries)), len(alike))
-    return Candidates((alike[:, None] @ symmetries).reshape(-1, 4, 4), numbers)
+    return _Options((alike[:, None] @ symmetries).reshape(-1, 4, 4), numbers)
 
 
 def _off_px(lens: Camera, pose: FloatArray, points: FloatArray, px: FloatArray) -> float:
@@ -302,290 +290,34 @@ def _off_px(lens: Camera, pose: FloatArray, points: FloatArray, px: FloatArray) 
     return float(np.sqrt(np.nanmean((found - px) ** 2)))
 
 
-def away(predicted: FloatArray, poses: FloatArray) -> FloatArray:
-    """Distances (..., j) [m] of (..., j, 4, 4) poses from (..., 4, 4) predictions."""
-    between = invert(predicted)[..., None, :, :] @ poses
-    distances = np.linalg.norm(between[..., :3, 3], axis=-1)
-    return np.asarray(distances + LEVER_M * rotation_angle(between))
+def _network(cell: Cell, options: Sequence[_Options]) -> Network:
+    """The sightings as a network; priors that state a whole pose come last."""
+    seen = [at for at, one in enumerate(cell.sightings) if not one.is_stated]
+    stated = [pair for pair in cell.pairs.items() if cell.sightings[pair[1][0]].is_stated]
+    found = [_stated(pair, [cell.sightings[row].evidence for row in rows]) for pair, rows in stated]
+    rows = [cell.sightings[at] for at in seen]
+    turns = {name: rotation_transforms(cell.boards[name]) for name in pictured(cell)}
+    return Network(
+        cell.tree,
+        {name: arm.poses for name, arm in cell.arms.items()},
+        [one.seer for one in rows],
+        [one.seen for one in rows],
+        np.array([one.stop for one in rows]),
+        np.array([not isinstance(one.evidence, MeasuredPlace) for one in rows]),
+        Candidates.of([options[at].poses for at in seen], [options[at].turns for at in seen]),
+        {name: own for name, own in turns.items() if len(own) > 1},
+        tuple(one for one in found if one is not None),
+        frozenset(name for pair, _ in stated for name in pair),
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class _Joint:
-    """Edges that a pair's sightings determine, and how surely."""
-
-    typical: float  # Mean distance of the nearest half, less where they are many [m].
-    # First and second frame, (4, 4) `first_from_second`.
-    links: tuple[tuple[str, str, FloatArray], ...]
-
-
-_HandEye: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
-
-
-class _Places:
-    """Frames whose relative poses are known form parts; sightings join these."""
-
-    def __init__(self, cell: Cell) -> None:
-        self.cell, self.tree = cell, cell.tree
-        frames = [cell.tree.root, *cell.tree.branches]
-        self.part = {name: name for name in frames}
-        self.pose = {name: np.eye(4) for name in frames}  # In the part's own frame.
-        self.misplaced = set[int]()  # Views whose robot's pose is that of a row nearby.
-        for name, branch in cell.tree.branches.items():
-            if branch.known is not None:
-                self.join(branch.parent, name, branch.known)
-
-    def join(self, first: str, second: str, first_from_second: FloatArray) -> None:
-        """Makes one part of two."""
-        if self.part[first] == self.part[second]:
-            return
-        change = self.pose[first] @ first_from_second @ invert(self.pose[second])
-        gone, kept = self.part[second], self.part[first]
-        for name in [name for name, part in self.part.items() if part == gone]:
-            self.part[name], self.pose[name] = kept, change @ self.pose[name]
-
-    def segments(self, seer: str, seen: str) -> list[tuple[str, str, str, bool]]:
-        """Frames between which no robot moves, along a path, each with the robot behind it."""
-        found, at = [], seer
-        for step in self.tree.path(seer, seen):
-            if step.robot:
-                base = self.tree.branches[step.frame].parent
-                near, far = (step.frame, base) if step.is_up else (base, step.frame)
-                found.append((at, near, step.robot, step.is_up))
-                at = far
-        return [*found, (at, seen, "", True)]
-
-    def are_joined(self, seer: str, seen: str) -> bool:
-        """Whether all between two frames is known."""
-        return all(self.part[a] == self.part[b] for a, b, *_ in self.segments(seer, seen))
-
-    def edge(self, name: str) -> FloatArray:
-        """(4, 4) `parent_from_frame`."""
-        return np.asarray(invert(self.pose[self.tree.branches[name].parent]) @ self.pose[name])
-
-    def predicted(self, sighting: Sighting) -> FloatArray:
-        """(4, 4) `seer_from_seen` where all between is known."""
-        found = np.eye(4)
-        for first, second, robot, is_up in self.segments(*sighting.pair):
-            found = found @ invert(self.pose[first]) @ self.pose[second]
-            if robot:
-                moved = self.cell.arms[robot].poses[sighting.stop]
-                found = found @ (invert(moved) if is_up else moved)
-        return found
-
-    def join_all(self, options: Sequence[Candidates]) -> None:
-        """Joins all that sightings join."""
-        known: dict[tuple[tuple[str, str], tuple[bool, ...]], _Joint | None] = {}
-        while True:
-            joints = []
-            for pair, rows in self.cell.pairs.items():
-                state = tuple(self.part[a] == self.part[b] for a, b, *_ in self.segments(*pair))
-                if all(state):
-                    continue
-                if (pair, state) not in known:
-                    known[pair, state] = self._joint(pair, rows, options)
-                joint = known[pair, state]
-                if joint is not None:
-                    joints.append(joint)
-            if not joints:
-                return
-            for first, second, matrix in min(joints, key=lambda joint: joint.typical).links:
-                self.join(first, second, matrix)
-
-    def _joint(
-        self, pair: tuple[str, str], rows: Sequence[int], options: Sequence[Candidates]
-    ) -> _Joint | None:
-        """Edges by the sightings of a pair, where one or two are unknown."""
-        seen_rows = [row for row in rows if not self.cell.sightings[row].is_stated]
-        if not seen_rows:
-            return self._stated(rows)
-        rows = [row for row in seen_rows if self.cell.sightings[row].view not in self.misplaced]
-        sightings = [self.cell.sightings[row] for row in rows]
-        if not rows:
-            return None
-        stops = np.array([sighting.stop for sighting in sightings])
-        links, parts = self._parts(pair, stops)
-        places = [s.evidence.place_m for s in sightings if isinstance(s.evidence, MeasuredPlace)]
-        if len(places) == len(rows):
-            return _placed(links, parts, np.array(places))
-        both = _padded([options[row] for row in rows])
-        seen = invert(parts[0])[:, None] @ both @ invert(parts[-1])[:, None]
-        if len(links) == 1:
-            matrix, typical = _agreed(seen)
-            return _Joint(typical, ((*links[0], matrix),))
-        if len(links) != 2 or len(rows) < 3:
-            return None
-        x, z, own = robust_hand_eye(invert(parts[1]), seen)
-        if _is_doubtful(own):
-            x, z, own = self._shifted(sightings, both, (x, z, own))
-        typical = float(np.sort(own)[: len(rows) // 2 + 1].mean())
-        return _Joint(typical, ((*links[0], invert(x)), (*links[1], z)))
-
-    def _parts(
-        self, pair: tuple[str, str], stops: IntArray
-    ) -> tuple[list[tuple[str, str]], list[FloatArray]]:
-        """Ends of the unknown edges of a path, and (m, 4, 4) what is known around them."""
-        links, parts = list[tuple[str, str]](), [np.tile(np.eye(4), (len(stops), 1, 1))]
-        for first, second, robot, is_up in self.segments(*pair):
-            if self.part[first] == self.part[second]:
-                parts[-1] = parts[-1] @ invert(self.pose[first]) @ self.pose[second]
-            else:
-                links.append((first, second))
-                parts.append(np.tile(np.eye(4), (len(stops), 1, 1)))
-            if robot:
-                moved = self.cell.arms[robot].poses[stops]
-                parts[-1] = parts[-1] @ (invert(moved) if is_up else moved)
-        return links, parts
-
-    def _shifted(self, sightings: Sequence[Sighting], seen: FloatArray, best: _HandEye) -> _HandEye:
-        """Both edges by poses of rows nearby, if these are of the same edges as some rows' own.
-
-        Where rows are shifted from one on, fewer than half may be right; those shifted back have
-        the same edges, and both together have more.
-        """
-        pair, stops = sightings[0].pair, np.array([sighting.stop for sighting in sightings])
-        half, found = len(stops) // 2 + 1, best
-        robots = [robot for _, _, robot, _ in self.segments(*pair) if robot]
-        own = self._parts(pair, stops)[1]
-        for shift in _SHIFTS:
-            there = np.flatnonzero((stops + shift >= 0) & (stops + shift < len(self.cell.moments)))
-            moved = [self.cell.arms[robot].poses[stops[there] + shift] for robot in robots]
-            there = there[np.isfinite(moved).all(axis=(0, 2, 3))]
-            if len(there) < half:
-                continue
-            other = self._parts(pair, stops[there] + shift)[1]
-            near_both = invert(other[0])[:, None] @ seen[there] @ invert(other[2])[:, None]
-            x, z, _ = robust_hand_eye(invert(other[1]), near_both)
-            near = away(own[0] @ invert(x) @ own[1] @ z @ own[2], seen).min(axis=1)
-            by_shift = np.full(len(stops), np.inf)
-            by_shift[there] = away(invert(x) @ other[1] @ z, near_both).min(axis=1)
-            either = np.minimum(near, by_shift)
-            limit = _FAR * np.sort(either)[:half].mean()
-            is_better = 4.0 * np.sort(either)[:half].sum() < np.sort(found[2])[:half].sum()
-            if is_better and (near <= limit).sum() >= 4:
-                found = x, z, either
-                wrong = (near > limit) & (by_shift <= limit)
-                gone = set(stops[wrong].tolist()) - set(stops[~wrong].tolist())
-                views = {sightings[row].view for row in np.flatnonzero(wrong).tolist()}
-                self.misplaced = views | {
-                    s.view for s in self.cell.sightings if s.stop in gone and not s.is_stated
-                }
-        return found
-
-    def _stated(self, rows: Sequence[int]) -> _Joint | None:
-        """Edges by priors of two frames that state all six numbers: the last to be used."""
-        matrix, known = np.eye(4), 0
-        for row in rows:
-            evidence = self.cell.sightings[row].evidence
-            if isinstance(evidence, MeasuredPlace):
-                matrix[list(evidence.axes), 3] = evidence.place_m[list(evidence.axes)]
-                known += len(evidence.axes)
-            elif isinstance(evidence, MeasuredPose):
-                matrix[:3, :3], known = evidence.matrix[:3, :3], known + 3
-        pair = self.cell.sightings[rows[0]].pair
-        between = self.segments(*pair)
-        is_whole = known == 6 and len(between) == 1
-        return _Joint(np.inf, ((*pair, matrix),)) if is_whole else None
-
-
-def _placed(
-    links: Sequence[tuple[str, str]], parts: Sequence[FloatArray], places: FloatArray
-) -> _Joint | None:
-    """Edges by (m, 3) places: rotations of frames at their ends are left as they are."""
-    near = apply_each(invert(parts[0]), places)
-    far = parts[-1][:, :3, 3]
-    is_point = float(np.ptp(far, axis=0).max()) < 1e-9  # But for rounding.
-    if len(links) == 1 and is_point:
-        point = np.median(near - far, axis=0)
-        typical = float(np.median(np.linalg.norm(near - far - point, axis=1)))
-        return _Joint(typical, ((*links[0], compose(np.eye(3), point)),))
-    if len(links) == 1 and len(places) >= 3:
-        # A carrier without axes leaves no point to find.
-        frame, _, typical = robust_carried(compose(np.zeros((3, 3)), far), near)
-        return _Joint(typical, ((*links[0], invert(frame)),))
-    if len(links) == 2 and len(places) >= 4 and is_point:
-        frame, point, typical = robust_carried(parts[1], near)
-        second = compose(np.eye(3), point - far[0])
-        return _Joint(typical, ((*links[0], invert(frame)), (*links[1], second)))
-    return None
-
-
-def _padded(options: Sequence[Candidates]) -> FloatArray:
-    """(m, j, 4, 4) poses, the first repeated where there are fewer."""
-    most = max(len(option.poses) for option in options)
-    rows = [np.minimum(np.arange(most), len(option.poses) - 1) for option in options]
-    return np.array([option.poses[at] for option, at in zip(options, rows, strict=True)])
-
-
-def _agreed(seen: FloatArray) -> tuple[FloatArray, float]:
-    """The pose (4, 4) on which the nearest half of (m, j, 4, 4) agree, and its distance [m]."""
-    count = len(seen)
-    flat = seen.reshape(-1, 4, 4)
-    flat = flat[:: len(flat) // 100 + 1]
-    off = away(np.broadcast_to(flat[:, None], (len(flat), count, 4, 4)), seen)
-    half = count // 2 + 1
-    best = int(np.sort(off.min(axis=2), axis=1)[:, :half].sum(axis=1).argmin())
-    own = off[best].min(axis=1)
-    near = own.argsort()[:half]
-    matrix = mean_transform(seen[near, off[best, near].argmin(axis=1)])
-    return matrix, float(own[near].mean() / np.sqrt(half))
-
-
-def robust_hand_eye(robot: FloatArray, seen: FloatArray) -> _HandEye:
-    """Both edges (4, 4) of `robot X seen = Z`, and (m,) how far each row is from them [m].
-
-    Least trimmed squares over small sets (Rousseeuw and Van Driessen 1999).
-
-    Args:
-        robot: (m, 4, 4) poses.
-        seen: (m, j, 4, 4) candidates for what was seen there.
-    """
-    count, rng = len(robot), np.random.default_rng(0)
-    half = max(count // 2 + 1, 3)
-    sets = np.array([rng.choice(count, min(4, count), replace=False) for _ in range(_SETS)])
-    picks = rng.integers(seen.shape[1], size=sets.shape)
-    picks[::2] = 0
-    x, z = _hand_eye(robot[sets], seen[sets, picks])
-    off = away(invert(robot[None] @ x[:, None]) @ z[:, None], seen[None])
-    sums = np.sort(off.min(axis=2), axis=1)[:, :half].sum(axis=1)
-    found = []
-    for at in sums.argsort()[:_BEST]:
-        best, own, total = (x[at], z[at]), off[at], float(sums[at])
-        for _ in range(10):
-            rows = own.min(axis=1).argsort()[:half]
-            one = _hand_eye(robot[rows][None], seen[rows, own[rows].argmin(axis=1)][None])
-            trial = away(invert(robot @ one[0]) @ one[1], seen)
-            lower = float(np.sort(trial.min(axis=1))[:half].sum())
-            if lower >= total:
-                break
-            best, own, total = (one[0][0], one[1][0]), trial, lower
-        found.append((total, best, own.min(axis=1)))
-    _, best, own = min(found, key=lambda item: item[0])
-    return *best, own
-
-
-def _is_doubtful(own: FloatArray) -> bool:
-    """Whether (m,) distances are not those of noise for two thirds of the rows [m]."""
-    typical = np.sort(own)[: max(2 * len(own) // 5, 1)].mean()
-    return bool(typical > _NEAR_M or np.mean(own > _FAR * typical) > 1 / 3)
-
-
-def _hand_eye(robot: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """X and Z (k, 4, 4) of `robot X seen = Z`, of k sets of m poses (Park and Martin 1994)."""
-    first, second = np.triu_indices(robot.shape[1], 1)
-    if len(first) > _PAIRS:
-        chosen = np.random.default_rng(0).choice(len(first), _PAIRS, replace=False)
-        first, second = first[chosen], second[chosen]
-    a = invert(robot[:, second]) @ robot[:, first]
-    b = seen[:, second] @ invert(seen[:, first])
-    turns_a, turns_b = log(a)[..., :3], log(b)[..., :3]
-    rotation = nearest_rotation(np.swapaxes(turns_a, 1, 2) @ turns_b)
-    left = (a[..., :3, :3] - np.eye(3)).reshape(len(robot), -1, 3)
-    right = (rotation[:, None] @ b[..., :3, 3:] - a[..., :3, 3:]).reshape(len(robot), -1, 1)
-    normal = np.swapaxes(left, 1, 2) @ left
-    # A direction about which poses turn by less than a microradian is left at nothing.
-    normal += 1e-12 * len(first) * np.eye(3)
-    place: FloatArray = np.linalg.solve(normal, np.swapaxes(left, 1, 2) @ right).astype(float)
-    x = compose(rotation, place[..., 0])
-    placed = robot @ x[:, None] @ seen
-    middle = np.median(placed[..., :3, 3], axis=1)
-    return x, compose(nearest_rotation(placed[..., :3, :3].sum(axis=1)), middle)
+def _stated(pair: tuple[str, str], stated: Sequence[Evidence]) -> Relation | None:
+    """The pose that priors of two frames state; None unless they state all six numbers."""
+    matrix, known = np.eye(4), 0
+    for evidence in stated:
+        if isinstance(evidence, MeasuredPlace):
+            matrix[list(evidence.axes), 3] = evidence.place_m[list(evidence.axes)]
+            known += len(evidence.axes)
+        elif isinstance(evidence, MeasuredPose):
+            matrix[:3, :3], known = evidence.matrix[:3, :3], known + 3
+    return Relation(*pair, matrix[None], np.inf) if known == 6 else None

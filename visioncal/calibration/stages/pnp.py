@@ -7,13 +7,13 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import adjoint, invert, rotation_angle
+from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
-from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.corners import CornerStack, floored_sigma_px, mean_square_by_view
 from visioncal.estimation.gating import gate
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.poses import PoseFit, fit_poses, planar_poses
+from visioncal.fit.consensus import distances_m
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.vision.targets import (
@@ -71,14 +71,6 @@ class ViewPoses:
         """Chooses the candidate that is nearest to a predicted `cam_from_target` (4, 4)."""
         pick = int(distances_m(self.cam_from_target, predicted).argmin())
         return self.chosen(pick, target)
-
-
-def distances_m(poses: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Distances (...) [m] of (..., 4, 4) poses from predicted ones, rotations on a lever."""
-    between = invert(predicted) @ poses
-    return np.asarray(
-        np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
-    )
 
 
 @dataclass(frozen=True, eq=False)

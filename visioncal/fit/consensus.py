@@ -1,22 +1,19 @@
-"""Consensus transforms of one pair of frames: one, or two with a robot between."""
+"""Consensus transforms of one pair of frames: one, two with a robot between, or three."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration.stages.pnp import ViewPoses, distances_m
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
-from visioncal.core.transforms import compose, invert, mean_transform
+from visioncal.core.transforms import adjoint, compose, invert, mean_transform, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 from visioncal.estimation.linalg import NULL_SHARE, covariance_from, eigenvalue_shares
-from visioncal.estimation.normal_equations import fisher_information
-from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robust import ROUNDS, nearest, trimmed_start, trimmed_sum
 
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
@@ -26,8 +23,16 @@ _TRIPLES = 40
 WORST_M = 0.1
 # Largest mean distance of views that agree, rotations on a lever [m].
 AGREE_M = 0.02
-# Robot noise by which pairs are compared [rad, m], and the camera's, negligible beside it.
-_NOISE, _CAMERA_SIGMA = Noise(np.full((1, 2), 5e-4), np.zeros(0)), 1e-6
+# Robot noise by which pairs are compared [rad], [m]; the camera's is negligible beside it.
+_ROBOT_SIGMA = 5e-4
+
+
+def distances_m(poses: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Distances (...) [m] of (..., 4, 4) poses from predicted ones, rotations on a lever."""
+    between = invert(predicted) @ poses
+    return np.asarray(
+        np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,21 +46,22 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.poses)
 
-    @staticmethod
-    def of(views: Sequence[ViewPoses]) -> "Candidates":
-        """Collects the candidates of views."""
-        counts = np.array([len(view.cam_from_target) for view in views])
-        valid = np.arange(counts.max()) < counts[:, None]
-        at = np.minimum(np.arange(counts.max()), counts[:, None] - 1)
-        poses = [view.cam_from_target[rows] for view, rows in zip(views, at, strict=True)]
-        turns = [np.array(view.turns)[rows] for view, rows in zip(views, at, strict=True)]
-        return Candidates(np.array(poses), np.array(turns), valid)
+    @classmethod
+    def of(cls, poses: Sequence[FloatArray], turns: Sequence[Sequence[int] | IntArray]) -> Self:
+        """Collects the (c, 4, 4) candidates of each view, and their (c,) turns."""
+        counts = np.array([len(own) for own in poses], dtype=np.int64)
+        numbers = np.arange(counts.max(initial=1))
+        valid = numbers < counts[:, None]
+        at = np.minimum(numbers, counts[:, None] - 1)
+        padded = [own[rows] for own, rows in zip(poses, at, strict=True)]
+        turned = [np.asarray(own)[rows] for own, rows in zip(turns, at, strict=True)]
+        return cls(np.array(padded), np.array(turned), valid)
 
-    def take(self, rows: IntArray) -> "Candidates":
+    def take(self, rows: IntArray) -> Self:
         """Returns the candidates of some views."""
-        return Candidates(self.poses[rows], self.turns[rows], self.valid[rows])
+        return type(self)(self.poses[rows], self.turns[rows], self.valid[rows])
 
-    def carried(self, before: FloatArray, after: FloatArray) -> "Candidates":
+    def carried(self, before: FloatArray, after: FloatArray) -> Self:
         """Returns them multiplied by (m or 1, 4, 4) transforms on both sides."""
         return replace(self, poses=before[:, None] @ self.poses @ after[:, None])
 
@@ -162,16 +168,15 @@ def hand_eye(robot: FloatArray, candidates: Candidates) -> PairEdges | None:
     half, edges, typical_m = _trimmed_edges(robot, candidates, SOLVERS["park"])
     if typical_m > AGREE_M:
         return None
-    picked = candidates.poses[half, edges.picks[half]]
-    exact = np.tile(_CAMERA_SIGMA**2 * np.eye(6), (len(picked), 1, 1))
-    problem = chain("eye-in-hand", robot[half], picked, exact)
-    state = State(np.stack([edges.x, edges.z]), np.zeros(0))
-    information = fisher_information(problem, state, _NOISE)
+    # Right perturbations of both, as twists of the frame in which the robot errs.
+    by_z = adjoint(invert(robot[half]) @ edges.z)
+    rows = np.concatenate([np.broadcast_to(-adjoint(edges.x), by_z.shape), by_z], axis=2)
+    information = np.einsum("mij,mik->jk", rows, rows) / _ROBOT_SIGMA**2
     if eigenvalue_shares(information)[0] < NULL_SHARE:
         return None
     variances = np.diag(covariance_from(information)).reshape(4, 3).sum(axis=1)
     # Views that agree poorly determine less than their motion would.
-    excess = max(typical_m / _NOISE.robots[0, 1], 1.0)
+    excess = max(typical_m / _ROBOT_SIGMA, 1.0)
     x, z = (np.sqrt(variances[1::2]) + LEVER_M * np.sqrt(variances[::2])).tolist()
     return None if max(x, z) > WORST_M else replace(edges, sigmas_m=(excess * x, excess * z))
 
