@@ -72,7 +72,7 @@ def test_a_guards_looks_show_when_it_raised_its_alarm(tmp_path):
     ]
     record_looks(tmp_path / "looks.rrd", [*answers, {"acknowledged": True}], "guard")
     found = logged(tmp_path / "looks.rrd")
-    assert found["/figures/evidence"] == pytest.approx([0.0, 0.4, 0.8, 1.2, 1.6])
+    assert found["/figures/evidence/evidence"] == pytest.approx([0.0, 0.4, 0.8, 1.2, 1.6])
     # One alarm, at its first look.
     assert found["/log"] == ["camera (97 %)"]
 

@@ -1,5 +1,7 @@
 """Recordings of day 2: figures of stops, looks or years on one timeline, with what was found."""
 
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -9,6 +11,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind
 
 from visioncal.core.files import replacing_file
 from visioncal.core.number_format import percent
@@ -23,6 +26,8 @@ from visioncal.verification import Check
 from visioncal.vision.camera import project
 
 _FIGURES, _LOG, _NOTE = "/figures", "/log", "/note"
+# Most plots, of the units that most moments have.
+_PLOTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +56,7 @@ def write_timeline(path: Path, name: str, moments: Sequence[Moment], note: str) 
         stream = recorder.stream
         stream.send_recording_name(name)
         has_image = any(len(each.seen_px) for each in moments)
-        recorder.lay_out(_blueprint(has_image=has_image))
+        recorder.lay_out(_blueprint(moments, has_image=has_image))
         stream.log(_NOTE, markdown(note), static=True)
         in_image = rr.CoordinateFrame(paths.IMAGE_FRAME)
         for each in moments:
@@ -62,7 +67,7 @@ def write_timeline(path: Path, name: str, moments: Sequence[Moment], note: str) 
             else:
                 stream.set_time(paths.TIMELINE, sequence=each.at)
             for label, value in each.figures.items():
-                stream.log([_FIGURES[1:], *label.split("/")], rr.Scalars(value))
+                stream.log([_FIGURES[1:], _unit(label), *label.split("/")], rr.Scalars(value))
             if each.words:
                 level = rr.TextLogLevel.ERROR if each.is_alarm else rr.TextLogLevel.INFO
                 stream.log(_LOG, rr.TextLog(each.words, level=level))
@@ -77,16 +82,49 @@ def write_timeline(path: Path, name: str, moments: Sequence[Moment], note: str) 
         recorder.keep()
 
 
-def _blueprint(*, has_image: bool) -> rrb.Blueprint:
-    views: list[rrb.View] = [rrb.TimeSeriesView(name="Figures", origin=_FIGURES)]
+def _unit(label: str) -> str:
+    """The plot that a figure belongs to: that of its unit, or its own."""
+    unit = re.search(r"(?:_|\[)(mm|deg|px)\]?$", label)
+    return unit[1] if unit else label.rpartition("/")[2]
+
+
+def _time(at: float | datetime) -> rr.TimeRangeBoundary:
+    """A moment's time, as a boundary of a plot."""
+    if isinstance(at, int):
+        return rr.TimeRangeBoundary.absolute(seq=at)
+    seconds = at.timestamp() if isinstance(at, datetime) else at
+    return rr.TimeRangeBoundary.absolute(seconds=seconds)
+
+
+def _blueprint(moments: Sequence[Moment], *, has_image: bool) -> rrb.Blueprint:
+    # Figures of different units would hide each other in one plot.
+    counts = Counter(unit for each in moments for unit in {*map(_unit, each.figures)})
+    axis = None
+    if len({each.at for each in moments}) > 1:
+        # Of a year the viewer shows a minute, unless it is told.
+        span = rr.TimeRange(start=_time(moments[0].at), end=_time(moments[-1].at))
+        axis = rrb.TimeAxis(view_range=span)
+    views: list[rrb.View] = [
+        rrb.TimeSeriesView(
+            name=unit, origin=f"{_FIGURES}/{unit}", axis_x=axis, plot_legend=rrb.Corner2D.RightTop
+        )
+        for unit, count in counts.most_common(_PLOTS)
+        if count > 1 or len(moments) == 1
+    ]
     if has_image:
         views.append(rrb.Spatial2DView(name="Predicted and found", origin=paths.IMAGE))
+    kinds = (TextLogColumnKind.LogLevel, TextLogColumnKind.Body)
+    columns = rrb.TextLogColumns(text_log_columns=[TextLogColumn(kind) for kind in kinds])
     words = rrb.Vertical(
         rrb.TextDocumentView(name="What was found", origin=_NOTE),
-        rrb.TextLogView(name="Alarms and causes", origin=_LOG),
+        rrb.TextLogView(name="Alarms and causes", origin=_LOG, columns=columns),
     )
-    content = rrb.Horizontal(rrb.Vertical(*views), words, column_shares=[1.5, 1.0])
-    return rrb.Blueprint(content, rrb.TimePanel(state=rrb.PanelState.Collapsed))
+    content = rrb.Horizontal(rrb.Vertical(*views), words)
+    panels = (
+        rrb.SelectionPanel(state=rrb.PanelState.Collapsed),
+        rrb.TimePanel(state=rrb.PanelState.Collapsed),
+    )
+    return rrb.Blueprint(content, *panels)
 
 
 def record_check(path: Path, check: Check, verdict: Verdict) -> None:
@@ -106,7 +144,8 @@ def record_check(path: Path, check: Check, verdict: Verdict) -> None:
             points = free.positions + free.basis @ free.appearance.board
             seen = corners.px
             expected = project(free.appearance.camera, apply(poses[at], points[corners.ids]))
-        words = f"view {view}: {cause}" if cause else f"view {view} agrees"
+        words = f"{figures['residual [mm]']:.2g} mm"
+        words += f", by the {cause}" if cause else ", agrees"
         moments.append(Moment(view, figures, words, bool(cause), seen, expected))
     word = "holds" if check.passed else "does not hold any more"
     lines = [f"# The calibration {word}", *(f"- {line}" for line in (*verdict.top, *verdict.rest))]
@@ -140,7 +179,7 @@ def record_years(path: Path, entries: Sequence[Entry], name: str) -> None:
         Moment(
             entry.time,
             {f"{entry.cell}/{label}": value for label, value in entry.figures.items()},
-            f"{entry.cell}: {entry.kind}, {entry.status}: {entry.reason}",
+            f"{entry.time:%Y-%m-%d} {entry.cell}: {entry.kind}, {entry.status}: {entry.reason}",
             entry.status == "bad",
         )
         for entry in sorted(entries, key=lambda entry: entry.time)
