@@ -165,10 +165,16 @@ class Fitter:
     moving: bool
     misfit: float  # Error of the model of blur, a share of the contrast.
 
-    def look(self, seen: Seen, weights: Pixels | None = None, noise: float = _LEAST_NOISE) -> Look:
-        """Renders the print and fits the light; by all pixels inside where weights are None."""
+    def look(
+        self,
+        seen: Seen,
+        weights: Pixels | None = None,
+        noise: float = _LEAST_NOISE,
+        drawn: Rendered | None = None,
+    ) -> Look:
+        """Renders the print, unless it is, and fits the light; weights are 1 inside where None."""
         level = self.level
-        drawn = level.rendered(self.flat, seen, moving=self.moving)
+        drawn = drawn or level.rendered(self.flat, seen, moving=self.moving)
         light, image = drawn.light.ravel(), level.image.ravel()
         terms = np.concatenate([level.nodes * light, level.nodes, light[None] ** 2])
         # A print moves by no more than a fifth of itself, nor turns by as much.
@@ -210,7 +216,7 @@ class Fitter:
         free = (local < (0.45 if slack_px <= 0.3 else 0.75)).astype(np.float32)
         free = np.asarray(cv2.erode(free, np.ones(side, np.uint8)))
         weights = look.inside * free.ravel() / (1 + look.residuals**2 / (4 * allowed))
-        return self.look(look.seen, weights.astype(np.float32), noise)
+        return self.look(look.seen, weights.astype(np.float32), noise, look.drawn)
 
     def fitted(self, seen: Seen, before: Look | None) -> Look | None:
         """Fits from a start, with weights anew after each round; first those of a look before."""
@@ -218,7 +224,7 @@ class Fitter:
         if before is not None and look is not None:
             # Blurs differ between levels, and would pass for covers.
             weights = look.inside * self.level.resampled(before.level, before.weights)
-            look = self.steps(self.look(seen, weights, before.noise), 5)
+            look = self.steps(self.look(seen, weights, before.noise, look.drawn), 5)
         is_first = before is None or before.level is self.level
         for slack in (0.6, 0.3) if is_first else (0.3, 0.2):
             look = None if look is None else self.steps(self.weighed(look, slack), 6)
@@ -235,13 +241,14 @@ class Fitter:
             scaled = normal / np.outer(scale, scale)
             for _ in range(4):
                 step = np.linalg.solve(scaled + damping * np.eye(len(scale)), goal / scale) / scale
-                # Less is below what noise moves.
-                if goal @ step < 0.1 * look.noise**2 + 1e-6 * look.cost:
-                    return look
+                gain = float(goal @ step)
                 seen = look.seen.moved(step[: len(look.prior)], self.moving)
                 tried = self.look(seen, look.weights, look.noise)
                 # Interpolation in steps of 1/32 px makes costs uneven, and derivatives less so.
                 if tried.cost <= 1.001 * look.cost:
+                    # The next is below what noise moves, as convergence is quadratic.
+                    if gain < 2 * look.noise**2 + 1e-5 * look.cost:
+                        return tried
                     look, damping = tried, damping / 10
                     break
                 damping *= 10

@@ -267,6 +267,7 @@ class Level:
             layers = np.stack([_through(layer, _disc(radius)) for layer in layers])
             wider = _through(sharp, _disc(1.02 * radius)) - layers[0]
             by_disc = [_gauss(wider, sigma) / np.float32(0.02 * seen.disc_px)]
+        by_sigma = _gauss_slope(layers[0], sigma)
         layers = np.stack([_gauss(layer, sigma) for layer in layers])
         point = [depth * one for one in ray]
 
@@ -281,8 +282,7 @@ class Level:
             return [*(-one for one in q), *crossed]
 
         q = by_point(layers[1], layers[2])
-        bent = cv2.Laplacian(layers[0], cv2.CV_32F, ksize=1, borderType=_EDGE)
-        slopes = [*by_pose(q), bent * np.float32(sigma / self.factor), *by_disc]
+        slopes = [*by_pose(q), by_sigma / np.float32(self.factor), *by_disc]
         slopes += by_pose(by_point(layers[3], layers[4])) if moving else []
         slopes += [depth * (q[0] * bend[0] + q[1] * bend[1]) for bend in self.bends]
         return Rendered(layers[0], _pixels(np.stack(slopes)), place)
@@ -328,6 +328,22 @@ def _gauss(layer: Pixels, sigma: float) -> Pixels:
     sigma = max(sigma, _SHARPEST_PX)
     size = max(2 * int(3 * sigma + 0.5) + 1, 5)
     return _pixels(cv2.GaussianBlur(layer, (size, size), sigma, borderType=_EDGE))
+
+
+def _gauss_slope(layer: Pixels, sigma: float) -> Pixels:
+    """The derivative of `_gauss` by its sigma, that of the sampled kernel itself.
+
+    A Laplacian of pixels misses a third of a sharp image's, and steps overshoot by as much.
+    """
+    sigma = max(sigma, _SHARPEST_PX)
+    kernel = cv2.getGaussianKernel(max(2 * int(3 * sigma + 0.5) + 1, 5), sigma)
+    squares = (np.arange(len(kernel))[:, None] - len(kernel) // 2) ** 2.0
+    slope = kernel * (squares - np.sum(kernel * squares)) / sigma**3
+    both = (
+        cv2.sepFilter2D(layer, -1, *pair, borderType=_EDGE)
+        for pair in ((kernel, slope), (slope, kernel))
+    )
+    return _pixels(sum(both))
 
 
 def _through(layer: Pixels, kernel: Pixels) -> Pixels:
