@@ -11,7 +11,7 @@ from visioncal.simulation import CAMERAS
 from visioncal.vision.camera import project
 from visioncal.vision.patches import places_of
 from visioncal.vision.register.fit import register
-from visioncal.vision.register.image_model import Level, Print, Seen
+from visioncal.vision.register.image_model import BLOCK_PX, Level, Print, Seen
 
 WIDE = CAMERAS["wide"]
 # A quarter of the pixels.
@@ -75,7 +75,9 @@ def test_derivatives_are_those_of_differences(disc_px, twist):
     # Some tenths of a pixel, beside which the sampling of the print is exact.
     steps = [2e-4] * 3 + [4e-4] * 3 + [0.1] + [0.2] * bool(disc_px)
     steps += [8e-4] * 6 * moving + [0.5, 0.2, 0.2, 8e-3]
-    assert len(drawn.slopes) == len(steps)
+    size = BLOCK_PX
+    shares = drawn.shares.repeat(size, axis=2).repeat(size, axis=3)
+    assert shares.shape == (len(drawn.slopes), len(steps), *level.image.shape)
     inner = ((drawn.places_m > 0.03) & (drawn.places_m < flat.size_m[:, None, None] - 0.03)).all(0)
     for at, step in enumerate(steps):
         change = np.zeros(len(steps))
@@ -83,7 +85,7 @@ def test_derivatives_are_those_of_differences(disc_px, twist):
         ends = (level.rendered(flat, seen.moved(way * change, moving), moving=moving).light
                 for way in (1, -1))  # fmt: skip
         numeric = np.subtract(*ends)[inner] / (2 * step)
-        closed = drawn.slopes[at][inner]
+        closed = np.sum(drawn.slopes * shares[:, at], axis=0)[inner]
         # Slopes of places vary within a blur, and differences over two steps are no slopes: some
         # percent, most for motions along the axis. A wrong sign, factor or axis is off by 1.
         assert numeric @ closed / (closed @ closed) == pytest.approx(1.0, abs=0.1), at

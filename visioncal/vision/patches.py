@@ -41,24 +41,32 @@ def places_of(
     """
     look, level = found.look, found.look.level
     light = look.drawn.light
-    columns = np.concatenate([-look.by_px, [light.ravel(), np.ones(light.size)]])
+    columns = np.concatenate([-look.by_px, [light, np.ones_like(light)]]).reshape(4, -1)
+    free, residuals = look.weights.ravel(), look.residuals.ravel()
     v, u = np.divmod(np.arange(light.size), light.shape[1])
     blocks = v // _BLOCK_PX * light.size + u // _BLOCK_PX
-    at, (x, y) = look.drawn.places_m.reshape(2, -1), points_m[:, :2].T.astype(np.float32)
+    at, numbers = look.drawn.places_m, np.arange(light.size).reshape(light.shape)
+    pixel_m = level.factor * float(look.flat.middle_at(found.seen.cam_from_target)[2])
+    reach_m = half_m + 30 * pixel_m / float(level.camera.matrix[:2].mean())
     rows: list[tuple[int, FloatArray, float, float]] = []
-    for number in range(len(points_m)):
-        near = (np.abs(at[0] - x[number]) < half_m) & (np.abs(at[1] - y[number]) < half_m)
-        inside = np.flatnonzero(near)
-        taken = inside[look.weights[inside] > 0.3]
+    for number, place in enumerate(points_m[:, :2, None, None].astype(np.float32)):
+        # Of every eighth pixel, those that are near tell where to look.
+        rough = np.argwhere((np.abs(at[:, ::8, ::8] - place) < reach_m).all(axis=0))
+        if not len(rough):
+            continue
+        (top, left), (bottom, right) = 8 * rough.min(axis=0), 8 * rough.max(axis=0) + 8
+        near = (np.abs(at[:, top:bottom, left:right] - place) < half_m).all(axis=0)
+        inside = numbers[top:bottom, left:right][near]
+        taken = inside[free[inside] > 0.3]
         if len(taken) < max(_FEWEST, _FREE * len(inside)):
             continue
-        own, weights = columns[:, taken], look.weights[taken].astype(float)
+        own, weights = columns[:, taken], free[taken].astype(float)
         normal = (own * weights) @ own.T
         inverse = np.linalg.inv(normal + 1e-9 * (np.trace(normal) + 1e-9) * np.eye(4))
         if np.linalg.cond(inverse[:2, :2]) > _LONGEST**2:
             continue
-        solved = inverse @ (own * weights) @ look.residuals[taken]
-        rest = look.residuals[taken] - solved @ own
+        solved = inverse @ (own * weights) @ residuals[taken]
+        rest = residuals[taken] - solved @ own
         variance = float(weights @ rest**2) / (float(weights.sum()) - 4)
         _, block = np.unique(blocks[taken], return_inverse=True)
         scores = np.stack([np.bincount(block, row) for row in own * weights * rest])

@@ -16,10 +16,18 @@ import numpy as np
 
 from visioncal.core.transforms import skew
 from visioncal.core.types import Camera, FloatArray, Image
-from visioncal.vision.register.image_model import Level, Pixels, Print, Rendered, Seen, moved_px
+from visioncal.vision.register.image_model import (
+    BLOCK_PX,
+    Level,
+    Pixels,
+    Print,
+    Rendered,
+    Seen,
+    moved_px,
+)
 
-# Side of blocks [px], and fewest pixels to fit.
-_BLOCK_PX, _FEWEST = 16, 200
+# Side of the blocks that err alone [px], and fewest pixels to fit.
+_WIDE_PX, _FEWEST = 16, 200
 # Least noise of a pixel, a share of its range: that of rounding to 8 bits, and of a print's ink.
 _LEAST_NOISE = 0.002
 
@@ -32,10 +40,9 @@ class Look:
     flat: Print
     seen: Seen
     drawn: Rendered
-    terms: Pixels  # (19, n) columns of the light.
-    gain: Pixels  # (n,) derivative of the image by the print's light.
-    residuals: Pixels  # (n,) image less model.
-    weights: Pixels  # (n,).
+    gain: Pixels  # (h, w) derivative of the image by the print's light.
+    residuals: Pixels  # (h, w) image less model.
+    weights: Pixels  # (h, w).
     noise: float  # Robust standard deviation of a pixel.
     # (p,) information that is known before on pose, blur, twist and lens, and what it is on.
     prior: FloatArray
@@ -43,7 +50,7 @@ class Look:
 
     @cached_property
     def inside(self) -> Pixels:
-        """(n,) 1 where a pixel sees nothing but the print, through all blur."""
+        """(h, w) 1 where a pixel sees nothing but the print, through all blur."""
         seen, camera = self.seen, self.level.camera
         blur_px = 3 * seen.gauss_px + seen.disc_px + 0.8 * self.level.factor
         blur_px += moved_px(camera, self.flat, seen) / 2
@@ -51,40 +58,64 @@ class Look:
         rim = min(blur_px * pixel_m, 0.12 * self.flat.size_m.min())
         at = self.drawn.places_m - self.flat.corner_m[:, None, None]
         inside = ((at > rim) & (at < (self.flat.size_m - rim)[:, None, None])).all(axis=0)
-        return np.asarray(inside & self.level.is_sound, np.float32).ravel()
+        return np.asarray(inside & self.level.is_sound, np.float32)
 
     @cached_property
     def by_px(self) -> Pixels:
-        """(2, n) derivatives of the image by a shift of this level's pixels along u and v.
+        """(2, h, w) derivatives of the image by a shift of this level's pixels along u and v.
 
         Differences of the light would miss a part of what is finest.
         """
-        by_place = -np.tensordot(
-            self.seen.cam_from_target[:3, :2].T.astype(np.float32), self.drawn.slopes[:3], 1
-        )
         moved = (np.gradient(self.drawn.places_m, axis=axis) for axis in (2, 1))
-        slopes = np.stack([np.sum(by_place * one, axis=0) for one in moved])
-        return np.asarray(slopes.reshape(2, -1) * self.gain, np.float32)
+        return np.stack([np.sum(self.drawn.slopes[:2] * one, axis=0) for one in moved]) * self.gain
 
     @property
     def cost(self) -> float:
         """Weighted sum of squares, and those of what is known before."""
         known = self.noise**2 * float(self.prior @ self.changes**2)
-        return float((self.weights * self.residuals) @ self.residuals) + known
+        return float(np.vdot(self.weights * self.residuals, self.residuals)) + known
 
     def normal(self) -> tuple[FloatArray, FloatArray, Pixels]:
-        """Normal matrix (p + 19)^2 and right side by parameters and light, and weighted columns."""
-        slopes = self.drawn.slopes.reshape(len(self.drawn.slopes), -1)
-        jacobian = np.concatenate([slopes * self.gain, self.terms])
-        root = np.sqrt(self.weights)
-        jacobian *= root
-        normal = (jacobian @ jacobian.T).astype(float)
-        jacobian *= root
-        goal = (jacobian @ self.residuals).astype(float)
-        known = np.arange(len(self.prior))
-        normal[known, known] += self.noise**2 * self.prior
-        goal[known] -= self.noise**2 * self.prior * self.changes
-        return normal, goal, jacobian
+        """Normal matrix (p + 19)^2 and right side by parameters and light, and scores of blocks.
+
+        Within a block, derivatives by pose, lens and nodes are its middle's times slopes of the
+        print: so products of pixels are summed for few slopes, and not for all parameters.
+
+        Returns:
+            The matrix, the right side, and the scores (p + 19, blocks down, along).
+        """
+        light, shares = self.drawn.light, self.drawn.shares
+        (count, known), shape = shares.shape[:2], shares.shape[2:]
+        own = np.stack([*self.drawn.slopes, light, np.ones_like(light), light**2, self.residuals])
+        sums = np.zeros((*shape, count + 3, count + 4), np.float32)
+        # Row by row, as more pixels do not fit into a cache.
+        for row, total in enumerate(sums):
+            rows = slice(BLOCK_PX * row, BLOCK_PX * (row + 1))
+            part = own[:, rows].copy()
+            part[:count] *= self.gain[rows]
+            pair = [
+                one.reshape(-1, BLOCK_PX, shape[1], BLOCK_PX).transpose(2, 0, 1, 3)
+                for one in (part[:-1] * self.weights[rows], part)
+            ]
+            weighed, plain = (one.reshape(*one.shape[:2], -1) for one in pair)
+            np.matmul(weighed, np.swapaxes(plain, 1, 2), out=total)
+        sums = sums.reshape(-1, count + 3, count + 4)
+        down, along = (side.reshape(3, -1, BLOCK_PX).mean(axis=2) for side in self.level.nodes)
+        nodes = (down[:, None, :, None] * along[:, None, :]).reshape(9, *shape)
+        mixed = np.zeros((count + 3, known + 19, *shape), np.float32)
+        mixed[:count, :known] = shares
+        mixed[count, known : known + 9] = mixed[count + 1, known + 9 : known + 18] = nodes
+        mixed[count + 2, known + 18] = 1.0
+        mixed = np.ascontiguousarray(mixed.reshape(count + 3, known + 19, -1).transpose(2, 0, 1))
+        normal = np.tensordot(mixed, sums[:, :, :-1] @ mixed, ([0, 1], [0, 1])).astype(float)
+        scores = np.einsum("bk,bkp->pb", sums[:, :, -1], mixed)
+        goal = scores.sum(axis=1, dtype=float)
+        # The light is fitted.
+        goal[known:] = 0.0
+        at = np.arange(known)
+        normal[at, at] += self.noise**2 * self.prior
+        goal[at] -= self.noise**2 * self.prior * self.changes
+        return normal, goal, scores.reshape(-1, *shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,34 +206,46 @@ class Fitter:
         """Renders the print, unless it is, and fits the light; weights are 1 inside where None."""
         level = self.level
         drawn = drawn or level.rendered(self.flat, seen, moving=self.moving)
-        light, image = drawn.light.ravel(), level.image.ravel()
-        terms = np.concatenate([level.nodes * light, level.nodes, light[None] ** 2])
         # A print moves by no more than a fifth of itself, nor turns by as much.
         still = np.repeat([1 / (0.2 * self.flat.size_m.max()), 1 / 0.2], 3) ** 2
         known = [np.zeros(7 + (seen.disc_px > 0)), still[: 6 * self.moving], self.lens_sigma**-2.0]
         changes = [known[0], seen.twist[: 6 * self.moving], seen.lens]
+        light, image = drawn.light, level.image
         blank = Look(
-            level, self.flat, seen, drawn, terms, light, image, light, noise,
-            np.concatenate(known), np.concatenate(changes),
+            level, self.flat, seen, drawn, light, image, light, noise, np.concatenate(known),
+            np.concatenate(changes),
         )  # fmt: skip
         weights = blank.inside if weights is None else weights
-        root = np.sqrt(weights)
-        rooted = terms * root
-        normal = (rooted @ rooted.T).astype(float)
+        # Sums over pixels of products of two nodes with powers of the light and with the image.
+        layers = [weights, weights * light]
+        layers += [layers[1] * light, weights * image]
+        layers += [layers[2] * light, layers[2] * light**2, layers[3] * light, layers[2] * image]
+        down, along = ((side[:, None] * side).reshape(9, -1) for side in level.nodes)
+        sums = (down @ (np.stack(layers) @ along.T)).astype(float).reshape(-1, 3, 3, 3, 3)
+        both = sums.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9)
+        zeroth, one, two, imaged, three, four, imaged_one, imaged_two = both
+        # Nodes' weights sum to 1.
+        square = three.sum(axis=1), two.sum(axis=1)
+        normal = np.block([
+            [two, one, square[0][:, None]],
+            [one, zeroth, square[1][:, None]],
+            [square[0], square[1], four.sum()],
+        ])  # fmt: skip
         normal += 1e-6 * (float(np.trace(normal)) / len(normal) + 1e-3) * np.eye(len(normal))
-        goal = (rooted @ (root * image)).astype(float)
+        goal = np.r_[imaged_one.sum(axis=1), imaged.sum(axis=1), imaged_two.sum()]
         solved = np.linalg.solve(normal, goal).astype(np.float32)
-        gain = solved[:9] @ level.nodes + 2 * solved[18] * light
+        down, along = level.nodes
+        gain, offset = (down.T @ part @ along for part in solved[:18].reshape(2, 3, 3))
+        bent = solved[18] * light
         # Light that few pixels determine is anything where it is not seen.
-        residuals = np.clip(image - solved @ terms, -1e3, 1e3)
-        return replace(blank, gain=gain, residuals=residuals, weights=weights)
+        residuals = np.clip(image - offset - (gain + bent) * light, -1e3, 1e3)
+        return replace(blank, gain=gain + 2 * bent, residuals=residuals, weights=weights)
 
     def weighed(self, look: Look, slack_px: float) -> Look:
         """With weights by the residuals: of what covers the print, and of single pixels.
 
         A shift of `slack_px` of this level is no cover yet.
         """
-        shape = self.level.image.shape
         taken = look.weights > 0
         if taken.sum() < _FEWEST:
             return look
@@ -210,12 +253,12 @@ class Fitter:
         known = noise**2 + (self.misfit * float(np.median(look.gain))) ** 2
         allowed = 4 * known + slack_px**2 * np.sum(look.by_px**2, axis=0)
         side = (5, 5) if self.level.factor > 2 else (7, 7)
-        squares, inside = look.residuals**2 / allowed * look.inside, look.inside.reshape(shape)
-        local = cv2.blur(squares.reshape(shape), side) / np.maximum(cv2.blur(inside, side), 0.05)
+        squares = look.residuals**2 / allowed * look.inside
+        local = cv2.blur(squares, side) / np.maximum(cv2.blur(look.inside, side), 0.05)
         # Of noise alone the mean is a quarter.
         free = (local < (0.45 if slack_px <= 0.3 else 0.75)).astype(np.float32)
         free = np.asarray(cv2.erode(free, np.ones(side, np.uint8)))
-        weights = look.inside * free.ravel() / (1 + look.residuals**2 / (4 * allowed))
+        weights = look.inside * free / (1 + look.residuals**2 / (4 * allowed))
         return self.look(look.seen, weights.astype(np.float32), noise, look.drawn)
 
     def fitted(self, seen: Seen, before: Look | None) -> Look | None:
@@ -224,15 +267,15 @@ class Fitter:
         if before is not None and look is not None:
             # Blurs differ between levels, and would pass for covers.
             weights = look.inside * self.level.resampled(before.level, before.weights)
-            look = self.steps(self.look(seen, weights, before.noise, look.drawn), 5)
+            look = self.steps(self.look(seen, weights, before.noise, look.drawn), 5, 1e-7)
         is_first = before is None or before.level is self.level
         for slack in (0.6, 0.3) if is_first else (0.3, 0.2):
-            look = None if look is None else self.steps(self.weighed(look, slack), 6)
+            damping = 1e-3 if is_first and slack > 0.5 else 1e-7
+            look = None if look is None else self.steps(self.weighed(look, slack), 6, damping)
         return look
 
-    def steps(self, look: Look, most: int) -> Look | None:
+    def steps(self, look: Look, most: int, damping: float = 1e-3) -> Look | None:
         """Levenberg and Marquardt's steps; None where too little is left to fit."""
-        damping = 1e-3
         for _ in range(most):
             if look.weights.sum() < _FEWEST:
                 return None
@@ -246,12 +289,13 @@ class Fitter:
                 tried = self.look(seen, look.weights, look.noise)
                 # Interpolation in steps of 1/32 px makes costs uneven, and derivatives less so.
                 if tried.cost <= 1.001 * look.cost:
-                    # The next is below what noise moves, as convergence is quadratic.
-                    if gain < 2 * look.noise**2 + 1e-5 * look.cost:
+                    # The next is below what noise moves, as convergence is quadratic; what lens and
+                    # pose share has 1e-5 of an information, which damping must not hold.
+                    if damping < 1e-6 and gain < 2 * look.noise**2 + 1e-5 * look.cost:
                         return tried
-                    look, damping = tried, damping / 10
+                    look, damping = tried, damping / 100
                     break
-                damping *= 10
+                damping *= 100
             else:
                 return look
         return look
@@ -281,17 +325,17 @@ class Fitter:
 
 
 def _result(look: Look) -> Registered:
-    height, width = look.level.image.shape
-    normal, _, weighed = look.normal()
+    normal, _, scores = look.normal()
 
-    def by_block(array: Pixels) -> FloatArray:
-        rows = np.add.reduceat(array.reshape(-1, height, width), np.arange(0, height, _BLOCK_PX), 1)
-        sums = np.add.reduceat(rows, np.arange(0, width, _BLOCK_PX), 2)
-        return sums.reshape(len(array), -1).astype(float)
+    def wide(sums: Pixels, size: int) -> FloatArray:
+        """Sums of (k, h, w) over wide blocks."""
+        for axis in (1, 2):
+            sums = np.add.reduceat(sums, np.arange(0, sums.shape[axis], size), axis)
+        return sums.reshape(len(sums), -1).astype(float)
 
-    scores = by_block(weighed * look.residuals)
-    used = int((by_block(look.weights[None]) > _BLOCK_PX**2 / 4).sum())
-    meat = scores @ scores.T * used / max(used - len(normal), 5)
+    errors = wide(scores, _WIDE_PX // BLOCK_PX)
+    used = int((wide(look.weights[None], _WIDE_PX) > _WIDE_PX**2 / 4).sum())
+    meat = errors @ errors.T * used / max(used - len(normal), 5)
     known = np.arange(len(look.prior))
     meat[known, known] += look.noise**4 * look.prior
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-12 * normal.max()))
@@ -305,7 +349,7 @@ def _result(look: Look) -> Registered:
         [[np.zeros((3, 3)), back], [back, -back @ skew(look.seen.cam_from_target[:3, 3])]]
     )
     covariance = turned @ (inverse @ meat @ inverse)[np.ix_(kept, kept)] @ turned.T
-    taken, image = look.weights.astype(float), look.level.image.ravel()
+    taken, image = look.weights.astype(float), look.level.image
     varied = np.sum(taken * (image - np.average(image, weights=taken)) ** 2)
     explained = 1.0 - float(np.sum(taken * look.residuals**2) / max(varied, 1e-12))
     shown = float((taken > 0).sum()) / max(float(look.inside.sum()), 1.0)

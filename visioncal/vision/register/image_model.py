@@ -19,7 +19,7 @@ from typing import Self, TypeAlias
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import apply
@@ -29,6 +29,8 @@ from visioncal.vision.camera import normalise, project, project_with_jacobian
 Pixels: TypeAlias = npt.NDArray[np.float32]
 
 _EDGE = cv2.BORDER_REPLICATE
+# Side of the blocks within which derivatives by pose and lens are those of the middle [px].
+BLOCK_PX = 8
 # Gaussian of print and of reduced images before they are sampled [px]: the narrowest at which
 # sampling at each pixel aliases by less than noise does; and the narrowest blur after it.
 _SAMPLED_PX, _SHARPEST_PX = 0.5, 0.25
@@ -137,22 +139,26 @@ class Rendered:
     """The print as it is seen, in light 1, and its derivatives."""
 
     light: Pixels  # (h, w).
-    # (p, h, w) by pose, as left perturbation (translation, rotation), blur, twist and lens.
-    slopes: Pixels
+    slopes: Pixels  # (k, h, w) along x and y of the print, by blurs, and along x and y by a motion.
+    # (k, p, blocks down, along) shares of these in the derivatives by pose, as left perturbation
+    # (translation, rotation), blur, twist and lens.
+    shares: Pixels
     places_m: Pixels  # (2, h, w) place on the target in the middle of the exposure [m].
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A part of an image, reduced by a factor, around where a print is expected."""
+    """A part of an image, reduced by a factor, around where a print is expected: whole blocks."""
 
     factor: int
     corner_px: tuple[int, int]  # The first pixel's in the image (u, v).
     image: Pixels  # (h, w) grey, 0 to 1.
     is_sound: npt.NDArray[np.bool_]  # (h, w) neither saturated nor without a ray.
     camera: Camera
-    rays: Pixels  # (2, h, w) of the lens as given, at depth 1.
-    bends: Pixels  # (l, 2, h, w) derivatives of the rays by `Seen.lens`.
+    # (2 + 2 l, m, n) rays of the lens as given at nodes of cubic splines, at depth 1, and their
+    # derivatives by `Seen.lens`; and the splines (h, m) and (w, n).
+    table: Pixels
+    splines: list[Pixels]
 
     @classmethod
     def of(
@@ -167,9 +173,16 @@ class Level:
         high = np.clip(np.ceil(px.max(axis=0) / factor) + 3, 0, size).astype(int)
         if (high - low < 12).any():
             return None
-        (u, v), (w, h) = (low * factor).tolist(), (high - low).tolist()
+        (u, v), (w, h) = (low * factor).tolist(), (-(-(high - low) // BLOCK_PX) * BLOCK_PX).tolist()
         part = image[v : v + factor * h, u : u + factor * w]
-        layers = [_pixels(part / 255), _pixels((part > 1) & (part < 254))]
+        beyond = 0, factor * h - part.shape[0], 0, factor * w - part.shape[1]
+        layers = [
+            _pixels(cv2.copyMakeBorder(_pixels(layer), *beyond, border))
+            for layer, border in (
+                (part / np.float32(255), _EDGE),
+                ((part > 1) & (part < 254), cv2.BORDER_CONSTANT),
+            )
+        ]
         if factor > 1:
             # The box of the reduction alone would alias.
             layers[0] = _gauss(layers[0], factor * float(np.sqrt(_SAMPLED_PX**2 - 1 / 12)))
@@ -182,22 +195,31 @@ class Level:
         rays, bends = _bends(camera, at, columns)
         table = np.concatenate([rays, bends.reshape(len(at), -1), np.ones((len(at), 1))], axis=1)
         table = np.where(np.isfinite(table).all(axis=1, keepdims=True), table, 0.0)
-        shape = -1, len(nodes[0]), len(nodes[1])
-        drawn = [RectBivariateSpline(*nodes, layer)(*ends) for layer in table.T.reshape(shape)]
-        is_sound = (layers[1] > 0.99) & (np.abs(drawn.pop() - 1.0) < 1e-6)
-        found = _pixels(np.stack(drawn))
-        slopes = found[2:].reshape(columns, 2, h, w)
-        return cls(factor, (u, v), layers[0], is_sound, camera, found[:2], slopes)
+        table = table.T.reshape(-1, len(nodes[0]), len(nodes[1]))
+        down, along = (
+            make_interp_spline(node, np.eye(len(node)))(end)
+            for node, end in zip(nodes, ends, strict=True)
+        )
+        is_sound = (layers[1] > 0.99) & (np.abs(down @ table[-1] @ along.T - 1.0) < 1e-6)
+        table, splines = _pixels(table[:-1]), [_pixels(down), _pixels(along)]
+        return cls(factor, (u, v), _pixels(layers[0]), is_sound, camera, table, splines)
 
     @cached_property
-    def nodes(self) -> Pixels:
-        """(9, h w) bilinear weights of 3 x 3 nodes."""
+    def nodes(self) -> list[Pixels]:
+        """(3, h) and (3, w) weights of nodes down and along: of 3 x 3, they are products."""
         at = (np.linspace(0, 2, count) - np.arange(3)[:, None] for count in self.image.shape)
-        down, along = (np.clip(1 - np.abs(off), 0, 1) for off in at)
-        return _pixels(down[:, None, :, None] * along[None, :, None]).reshape(9, -1)
+        return [_pixels(np.clip(1 - np.abs(off), 0, 1)) for off in at]
+
+    @cached_property
+    def middles(self) -> Pixels:
+        """(2 + 2 l, blocks down, along) rays and their derivatives in the middles of blocks."""
+        down, along = (
+            side.reshape(-1, BLOCK_PX, side.shape[1]).mean(axis=1) for side in self.splines
+        )
+        return _pixels(down @ self.table @ along.T)
 
     def resampled(self, other: "Level", values: Pixels) -> Pixels:
-        """(n,) values at this level's pixels, of (m,) at another one's around the same print."""
+        """(h, w) values at this level's pixels, of (m, n) at another's around the same print."""
         at = [
             (np.arange(count) * self.factor + first - zero) // other.factor
             for count, first, zero in zip(
@@ -207,7 +229,7 @@ class Level:
         rows, columns = (
             np.clip(a, 0, size - 1) for a, size in zip(at, other.image.shape, strict=True)
         )
-        return values.reshape(other.image.shape)[np.ix_(rows, columns)].ravel()
+        return values[np.ix_(rows, columns)]
 
     def rendered(self, flat: Print, seen: Seen, *, moving: bool = False) -> Rendered:
         """The print and its derivatives, with those by the twist where it is moving."""
@@ -219,26 +241,28 @@ class Level:
         count = 1 + 2 * moving * int(
             np.clip(moved_px(self.camera, flat, seen) / self.factor / 3, 2, 6)
         )
-        x, y = self.rays + np.tensordot(_pixels(seen.lens), self.bends, 1)
-        ray, n, along = (
-            np.stack([x, y, np.ones_like(x)]),
-            _pixels(pose[:3, 2]),
-            _pixels(pose[:3, :2]),
+        lens, both = _pixels(seen.lens), (self.table, self.middles)
+        bends = [one[2:].reshape(len(lens), 2, *one.shape[1:]) for one in both]
+        at_nodes, rays = (
+            one[:2] + np.tensordot(lens, bend, 1) for one, bend in zip(both, bends, strict=True)
         )
-        across = 1 / sum(n[i] * ray[i] for i in range(3))
+        x, y = self.splines[0] @ at_nodes @ self.splines[1].T
+        n, along = _pixels(pose[:3, 2]), _pixels(pose[:3, :2])
+        ray = np.stack([*rays, np.ones_like(rays[0])])
+        across = 1 / np.tensordot(n, ray, 1)
         depth = np.float32(n @ pose[:3, 3]) * across
+        # (2, 3, ...) slopes of x and y on the print by a motion of the point that is seen, its ray
+        # being fixed.
+        q = along.T[:, :, None, None] - n[:, None, None] * (
+            across * np.tensordot(along.T, ray, 1)[:, None]
+        )
         # The print at each pixel beside one Gaussian for all, by the heat equation, and
         # how that is shifted, as slopes of perspective change within a pixel.
         side = np.float32(_SAMPLED_PX * pixel_m / middle[2])
-        (xx, xy), (yx, yy) = (
-            [
-                side * depth * (along[i, k] - n[i] * across * sum(along[:, k, None, None] * ray))
-                for i in range(2)
-            ]
-            for k in range(2)
-        )
-        spread = xx**2 + xy**2 - sigma_m**2, yx**2 + yy**2 - sigma_m**2, xx * yx + xy * yy
-        shift = [-side * across * (n[0] * px + n[1] * py) for px, py in ((xx, xy), (yx, yy))]
+        (xx, xy), (yx, yy) = side * depth * q[:, :2]
+        fields = [xx**2 + xy**2 - sigma_m**2, yx**2 + yy**2 - sigma_m**2, xx * yx + xy * yy]
+        fields += [-side * across * (n[0] * px + n[1] * py) for px, py in ((xx, xy), (yx, yy))]
+        finer = [_pixels(cv2.resize(_pixels(one), x.shape[::-1])) for one in fields]
         layers = np.zeros((5 if moving else 3, *x.shape), np.float32)
         place = np.zeros((2, *x.shape), np.float32)
         for k in range(count):
@@ -254,11 +278,12 @@ class Level:
                 cv2.remap(table, texels[0], texels[1], cv2.INTER_LINEAR, None, _EDGE)
                 for table in (first, second)
             )
-            layers[0] += sum(spread[i] * bent[..., i] for i in range(3))
-            layers[0] += shift[0] * drawn[..., 1] + shift[1] * drawn[..., 2]
-            layers[:3] += np.moveaxis(_pixels(drawn), -1, 0)
+            parts, more = cv2.split(drawn), cv2.split(bent)
+            for share, part in zip(finer, (*more, *parts[1:]), strict=True):
+                layers[0] += share * part
+            layers[:3] += parts
             if moving:
-                layers[3:] += np.float32(at) * np.moveaxis(_pixels(drawn), -1, 0)[1:]
+                layers[3:] += np.float32(at) * np.stack(parts[1:])
             place = on if 2 * k + 1 == count else place
         layers, sigma = layers / np.float32(count), seen.gauss_px / self.factor
         by_disc = []
@@ -269,23 +294,17 @@ class Level:
             by_disc = [_gauss(wider, sigma) / np.float32(0.02 * seen.disc_px)]
         by_sigma = _gauss_slope(layers[0], sigma)
         layers = np.stack([_gauss(layer, sigma) for layer in layers])
-        point = [depth * one for one in ray]
-
-        def by_point(gx: Pixels, gy: Pixels) -> list[Pixels]:
-            """Slopes by a motion of the point that is seen, its ray being fixed: (3) of (h, w)."""
-            g = [along[i, 0] * gx + along[i, 1] * gy for i in range(3)]
-            off = sum(g[i] * ray[i] for i in range(3)) * across
-            return [g[i] - n[i] * off for i in range(3)]
-
-        def by_pose(q: list[Pixels]) -> list[Pixels]:
-            crossed = [q[i - 2] * point[i - 1] - q[i - 1] * point[i - 2] for i in range(3)]
-            return [*(-one for one in q), *crossed]
-
-        q = by_point(layers[1], layers[2])
-        slopes = [*by_pose(q), by_sigma / np.float32(self.factor), *by_disc]
-        slopes += by_pose(by_point(layers[3], layers[4])) if moving else []
-        slopes += [depth * (q[0] * bend[0] + q[1] * bend[1]) for bend in self.bends]
-        return Rendered(layers[0], _pixels(np.stack(slopes)), place)
+        slopes = [*layers[1:3], by_sigma / np.float32(self.factor), *by_disc, *layers[3:]]
+        blurs = 1 + len(by_disc)
+        shares = np.zeros((len(slopes), 6 + blurs + 6 * moving + len(lens), *depth.shape))
+        by_pose = np.concatenate([-q, np.cross(q, (depth * ray)[None], axis=1)], axis=1)
+        shares[:2, :6] = by_pose
+        shares[range(2, 2 + blurs), range(6, 6 + blurs)] = 1.0
+        if moving:
+            shares[-2:, 6 + blurs : 12 + blurs] = by_pose
+        by_lens = np.einsum("kixy,lixy->klxy", q[:, :2], bends[1])
+        shares[:2, shares.shape[1] - len(lens) :] = depth * by_lens
+        return Rendered(layers[0], np.stack(slopes), _pixels(shares), place)
 
     def pixels_of(self, seen: Seen, places_m: FloatArray) -> FloatArray:
         """(n, 2) pixels of the image at which (n, 3) places of the target are seen [px]."""
@@ -339,11 +358,11 @@ def _gauss_slope(layer: Pixels, sigma: float) -> Pixels:
     kernel = cv2.getGaussianKernel(max(2 * int(3 * sigma + 0.5) + 1, 5), sigma)
     squares = (np.arange(len(kernel))[:, None] - len(kernel) // 2) ** 2.0
     slope = kernel * (squares - np.sum(kernel * squares)) / sigma**3
-    both = (
-        cv2.sepFilter2D(layer, -1, *pair, borderType=_EDGE)
-        for pair in ((kernel, slope), (slope, kernel))
+    along, down = (
+        cv2.sepFilter2D(layer, -1, one, other, borderType=_EDGE)
+        for one, other in ((slope, kernel), (kernel, slope))
     )
-    return _pixels(sum(both))
+    return _pixels(along + down)
 
 
 def _through(layer: Pixels, kernel: Pixels) -> Pixels:
