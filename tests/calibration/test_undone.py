@@ -4,6 +4,7 @@ Cells of poses measured with noise, without images.
 """
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.cells import pairs_session
 from support.commands import visioncal as typed
 from support.following import follow
-from support.marks import slow
+from support.marks import crossed, slow
 from support.whole_cells import OPTIONS, recorded
 
 import visioncal
@@ -45,6 +46,12 @@ def poses_of(mount, views=24, seed=0):
     flanges = flanges if mount == "eye-in-hand" else invert(flanges)
     noise = rng.normal(size=(2, views, 6)) * np.repeat([1e-3, 5e-4], 3)
     return flanges @ exp(noise[0]), boards @ exp(noise[1])
+
+
+@cache
+def calibrated(mount):
+    """The result of these poses."""
+    return visioncal.calibrate(pairs_session(mount, *poses_of(mount)))
 
 
 def shifted(robot, boards, start=10, by=2):
@@ -125,13 +132,12 @@ def test_positions_that_lost_a_sign_get_it_back_by_the_printed_command(
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("kind", ["sign", "unit", "inverse"])
+@pytest.mark.parametrize(("kind", "mount"), crossed(["sign", "unit", "inverse"], MOUNTS))
 def test_poses_that_are_misread_and_rows_apart_are_mended_one_after_the_other(
     tmp_path, monkeypatch, mount, kind
 ):
     monkeypatch.chdir(tmp_path)
-    sound = visioncal.calibrate(pairs_session(mount, *poses_of(mount)))
+    sound = calibrated(mount)
     robot, boards = shifted(*poses_of(mount))
     if kind == "inverse":
         robot = invert(robot)
@@ -163,8 +169,7 @@ def test_poses_that_are_there_twice_hide_no_misread_rotations(mount):
     assert "Euler angles xyz about fixed axes in radians, which were taken for" in cause.words
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("column", ["", "rail_m", "rail_mm"])
+@pytest.mark.parametrize(("column", "mount"), crossed(["", "rail_m", "rail_mm"], MOUNTS))
 def test_a_rail_that_is_in_no_pose_is_named_and_added_from_its_column(
     tmp_path, monkeypatch, mount, column
 ):
@@ -173,7 +178,7 @@ def test_a_rail_that_is_in_no_pose_is_named_and_added_from_its_column(
     places = np.random.default_rng(1).uniform(-1.0, 1.0, len(robot))
     logged = robot.copy()
     logged[:, 1, 3] -= places
-    sound = visioncal.calibrate(pairs_session(mount, robot, boards))
+    sound = calibrated(mount)
     pairs_session(mount, logged, boards).save(tmp_path / "cell")
     if column:
         path = tmp_path / "cell/views.csv"
@@ -191,15 +196,15 @@ def test_a_rail_that_is_in_no_pose_is_named_and_added_from_its_column(
             np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=1e-6)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize(
-    ("axis", "unit", "per_m"),
-    [("z", "mm", 1e3), ("x", "inch", 1 / 0.0254), ("y", "another unit", 10.0)],
+    ("scaled", "mount"),
+    crossed([("z", "mm", 1e3), ("x", "inch", 1 / 0.0254), ("y", "another unit", 10.0)], MOUNTS),
 )
-def test_one_axis_in_another_unit_is_no_rail(tmp_path, monkeypatch, mount, axis, unit, per_m):
+def test_one_axis_in_another_unit_is_no_rail(tmp_path, monkeypatch, mount, scaled):
     monkeypatch.chdir(tmp_path)
+    axis, unit, per_m = scaled
     robot, boards = poses_of(mount)
-    sound = visioncal.calibrate(pairs_session(mount, robot, boards))
+    sound = calibrated(mount)
     logged = robot.copy()
     logged[:, "xyz".index(axis), 3] *= per_m
     pairs_session(mount, logged, boards).save(tmp_path / "cell")
@@ -213,12 +218,11 @@ def test_one_axis_in_another_unit_is_no_rail(tmp_path, monkeypatch, mount, axis,
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=1e-6)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("kind", PLANTED)
+@pytest.mark.parametrize(("kind", "mount"), crossed([*PLANTED], MOUNTS))
 def test_a_mistake_is_named_and_its_command_mends_it(tmp_path, monkeypatch, kind, mount):
     monkeypatch.chdir(tmp_path)
     plant, views, words = PLANTED[kind]
-    sound = visioncal.calibrate(pairs_session(mount, *poses_of(mount)))
+    sound = calibrated(mount)
     session = pairs_session(mount, *plant(*poses_of(mount)))
     session.save(tmp_path / "cell")
     found = visioncal.calibrate(session)
