@@ -104,8 +104,19 @@ def side_by_side(folder):
     return 3, "", ("instrument", 20.0), ("--mount", "instrument", "--instrument", "0.02")
 
 
+def report(folder):
+    """A row an axis, as reports have them."""
+    rows = [["Object", "Control", "Nominal", "Measured [mm]", "Deviation"]]
+    for stop, _, pose in shop().rows:
+        for axis, value in zip("XYZ", 1e3 * pose[:3, 3], strict=True):
+            rows.append([f"pt {stop + 1}", axis, "1.5", f"{value:.7f}", "0.2"])
+    (folder / "report.csv").write_text("PolyWorks|Inspector\n" + joined(rows))
+    (folder / "arm.csv").write_text(joints_table("pt {stop}", order=range(STOPS)[::-1]))
+    return 1, "equal names", ("instrument", 20.0), ("--instrument", "0.02")
+
+
 @pytest.mark.parametrize(
-    "layout", [spatial_analyzer, spatial_analyzer_by_points, polyworks, cam2, side_by_side]
+    "layout", [report, spatial_analyzer, spatial_analyzer_by_points, polyworks, cam2, side_by_side]
 )
 def test_points_of_metrology_programs_are_a_session_of_an_instrument(tmp_path, layout):
     (tmp_path / "in").mkdir()
@@ -127,6 +138,26 @@ def test_points_of_metrology_programs_are_a_session_of_an_instrument(tmp_path, l
         np.testing.assert_allclose(view.joints_rad, world.joints[stop], rtol=0, atol=1e-9)
     stops = [tuple(view.joints_rad) for view in session.views]
     assert len({*zip(stops, (view.stop for view in session.views), strict=True)}) == len({*stops})
+
+
+def test_frames_of_a_probe_beside_a_table_of_joints_are_readings(tmp_path):
+    (tmp_path / "in").mkdir()
+    rows = [["Frame", *"XYZ", "Rx", "Ry", "Rz"]]
+    for stop, _, pose in shop(poses=True).rows:
+        turns = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", degrees=True)
+        rows.append(reads(["F{stop}"], *turns)(stop, 0, pose))
+    (tmp_path / "in/frames.csv").write_text("// SpatialAnalyzer\n" + joined(rows))
+    order = np.random.default_rng(2).permutation(STOPS)
+    table = joints_table("F{stop}", order=order)
+    (tmp_path / "in/arm.csv").write_text(table)
+    said = ("--robot-model", "ur10e", "--instrument", "leica-at960")
+    visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    views = Session.load(tmp_path / "out").views
+    for view, (stop, _, pose) in zip(views, shop(poses=True).rows, strict=True):
+        np.testing.assert_allclose(view.instrument_from_probe(), pose, rtol=0, atol=2e-9)
+        np.testing.assert_allclose(view.joints_rad, shop(poses=True).joints[stop], atol=1e-9)
+    other = visioncal("convert", tmp_path / "in", tmp_path / "again", "--instrument", "my tracker")
+    other.refused("There is no instrument named 'my tracker'", "--instrument 0.02")
 
 
 def test_a_probe_s_turns_are_read_and_the_robot_s_own_poses_beside_them(tmp_path):

@@ -21,7 +21,7 @@ from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
-from visioncal.core.number_format import counted, figure, some_of
+from visioncal.core.number_format import counted, figure, known_name, some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.assemble import pose_cells
 from visioncal.interchange.formats.fields import HOW, Fields, Keys, is_headerless, matched
@@ -57,7 +57,7 @@ _OTHER |= _set("robot roboter tcp flange base programmed prog cmd commanded cont
 _OTHER |= _set("nom nominal soll ref reference design cad d dev deviation delta diff error tol")
 _OTHER |= _set("tolerance upper lower n normal rms offset abweichung")
 # Names of rows, the outermost first, and of the stops of the robot.
-_TARGETS = "target point name label feature punkt messpunkt punto"
+_TARGETS = "target point name label feature object frame punkt messpunkt punto"
 _LEVELS = (_set("collection"), _set("group gruppe grupo"), _set(_TARGETS))
 _STOP = _set("stop pose station posture stelle")
 # An axis in one word with what is measured, as in Ux, ActX, Rx.
@@ -120,7 +120,7 @@ class _Table:
         sizes = [sum(map(is_number, re.split(r"[\s,;]+", line))) for line in lines]
         first = next((at for at, size in enumerate(sizes) if size > 2), len(lines))
         title = "\n".join(text for at, text in enumerate(lines) if at < first or text[:1] in "/#%")
-        fields = _side_by_side(_with_headings(fields))
+        fields = _side_by_side(_by_axis(_with_headings(fields)))
         own = {*fields.numbers, *fields.texts}
         table = cls(fields, title, file.name)
         taken = tuple(name for name in requested.camera.names if name in own)
@@ -191,6 +191,23 @@ def _with_headings(fields: Fields) -> Fields:
     return replace(fields, numbers=arrays, texts=texts)
 
 
+def _by_axis(fields: Fields) -> Fields:
+    """Rows of a report with a row an axis, with a row a point."""
+    measured = [name for name in fields.numbers if _Heading.of(name).words & _MEASURED]
+    axes = [cells for cells in fields.texts.values() if {*map(str.lower, cells)} == {*"xyz"}]
+    if len(measured) != 1 or len(axes) != 1:
+        return fields
+    places, heads = fields.column(measured[0])[:, 0], np.char.lower(axes[0])
+    starts = np.flatnonzero(heads == "x")
+    triples = starts[:, None] + np.arange(3)
+    if 3 * len(starts) != len(fields) or (heads[triples] != [*"xyz"]).any():
+        return fields
+    numbers = {
+        measured[0].replace(" ", "_") + f" {a}": places[starts + at] for at, a in enumerate("xyz")
+    }
+    return replace(fields.rows(starts.tolist()), numbers=numbers)
+
+
 def _side_by_side(fields: Fields) -> Fields:
     """Rows of several points side by side, with a row a point."""
     measured = _Table(fields).points()
@@ -222,7 +239,8 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
             tables += [_Table.of(fields, file, requested) for fields in rows]
     given = {*requested.camera.names}
     of_points = [t for t in tables if t.points() or (given and given <= {*t.fields.numbers})]
-    states = [table for table in tables if table.joints or table.poses]
+    # Poses beside joint angles are of what was measured.
+    states = [t for t in tables if t.joints] or [t for t in tables if t.poses]
     alone = [table for table in of_points if table not in states]
     points = next(iter(alone or sorted(of_points, key=lambda table: not table.is_measured)), None)
     state = next((t for t in states if (t is points) != bool(alone)), None)
@@ -244,7 +262,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
             "--robot-form; or put a table of them, with a column of the targets' or groups' names, "
             f"beside {points.file} in one folder, and convert that.",
         )
-    return _recording(points, state, requested)
+    return _recording(points if state is points else replace(points, poses=()), state, requested)
 
 
 def _recording(points: _Table, state: _Table, requested: ImportOptions) -> ForeignRecording:
@@ -264,9 +282,10 @@ def _recording(points: _Table, state: _Table, requested: ImportOptions) -> Forei
     columns |= {"stop": tuple(numbers[stop] for stop in stops), "point": tuple(spots)}
     for name in dict.fromkeys(name for row in places for name in row):
         columns[name] = tuple(row.get(name, "") for row in places)
-    if (lost := np.flatnonzero(at < 0)).size:
-        left = some_of([fields.places[row] for row in lost])
-        notes += (f"Points without a state of the robot are left out: {left}.",)
+    kept = (at >= 0) & np.array([bool(row) for row in places])
+    if not kept.all():
+        left = some_of([fields.places[row] for row in np.flatnonzero(~kept)])
+        notes += (f"Rows without a place or a state of the robot are left out: {left}.",)
     joints, poses = None, PoseNumbers.empty(robot.places)
     unstated = dict[Side, Unstated]()
     if state.joints:
@@ -288,7 +307,7 @@ def _recording(points: _Table, state: _Table, requested: ImportOptions) -> Forei
         unstated=unstated,
         instrument=instrument,
     )
-    return rows_of(foreign, np.flatnonzero(at >= 0))
+    return rows_of(foreign, np.flatnonzero(kept))
 
 
 def _places(
@@ -446,6 +465,9 @@ def _instrument(
         if words & _UNCERTAIN or {"standard", "deviation"} <= words
     )
     if not (names := next(stated, ())):
+        if name:
+            step = "Or say its sigma in mm, as --instrument 0.02."
+            known_name("instrument", name, known_instruments(), next_step=step)
         step = "Say --instrument NAME, or its sigma in mm, or add [instrument] to session.toml."
         return found, () if found else (f"How good the readings are is not said. {step}",)
     places = next(iter(points.points().values()), ())
