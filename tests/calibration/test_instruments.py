@@ -21,8 +21,15 @@ from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
 from visioncal.session.document import InstrumentTable
 from visioncal.session.kinds import known_instruments, stated_instrument
-from visioncal.simulation.arms import forward
-from visioncal.simulation.instrument_session import THREE, InstrumentOptions, session_of, tracked
+from visioncal.simulation import arms
+from visioncal.simulation.arms import Payload, arm_named, forward
+from visioncal.simulation.instrument_session import (
+    THREE,
+    InstrumentOptions,
+    random_postures,
+    session_of,
+    tracked,
+)
 
 PROBE, POINT, POINTS = (
     InstrumentOptions(poses=True),
@@ -301,3 +308,39 @@ def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
     height = found.edges["flange_from_probe"].matrix[2, 3]
     # Readings alone leave it open: it is where it was measured.
     assert height == pytest.approx(0.05, abs=1e-5)
+
+
+@pytest.mark.parametrize("beyond", [0.5, 1.0])
+def test_gears_of_two_slopes_are_told_under_heavy_loads(beyond, monkeypatch):
+    """Shoulder and elbow yield half as much beyond a torque, or as much."""
+    stiff, knees = np.array([1e6, 4.7e5, 3e5, 1e5, 1e5, 7e4]), {1: 900.0, 2: 500.0}
+
+    def yielding(arm, compliance, joints, payloads=()):
+        most = np.array([knees.get(joint, np.inf) for joint in range(6)])
+        bent, each = joints, np.array(compliance)
+        for _ in range(8):
+            torques = arms.load_torques(arm, bent, payloads)
+            over = np.sign(torques) * np.maximum(np.abs(torques) - most, 0.0)
+            bent = joints + each * (torques + (beyond - 1.0) * over)
+        return bent
+
+    monkeypatch.setattr(arms, "loaded_joints", yielding)
+    loads = tuple(Payload(kg, (0.0, 0.0, 0.1)) for kg in (0.0, 20.0, 100.0))
+    options = InstrumentOptions(
+        robot="generic-6r-1800",
+        dh_sigma_m=5e-4,
+        dh_sigma_rad=5e-4,
+        compliance_rad_per_nm=tuple(1.0 / stiff),
+        payloads=loads,
+    )
+    drawn = random_postures(arm_named(options.robot), 20, np.random.default_rng(100))
+    found = calibrate(session_of(tracked(options, np.repeat(drawn, 3, axis=0))))
+    told = {at: spring.slopes for at, spring in enumerate(found.elastic.joints) if spring.slopes}
+    assert told.keys() == (knees.keys() if beyond < 1.0 else set())
+    words = " ".join(finding.words for finding in found.verdict.findings)
+    assert words.count("yields by two slopes") == len(told)
+    for joint, slopes in told.items():
+        assert slopes.knee_nm == pytest.approx(knees[joint], rel=0.15)
+        first, second = 1.0 / stiff[joint], beyond / stiff[joint]
+        assert abs(slopes.compliance_rad_per_nm - first) < 2.0 * slopes.sigma_rad_per_nm
+        assert abs(slopes.beyond_rad_per_nm - second) < 2.0 * slopes.sigma_beyond_rad_per_nm

@@ -194,6 +194,17 @@ class ArmErrorsResult(Section):
     of: Literal["flange"] | None = None
 
 
+@dataclass(frozen=True)
+class TwoSlopes:
+    """Compliance of a gear that yields otherwise beyond some torque."""
+
+    knee_nm: float  # The torque [N m].
+    compliance_rad_per_nm: float  # Up to it [rad/(N m)].
+    beyond_rad_per_nm: float  # Of what goes beyond it [rad/(N m)].
+    sigma_rad_per_nm: float
+    sigma_beyond_rad_per_nm: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class JointSpring:
     """Compliance of a joint."""
@@ -207,6 +218,7 @@ class JointSpring:
     stiffness_nm_per_rad: float | None = None  # Stiffness [N m/rad]; None where practically rigid.
     # Its standard deviation, to first order [N m/rad].
     stiffness_sigma_nm_per_rad: float | None = None
+    slopes: TwoSlopes | None = None  # Where loads of several sizes show two.
 
 
 @dataclass(frozen=True)
