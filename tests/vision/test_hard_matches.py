@@ -1,7 +1,9 @@
 """Matches by kornia, where it is installed; and what stands without it."""
 
+import base64
 import subprocess
 import sys
+from dataclasses import replace
 from unittest.mock import Mock
 
 import cv2
@@ -10,12 +12,15 @@ import pytest
 from support.commands import visioncal
 from support.printed import poster
 
+from visioncal import Session
 from visioncal.core.errors import DataError
 from visioncal.vision import hard_matches as matching
-from visioncal.vision.boards import picture
+from visioncal.vision.boards import find_target, picture
+from visioncal.vision.boards.imaging import encode_png
 from visioncal.vision.boards.picture import features_of
-from visioncal.vision.hard_matches import hard_matches, is_installed, light_glue, weights_in
+from visioncal.vision.hard_matches import hard_matches, is_installed, light_glue
 from visioncal.vision.register.image_model import Print
+from visioncal.vision.targets import target_from_document
 
 needs_kornia = pytest.mark.skipif(not is_installed(), reason="kornia is not installed")
 # Its modules warn of what they will leave out.
@@ -75,8 +80,7 @@ def test_weights_in_the_cache_are_used_and_others_refused(tmp_path, monkeypatch)
     assert [way.shape[1] for way in ways] == [2, 2]
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "none"))
     assert len(list(hard_matches(features_of(grey), features_of(grey)))) == 1
-    with weights_in(folder):
-        assert len(list(hard_matches(features_of(grey), features_of(grey)))) == 2
+    assert len(list(hard_matches(features_of(grey), features_of(grey), folder))) == 2
     torch.save({"transformers.0.self_attn.Wqkv.weight": torch.zeros(3, 3)}, file)
     with pytest.raises(DataError, match="does not have the weights"):
         light_glue(file)
@@ -87,17 +91,30 @@ def test_weights_in_the_cache_are_used_and_others_refused(tmp_path, monkeypatch)
 
 def test_weights_are_looked_for_where_they_are_named_and_nowhere_else(tmp_path, monkeypatch):
     monkeypatch.setattr(matching, "is_installed", lambda: False)
-    with pytest.raises(DataError, match="kornia's, which is not installed"), weights_in(tmp_path):
-        pass
+    with pytest.raises(DataError, match="kornia's, which is not installed"):
+        matching.check_weights(tmp_path)
     monkeypatch.setattr(matching, "is_installed", lambda: True)
-    with pytest.raises(DataError, match="has no file sift_lightglue"), weights_in(tmp_path):
-        pass
+    with pytest.raises(DataError, match="has no file sift_lightglue"):
+        matching.check_weights(tmp_path)
     (tmp_path / "sift_lightglue.pth").touch()
-    with weights_in(tmp_path):
-        assert tmp_path in matching._FOLDERS
-    assert not matching._FOLDERS
-    with weights_in(None):
-        assert not matching._FOLDERS
+    matching.check_weights(tmp_path)
+    matching.check_weights(None)
+
+
+def test_a_session_hands_the_folder_of_weights_to_its_pictures_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    visioncal("simulate", "cell", "--views", 10, "--seed", 1, "--no-images")
+    session, image = Session.load("cell"), encode_png(poster())
+    document = {"kind": "picture", "width_m": 0.3, "image": base64.b64encode(image).decode()}
+    label = target_from_document(document, "label")
+    given = replace(session, targets={"label": label}).with_weights(tmp_path)
+    assert given.target is session.target
+    folders = []
+    monkeypatch.setattr(picture, "is_installed", lambda: True)
+    monkeypatch.setattr(picture, "hard_matches", lambda *args: folders.append(args[2]) or iter([]))
+    monkeypatch.setattr(cv2, "BFMatcher", lambda: Mock(knnMatch=lambda *_, **__: []))
+    assert "not seen" in find_target(poster(), given.targets["label"]).reason
+    assert folders[0] == tmp_path
 
 
 def test_calibrate_and_locate_take_a_folder_of_weights(tmp_path, monkeypatch):

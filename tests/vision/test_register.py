@@ -161,6 +161,16 @@ def test_blurred_prints_are_found_from_a_start_by_the_robot(look, most):
             assert found.seen.disc_px == pytest.approx(look.disc_px, abs=0.7)
 
 
+def test_a_blur_that_is_thought_too_narrow_is_left_again():
+    flat, image, _, start = view(3, Look())
+    narrow, wide = (
+        register(image, flat, CAMERA, Seen(start, gauss_px=px), factors=(1,)).seen.gauss_px
+        for px in (0.25, 1.0)
+    )
+    assert narrow > 0.36
+    assert narrow == pytest.approx(wide, abs=0.01)
+
+
 def test_too_little_of_a_print_gives_nothing():
     flat, image, pose, _ = view(0, Look())
     outside = pose.copy()

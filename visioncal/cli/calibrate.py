@@ -18,7 +18,7 @@ from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import frames_to_keep, load_calibration
 from visioncal.results.history import entries_of
 from visioncal.session import Session
-from visioncal.vision.hard_matches import weights_in
+from visioncal.vision.hard_matches import check_weights
 
 
 def calibrate_command(options: CalibrateOptions) -> None:
@@ -41,10 +41,12 @@ def calibrate_command(options: CalibrateOptions) -> None:
         dense=options.dense,
         pictures=options.images == "thumbnail" and not options.no_recording,
     )
+    check_weights(options.weights)
+    if options.weights is not None:
+        loaded = loaded.with_weights(options.weights)
     left = frames_to_keep(options.out)
     with with_run_paths(session, options.out), shown_progress(quiet=options.as_json) as progress:
-        with weights_in(options.weights):
-            result = run(loaded, **(asked | {"progress": progress}))
+        result = run(loaded, **(asked | {"progress": progress}))
         progress("write", 0, 1)
         typed = need_options(options.need_mm, options.need_deg, corrected=options.corrected)
         if options.views is not None:

@@ -34,7 +34,8 @@ from visioncal.results.selecting import targets_fixed_to_base
 from visioncal.session import Session, View
 from visioncal.session.selecting import EYE, Choice, has_several, select
 from visioncal.vision.boards.imaging import read_image
-from visioncal.vision.hard_matches import weights_in
+from visioncal.vision.boards.picture import with_weights
+from visioncal.vision.hard_matches import check_weights
 from visioncal.vision.targets import target_from_document
 
 _LEAD = "base_from_"
@@ -82,11 +83,14 @@ def locate_command(options: LocateOptions) -> None:
         if session is None and source is not None and target is None:
             target = _only_target(result, source.name)
         other_target = None if target is None else _target(target, result)
-        with weights_in(options.weights):
-            if session is not None:
-                points = _by_views(options, session, calibrated, other_target, origin_m)
-            else:
-                points = _by_image(options, calibrated, other_target, origin_m, flange)
+        check_weights(options.weights)
+        if options.weights is not None:
+            session = session and session.with_weights(options.weights)
+            other_target = other_target and with_weights(other_target, options.weights)
+        if session is not None:
+            points = _by_views(options, session, calibrated, other_target, origin_m)
+        else:
+            points = _by_image(options, calibrated, other_target, origin_m, flange)
     _report(points, as_json=options.as_json)
 
 

@@ -56,6 +56,7 @@ from visioncal.session.saving import digest_of, save_session
 from visioncal.session.selecting import Choice, keep_views, select
 from visioncal.session.streams import Stream, check_stream, gap_warnings, read_streams
 from visioncal.session.table import View, check_times, parse_csv, read_views
+from visioncal.vision.boards.picture import with_weights
 
 _NO_VIEWS = TextTable("", ("view",), (), ())
 
@@ -306,6 +307,12 @@ class Session:
                 between camera and target.
         """
         return select(self, Choice(camera, robot, target))
+
+    def with_weights(self, folder: Path) -> "Session":
+        """With pictures whose hard views are matched by weights in a folder, too."""
+        targets = {name: with_weights(one, folder) for name, one in self.targets.items()}
+        first = self.target and with_weights(self.target, folder)
+        return replace(self, target=first, targets=targets)
 
     @typed
     def only(self, views: Sequence[int]) -> "Session":

@@ -1,13 +1,13 @@
 """Matches of features where a ratio test fails, by kornia (extra `kornia`), on a GPU if present.
 
 AdaLAM (Cavalli et al. 2020) keeps matches whose neighbours move alike and needs no weights.
-LightGlue (Lindenberger et al. 2023) is used where its weights for SIFT lie in a folder of
-`weights_in` or in torch's own cache, and never fetched. Nothing else imports kornia or torch.
+LightGlue (Lindenberger et al. 2023) is used where its weights for SIFT lie in the folder of a
+picture's `weights_in` or in torch's own cache, and never fetched. Nothing else imports kornia or
+torch.
 """
 
 import pickle
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 # Names that kornia and the authors give to the weights for SIFT.
 _NAMES = ("sift_lightglue_v0-1_arxiv-pth", "sift_lightglue.pth")
-# Folders of weights that are looked into before torch's cache, in all threads.
-_FOLDERS: list[Path] = []
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +43,13 @@ def is_installed() -> bool:
     return find_spec("kornia") is not None
 
 
-@contextmanager
-def weights_in(folder: Path | None) -> Iterator[None]:
-    """Looks for weights of LightGlue in a folder, too, while the context lasts; None for none.
+def check_weights(folder: Path | None) -> None:
+    """Checks that a folder has weights of LightGlue, and that these can be used; None for none.
 
     Raises:
         DataError: The extra is not installed, or the folder has no weights for SIFT.
     """
     if folder is None:
-        yield
         return
     if not is_installed():
         raise DataError(
@@ -67,15 +63,15 @@ def weights_in(folder: Path | None) -> Iterator[None]:
             culprits=["--weights"],
             next_step="Put the weights of LightGlue for SIFT there; nothing is fetched.",
         )
-    _FOLDERS.append(folder)
-    try:
-        yield
-    finally:
-        _FOLDERS.remove(folder)
 
 
-def hard_matches(seen: Features, known: Features) -> Iterator[IntArray]:
-    """(m, 2) indices of features of two images that belong together, by one way after the other."""
+def hard_matches(
+    seen: Features, known: Features, weights_in: Path | None = None
+) -> Iterator[IntArray]:
+    """(m, 2) indices of features of two images that belong together, by one way after the other.
+
+    Weights of LightGlue are looked for in a folder, where one is given, and in torch's cache.
+    """
     import torch
     from kornia.feature import laf_from_center_scale_ori, match_adalam
 
@@ -97,7 +93,8 @@ def hard_matches(seen: Features, known: Features) -> Iterator[IntArray]:
     with torch.inference_mode():
         _, pairs = match_adalam(*described, *frames, hw1=seen.shape, hw2=known.shape)
         yield pairs.cpu().numpy()
-        folders = (*_FOLDERS, Path(torch.hub.get_dir(), "checkpoints"))
+        cache = Path(torch.hub.get_dir(), "checkpoints")
+        folders = (cache,) if weights_in is None else (weights_in, cache)
         files = (folder / name for folder in folders for name in _NAMES)
         weights = next((file for file in files if file.is_file()), None)
         if weights is None:

@@ -7,7 +7,7 @@ pixels, which serve as a board's corners do.
 
 import base64
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -53,6 +53,8 @@ class PictureTarget(Target):
     """A picture: its `square_m` is the printed width, columns and rows those of its patches."""
 
     image: str = ""  # Its file, in base64.
+    # Folder of LightGlue's weights, by which hard views are matched.
+    weights_in: Path | None = field(default=None, compare=False)
 
 
 class Picture(BoardKind):
@@ -137,10 +139,11 @@ class Picture(BoardKind):
 
     def find(self, image: Image, target: Target) -> DetectedCorners | NotFound:
         """Places of its patches in a (h, w) grey image, or why it is not found."""
-        picture = _known(cast("PictureTarget", target))
+        asked = cast("PictureTarget", target)
+        picture = _known(asked)
         if picture.unfit:
             return NotFound(f"the picture {picture.unfit}")
-        start = picture.matched(image)
+        start = picture.matched(image, asked.weights_in)
         found = start if isinstance(start, str) else self._registered(image, target, start)
         if isinstance(found, DetectedCorners):
             return found
@@ -176,6 +179,11 @@ class Picture(BoardKind):
         # Patches that tell little of their place err by the model, which no weight says.
         clear = weights**2 > 0.2
         return DetectedCorners(ids[clear], px[clear], weights[clear], blur_px=found.seen.blur_px)
+
+
+def with_weights(target: Target, folder: Path) -> Target:
+    """A target whose hard views are matched by the weights in a folder, too, if it is a picture."""
+    return replace(target, weights_in=folder) if isinstance(target, PictureTarget) else target
 
 
 def kept_picture(path: Path) -> str:
@@ -214,7 +222,9 @@ class _Known:
     features: Features
     unfit: str  # Why no pose is known by it; empty where it is.
 
-    def matched(self, image: Image) -> tuple[FloatArray, FloatArray, FloatArray] | str:
+    def matched(
+        self, image: Image, weights_in: Path | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | str:
         """(3, 3) from the print [m] to an image, (n, 3) features and (n, 2) pixels; or why not."""
         seen = features_of(image)
         if len(seen.px) < _FEWEST:
@@ -226,7 +236,8 @@ class _Known:
         ]
         found = self._agreeing(seen, np.array(good).reshape(-1, 2))
         if found is None and is_installed():
-            tries = (self._agreeing(seen, match) for match in hard_matches(seen, self.features))
+            hard = hard_matches(seen, self.features, weights_in)
+            tries = (self._agreeing(seen, match) for match in hard)
             found = next((one for one in tries if one is not None), None)
         lack = f"the picture is not seen: {len(good)} features are like its own, and do not agree"
         if found is None and len(good) >= _FEWEST and not is_installed():

@@ -32,8 +32,9 @@ _EDGE = cv2.BORDER_REPLICATE
 # Side of the blocks within which derivatives by pose and lens are those of the middle [px].
 BLOCK_PX = 8
 # Gaussian of print and of reduced images before they are sampled [px]: the narrowest at which
-# sampling at each pixel aliases by less than noise does; and the narrowest blur after it.
-_SAMPLED_PX, _SHARPEST_PX = 0.5, 0.25
+# sampling at each pixel aliases by less than noise does; and the narrowest blur after it, below
+# which a sampled kernel no longer changes with its sigma, so that no step would leave it.
+_SAMPLED_PX, _SHARPEST_PX = 0.5, 0.32
 
 
 @dataclass(frozen=True, eq=False)
