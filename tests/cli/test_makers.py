@@ -157,7 +157,8 @@ def test_views_about_one_axis_are_asked_for_tilts_before_a_form(tmp_path):
     turned = cell_session(simulate(options), "cell", seen="poses")
     source = table_of(turned, "kuka", tmp_path / "log.csv")
     asked = visioncal("convert", source, tmp_path / "cell", "--mount", "eye-in-hand")
-    asked.refused("All views turn about one axis", "First add 3 or more views", "--robot-form")
+    asked.refused("All views turn about one axis", "First add 3 or more views")
+    assert "--robot-form kuka, as the columns' names suggest, or" in asked.err
 
 
 def test_a_form_of_a_library_is_no_maker_s(cell, tmp_path):

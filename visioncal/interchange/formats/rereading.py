@@ -371,6 +371,9 @@ def _untested(
                 else "rotation-vector, euler-xyz-rad, euler-ZYX-deg or another, or whose they are, "
                 "as kuka"
             )
+            by_names = [name for name in foreign.makers if POSE_FORMS[name].likely]
+            if whose == "robot" and len(by_names) == 1:
+                forms = f"{by_names[0]}, as the columns' names suggest, or {forms}"
             raise DataError(
                 f"{foreign.name}: the form of the {whose}'s rotations is not said, and nothing "
                 f"determines it: {why}.",
