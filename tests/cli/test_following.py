@@ -149,6 +149,17 @@ def test_a_board_that_visioncal_ships_is_corrected_in_a_file_of_the_user_s(place
     assert "square_m = 0.0303" in (place / "cell/charuco_9x6_30mm.toml").read_text("utf-8")
 
 
+def test_a_size_that_poses_gave_is_known_no_better_than_so(place):
+    options = CellOptions(views=16, seed=3, board_scale=0.6, pixel_sigma_px=0.05)
+    cell_session(simulate(options), "cell", seen="corners").save(place / "cell")
+    guessed = visioncal("convert", "cell", "guessed", "--guess", "--yes")
+    assert "times as large" in guessed.good().said
+    board = tomllib.loads((place / "guessed/target.toml").read_text("utf-8"))
+    # Of 16 poses of an arm that repeats to 0.1 mm.
+    assert board["square_m"] == pytest.approx(0.018, rel=0.003)
+    assert board["square_sigma_m"] == pytest.approx(0.01 * board["square_m"])
+
+
 @pytest.mark.parametrize("mistake", ["images named .jpg", "images in another folder"])
 def test_images_that_are_elsewhere_are_found(place, mistake):
     BROKEN[mistake].plant(sound_session(place / "cell"))

@@ -361,6 +361,36 @@ def separate_lens(folder: Path) -> Recording:
     return replace(recording, requested=replace(recording.requested, intrinsics=str(lens)))
 
 
+def alternating(folder: Path) -> Recording:
+    """Lines of the hand and of the eye in turn, without a header."""
+    pairs = zip(quaternions(BASE_FROM_FLANGE), quaternions(CAM_FROM_TARGET), strict=True)
+    rows = (("hand", hand.tolist(), "eye", eye.tolist()) for hand, eye in pairs)
+    text = "".join(f"{_joined(a, x)}{_joined(b, y)}" for a, x, b, y in rows)
+    return _in_hand(folder / "pairs.csv", text)
+
+
+def halves(folder: Path) -> Recording:
+    """The robot's poses, an empty line, and the target's."""
+    both = (quaternions(at).tolist() for at in (BASE_FROM_FLANGE, CAM_FROM_TARGET))
+    blocks = ("\n".join(" ".join(map(repr, row)) for row in rows) for rows in both)
+    return _in_hand(folder / "data.txt", "\n\n\n".join(blocks) + "\n")
+
+
+def counted_rows(folder: Path) -> Recording:
+    """Files whose rows begin with their number, and have the rotation before the position [mm]."""
+    for name, poses in (("gripper2base", BASE_FROM_FLANGE), ("target2cam", CAM_FROM_TARGET)):
+        flat = vectors(poses)
+        rows = np.hstack([flat[:, 3:], 1e3 * flat[:, :3]]).tolist()
+        numbers = (3 * at // 2 + 1 for at in range(len(rows)))
+        text = "".join(_joined(str(at), row) for at, row in zip(numbers, rows, strict=True))
+        _write(folder / f"{name}.csv", text)
+    return Recording(folder, ImportOptions(mount="eye-in-hand"))
+
+
+def _joined(first: str, numbers: list[float]) -> str:
+    return ", ".join([first, *map(repr, numbers)]) + "\n"
+
+
 RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
     make.__name__: make
     for make in (
@@ -368,6 +398,7 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
         views_npz, opencv_matrices, kuka_csv, plain_table, stacked_npz, keyed_json,
         images_and_table, matrices_below, matrices_in_rows, numbered_yaml,
         lettered_quaternions, printed_lists, headed_units, ros_poses, visp_seen,
+        alternating, halves, counted_rows,
     )
 }  # fmt: skip
 

@@ -86,8 +86,8 @@ def print_table(
     from rich.table import Column, Table
     from rich.text import Text
 
-    first, *rest = (Text(plain(title)) for title in titles)
-    columns = (Column(first, no_wrap=True), *(Column(name, overflow="fold") for name in rest))
+    # The widest column folds first; nothing is cut off.
+    columns = (Column(Text(plain(title)), overflow="fold") for title in titles)
     table = Table(*columns, box=None, pad_edge=False, caption=caption, caption_justify="left")
     for at, cells in enumerate(rows):
         table.add_row(

@@ -9,10 +9,13 @@ from visioncal.cli.console import print_table, say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import ConvertOptions, RobotPoseOptions
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.interchange.formats import DoubtfulSession, ImportOptions, PoseImportOptions, convert
 from visioncal.results import Calibration
 
 # Options that are named as the import's.
+# Readings that a table shows, at most.
+_SHOWN = 12
 _AS_TYPED = (
     *("camera_file", "mount", "target", "intrinsics"),
     *("images", "resolution", "tip", "instrument"),
@@ -74,6 +77,9 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
     """Tries other readings, prints them, and returns the clearly best one with --yes."""
     with shown_progress(quiet=False) as progress:
         guess = recorded.guess(progress)
+    at = guess.candidates.index(guess.best)
+    shown = guess.candidates[: max(_SHOWN, at + 1)]
+    left = len(guess.candidates) - len(shown)
     print_table(
         ("reading", "robot and camera agree to", "views that agree"),
         [
@@ -82,9 +88,10 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
                 candidate.fit.figures,
                 f"{candidate.fit.agreeing} of {len(candidate.of_rows)}",
             )
-            for candidate in guess.candidates
+            for candidate in shown
         ],
-        bold=guess.candidates.index(guess.best),
+        caption=f"and {counted(left, 'reading')} that fit worse" if left else "",
+        bold=at,
         is_message=True,
     )
     say("\n".join([guess.sentence, *(f"note: {note}" for note in guess.notes)]))

@@ -493,8 +493,12 @@ def _merged(
         }
         values = dict(part.numbers)
         if prefixed and is_headerless(part):
-            # Columns without names are an array of the file's.
-            new[part.name], values = part.name, {part.name: np.stack([*values.values()], axis=1)}
+            # Columns without names are an array of the file's; the first may count the rows.
+            flat = np.stack([*values.values()], axis=1)
+            counts = flat[:, 0]
+            is_counted = not (counts % 1).any() and bool((np.diff(counts) > 0).all())
+            flat = flat[:, 1:] if is_counted and flat.shape[1] - 1 in (6, 7, 12, 16) else flat
+            new[part.name], values = part.name, {part.name: flat}
         for key, each in values.items():
             numbers[new[key]] = each[rows].astype(float)
             numbers[new[key]][rows < 0] = np.nan

@@ -462,6 +462,9 @@ def _split(
     flat, sizes = np.hstack(blocks), [block.shape[1] for block in blocks]
     if flat.shape[1] == 7 and 4 not in sizes:
         flat = position_first(flat)
+    is_unnamed = len(blocks) == 1 or all(map(str.isdecimal, names))
+    if flat.shape[1] == 6 and is_unnamed and _is_rotation_first(flat):
+        flat = np.roll(flat, 3, axis=1)
     positions, rotations = flat[:, :3], flat[:, 3:]
     of_rotation = tuple(names[int(np.searchsorted(np.cumsum(sizes), 3)) + 1 :] or names)
     if len(blocks) == 2:
@@ -481,6 +484,12 @@ def _split(
     # The numbers of a mapping have names of their own.
     inner = tuple(name for name in fields.numbers if name.startswith(f"{of_rotation[0]}."))
     return positions, rotations, inner if len(of_rotation) == 1 and inner else of_rotation
+
+
+def _is_rotation_first(flat: FloatArray) -> bool:
+    """Whether of (n, 6) numbers the last three are no rotation, in any unit, and the first are."""
+    turns, places = (np.abs(half[np.isfinite(half)]) for half in (flat[:, :3], flat[:, 3:]))
+    return bool(turns.max(initial=0.0) <= 2.0 * np.pi and (places > 360.0).sum() > len(flat) / 2)
 
 
 def _by_rows(requested: PoseImportOptions, count: int) -> PoseImportOptions:

@@ -28,6 +28,7 @@ from visioncal.core.documents.tables import TextTable, is_number, read_table
 from visioncal.core.documents.toml import check_values
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
@@ -172,6 +173,44 @@ def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
     return Fields(path.stem, path.parent, places, {"matrix": matrices.reshape(-1, 16)})
 
 
+def _paired_rows(table: TextTable, path: Path) -> Fields | None:
+    """Rows in pairs, one of the robot and one of the camera: every other one, or by halves.
+
+    A column of two words says which is whose; below an empty line in the middle stand the camera's.
+    """
+    count, rows = len(table.rows), table.rows
+    half, columns = count // 2, range(len(table.columns))
+    if count < 2 * FEWEST_VIEWS or count % 2:
+        return None
+    worded = [at for at in columns if not any(is_number(row[at]) for row in rows)]
+    kinds = [row[worded[0]].strip() for row in rows] if worded else []
+    first, second = np.arange(half), np.arange(half, count)
+    if len(worded) == 1:
+        names = tuple(dict.fromkeys(kinds))
+        if kinds == [*names] * half and len(names) == 2:
+            first, second = np.arange(0, count, 2), np.arange(1, count, 2)
+        elif kinds != [name for name in names for _ in range(half)] or len(names) != 2:
+            return None
+    elif not worded and not table.has_header:
+        names, steps = ("robot", "camera"), np.diff(table.lines)
+        if steps[half - 1] == 1 or (np.delete(steps, half - 1) != 1).any():
+            return None
+    else:
+        return None
+    numbers = [at for at in columns if at not in worded]
+    if len(numbers) not in _POSE_SIZES or any(map(is_image_name, names)):
+        return None
+    records, places = list[dict[str, object]](), list[str]()
+    for both in zip(first.tolist(), second.tolist(), strict=True):
+        values = [[rows[at][column] for column in numbers] for at in both]
+        if not all(is_number(cell) for own in values for cell in own):
+            return None
+        arrays = [np.array(own, dtype=float) for own in values]
+        records.append({f"{name}_pose": own for name, own in zip(names, arrays, strict=True)})
+        places.append(table.place(both[0]))
+    return fields_of_records(records, places, path.stem, path.parent)
+
+
 # Names of numbers in a mapping that are one array.
 _JOINED = ("x y z", "x y z w", "qx qy qz qw", "roll pitch yaw", "rx ry rz")
 
@@ -286,8 +325,8 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
             culprits=[str(path)],
             next_step="Convert the folder.",
         )
-    if matrices := _stacked_matrices(table, path):
-        return [matrices]
+    if found := _stacked_matrices(table, path) or _paired_rows(table, path):
+        return [found]
     records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     places = [table.place(index) for index in range(len(table.rows))]
     fields = fields_of_records(records, places, path.stem, path.parent)
@@ -296,8 +335,8 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
     pictured = _IMAGE.search(text.splitlines()[table.lines[0] - 1])
     is_odd |= pictured is not None and not any(map(is_image_name, table.rows[0]))
     blocks = _blocks(_placed(text, path), path) if is_odd and not table.has_header else None
-    found = blocks.numbers.values() if blocks else ()
-    return [blocks if blocks and any(n[0].size in _POSE_SIZES for n in found) else fields]
+    arrays = blocks.numbers.values() if blocks else ()
+    return [blocks if blocks and any(n[0].size in _POSE_SIZES for n in arrays) else fields]
 
 
 def read_record(path: Path, document: object = None) -> dict[str, object]:

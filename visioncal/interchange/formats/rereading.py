@@ -58,6 +58,9 @@ _MOVE = (
     "axes: it takes them for any result, and they show the form, too. Or "
 )
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
+# Sigma of a board's size, as a share of it, that the distances of some poses gave: nobody measured
+# it, and the fit finds it better.
+_BY_POSES = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,6 +311,11 @@ def _applied(
         or (is_open and "positions" in note)
     )
     notes = [f"Found by the {'images' if is_measured else 'poses'}: {guess.sentence}"]
+    if is_measured and best.camera.scale != declared.camera.scale:
+        notes.append(
+            "The session keeps the board's stated size: measure the board, and correct target.toml "
+            "(`visioncal convert SESSION NEW --guess` writes the size that was found)."
+        )
     forms = [form for form in POSE_FORMS.values() if form.rotation == best.robot.rotation]
     makers = [form.name for form in forms if form.models and not foreign.form]
     # Columns A, B, C of turns about Z, Y, X are a KUKA's; roll, pitch, yaw may be any program's.
@@ -490,7 +498,7 @@ def reread(
         changes += (f"The poses are read otherwise than at first: {candidate.words}.",)
     document, target = {**session.document, "mount": reading.mount}, session.target_document
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
-        target = _scaled(target, candidate.board_scale)
+        target = _rescaled(target, candidate)
         document["target"] = "target.toml"
     sides = (reading.robot, candidate.recording.declared.robot)
     if "robot" in document and len({(side.rotation, side.written) for side in sides}) > 1:
@@ -554,6 +562,15 @@ def _replace_cells(
 ) -> None:
     for row, new_cells in zip(rows, cells, strict=True):
         row.update({name: new_cells.get(name, "") for name in names})
+
+
+def _rescaled(target: Mapping[str, Any], candidate: Candidate) -> Mapping[str, Any]:
+    """The board in another unit, or of another size, which then is no better known than so."""
+    scaled = _scaled(target, candidate.board_scale)
+    size = scaled.get("square_m", scaled.get("size_m"))
+    if candidate.hypothesis.camera.scale == 1.0 or not isinstance(size, float):
+        return scaled
+    return {**scaled, "square_sigma_m": _BY_POSES * size}
 
 
 def _scaled(target: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
