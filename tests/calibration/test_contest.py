@@ -92,6 +92,15 @@ def test_a_cause_is_sure_where_its_cure_leaves_noise():
     assert "Applied and refitted, it leaves noise of" in cause.without_it
 
 
+def test_a_small_step_of_an_arm_without_joints_may_be_its_other_posture():
+    """An arm that goes over to its other shoulder has its errors the other way at once."""
+    cause = calibrated(lifted(simulate(FINE)), joints=False).verdict.causes[0]
+    assert cause.kind == "moved_at_once"
+    assert "or the arm went over to another posture (shoulder, elbow or wrist)" in cause.words
+    # The cure leaves mere noise, and so would errors of the arm.
+    assert cause.by_limit
+
+
 def test_what_no_cure_was_applied_of_is_not_sure():
     """No fit of an arm's links is possible without its joint angles."""
     cell = simulate(replace(FINE, dh_sigma_m=5e-4, dh_sigma_rad=1e-3))

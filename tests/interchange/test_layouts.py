@@ -1224,6 +1224,23 @@ def test_poses_beside_joints_are_the_target_s_where_nothing_else_was_seen(tmp_pa
     np.testing.assert_allclose(views[2].joints_rad, np.deg2rad(60.0 + np.arange(6)))
 
 
+@pytest.mark.parametrize("said", [(), ("--robot-columns", "x,y,z,rx,ry,rz")])
+def test_poses_of_six_columns_are_no_joint_angles_of_an_arm_of_six(tmp_path, said):
+    poses = world()[0]
+    rows = [[*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_rotvec()] for pose in poses]
+    table = [f"{at}.png,{','.join(map(repr, map(float, row)))}" for at, row in enumerate(rows)]
+    write(tmp_path / "in/log.csv", "\n".join(["image,x,y,z,rx,ry,rz", *table]))
+    for at in range(len(poses)):
+        cv2.imwrite(str(tmp_path / f"in/{at}.png"), np.full((60, 80), at, dtype=np.uint8))
+    how = ("--mount", "eye-to-hand", "--robot-model", "ur5e", "--robot-form", "ur", *said)
+    how += ("--target", "charuco_9x6_30mm")
+    visioncal("convert", tmp_path / "in", tmp_path / "out", *how).good()
+    first = Session.load(tmp_path / "out").views[0]
+    assert first.joints_rad is None
+    assert first.reading_m is None
+    np.testing.assert_allclose(first.base_from_flange().as_matrix(), poses[0], atol=1e-9)
+
+
 def test_rows_of_joints_and_of_a_tracker_belong_together_by_their_id(tmp_path):
     """One id is missing, others are in another order, and a title stands above the header."""
     poses = world()[0]

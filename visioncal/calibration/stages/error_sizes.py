@@ -12,13 +12,14 @@ from visioncal.estimation.lens_field import LensLevels, lens_part
 from visioncal.estimation.scene import BoardSizes
 from visioncal.fit.fit import Fit
 from visioncal.fit.held import doubted_boards
+from visioncal.fit.linearise import MEASURED_NOISES, sight_weights
 from visioncal.fit.solve import CellFit, solve
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
 from visioncal.model.effects import Effect, LensGrows, LensSteps
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics
-from visioncal.vision.targets import first_corners
+from visioncal.vision.targets import corner_positions, first_corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +123,45 @@ def measured_sizes(observed: Observed) -> dict[str, float]:
     return {name: fit.sizes[f"scale {name}"] for name in boards if f"scale {name}" in fit.sizes}
 
 
+def measured_noise(observed: Observed) -> dict[int, FloatArray]:
+    """(6, 6) covariances of the residuals of poses that a program measured in images, by view.
+
+    They are about the target, with the noise of the flange from stop to stop. None is returned
+    where no fit converges.
+    """
+    try:
+        fit = solve_session(observed).fit
+    except VisioncalError:
+        return {}
+    found = dict[int, FloatArray]()
+    for one in fit.cell.sightings:
+        pose = one.evidence
+        if not isinstance(pose, MeasuredPose) or not pose.is_of_board:
+            continue
+        sigmas = np.zeros(6)
+        for name, rows in MEASURED_NOISES:
+            sigmas[rows] = fit.sizes[f"{name} {one.seer}"]
+        board = fit.cell.boards.get(one.seen)
+        middle = np.zeros(3) if board is None else corner_positions(board).mean(axis=0)
+        factor = np.linalg.inv(sight_weights(pose.matrix[None], middle)[0]) * sigmas
+        found[one.view] = factor @ factor.T
+    flanges = [frame for frame in fit.cell.arms if f"rad {frame}" in fit.sizes]
+    for frame in flanges:
+        rad, metres = fit.sizes[f"rad {frame}"], fit.sizes[f"m {frame}"]
+        found = {
+            view: own + np.diag(np.repeat([rad, metres], 3) ** 2) for view, own in found.items()
+        }
+    return found
+
+
 def solve_session(observed: Observed) -> CellFit:
     """The one likelihood of what is known of a session; raises what `solve` raises."""
     session = observed.timed
+    if not observed.scenes:
+        # Of images, those without corners are left out; poses are in the rows.
+        unused = observed.reasons.keys() | observed.spared.keys()
+        views = tuple(view for view in session.views if view.number not in unused)
+        session = replace(session, views=views)
     sweeps = [
         Swept(
             pair.camera,

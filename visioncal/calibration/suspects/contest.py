@@ -18,6 +18,7 @@ from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.calibration.suspects.suspect import STEPS
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits, CheckLimits
 from visioncal.core.number_format import mm_and_deg
+from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import Finding
 from visioncal.estimation.appearance import SCALE
@@ -26,7 +27,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import Solution, fit_problem
-from visioncal.estimation.steps import with_step
+from visioncal.estimation.steps import FRAME, is_within_arms, with_step
 from visioncal.estimation.unknowns import BOARD, SIZE
 from visioncal.robot.model import REPEATABILITY
 
@@ -66,7 +67,9 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
         share = max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0)
         is_proven = bool(finding.mahalanobis_sq) and _proves(run, trial)
-        is_stepped |= is_proven and finding.kind in STEPS
+        if finding.kind in STEPS:
+            is_stepped |= is_proven
+            is_proven &= not _may_be_of_arm(run)
         yield replace(
             finding,
             without_it=f"Applied and refitted, it leaves noise of {after} an axis; else it is "
@@ -99,6 +102,13 @@ def _proves(run: RunState, trial: Trial) -> bool:
     )
     gain = 2.0 * (lost - least - float(np.log(CheckLimits.ruled_out)))
     return all(step.gain <= gain for step in rivals)
+
+
+def _may_be_of_arm(run: RunState) -> bool:
+    """Whether errors of an arm without joint angles, in two postures, look as a step does."""
+    step = run.assessment.steps[0]
+    is_small = step.kind == FRAME and is_within_arms(exp(step.value))
+    return is_small and not all(arm.is_modelled for arm in run.cell_fit.arms.values())
 
 
 def _of_step(run: RunState, _: str) -> Trial:

@@ -29,6 +29,7 @@ from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.intrinsics import LENS_KEYS, lenses_in
 from visioncal.interchange.formats.poses import (
     column_groups,
+    columns_named,
     joint_names,
     pose_names,
     possible_poses,
@@ -213,7 +214,14 @@ def _joints(fields: Fields, requested: ImportOptions) -> tuple[str, ...]:
     if requested.robot_model is None:
         return ()
     count = Robot.from_document(read_robot_document(requested.robot_model)).joint_count
-    groups = [names for names in column_groups(fields).values() if len(names) == count]
+    # Columns called x, y, z, or named by the user, are a pose.
+    poses = pose_names(fields, requested.robot.names, "robot", (), by_shape=False)
+    places = {*poses, *columns_named(fields, ("x", "y", "z"))}
+    groups = [
+        names
+        for names in column_groups(fields).values()
+        if len(names) == count and places.isdisjoint(names)
+    ]
     return groups[0] if len(groups) == 1 else ()
 
 
