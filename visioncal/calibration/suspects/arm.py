@@ -17,8 +17,8 @@ from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, stops_of
 _LIMITS = CalibrationLimits()
 # Remedy for errors of an arm whose joints are not known.
 NO_JOINTS = Remedy(
-    "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
-    "calibrate then estimates the arm, too."
+    "Name the arm as [robot] model in session.toml, and record its joint angles (q1_rad, ... of "
+    "views.csv) unless they are there: calibrate then estimates the arm, too."
 )
 
 
