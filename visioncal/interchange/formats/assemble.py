@@ -27,6 +27,10 @@ from visioncal.session.images import CLOUD_ENDINGS, ListedImages
 from visioncal.vision.boards.imaging import image_size, looks_like_image
 from visioncal.vision.targets import target_name
 
+_TARGET = (
+    "--target with a name in targets/, a .toml, or a description such as checkerboard_9x6_23.6mm."
+)
+
 
 @dataclass(frozen=True, eq=False)
 class FileImages(ListedImages[Path]):
@@ -116,7 +120,8 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
         raise DataError(
             f"{foreign.name}: how the camera is mounted is not known.",
             culprits=["mount"],
-            next_step="Say --mount eye-in-hand or --mount eye-to-hand.",
+            next_step="Say --mount eye-in-hand or --mount eye-to-hand"
+            + (f", and {_TARGET}" if _lacks_target(foreign) else "."),
         )
     foreign = with_observations_only(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.title or foreign.name}
@@ -212,6 +217,11 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
     return replace(rows_of(foreign, np.flatnonzero(saw)), notes=(*foreign.notes, *notes))
 
 
+def _lacks_target(foreign: ForeignRecording) -> bool:
+    """Whether there are images alone, and nothing says what they show."""
+    return bool(foreign.images) and foreign.target is None and foreign.camera is None
+
+
 def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignRecording:
     """Chooses between images and stored target poses where there are both."""
     if not foreign.images:
@@ -222,12 +232,11 @@ def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignReco
                 "The stored poses of the target are left aside: the images determine them better."
             )
         return replace(foreign, camera=None)
-    if foreign.camera is None:
+    if _lacks_target(foreign):
         raise DataError(
             f"{foreign.name} has images, but what target they show is not known.",
             culprits=["target"],
-            next_step="Say --target with a name in targets/, a .toml, or a description such as "
-            "checkerboard_9x6_23.6mm.",
+            next_step=f"Say {_TARGET}",
         )
     notes.append("The images are left aside: no --target says what they show.")
     return replace(foreign, images=())

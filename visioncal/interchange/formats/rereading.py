@@ -136,6 +136,11 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
         try:
             seen = _Seen.of(foreign, most, progress, searches)
         except VisioncalError as error:
+            if error.culprits == ("target",):
+                then = "Forms of poses that are not stated are then found by the images."
+                raise DataError(
+                    error.message, culprits=["--target"], next_step=f"{error.next_step} {then}"
+                ) from error
             other = error.finding if isinstance(error, OtherBoardError) else None
             why = error.message.rstrip(".")
             continue
