@@ -19,9 +19,9 @@ from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.error_sizes import (
+    MeasuredErrors,
     estimate_error_sizes,
-    measured_noise,
-    measured_sizes,
+    measured_errors,
 )
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.kinematics import check_level_is_possible
@@ -84,9 +84,11 @@ def solve(
         check_level_is_possible(level, can=can)
     if solver != "joint":
         cell, level = replace(cell, priors=()), "hand-eye"
-    start = _with_shapes(find_start(cell, observed), observed)
+    is_measured = not (observed.scenes or observed.misread)
+    measured = measured_errors(observed) if is_measured else MeasuredErrors()
+    start = _with_shapes(find_start(cell, observed), measured)
     try:
-        cell_fit = _fit(start, observed, arms, level)
+        cell_fit = _fit(start, observed, arms, level, measured.sizes)
     except (VisioncalError, np.linalg.LinAlgError):
         # Along an undetermined direction the fit of lens and frames diverges.
         if start.cell.mount is not None and not observed.misread:
@@ -97,26 +99,29 @@ def solve(
     return cell_fit if solver == "joint" else _by_closed_form(cell_fit, solver)
 
 
-def _with_shapes(start: Start, observed: Observed) -> Start:
+def _with_shapes(start: Start, measured: MeasuredErrors) -> Start:
     """The start with the noise of measured poses by distance and line of sight; itself of others.
 
     A program that finds a board in an image tells neither: tilt and distance of a single marker are
     less sure by ten times than what is across the sight.
     """
-    problem = start.problem
-    if not problem.is_combined or observed.misread:
+    problem, rows = start.problem, start.cell.rows
+    if not problem.is_combined or not all(row.view in measured.noise for row in rows):
         return start
-    covariances = measured_noise(observed)
-    if not all(row.view in covariances for row in start.cell.rows):
-        return start
-    covariance = np.array([covariances[row.view] for row in start.cell.rows])
+    covariance = np.array([measured.noise[row.view] for row in rows])
     variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=(0, 2))
     shapes = np.linalg.cholesky(covariance) / np.sqrt(np.repeat(variances, 3))
     observations = replace(problem.observations, shapes=shapes)
     return replace(start, problem=replace(problem, observations=observations))
 
 
-def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> CellFit:
+def _fit(
+    start: Start,
+    observed: Observed,
+    arms: Mapping[str, RobotArm],
+    level: str,
+    sizes: Mapping[str, float],
+) -> CellFit:
     """Alternates between inliers, lenses and boards, and arms."""
     cell, poses = start.cell, start.poses
     misread = observed.misread
@@ -145,11 +150,11 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
     nominal = cell_fit
     cell_fit, noise = _calibrate_arms(nominal, observed, final)
-    if not observed.scenes and (sigmas := measured_sizes(observed)):
+    if sizes:
         # Boards of another size look as other lengths of an arm do. Slopes by a size are those at
         # the poses of the fit before, which a size of some percent moves.
         for _ in range(2):
-            nominal = _fit_with_inliers(_with_sizes(nominal, sigmas), observed)
+            nominal = _fit_with_inliers(_with_sizes(nominal, sizes), observed)
         cell_fit, noise = _calibrate_arms(nominal, observed, None)
     if level != "hand-eye":
         # The many unknowns of functions of the joints would slow each update of the inliers down.

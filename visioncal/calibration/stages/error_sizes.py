@@ -109,49 +109,42 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
     return ErrorSizes(levels, lenses, boards, grown, zoomed, tuple(effects), held)
 
 
-def measured_sizes(observed: Observed) -> dict[str, float]:
-    """Sigmas of the sizes of boards whose poses a program measured in images, by frame."""
+@dataclass(frozen=True, eq=False)
+class MeasuredErrors:
+    """Errors of boards' poses that a program measured in images; none where no fit converges."""
+
+    # (6, 6) covariance about the target of each pose's residual, by view, with the noise of the
+    # flange from stop to stop.
+    noise: Mapping[int, FloatArray] = field(default_factory=dict)
+    sizes: Mapping[str, float] = field(default_factory=dict)  # Sigmas of scales, by frame.
+
+
+def measured_errors(observed: Observed) -> MeasuredErrors:
+    """The errors of measured poses by the one likelihood of a session without images."""
     try:
         fit = solve_session(observed).fit
     except VisioncalError:
-        return {}
-    boards = [
-        one.seen
-        for one in fit.cell.sightings
-        if isinstance(one.evidence, MeasuredPose) and one.evidence.is_of_board
-    ]
-    return {name: fit.sizes[f"scale {name}"] for name in boards if f"scale {name}" in fit.sizes}
-
-
-def measured_noise(observed: Observed) -> dict[int, FloatArray]:
-    """(6, 6) covariances of the residuals of poses that a program measured in images, by view.
-
-    They are about the target, with the noise of the flange from stop to stop. None is returned
-    where no fit converges.
-    """
-    try:
-        fit = solve_session(observed).fit
-    except VisioncalError:
-        return {}
-    found = dict[int, FloatArray]()
+        return MeasuredErrors()
+    noise, sizes = dict[int, FloatArray](), dict[str, float]()
+    of_flange = np.zeros((6, 6))
+    for frame in fit.cell.arms:
+        if f"rad {frame}" in fit.sizes:
+            rad, metres = fit.sizes[f"rad {frame}"], fit.sizes[f"m {frame}"]
+            of_flange += np.diag(np.repeat([rad, metres], 3) ** 2)
     for one in fit.cell.sightings:
         pose = one.evidence
         if not isinstance(pose, MeasuredPose) or not pose.is_of_board:
             continue
+        if f"scale {one.seen}" in fit.sizes:
+            sizes[one.seen] = fit.sizes[f"scale {one.seen}"]
         sigmas = np.zeros(6)
         for name, rows in MEASURED_NOISES:
             sigmas[rows] = fit.sizes[f"{name} {one.seer}"]
         board = fit.cell.boards.get(one.seen)
         middle = np.zeros(3) if board is None else corner_positions(board).mean(axis=0)
         factor = np.linalg.inv(sight_weights(pose.matrix[None], middle)[0]) * sigmas
-        found[one.view] = factor @ factor.T
-    flanges = [frame for frame in fit.cell.arms if f"rad {frame}" in fit.sizes]
-    for frame in flanges:
-        rad, metres = fit.sizes[f"rad {frame}"], fit.sizes[f"m {frame}"]
-        found = {
-            view: own + np.diag(np.repeat([rad, metres], 3) ** 2) for view, own in found.items()
-        }
-    return found
+        noise[one.view] = factor @ factor.T + of_flange
+    return MeasuredErrors(noise, sizes)
 
 
 def solve_session(observed: Observed) -> CellFit:
