@@ -12,14 +12,13 @@ from visioncal.estimation.lens_field import LensLevels, lens_part
 from visioncal.estimation.scene import BoardSizes
 from visioncal.fit.fit import Fit
 from visioncal.fit.held import doubted_boards
-from visioncal.fit.linearise import MEASURED_NOISES, sight_weights
 from visioncal.fit.solve import CellFit, solve
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
 from visioncal.model.effects import Effect, LensGrows, LensSteps
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics
-from visioncal.vision.targets import corner_positions, first_corners
+from visioncal.vision.targets import first_corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,52 +108,23 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
     return ErrorSizes(levels, lenses, boards, grown, zoomed, tuple(effects), held)
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredErrors:
-    """Errors of boards' poses that a program measured in images; none where no fit converges."""
-
-    # (6, 6) covariance about the target of each pose's residual, by view, with the noise of the
-    # flange from stop to stop.
-    noise: Mapping[int, FloatArray] = field(default_factory=dict)
-    sizes: Mapping[str, float] = field(default_factory=dict)  # Sigmas of scales, by frame.
-
-
-def measured_errors(observed: Observed) -> MeasuredErrors:
-    """The errors of measured poses by the one likelihood of a session without images."""
+def measured_sizes(observed: Observed) -> dict[str, float]:
+    """Sigmas of the sizes of boards whose poses a program measured in images, by frame."""
     try:
         fit = solve_session(observed).fit
     except VisioncalError:
-        return MeasuredErrors()
-    noise, sizes = dict[int, FloatArray](), dict[str, float]()
-    of_flange = np.zeros((6, 6))
-    for frame in fit.cell.arms:
-        if f"rad {frame}" in fit.sizes:
-            rad, metres = fit.sizes[f"rad {frame}"], fit.sizes[f"m {frame}"]
-            of_flange += np.diag(np.repeat([rad, metres], 3) ** 2)
-    for one in fit.cell.sightings:
-        pose = one.evidence
-        if not isinstance(pose, MeasuredPose) or not pose.is_of_board:
-            continue
-        if f"scale {one.seen}" in fit.sizes:
-            sizes[one.seen] = fit.sizes[f"scale {one.seen}"]
-        sigmas = np.zeros(6)
-        for name, rows in MEASURED_NOISES:
-            sigmas[rows] = fit.sizes[f"{name} {one.seer}"]
-        board = fit.cell.boards.get(one.seen)
-        middle = np.zeros(3) if board is None else corner_positions(board).mean(axis=0)
-        factor = np.linalg.inv(sight_weights(pose.matrix[None], middle)[0]) * sigmas
-        noise[one.view] = factor @ factor.T + of_flange
-    return MeasuredErrors(noise, sizes)
+        return {}
+    boards = [
+        one.seen
+        for one in fit.cell.sightings
+        if isinstance(one.evidence, MeasuredPose) and one.evidence.is_of_board
+    ]
+    return {name: fit.sizes[f"scale {name}"] for name in boards if f"scale {name}" in fit.sizes}
 
 
 def solve_session(observed: Observed) -> CellFit:
     """The one likelihood of what is known of a session; raises what `solve` raises."""
     session = observed.timed
-    if not observed.scenes:
-        # Of images, those without corners are left out; poses are in the rows.
-        unused = observed.reasons.keys() | observed.spared.keys()
-        views = tuple(view for view in session.views if view.number not in unused)
-        session = replace(session, views=views)
     sweeps = [
         Swept(
             pair.camera,
