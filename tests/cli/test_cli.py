@@ -739,7 +739,7 @@ WRONG_PLACES = {
         "views.csv has rotations",
         "Name the touches first",
     ),
-    "no arm": (("simulate", "x", "--robot", "foo"), "generic-6r-1800, generic-scara-600 are", "Name one"),
+    "no arm": (("simulate", "x", "--robot", "foo"), "generic-scara-600 are", "Name one"),
     "readings to look in": (
         ("locate", "tracker", "-c", "tracked"),
         "is of an instrument",
