@@ -81,6 +81,16 @@ def test_every_form_gives_the_same_poses(make, tmp_path):
             np.testing.assert_array_equal(after.positions, before.positions)
 
 
+def test_positions_that_are_too_far_are_millimetres_whatever_the_form(tmp_path):
+    """A UR's form is in metres; its poses were written in millimetres."""
+    rows = vectors(BASE_FROM_FLANGE) * [1e3, 1e3, 1e3, 1, 1, 1]
+    text = "\n".join(",".join(map(repr, row)) for row in rows.tolist())
+    (tmp_path / "poses.csv").write_text(f"x,y,z,rx,ry,rz\n{text}\n", encoding="utf-8")
+    for unit, read in ((None, "mm"), ("m", "m")):
+        requested = ImportOptions(robot=PoseImportOptions(form="ur", unit=unit))
+        assert read_foreign(tmp_path / "poses.csv", requested).robot.reading.unit == read
+
+
 def test_what_a_form_says_besides_poses_is_kept(tmp_path):
     recording = industrial(tmp_path / "in")
     session = convert(recording.source, tmp_path / "out", requested=recording.requested)

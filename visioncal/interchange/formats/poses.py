@@ -425,11 +425,13 @@ def poses_from(
         unstated |= {"rotation"} if "does not say" in doubt else set()
     lengths = units - {"", *_ANGLES}
     unit = requested.unit or (lengths.pop() if len(lengths) == 1 else None)
-    if unit is None and requested.form not in POSE_FORMS:
+    form = POSE_FORMS.get(requested.form or "")
+    farthest = float(np.nanmax(np.abs(positions), initial=0.0))
+    # No arm reaches so far, and no camera looks there, whatever the unit of a maker's form is.
+    is_far = farthest > FAR_M and (form is None or form.unit == "m")
+    if unit is None and (form is None or is_far):
         unstated.add("unit")
-        farthest = float(np.nanmax(np.abs(positions), initial=0.0))
-        # No arm reaches so far, and no camera looks there.
-        unit = "mm" if farthest > FAR_M else None
+        unit = "mm" if is_far else None
         words = f"millimetres, as {farthest:.0f} m is far," if unit else "metres,"
         notes.append(
             f"The {whose}'s positions are taken for {words} as the source does not say; "
