@@ -16,7 +16,7 @@ from visioncal.core import transforms
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, rounded_up, sigma_words, significant
 from visioncal.core.quantiles import chi2_limit, f_limit, root_of, t_chance
-from visioncal.core.types import FloatArray, scalar_of
+from visioncal.core.types import FloatArray, evenly, scalar_of
 from visioncal.robot.model import REPEATABILITY
 
 
@@ -162,3 +162,9 @@ def test_a_sigma_beyond_all_cells_is_called_not_determined():
     assert sigma_words(3.9e12, "mm") == "not determined (mm)"
     assert sigma_words(250.0, "deg") == "not determined (deg)"
     assert sigma_words(float("inf"), "deg") == "not determined (deg)"
+
+
+@pytest.mark.parametrize(("count", "chosen"), [(-2, []), (0, []), (1, [0]), (5, [0, 2, 4])])
+def test_numbers_are_chosen_evenly_and_none_of_nothing(count, chosen):
+    # A robot that never moved has one stop, and a change needs two on either side of it.
+    assert evenly(count, 3).tolist() == chosen

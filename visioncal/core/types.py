@@ -49,8 +49,8 @@ def chosen_rows(record: _T, rows: Any, *others: str) -> _T:  # noqa: ANN401 - an
 
 
 def evenly(count: int, most: int) -> IntArray:
-    """Numbers up to a count, evenly distributed, and at most so many."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+    """Numbers up to a count, evenly distributed, and at most so many; none below one."""
+    return np.unique(np.linspace(0, count - 1, max(min(count, most), 0)).astype(np.int64))
 
 
 def interpolated(at: FloatArray, places: FloatArray, values: FloatArray) -> FloatArray:
