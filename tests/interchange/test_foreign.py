@@ -396,24 +396,18 @@ def test_angles_beyond_a_turn_are_read_as_the_target_s_poses_have_them(
 
 
 @pytest.mark.parametrize(
-    ("form", "unit", "said"),
-    [
-        ("ur", 1.0, ""),
-        ("ur", 1e3, " --robot-unit mm"),
-        ("rpy", 1.0, ""),
-        ("rotation-vector", 1.0, ""),
-    ],
+    ("form", "unit"),
+    # Millimetres are found by their size.
+    [("ur", 1.0), ("ur", 1e3), ("rpy", 1.0), ("rotation-vector", 1.0)],
 )
-def test_degrees_in_a_form_of_radians_are_named_first(
-    tmp_path, logged, monkeypatch, form, unit, said
-):
+def test_degrees_in_a_form_of_radians_are_named_first(tmp_path, logged, monkeypatch, form, unit):
     monkeypatch.chdir(tmp_path)
     names = "x,y,z,roll,pitch,yaw" if form == "rpy" else "x,y,z,rx,ry,rz"
     poses = written(POSE_FORMS.get(form, POSE_FORMS["ur"])) * np.repeat([unit, np.rad2deg(1)], 3)
     logged(names, poses.tolist())
     followed = follow("convert", "log.csv", "out", "--mount", "eye-in-hand", "--robot-form", form)
     degrees = "rpy-deg" if form == "rpy" else "rotation-vector-deg"
-    assert f"\nSay --robot-form {degrees}{said}, where" in followed.runs[0].refused().err
+    assert f"\nSay --robot-form {degrees}, where" in followed.runs[0].refused().err
     followed.last.good()
     found = poses_of(Session.load("out"), "base_from_flange")
     np.testing.assert_allclose(found, BASE_FROM_FLANGE, atol=1e-9)
