@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.core.limits import FEWEST_VIEWS, CalibrationLimits
+from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
-from visioncal.core.transforms import adjoint, invert, pose_difference
+from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import ROUNDING, covariance_from
@@ -31,8 +31,6 @@ from visioncal.estimation.solve import (
     fitted_covariance,
 )
 
-# An arm without joint angles may look like a step of a frame.
-OTHER_POSTURE = "went over to another posture (shoulder, elbow or wrist) with its errors"
 FRAME, JOINT, SIZE, DRIFT = "frame", "joint", "size", "drift"
 # Sizes of changes with equal prior probability, and the unit of each value.
 _MOTION = SIZES_M, np.repeat([TURN_PER_M, 1.0], 3)
@@ -296,13 +294,3 @@ def _log_likelihoods(squares: FloatArray) -> FloatArray:
         scale = float(np.mean(10.0 * squares / (4.0 + squares / scale))) / 6.0
     tails = 5.0 * np.log1p(squares / (4.0 * scale))
     return np.array([even, -half * np.log(scale) - float(tails.sum())])
-
-
-def is_within_arms(step: FloatArray) -> bool:
-    """Whether an arm without joint angles may be off by as much as a frame stepped, a (4, 4) pose.
-
-    An arm that goes over to another posture of shoulder, elbow or wrist has its links' errors the
-    other way from there on, at poses that do not tell.
-    """
-    mm, deg = pose_difference(np.eye(4), step)
-    return mm <= CalibrationLimits.arm_errors[0] and deg <= CalibrationLimits.arm_errors[1]

@@ -99,17 +99,22 @@ class Connected:
     ambiguous: tuple[str, ...]
     misplaced: Mask  # (n,) rows that have the robot's pose of a row nearby.
 
+    @cached_property
+    def _parent_from(self) -> Mapping[str, FloatArray]:
+        """The edges, with those that are known."""
+        branches = self.tree.branches.items()
+        known = {name: branch.known for name, branch in branches if branch.known is not None}
+        return {**known, **self.edges}
+
     def ties(self, seer: str, seen: str) -> bool:
         """Whether all between two frames is known."""
         return not any(step.frame in self.untied for step in self.tree.path(seer, seen))
 
     def predicted(self, seer: str, seen: str, poses: Mapping[str, FloatArray]) -> FloatArray:
         """`seer_from_seen` (..., 4, 4) by (..., 4, 4) poses of the robots between."""
-        branches = self.tree.branches.items()
-        known = {name: branch.known for name, branch in branches if branch.known is not None}
-        found, edges = np.eye(4), {**known, **self.edges}
+        found = np.eye(4)
         for step in self.tree.path(seer, seen):
-            edge = poses[step.robot] if step.robot else edges[step.frame]
+            edge = poses[step.robot] if step.robot else self._parent_from[step.frame]
             found = found @ (invert(edge) if step.is_up else edge)
         return found
 
@@ -189,12 +194,12 @@ class Network:
             pairs.append(_Pair(seer, target, every, early, robots, segments))
         return tuple(pairs)
 
-    @property
+    @cached_property
     def oriented(self) -> list[_Pair]:
         """The pairs whose rotations were measured, too."""
         return [pair for pair in self.pairs if self.has_rotation[pair.rows[0]]]
 
-    @property
+    @cached_property
     def pointed(self) -> list[_Pair]:
         """The pairs of which positions alone were read."""
         return [pair for pair in self.pairs if not self.has_rotation[pair.rows[0]]]
@@ -326,7 +331,9 @@ class Network:
                 return
             if len(rows) < FEWEST_VIEWS:
                 continue
-            edges, wrong = self._hand_eye(joined, pair, rows) if count == 2 else (None, None)
+            edges, wrong = None, None
+            if count == 2:
+                edges, wrong = self._hand_eye(joined, pair, rows, parts[1], candidates)
             if edges is not None:
                 yield Relation(*unknown[0], invert(edges.x)[None], edges.sigmas_m[0], wrong)
                 matrices = edges.z @ turns if unknown[1][1] == pair.seen else edges.z[None]
@@ -337,16 +344,15 @@ class Network:
                 return
 
     def _hand_eye(
-        self, joined: _Joined, pair: _Pair, rows: IntArray
+        self, joined: _Joined, pair: _Pair, rows: IntArray, between: FloatArray, seen: Candidates
     ) -> tuple[PairEdges | None, Mask | None]:
         """Both unknown edges of a chain, and (n,) rows that have the pose of a row nearby.
 
+        `between` (m, 4, 4) is the part between them, and `seen` what else is left of the views.
         Where rows are shifted from one on, fewer than half may be right; those shifted back have
         the same edges, and both together have more.
         """
         stops, half = self.stops[rows], len(rows) // 2 + 1
-        between = self._parts(joined, pair, rows)[1][1]
-        seen = self._carried(joined, pair, rows)
         best, wrong = hand_eye(invert(between), seen), None
         least = np.full(len(rows), AGREE_M) if best is None else best.residuals.min(axis=1)
         if not _is_doubtful(least):
@@ -357,8 +363,9 @@ class Network:
             there = there[np.isfinite(robots).all(axis=(0, 2, 3))]
             if len(there) < max(half, FEWEST_VIEWS):
                 continue
-            moved = self._parts(joined, pair, rows[there], shift)[1][1]
-            edges = hand_eye(invert(moved), self._carried(joined, pair, rows[there], shift))
+            _, (before, moved, after) = self._parts(joined, pair, rows[there], shift)
+            shifted = self.candidates.take(rows[there]).carried(invert(before), invert(after))
+            edges = hand_eye(invert(moved), shifted)
             if edges is None:
                 continue
             near = seen.distances(invert(edges.x) @ between @ edges.z).min(axis=1)
@@ -379,11 +386,6 @@ class Network:
     @property
     def _stop_count(self) -> int:
         return len(next(iter(self.poses.values())))
-
-    def _carried(self, joined: _Joined, pair: _Pair, rows: IntArray, shift: int = 0) -> Candidates:
-        """The candidates of rows without what is known beside both unknown segments."""
-        _, parts = self._parts(joined, pair, rows, shift)
-        return self.candidates.take(rows).carried(invert(parts[0]), invert(parts[-1]))
 
     def _partly_solved(self, joined: _Joined) -> Iterator[Relation]:
         """Relations where the motion determines them in part, and a prior may the rest.

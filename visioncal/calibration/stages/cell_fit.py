@@ -13,6 +13,8 @@ from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.error_sizes import ErrorSizes
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import chain_rms_px
+from visioncal.core.limits import CalibrationLimits
+from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Corners, FloatArray, IntArray
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.fit import Fit
@@ -20,6 +22,11 @@ from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.scene import BoardSizes, CornerProblem, Scene
+
+# An arm without joint angles may look like a step of a frame.
+OTHER_POSTURE = (
+    ", or the arm went over to another posture (shoulder, elbow or wrist) with its errors"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +57,17 @@ class CellFit:
     def has_links(self) -> bool:
         """Whether errors of an arm's links are free."""
         return any(arm.has_free_errors for arm in self.arms.values())
+
+    def may_be_of_arms(self, step: FloatArray) -> bool:
+        """Whether an arm without joint angles may be off by as much as a frame stepped, (4, 4).
+
+        An arm that goes over to another posture of shoulder, elbow or wrist has its links' errors
+        the other way from there on, at poses that do not tell.
+        """
+        mm, deg = pose_difference(np.eye(4), step)
+        limit_mm, limit_deg = CalibrationLimits.arm_errors
+        is_small = mm <= limit_mm and deg <= limit_deg
+        return is_small and not all(arm.is_modelled for arm in self.arms.values())
 
     def with_arm_poses(self) -> Self:
         """Replaces the robots' poses by those of their arms."""

@@ -27,7 +27,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import Solution, fit_problem
-from visioncal.estimation.steps import FRAME, is_within_arms, with_step
+from visioncal.estimation.steps import FRAME, with_step
 from visioncal.estimation.unknowns import BOARD, SIZE
 from visioncal.robot.model import REPEATABILITY
 
@@ -107,8 +107,7 @@ def _proves(run: RunState, trial: Trial) -> bool:
 def _may_be_of_arm(run: RunState) -> bool:
     """Whether errors of an arm without joint angles, in two postures, look as a step does."""
     step = run.assessment.steps[0]
-    is_small = step.kind == FRAME and is_within_arms(exp(step.value))
-    return is_small and not all(arm.is_modelled for arm in run.cell_fit.arms.values())
+    return step.kind == FRAME and run.cell_fit.may_be_of_arms(exp(step.value))
 
 
 def _of_step(run: RunState, _: str) -> Trial:

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from visioncal.calibration.stages.cell_fit import CellFit
+from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS, CalibrationLimits
@@ -17,7 +17,6 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import TWIST_UNITS
 from visioncal.estimation.outliers import InlierFit
-from visioncal.estimation.steps import OTHER_POSTURE, is_within_arms
 from visioncal.results import Moved
 from visioncal.robot import Robot
 from visioncal.session.frames import frame_name
@@ -146,8 +145,8 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         "and record again. The result is that of the other views; calibrate these alone, too.",
         tuple(rows[row].view for row in outliers),
     )
-    if is_within_arms(change[1]) and not all(arm.is_modelled for arm in cell_fit.arms.values()):
-        how += f", or the arm {OTHER_POSTURE}"
+    if cell_fit.may_be_of_arms(change[1]):
+        how += OTHER_POSTURE
     words = f"{{views}} were left out: {when}, {what} was another one{how}."
     yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
 

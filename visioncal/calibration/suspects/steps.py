@@ -5,25 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.suspects.suspect import (
-    ARM_ERRORS,
-    INFLATED,
-    Suspect,
-)
+from visioncal.calibration.stages.cell_fit import OTHER_POSTURE
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import exp, pose_difference
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.identifiability import joint_words
-from visioncal.estimation.steps import (
-    DRIFT,
-    FRAME,
-    JOINT,
-    OTHER_POSTURE,
-    SIZE,
-    Step,
-    is_within_arms,
-)
+from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step
 
 _LIMITS = CalibrationLimits()
 _THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
@@ -89,10 +78,8 @@ def _words(step: Step, run: RunState) -> str:
     # Things beside a robot move relative to its base.
     of_base = "" if mount is None or on_flange else ", or the robot's base,"
     words = f"{thing}{of_base} moved at once: {when}, it is {moved} from where it was"
-    if is_within_arms(exp(step.value)) and not all(
-        arm.is_modelled for arm in run.cell_fit.arms.values()
-    ):
-        words += f", or the arm {OTHER_POSTURE}"
+    if run.cell_fit.may_be_of_arms(exp(step.value)):
+        words += OTHER_POSTURE
     if mount is not None and far_mm > _LIMITS.arm_errors[0]:
         words += f", or the controller's {'tool' if on_flange else 'base frame'} is another one"
     return words

@@ -121,7 +121,7 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
             f"{foreign.name}: how the camera is mounted is not known.",
             culprits=["mount"],
             next_step="Say --mount eye-in-hand or --mount eye-to-hand"
-            + (f", and {_TARGET}" if _lacks_target(foreign) else "."),
+            + (f", and {_TARGET}" if lacks_target(foreign) else "."),
         )
     foreign = with_observations_only(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.title or foreign.name}
@@ -217,9 +217,18 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
     return replace(rows_of(foreign, np.flatnonzero(saw)), notes=(*foreign.notes, *notes))
 
 
-def _lacks_target(foreign: ForeignRecording) -> bool:
+def lacks_target(foreign: ForeignRecording) -> bool:
     """Whether there are images alone, and nothing says what they show."""
     return bool(foreign.images) and foreign.target is None and foreign.camera is None
+
+
+def unknown_target(foreign: ForeignRecording, culprit: str, then: str = "") -> DataError:
+    """The error of images of which nothing says what they show, and what `then` follows."""
+    return DataError(
+        f"{foreign.name} has images, but what target they show is not known.",
+        culprits=[culprit],
+        next_step=f"Say {_TARGET}{then}",
+    )
 
 
 def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignRecording:
@@ -232,12 +241,8 @@ def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignReco
                 "The stored poses of the target are left aside: the images determine them better."
             )
         return replace(foreign, camera=None)
-    if _lacks_target(foreign):
-        raise DataError(
-            f"{foreign.name} has images, but what target they show is not known.",
-            culprits=["target"],
-            next_step=f"Say {_TARGET}",
-        )
+    if lacks_target(foreign):
+        raise unknown_target(foreign, "target")
     notes.append("The images are left aside: no --target says what they show.")
     return replace(foreign, images=())
 

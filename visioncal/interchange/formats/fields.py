@@ -25,6 +25,8 @@ _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timesta
 _NORM_TOLERANCE = 0.01
 # A pose with its covariance has fewer numbers; lists of corners and images have more.
 MOST_NUMBERS = 200
+# Numbers of a pose: three angles or a quaternion beside a position, and matrices.
+POSE_SIZES = (6, 7, 12, 16)
 
 
 def named_by(place: str) -> str:
@@ -497,7 +499,7 @@ def _merged(
             flat = np.stack([*values.values()], axis=1)
             counts = flat[:, 0]
             is_counted = not (counts % 1).any() and bool((np.diff(counts) > 0).all())
-            flat = flat[:, 1:] if is_counted and flat.shape[1] - 1 in (6, 7, 12, 16) else flat
+            flat = flat[:, 1:] if is_counted and flat.shape[1] - 1 in POSE_SIZES else flat
             new[part.name], values = part.name, {part.name: flat}
         for key, each in values.items():
             numbers[new[key]] = each[rows].astype(float)

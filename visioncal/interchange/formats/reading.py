@@ -33,6 +33,7 @@ from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
     MOST_NUMBERS,
+    POSE_SIZES,
     Fields,
     appearance,
     arrays_in_texts,
@@ -47,7 +48,6 @@ from visioncal.session.columns import pose_row
 _HEADED = re.compile(r"\s*([^\d\W][^:=]*?)\s*[:=]\s*(.*?)\s*")
 # A list within a line of text.
 _INNER = re.compile(r"[\[(]([^\[\]()]*)[\])]")
-_POSE_SIZES = (6, 7, 12, 16)
 
 
 # Lines with their places.
@@ -81,7 +81,7 @@ def _stops(lines: _Lines) -> list[_Lines]:
     )
     marks = np.array([_IMAGE.search(line) is not None for _, line in lines], dtype=bool)
     if not marks.any():
-        named = [name * (len(n) in _POSE_SIZES and name != "matrix") for name, n in inner]
+        named = [name * (len(n) in POSE_SIZES and name != "matrix") for name, n in inner]
         most, count = Counter(filter(None, named)).most_common(1)[0] if any(named) else ("", 0)
         words = Counter(line for (_, line), count in zip(lines, counts, strict=True) if not count)
         # Of headings those that differ are the stops'.
@@ -108,7 +108,7 @@ def _arrays_in(lines: _Lines) -> dict[str, list[float]]:
     arrays = defaultdict[str, list[float]](list)
     for name, numbers, line in ((*_numbers_in(line), line) for _, line in lines):
         # A pose or a list that is written again replaces the first.
-        is_whole = len(numbers) in _POSE_SIZES or (name != "matrix" and "[" in line)
+        is_whole = len(numbers) in POSE_SIZES or (name != "matrix" and "[" in line)
         is_again = is_whole and len(numbers) == len(arrays[name])
         arrays[name] = numbers if is_again else arrays[name] + numbers
     return {name: row for name, row in arrays.items() if row}
@@ -198,7 +198,7 @@ def _paired_rows(table: TextTable, path: Path) -> Fields | None:
     else:
         return None
     numbers = [at for at in columns if at not in worded]
-    if len(numbers) not in _POSE_SIZES or any(map(is_image_name, names)):
+    if len(numbers) not in POSE_SIZES or any(map(is_image_name, names)):
         return None
     records, places = list[dict[str, object]](), list[str]()
     for both in zip(first.tolist(), second.tolist(), strict=True):
@@ -336,7 +336,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
     is_odd |= pictured is not None and not any(map(is_image_name, table.rows[0]))
     blocks = _blocks(_placed(text, path), path) if is_odd and not table.has_header else None
     arrays = blocks.numbers.values() if blocks else ()
-    return [blocks if blocks and any(n[0].size in _POSE_SIZES for n in arrays) else fields]
+    return [blocks if blocks and any(n[0].size in POSE_SIZES for n in arrays) else fields]
 
 
 def read_record(path: Path, document: object = None) -> dict[str, object]:
@@ -435,7 +435,7 @@ def _declared(text: str, path: Path) -> list[Fields]:
         match = _DECLARED.fullmatch(line)
         name, text = match.groups() if match else ("", "")
         words, kind = re.split(r"[,\s]+", text.strip()), re.sub("[0-9]+", "", name)
-        if kind != name and len(words) in _POSE_SIZES and all(map(is_number, words)):
+        if kind != name and len(words) in POSE_SIZES and all(map(is_number, words)):
             row = (f"{place} ({name})", name, [*map(float, words)])
             in_pulses += system == "PULSE"
             kinds[kind, len(words)] += [row] * (system != "PULSE")

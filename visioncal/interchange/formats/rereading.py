@@ -32,7 +32,9 @@ from visioncal.core.verdict import Finding
 from visioncal.interchange.formats.assemble import (
     FileImages,
     assemble,
+    lacks_target,
     pose_cells,
+    unknown_target,
     with_observations_only,
 )
 from visioncal.interchange.formats.fields import fields_of_records
@@ -128,6 +130,9 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
         return foreign
     if foreign.mount is None:
         return foreign
+    if lacks_target(foreign):
+        then = " Forms of poses that are not stated are then found by the images."
+        raise unknown_target(foreign, "--target", then)
     readings = [(0, foreign), *foreign.rivals]
     other_orders = [(rank, each) for rank, item in readings for each in _reordered(item)]
     why, other = "too few rows have a pose and what the camera saw", None
@@ -136,11 +141,6 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
         try:
             seen = _Seen.of(foreign, most, progress, searches)
         except VisioncalError as error:
-            if error.culprits == ("target",):
-                then = "Forms of poses that are not stated are then found by the images."
-                raise DataError(
-                    error.message, culprits=["--target"], next_step=f"{error.next_step} {then}"
-                ) from error
             other = error.finding if isinstance(error, OtherBoardError) else None
             why = error.message.rstrip(".")
             continue
