@@ -18,7 +18,7 @@ from visioncal.calibration.run import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Target
-from visioncal.interchange.formats.rereading import exchange_views
+from visioncal.interchange.formats.mending import exchange_views
 from visioncal.present.recording import paths, read_evidence
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session

@@ -25,7 +25,7 @@ from visioncal.calibration.suspects.undoing import likeliest
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.verdict import GUESS_AND_CALIBRATE
-from visioncal.interchange.formats.rereading import shift_views, turn_boards
+from visioncal.interchange.formats.mending import shift_views, turn_boards
 from visioncal.session import Session
 from visioncal.simulation import simulate
 from visioncal.vision.targets import corner_positions

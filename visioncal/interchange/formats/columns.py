@@ -8,7 +8,6 @@ import numpy as np
 
 from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.errors import DataError
-from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Samples
@@ -18,6 +17,7 @@ from visioncal.interchange.formats.fields import (
     is_image_name,
     named_by,
     stamp_name,
+    unit_by_size,
 )
 from visioncal.interchange.formats.file_search import (
     FileGroup,
@@ -242,8 +242,7 @@ def _readings(
     used.update(names)
     places = np.hstack([fields.column(name) for name in names])
     stated = {unit for name in names if (unit := without_unit(name)[1])}
-    is_far = float(np.nanmax(np.abs(places), initial=0.0)) > FAR_M
-    unit = stated.pop() if len(stated) == 1 else "mm" if is_far else "m"
+    unit = stated.pop() if len(stated) == 1 else unit_by_size(places)
     cells = [
         ["" if np.isnan(v) else repr(v) for v in row] for row in (UNITS_M[unit] * places.T).tolist()
     ]

@@ -17,6 +17,7 @@ from visioncal.core.conventions import ROTATION_FORMS
 from visioncal.core.documents.pendants import is_marked_pose, line_numbers, read_pose
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.session.images import IMAGE_ENDINGS
@@ -521,6 +522,11 @@ def _merged(
         texts=texts,
         shape_errors=ragged,
     )
+
+
+def unit_by_size(lengths: FloatArray) -> str:
+    """The likely unit of lengths whose source says none: no arm and no camera reaches 20 m."""
+    return "mm" if np.nanmax(np.abs(lengths), initial=0.0) > FAR_M else "m"
 
 
 def is_headerless(fields: Fields) -> bool:

@@ -20,11 +20,17 @@ import numpy as np
 from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
-from visioncal.core.limits import FAR_M
 from visioncal.core.number_format import counted, figure, known_name, some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.assemble import pose_cells
-from visioncal.interchange.formats.fields import HOW, Fields, Keys, is_headerless, matched
+from visioncal.interchange.formats.fields import (
+    HOW,
+    Fields,
+    Keys,
+    is_headerless,
+    matched,
+    unit_by_size,
+)
 from visioncal.interchange.formats.file_search import files_in, groups_in, head
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -163,8 +169,7 @@ class _Table:
         above = {_UNITS.get(word.lower(), "") for word in _UNIT_LINE.findall(self.title)}
         if requested or len(stated) == 1 or len(stated := above & {*UNITS_M}) == 1:
             return requested or stated.pop(), ()
-        size = max(float(np.nanmax(np.abs(self.fields.column(name)))) for name in names)
-        unit = "mm" if size > FAR_M else "m"
+        unit = unit_by_size(np.hstack([self.fields.column(name) for name in names]))
         note = f"{', '.join(names)} are taken for {unit}; --camera-unit names another unit."
         return unit, (note,)
 

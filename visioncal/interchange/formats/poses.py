@@ -13,7 +13,6 @@ from visioncal.core.choices import UNITS_M
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, Reading
 from visioncal.core.documents.pendants import forms_named
 from visioncal.core.errors import DataError
-from visioncal.core.limits import FAR_M
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
     Fields,
@@ -22,6 +21,7 @@ from visioncal.interchange.formats.fields import (
     named_by,
     position_first,
     split_matrices,
+    unit_by_size,
 )
 from visioncal.interchange.formats.foreign import PoseImportOptions, Side, Unstated
 from visioncal.session.columns import joint_columns
@@ -426,12 +426,11 @@ def poses_from(
     lengths = units - {"", *_ANGLES}
     unit = requested.unit or (lengths.pop() if len(lengths) == 1 else None)
     form = POSE_FORMS.get(requested.form or "")
-    farthest = float(np.nanmax(np.abs(positions), initial=0.0))
-    # No arm reaches so far, and no camera looks there, whatever the unit of a maker's form is.
-    is_far = farthest > FAR_M and (form is None or form.unit == "m")
+    # So far no arm reaches, whatever the unit of a maker's form is.
+    is_far = unit_by_size(positions) == "mm" and (form is None or form.unit == "m")
     if unit is None and (form is None or is_far):
         unstated.add("unit")
-        unit = "mm" if is_far else None
+        unit, farthest = ("mm" if is_far else None), np.nanmax(np.abs(positions), initial=0.0)
         words = f"millimetres, as {farthest:.0f} m is far," if unit else "metres,"
         notes.append(
             f"The {whose}'s positions are taken for {words} as the source does not say; "
@@ -605,12 +604,9 @@ def check_radians(
     next_step = f"Say --{whose}-form: {'; '.join(listed)}; rotation-vector-deg, euler-ZYX-deg ..."
     if requested.form is not None:
         needed = f"poses of the form {requested.form} are in radians"
-        is_far = bool(np.abs(poses.positions[there]).max() > FAR_M) and poses.reading.unit == "m"
         degrees = f"{rotation.removesuffix('-rad')}-deg"
         degrees = f"{requested.form}-deg" if f"{requested.form}-deg" in POSE_FORMS else degrees
-        next_step = (
-            f"Say --{whose}-form {degrees}{f' --{whose}-unit mm' * is_far}, where these are degrees"
-        )
+        next_step = f"Say --{whose}-form {degrees}, where these are degrees"
     raise DataError(
         f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
         f"{size}, and {needed}.",

@@ -20,17 +20,19 @@ from visioncal.interchange.formats.columns import TABLE, VIEWS
 from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ImportOptions
 from visioncal.interchange.formats.industrial import EASY_HANDEYE, HAND_EYE, KINEMATICS, MOVEIT
 from visioncal.interchange.formats.lerobot import LEROBOT
+from visioncal.interchange.formats.mending import (
+    exchange_views,
+    shift_views,
+    turn_boards,
+    write_positions,
+)
 from visioncal.interchange.formats.metrology import METROLOGY
 from visioncal.interchange.formats.poses import check_radians
 from visioncal.interchange.formats.rereading import (
     DoubtfulSession,
-    exchange_views,
     load_for_rereading,
     reread,
     settled,
-    shift_views,
-    turn_boards,
-    write_positions,
 )
 from visioncal.interchange.formats.sources import describe, unknown
 from visioncal.interchange.formats.views import VISP, ZIVID

@@ -1,13 +1,12 @@
 """Finds another reading of a recording's poses, and applies it."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess import CLEAR, FEWEST_ROWS, ONE_AXIS, Candidate, Guess, Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
@@ -25,8 +24,7 @@ from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.documents.toml import read_toml
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside
-from visioncal.core.number_format import ranges, some_of
-from visioncal.core.transforms import apply, compose, invert
+from visioncal.core.number_format import some_of
 from visioncal.core.types import MOUNTS, FloatArray, Progress, Searched, evenly
 from visioncal.core.verdict import Finding
 from visioncal.interchange.formats.assemble import (
@@ -39,19 +37,16 @@ from visioncal.interchange.formats.assemble import (
 )
 from visioncal.interchange.formats.fields import fields_of_records
 from visioncal.interchange.formats.foreign import ForeignRecording, rows_of
+from visioncal.interchange.formats.mending import noting
 from visioncal.interchange.formats.poses import pose_names
 from visioncal.session import Session, Stream
 from visioncal.session.columns import (
-    INSTRUMENT_POSITION,
-    INSTRUMENT_QUATERNION,
     MEASURED_CAM_POSE,
     POSE,
     joint_columns,
-    pose_row,
 )
 from visioncal.session.table import parse_csv
 from visioncal.vision.boards.kind import LARGEST_M
-from visioncal.vision.targets import corner_positions
 
 _IDENTITY = ("0.0", "0.0", "0.0", "1.0")
 # Advice where the motion determines neither the calibration nor the form of the poses.
@@ -511,7 +506,7 @@ def reread(
         document["robot"] = {k: v for k, v in document["robot"].items() if k != "form"}
     streams = {name: _reread_stream(stream, reading) for name, stream in session.streams.items()}
     reread = session.with_content(
-        document=_noting(session, document, changes),
+        document=noting(session, document, changes),
         cells=[[row[name] for name in session.columns] for row in cells],
         target_document=target,
     ).with_streams(streams)
@@ -520,14 +515,6 @@ def reread(
     mount = () if doubtful.knows_mount else (f"The mount is taken for {reading.mount}.",)
     notes = dict.fromkeys((*changes, *mount, *kept, *reread.warnings))
     return replace(reread, warnings=tuple(notes))
-
-
-def _noting(
-    session: Session, document: Mapping[str, Any], changes: Sequence[str]
-) -> Mapping[str, Any]:
-    """A session's document that notes changes in `corrected`."""
-    corrected = [*session.declaration.corrected, *changes]
-    return {**document, "corrected": corrected} if changes else document
 
 
 def _reread_stream(stream: Stream, reading: Hypothesis) -> Stream:
@@ -583,160 +570,3 @@ def _scaled(target: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
         name: factor * value if name in _LENGTHS and isinstance(value, int | float) else value
         for name, value in target.items()
     }
-
-
-# Columns of what a view shows; the rest of its row is the robot's pose.
-_OBSERVED = ("image", *MEASURED_CAM_POSE, *INSTRUMENT_POSITION, *INSTRUMENT_QUATERNION)
-# Columns that must agree between the two views.
-_MUST_AGREE = ("camera", "target", "instrument", "point")
-
-
-def exchange_views(session: Session, first: int, second: int) -> Session:
-    """Exchanges the images, corners and readings of two views; the session notes it in `corrected`.
-
-    Raises:
-        DataError: There are no two such views.
-    """
-    cells = {
-        view.number: {name: view.cell(name) for name in session.columns} for view in session.views
-    }
-    first_cells, second_cells = cells.get(first, {}), cells.get(second, {})
-    differing = [
-        name for name in _MUST_AGREE if first_cells.get(name, "") != second_cells.get(name, "")
-    ]
-    if first == second or differing or not (first_cells and second_cells):
-        raise DataError(
-            f"Views {first} and {second} of session {session.name!r} are not two views that see "
-            f"the same{': another ' * bool(differing)}{' and '.join(differing)}.",
-            culprits=["--exchange"],
-        )
-    for name in {*_OBSERVED} & {*session.columns}:
-        first_cells[name], second_cells[name] = second_cells[name], first_cells[name]
-    corners = session.corner_table
-    if corners is not None:
-        is_first, is_second = corners.views == first, corners.views == second
-        views = np.where(is_first, second, np.where(is_second, first, corners.views))
-        corners = replace(corners, views=views)
-    note = f"the images of views {first} and {second} were exchanged"
-    return _with_cells(session, cells.values(), note, corners=corners)
-
-
-def _with_cells(
-    session: Session, cells: Iterable[Mapping[str, str]], note: str, **changes: object
-) -> Session:
-    """The session with other rows, which notes why in `corrected`."""
-    return session.with_content(
-        document=_noting(session, session.document, [note]),
-        cells=[[row[name] for name in session.columns] for row in cells],
-        **changes,
-    )
-
-
-def _chosen_views(session: Session, views: Sequence[int], option: str) -> list[int]:
-    """The session's views among some numbers; raises DataError where there are none."""
-    numbers = {view.number for view in session.views}
-    chosen = [view for view in dict.fromkeys(views) if view in numbers]
-    if not chosen:
-        words = f"Session {session.name!r} has none of the views {ranges(views)}."
-        raise DataError(words, culprits=[option], next_step="Name views of its views.csv.")
-    return chosen
-
-
-def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
-    """Gives some views the robot's columns of so many rows later, or earlier where negative.
-
-    Views whose row there is none, or another view's that stays, are dropped, and `corrected` names
-    them. Raises DataError.
-    """
-    moved, rows = set(_chosen_views(session, views, "--shift")), session.views
-    places = {at for at, view in enumerate(rows) if view.number in moved}
-    kept = {*_OBSERVED, *_MUST_AGREE, "view", "role"}
-    cells, dropped = list[dict[str, str]](), list[int]()
-    for at, view in enumerate(rows):
-        source = at + by if at in places else at
-        if at in places and source not in places:
-            dropped.append(view.number)
-            continue
-        cells.append(
-            {name: (view if name in kept else rows[source]).cell(name) for name in session.columns}
-        )
-    lost = f"; {ranges(dropped)} had none there and were dropped" if dropped else ""
-    note = f"views {ranges(moved)} have the robot's poses of the row {by:+d}{lost}"
-    corners = session.corner_table
-    if corners is not None:
-        corners = corners.of_views([view.number for view in rows if view.number not in dropped])
-    return _with_cells(session, cells, note, corners=corners)
-
-
-def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -> Session:
-    """Turns the board back that was read turned in some views.
-
-    Args:
-        session: A session of measured poses or corners.
-        views: Their numbers.
-        turn: Angle in the board's plane [deg], and the point about which it turns [mm]; of no
-            angle, the shift in that plane [mm].
-
-    Raises:
-        DataError: There are no such views, or corners are none of the board's once turned.
-    """
-    chosen = _chosen_views(session, views, "--turned")
-    degrees, *centre = turn
-    rotation = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    middle = 1e-3 * np.array([*centre, 0.0])
-    right_from_read = compose(rotation, middle - (rotation @ middle if degrees else 0.0))
-    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
-    numbers = numbers_in(session, MEASURED_CAM_POSE)
-    poses, is_turned = numbers.poses(), [view.number in chosen for view in session.views]
-    for row, pose, mine in zip(cells, poses @ invert(right_from_read), is_turned, strict=True):
-        if mine and np.isfinite(pose).all():
-            row.update({f"cft_{name}": repr(value) for name, value in pose_row(pose).items()})
-    corners, boards = session.corner_table, session.boards
-    if corners is not None:
-        ids = corners.points.copy()
-        for view in chosen:
-            points = corner_positions(next(iter(boards.values())))
-            own = corners.views == view
-            turned = apply(right_from_read, points)[ids[own]]
-            away = np.linalg.norm(turned[:, None] - points, axis=-1)
-            ids[own] = away.argmin(axis=1)
-        corners = replace(corners, points=ids)
-    by = f"{degrees:g} deg" if degrees else "({:g}, {:g}) mm".format(*centre)
-    note = f"the board was turned back by {by} in views {ranges(chosen)}"
-    return _with_cells(session, cells, note, corners=corners)
-
-
-def write_positions(
-    session: Session, views: Sequence[int], axes: Sequence[Sequence[tuple[float, str]]]
-) -> Session:
-    """Writes the robot's positions in some views as sums of columns.
-
-    Args:
-        session: A session.
-        views: Their numbers.
-        axes: Factors and names of columns, for x, y and z each; positions are in metres.
-
-    Raises:
-        DataError: There are no such views or columns, or a cell has no number.
-    """
-    chosen = _chosen_views(session, views, "--positions")
-    named = {name for axis in axes for _, name in axis}
-    if missing := sorted(named - {*session.columns}):
-        raise DataError(
-            f"Session {session.name!r} has no column {missing[0]} in its views.csv.",
-            culprits=["--positions"],
-            next_step=f"Name columns among {some_of(session.columns)}.",
-        )
-    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
-    for view, row in zip(session.views, cells, strict=True):
-        if view.number not in chosen:
-            continue
-        empty = next((name for name in named if not is_number(row[name])), None)
-        if empty is not None:
-            words = f"views.csv: view {view.number} has no number in column {empty}."
-            raise DataError(words, culprits=[empty], next_step="Fill it in, or name other views.")
-        sums = [sum(factor * float(row[name]) for factor, name in axis) for axis in axes]
-        row |= dict(zip(POSE, map(repr, sums), strict=False))
-    sums_of = ("".join(f"{factor:+g} {name} " for factor, name in axis).strip() for axis in axes)
-    note = f"the positions of views {ranges(chosen)} are {', '.join(sums_of)}"
-    return _with_cells(session, cells, note)
