@@ -496,12 +496,16 @@ def with_column(name: str, value: str):
         ("corners", with_line("99,700,10,10"), "column view: views.csv has no view 99"),
         ("corners", with_line("0,5,10,10"), "no point 5; its 37 points have the numbers 592 to 70"),
         ("corners", with_line("0,700,10,10"), "point 700 of view 0 is there twice, first in corne"),
-        ("corners", with_line("0,x,10,10"), "corners.csv, line 512, column point: 'x' is no whole"),
-        ("corners", with_line("0,700,nan,10"), "column u_px: 'nan' is no finite number"),
+        (
+            "corners",
+            with_line("0,x,10,10"),
+            "corners.csv, line 512, column point: 'x' must be a whole",
+        ),
+        ("corners", with_line("0,700,nan,10"), "column u_px: 'nan' must be a finite number"),
         ("corners", with_line("0,700,10"), "it has 3 fields, but the header has 4 columns"),
         ("corners", with_column("score", "1"), "others are not read"),
         # Its square overflows.
-        ("corners", with_column("sigma_px", "1e150"), "1e+150 px is no standard deviation"),
+        ("corners", with_column("sigma_px", "1e150"), "1e+150 px must be the standard deviation"),
         (
             "corners",
             lambda rows: [*with_column("sigma_px", "1")(rows), ["0", "0", "10", "10", ""]],

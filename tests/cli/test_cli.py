@@ -731,7 +731,11 @@ WRONG_PLACES = {
         "session/views.csv begins with 'view,",
         "nothing need be changed",
     ),
-    "a result for a session": (("convert", "out", "copy"), "no session, but a result", "recording"),
+    "a result for a session": (
+        ("convert", "out", "copy"),
+        "must be a session, but is a result",
+        "recording",
+    ),
     "no folder": (("calibrate", "session", "-o", ""), "-o is empty", "variable"),
     "no folder, as one word": (("plan", "session", "--out="), "--out is empty", "variable"),
     "touches for a drawing": (

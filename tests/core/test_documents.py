@@ -57,22 +57,22 @@ def test_yaml_values(text, value):
         ("a: 1\nb: !!python/object/apply:os.getcwd []", "line 2: the tag 'python/object/apply"),
         ("a: !!python/name:os.system x", "the tag"),
         ("a: !local x", "the tag"),
-        ("a: 1\nb: 2\na: 3", "line 3: 'a' is no key, or there twice"),
-        ("a: &a [*a]", "no YAML"),
-        ("[" * 200, "no YAML"),
-        ("[" * 100_000, "no YAML"),
+        ("a: 1\nb: 2\na: 3", "line 3: 'a' must be a key, a word that is there once"),
+        ("a: &a [*a]", "not YAML"),
+        ("[" * 200, "not YAML"),
+        ("[" * 100_000, "not YAML"),
         ("- " * 200 + "1", "nested deeper"),
-        ("a: [1, 2", "no YAML"),
-        ("a: !!opencv-matrix [1, 2]", "no YAML"),
-        ("a: !!int x", "no YAML"),
-        ("a: b: c", "line 1 is no YAML"),
-        ("? [1]\n: 2", "line 1: a list of 1 is no key"),
+        ("a: [1, 2", "not YAML"),
+        ("a: !!opencv-matrix [1, 2]", "not YAML"),
+        ("a: !!int x", "not YAML"),
+        ("a: b: c", "line 1 is not YAML"),
+        ("? [1]\n: 2", "line 1: a list of 1 must be a key"),
         (
             "m: !!opencv-matrix {rows: 2, cols: 2, dt: d, data: [1, 2, 3]}",
             "3 numbers are no matrix",
         ),
         ("m: !!opencv-matrix {rows: 1, cols: 1, dt: x, data: [1]}", "of the type 'x'"),
-        ("a: \x01", "no YAML"),
+        ("a: \x01", "not YAML"),
     ],
 )
 def test_yaml_that_is_refused(text, words):
@@ -90,11 +90,11 @@ def test_aliases_cost_nothing(file):
     ("text", "words"),
     [
         ('{"a": 1, "a": 2}', "the key 'a' occurs twice"),
-        ("[" * 100_000, "deep|no JSON"),
+        ("[" * 100_000, "deep|not JSON"),
         ("[" * 60 + "]" * 60, "nested deeper"),
         ("[" + "1," * 1_200_000 + "1]", "more than 1,000,000 values"),
         ("[1,\n2,\n}", "line 3"),
-        ("", "no JSON"),
+        ("", "not JSON"),
         ('{"\\ud800": 1}', "half of a letter"),
         ('["a\\uDFFFb"]', "half of a letter"),
     ],
@@ -128,7 +128,7 @@ def test_xml_has_no_document_type(file):
         path = file("a.xml", f"<!DOCTYPE r [{inner}]><r>&a;</r>")
         raised(DataError, "document type", read_xml, path)
     raised(DataError, "nested deeper", read_xml, file("deep.xml", "<a>" * 100 + "</a>" * 100))
-    raised(DataError, r"is no XML.*line 2", read_xml, file("cut.xml", "<a>\n<b>"))
+    raised(DataError, r"is not XML.*line 2", read_xml, file("cut.xml", "<a>\n<b>"))
     root = read_xml(file("good.xml", "<a>x<!-- no --><b c='1'> 2 </b>y</a>"))
     assert (root.findtext("b"), root.find("b").attrib) == (" 2 ", {"c": "1"})
 

@@ -208,7 +208,7 @@ def test_missing_file_and_folder_are_named(tmp_path):
 def test_what_might_never_end_is_not_read(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     for path in (tmp_path / "pipe.csv", Path("/dev/zero")):
-        raised(DataError, "is no regular file", read_bytes, path)
+        raised(DataError, "is not a regular file", read_bytes, path)
     (tmp_path / "large.csv").write_bytes(bytes(11))
     assert len(read_bytes(tmp_path / "large.csv", 11)) == 11
     raised(DataError, "has more than", read_bytes, tmp_path / "large.csv", 10)

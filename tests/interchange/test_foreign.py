@@ -689,10 +689,10 @@ def test_links_that_lead_out_are_not_followed(tmp_path, naming):
 def test_what_is_no_image_is_not_copied(tmp_path, naming):
     (tmp_path / "a.png").write_text("root:x:0:0")
     picture(tmp_path / "b.png")
-    raised(DataError, r"a\.png is no image", naming, "a.png", "b.png")
+    raised(DataError, r"a\.png must be an image", naming, "a.png", "b.png")
     session = naming("b.png")
     (tmp_path / "b.png").write_text("root:x:0:0")
-    raised(DataError, r"b\.png is no image", session.save, tmp_path / "out")
+    raised(DataError, r"b\.png must be an image", session.save, tmp_path / "out")
 
 
 def test_images_are_looked_for_beside_and_some_must_be_there(tmp_path, table):

@@ -111,5 +111,5 @@ def test_frames_that_cannot_be_kept_stop_a_new_result(sample, pairs, tmp_path):
     replace(Calibration.load(out), frames=frames).save(out / "calibration.json")
     (out / "frames.json").write_text("not frames", encoding="utf-8")
     before = contents(out)
-    raised(DataError, r"frames\.json, line 1.* is no JSON", calibrate_command, options(pairs, out))
+    raised(DataError, r"frames\.json, line 1.* is not JSON", calibrate_command, options(pairs, out))
     assert contents(out) == before

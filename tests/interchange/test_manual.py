@@ -236,13 +236,13 @@ def test_points_are_understood_as_ever_and_commas_as_points_or_not_at_all(number
         ("1.234,5 12,5 800,0", "kuka", "may be decimal, or separate numbers"),
         ("X 1,234 Y 2,500 Z 800 A 10 B 0 C 180", None, "1,234 may be decimal, or group thousands"),
         ("X 512,3 Y -12.5 Z 800 A 1 B 2 C 3", None, "decimal commas and decimal points"),
-        ("X 1.234,5 Y 2 Z 3 A 1 B 2 C 3", None, "is no pose"),
+        ("X 1.234,5 Y 2 Z 3 A 1 B 2 C 3", None, "must be a pose"),
         # A soft hyphen may be a minus, or nothing.
-        ("X 1 Y \N{SOFT HYPHEN}2 Z 3 A 1 B 2 C 3", None, "is no pose"),
-        ("1 2 3", None, "is no pose"),
+        ("X 1 Y \N{SOFT HYPHEN}2 Z 3 A 1 B 2 C 3", None, "must be a pose"),
+        ("1 2 3", None, "must be a pose"),
         # Such a line must not take for ever.
-        (40 * "1" + "x", None, "is no pose"),
-        ("X 1 mm Y 2 m Z 3 mm A 4 B 5 C 6", None, "is no pose"),
+        (40 * "1" + "x", None, "must be a pose"),
+        ("X 1 mm Y 2 m Z 3 mm A 4 B 5 C 6", None, "must be a pose"),
         (
             "1 2 3 4 5 6",
             None,
@@ -260,7 +260,7 @@ def test_points_are_understood_as_ever_and_commas_as_points_or_not_at_all(number
         ),
         ("X 1 Y 2 Z 3 O 4 A 5 T 6", "comau", "a pose of kawasaki, not of 'comau'"),
         ("1 2 3 4 5 6 7", "kuka", "a pose of ros, not of 'kuka'"),
-        (" ".join(map(str, range(16))), None, "is no pose"),
+        (" ".join(map(str, range(16))), None, "must be a pose"),
         ("p[0.4, 0, 0, 0, 0, 0]", "kuka", "a pose of ur, not of 'kuka'"),
         ("p[400, 0, 0, 0, 0, 0]", None, "400 m from the base"),
         ("[[400,0,0],[0.5,0.5,0.5,0.4]]", None, "not a quaternion w, x, y, z"),
@@ -302,11 +302,11 @@ def test_a_file_with_a_pose_a_line_says_itself_what_it_means(tmp_path, form):
 def test_a_file_of_poses_names_the_line_that_is_wrong(tmp_path):
     path = a_file(tmp_path / "poses.txt", CASES["any"][:3])
     path.write_text(path.read_text() + "img9.png; {X 1, Y 2}\n")
-    raised(DataError, r"poses\.txt, line 5.*is no pose", read_fields, path)
+    raised(DataError, r"poses\.txt, line 5.*must be a pose", read_fields, path)
     path.write_text("{X 1,Y 2,Z 3,A 4,B 5,C 6}\np[0.1, 0.2, 0.3, 0, 0, 1]\n")
     raised(DataError, "of several makers: kuka, ur", read_fields, path)
     path.write_text("p[0,0,0,0,0,1]\np[0,0,0,0,0,1] p[0.1,0,0,0,0,1]\n")
-    raised(DataError, r"line 2.*is no pose", read_fields, path)
+    raised(DataError, r"line 2.*must be a pose", read_fields, path)
 
 
 def asked(lines):
@@ -350,7 +350,7 @@ def test_lines_of_a_file_are_a_pose_each_and_none_is_passed_over():
     ask, questions = asked(lines)
     arm = ManualArm(ask, answers=False)
     assert [arm.state().base_from_flange[0, 3] for _ in range(2)] == [0.4, 0.5]
-    raised(DriverError, "is no pose", arm.state)
+    raised(DriverError, "must be a pose", arm.state)
     assert arm.state().base_from_flange[0, 3] == 0.7
     with pytest.raises(EOFError):
         arm.state()

@@ -456,7 +456,7 @@ def test_nothing_moves_without_a_word(planned, cell, tmp_path):
     with patch.object(sys, "stdin", io.StringIO("y\n")):
         done = record(tmp_path / "live", "--plan", planned[0])
     assert done.status == 2
-    assert "stdin is no terminal" in done.err
+    assert "stdin is not a terminal" in done.err
     assert "--yes" in done.err
     assert arm.moves == 0
     # Refused, and at the input's end.
@@ -606,7 +606,7 @@ def test_what_is_no_plan_is_named(tmp_path):
     file = tmp_path / "plan.json"
     raised(DataError, "does not exist", read_plan, tmp_path)
     for text, words in (
-        ("{", "is no JSON"),
+        ("{", "is not JSON"),
         ('{"schema": 1}', "not a plan that this version can read"),
         ('{"stops": [], "cell": {}, "request": {}, "schema": 1}', "cell.mount is missing"),
         ('{"stops": [], "cell": {}, "schema": 7}', "schema is 7"),

@@ -246,14 +246,14 @@ POSE, JOINTS = b"p[0.4, 0, 0.3, 0, 3.1, 0]", b"0 -90 90 0 45 10,5"
         (b"20000 | [[400,-100,300],[0.5,-0.5,0.5,0.5]] | %s deg\r" % JOINTS, "next\n"),
         (b"1 | 400 0 300 0 180 0\n", "error the pose may be of ur, kuka, fanuc"),
         (b"1 | 512,34,-12,5,800,0\n", "error the pose: the commas of"),
-        (b"1 | X 400 Y 0 Z 300\n", "error the pose: 'X 400 Y 0 Z 300' is no pose"),
-        (b"0 | %s\n" % POSE, "error '0 | p[0.4, 0, 0.3, 0' is no stop"),
-        (b"20001 | %s\n" % POSE, "error '20001 | p[0.4, 0, 0.' is no stop"),
-        (POSE + b"\n", "error 'p[0.4, 0, 0.3, 0, 3.' is no stop"),
-        (b"1\n", "error '1' is no stop"),
+        (b"1 | X 400 Y 0 Z 300\n", "error the pose: 'X 400 Y 0 Z 300' must be a pose"),
+        (b"0 | %s\n" % POSE, "error '0 | p[0.4, 0, 0.3, 0' must be a stop"),
+        (b"20001 | %s\n" % POSE, "error '20001 | p[0.4, 0, 0.' must be a stop"),
+        (POSE + b"\n", "error 'p[0.4, 0, 0.3, 0, 3.' must be a stop"),
+        (b"1\n", "error '1' must be a stop"),
         (b"1 | %s | %s\n" % (POSE, JOINTS), "error '0 -90 90 0 45 10,5' are no joint"),
         (b"1 | %s | %s rad\n" % (POSE, JOINTS), "error a joint angle of 90 rad"),
-        (b"1 | \xc4 400 Y 0 Z 300\n", "error the line is no text in ASCII or UTF-8"),
+        (b"1 | \xc4 400 Y 0 Z 300\n", "error the line must be text in ASCII or UTF-8"),
         (b"1 | %s\n2 | %s\n" % (POSE, POSE), "error more than one line before its answer"),
         (b"7" * 501, "error a line of more than 500 bytes"),
     ],
@@ -306,7 +306,7 @@ def test_a_program_ends_the_recording_and_learns_that_it_ended(arm):
 def test_a_robot_that_does_not_come_back_ends_the_recording():
     arm = SocketArm("127.0.0.1", 0, patience_s=0.05)
     asked(arm, b"hello\n")
-    raised(DriverError, "no stop .* was last refused: 'hello' is no stop", arm.request, 5.0)
+    raised(DriverError, "no stop .* was last refused: 'hello' must be a stop", arm.request, 5.0)
     raised(DriverError, "cannot be opened for", SocketArm, "127.0.0.1", arm.port)
     arm.close()
     for words in ("socket:", "socket:127.0.0.1", "socket:70000"):

@@ -199,4 +199,4 @@ def test_calibrated_stops_that_a_check_repeats_are_far_apart(tmp_path):
     poses = exp(stops.poses)[:, :3].reshape(len(stops.views), 12)
     apart = pdist(poses[[stops.views.index(view) for view in chosen]])
     assert apart.min() > 2.0 * pdist(poses).min()
-    visioncal("plan", session, "--verify", "-o", tmp_path / "plan").refused("is no calibration")
+    visioncal("plan", session, "--verify", "-o", tmp_path / "plan").refused("must be a calibration")

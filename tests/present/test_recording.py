@@ -261,7 +261,7 @@ def test_a_cut_recording_is_refused(recorded, tmp_path):
         # A loss of power leaves zeros.
         for rest in (b"", bytes(len(data) - size)):
             cut.write_bytes(data[:size] + rest)
-            raised(DataError, r"cut\.rrd (was cut off|is no recording)", Session.load, cut)
+            raised(DataError, r"cut\.rrd (was cut off|must be a recording)", Session.load, cut)
 
 
 def test_flipped_bytes_in_images_are_named(sample, recorded, tmp_path):

@@ -54,7 +54,7 @@ def test_what_cannot_be_reviewed_is_refused_with_the_next_step(tmp_path):
     for path, words in (
         (session, f"visioncal calibrate {session} -o OUT"),
         (empty, "holds no recording.rrd"),
-        (other, "is no recording"),
+        (other, "must be a recording"),
         (tmp_path / "nowhere.rrd", "does not exist"),
     ):
         visioncal("show", "--viewer", path).refused(words)

@@ -191,7 +191,7 @@ def test_without_a_seed_it_is_the_posture_nearest_to_the_middle(result):
         (np.full((4, 4), np.nan), None, "rigid"),
         (np.eye(4), np.zeros(5), "seeds must have the shape"),
         (np.eye(4), [0, 90, 0, 0, 0, 0], "degrees"),
-        (np.eye(4), [0, np.nan, 0, 0, 0, 0], "no finite number"),
+        (np.eye(4), [0, np.nan, 0, 0, 0, 0], "must be a finite number"),
     ],
 )
 def test_what_is_no_target_or_no_seed_is_refused(result, targets, seed, said):

@@ -140,13 +140,13 @@ def test_a_tip_that_is_not_there_is_refused_with_the_frames(tmp_path):
 
 def test_what_is_no_urdf_is_refused(tmp_path, capfd):
     (tmp_path / "a.urdf").write_text("<robot name='x'><link name=")
-    raised(DataError, "is no XML", load_robot, "a.urdf", "x", tmp_path)
+    raised(DataError, "is not XML", load_robot, "a.urdf", "x", tmp_path)
     (tmp_path / "a.urdf").write_text("<robot/>")
     raised(DataError, "cannot be parsed", load_robot, "a.urdf", "x", tmp_path)
     capfd.readouterr()  # the parser speaks on its own
     # One that Pinocchio's reader takes, and no other.
     (tmp_path / "bold.urdf").write_text(URDF.replace("<link name=", "<link note='<i>' name=", 1))
-    raised(DataError, "is no XML: not well-formed", load_robot, "bold.urdf", "tool0", tmp_path)
+    raised(DataError, "is not XML: not well-formed", load_robot, "bold.urdf", "tool0", tmp_path)
     (tmp_path / "long.urdf").write_text(f"<robot name='x'>{'<joint/>' * 2001}</robot>")
     raised(DataError, "has 2001 joints; up to 2000", load_robot, "long.urdf", "x", tmp_path)
     (tmp_path / "b.urdf").write_bytes(b" " * 10_000_001)

@@ -121,7 +121,7 @@ def test_pictures_of_numpy_and_the_largest_number_as_a_hole(cloud):
         ("a.png", b"\x89PNG", "damaged"),
         ("a.tif", tiff(np.full((30, 40), -0.5, np.float32)), "below 0 or NaN.*z forward"),
         ("a.ply", b"ply\nformat ascii 1.0\n", "no header"),
-        ("a.ply", ply(np.ones((5, 5, 3)))[:-9], "no cloud that can be read"),
+        ("a.ply", ply(np.ones((5, 5, 3)))[:-9], "cannot be read as a cloud"),
         ("a.ply", ply(np.ones((5, 5, 3))), "25 points in no order.*organised"),
         ("a.pcd", pcd(np.ones((5, 5, 3))).replace(b"DATA binary", b"DATA binary_lzf"), "asc"),
         ("a.npy", npy(np.ones((30, 40, 2))), r"\(h, w, 3\)"),

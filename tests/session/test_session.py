@@ -371,12 +371,12 @@ CSV_REFUSALS = [
     ("0.6,0,0.3", "0.6,0,0,3", "line 3: it has 14 fields"),
     (",note", ",role", r"column role is there twice \(columns 3 and 13\)"),
     (",qw,", ",w,", "the columns x_m, .* lack qw"),
-    ("3,,holdout", "3.5,,holdout", r"line 3, column view: '3\.5' is no whole number"),
+    ("3,,holdout", "3.5,,holdout", r"line 3, column view: '3\.5' must be a whole number"),
     ("3,,holdout", "7,,holdout", r"line 3, column view: 7 is already the view of .*line 2"),
     ("holdout", "test", 'line 3, column role: \'test\' must be a role: "fit", "holdout"'),
     ("0.6,0,0.3", '0.6,"1,100",0.3', "line 3, column y_m: '1,100' may have a decimal comma or"),
     ("0.6,0,0.3", '0.6,"0,1,2",0.3', "line 3, column y_m: '0,1,2' .*such as -1234.5"),
-    (",0.10,", ",1e308,", r"1e\+308 s is no time of a recording"),
+    (",0.10,", ",1e308,", r"1e\+308 s is beyond every recording"),
     ("0.6,0,0.3", "0.6,,0.3", r"line 3, column x_m \.\.\. qw: some are empty"),
     ("0.6,0,0,0.8", "0.6,0,0,0.9", r"line 3, column qx \.\.\. qw: .*norm is 1\.08167, but must"),
     ("0.6,0,0,0.8,", "0.6,0,0,0.8", "line 3: it has 12 fields, but the header has 13 columns"),
@@ -405,7 +405,7 @@ def test_what_is_wrong_alike_in_many_rows_is_said_once(folder):
     assert len(lines) == len(error.culprits) == 2
     assert "line 2, column image: the image 'images/0.gif'" in lines[0]
     assert lines[0].endswith("And 11 more, up to views.csv, line 13, column image.")
-    assert "line 14, column view: 'x' is no whole number" in lines[1]
+    assert "line 14, column view: 'x' must be a whole number" in lines[1]
 
 
 @pytest.mark.parametrize("name", ["session.toml", "views.csv"])
@@ -443,7 +443,7 @@ def test_what_is_no_session_is_refused(tmp_path):
     assert words[:3] == ["convert", str(pictures), f"{pictures}-session"]
     assert words[-2:] == ["doctor", words[2]]
     for path in (tmp_path, tmp_path / "calibration.json"):
-        caught = raised(DataError, "but a result", Session.load, path)
+        caught = raised(DataError, "but is a result", Session.load, path)
         assert f"name {tmp_path / 'recording.rrd'}" in caught.next_step
 
 

@@ -144,9 +144,14 @@ def test_every_storage_of_it_is_the_same_session(folder, tmp_path):
         ("views.csv", "2,0,,right,", "2,0,,,", "column camera must name the one that.* view 2"),
         ("views.csv", "0,0,,left,a", "0,0,,left,", "the one whose pose or joints .* view 0"),
         ("views.csv", "0,0,,left", "0,0,intrinsics,left", "the row has x_m"),
-        ("session.toml", '"flange_a"', '"flange_c"', "cam_left hangs on 'flange_c', which is no"),
-        ("session.toml", "cam_left", "cam_lef", "'cam_lef' is no frame.*Did you mean cam_left"),
-        ("session.toml", '"flange_a"', '["flange_a", "cell"]', "cam_left hangs on .* is no frame"),
+        ("session.toml", '"flange_a"', '"flange_c"', "cam_left hangs on 'flange_c', which must be"),
+        ("session.toml", "cam_left", "cam_lef", "'cam_lef' must be a frame.*Did you mean cam_left"),
+        (
+            "session.toml",
+            '"flange_a"',
+            '["flange_a", "cell"]',
+            "cam_left hangs on .* must be a frame",
+        ),
         ("session.toml", "[frames]", '[frames]\nflange_a = "cell"', "on base_a by its robot"),
         (
             "session.toml",

@@ -68,7 +68,10 @@ def test_rows_without_a_pose_are_no_poses():
         (["stamp_s,q1_rad", "0,1", "0,2"], "line 3, column stamp_s: it does not ascend"),
         (["stamp_s,q1_rad", "0,1", ",2"], "line 3, column stamp_s: it is empty"),
         (["stamp_s,q1_rad", "0,1", "1,2,3"], "line 3: it has 3 fields, but the header has 2"),
-        (["stamp_s,q1_rad", "0,1", "1,nan"], "line 3, column q1_rad: 'nan' is no finite number"),
+        (
+            ["stamp_s,q1_rad", "0,1", "1,nan"],
+            "line 3, column q1_rad: 'nan' must be a finite number",
+        ),
         (["stamp_s,mode", "0,auto"], "line 2, column mode: 'auto'.*numbers alone"),
         (["stamp_s,q2_rad", "0,1"], "lack q1_rad"),
         (["stamp_s,q1_rad,q2_rad", "0,1,"], "line 2, column q1_rad ... q2_rad: some are empty"),
@@ -142,10 +145,10 @@ def test_the_digest_knows_streams_and_is_as_it_was_without():
 @pytest.mark.parametrize(
     ("column", "value", "words"),
     [
-        ("stamp_s", "1e308", "no time of a recording; write seconds"),
+        ("stamp_s", "1e308", "beyond every recording; write seconds"),
         ("x_m", "-1e308", "beyond every robot cell"),
-        ("q1_rad", "1e300", "no angle of a joint"),
-        ("qx", "1e308", "no number that a cell has"),
+        ("q1_rad", "1e300", "beyond every joint"),
+        ("qx", "1e308", "beyond every number that a cell has"),
     ],
 )
 def test_a_number_that_no_cell_has_is_named_by_its_column(column, value, words, tmp_path):
@@ -183,9 +186,9 @@ def test_loads_are_read_and_nothing_is_no_load():
 @pytest.mark.parametrize(
     ("cells", "words"),
     [
-        ({"payload_kg": "-2"}, "column payload_kg: -2 kg is no payload"),
+        ({"payload_kg": "-2"}, "column payload_kg: -2 kg must be a payload"),
         ({"payload_x_m": "0.1"}, "payload_kg, its mass, is missing"),
-        ({"force_z_n": "5e7"}, "5e\\+07 N is no force"),
+        ({"force_z_n": "5e7"}, "5e\\+07 N is beyond every force"),
         ({"approach": "up"}, "column approach: 'up' must be a side"),
     ],
 )

@@ -198,7 +198,7 @@ from_stop = 4
         ("[robots.a]", "[robot.a]", "own.toml: robot is not known.*Did you mean robots"),
         ("stops = 6", "stop = 6", "own.toml: stop is not known.*Did you mean stops?"),
         ('on = "a"\nscale', 'on = "b"\nscale', "plate is on 'b'; there are a, cell"),
-        ("[robots.a]", '[robots."a b"]', "robots.a b is no name: letters, digits"),
+        ("[robots.a]", '[robots."a b"]', "robots.a b must be a name of letters, digits"),
         ("[robots.a]", "[robots]\na = 5\n[robots.b]", r"must be tables \[robots.NAME\]"),
         ("[instruments.tracker]", "[cameras.b]", "own.toml: there are points and no instrument"),
         ("place_m = [2.0, 0.0, 0.3]", "", "own.toml: instruments.0..place_m is missing"),

@@ -301,8 +301,8 @@ def test_of_the_command_line(tmp_path, monkeypatch):
     status, said = sent(*seen(20, 0))
     assert (status, said[-1]["look"], said[-1]["holds"]) == (0, 20, True)
     wrong = {
-        "{": "no JSON",
-        '{"time_s": 1, "target": "\udcff"': "no JSON",
+        "{": "not JSON",
+        '{"time_s": 1, "target": "\udcff"': "not JSON",
         '{"time_s": 1}': "cam_from_target or",
         '{"when": 2}': "'when'",
         '{"acknowledge": false}': "or acknowledge alone, true",

@@ -71,7 +71,7 @@ def _place(
         folder = path if path.is_dir() else path.parent
         if path.suffix.lower() == ".rrd" or not (folder / "calibration.json").is_file():
             raise DataError(
-                f"{path} is no output folder that a frame could join.",
+                f"{path} must be an output folder, which the frame joins.",
                 culprits=[str(path)],
                 next_step="Name the folder that calibrate wrote, or a file for the frame with -o.",
             )

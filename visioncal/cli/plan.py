@@ -149,7 +149,7 @@ def _plan_to_verify(
     calibration = start.calibration
     if calibration is None:
         raise DataError(
-            f"--verify: {start.words} is no calibration, whose stops could be repeated.",
+            f"--verify: {start.words} must be a calibration, whose stops are repeated.",
             culprits=["--verify"],
             next_step="Name an output folder of calibrate.",
         )

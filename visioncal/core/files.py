@@ -159,7 +159,7 @@ def absence(path: Path) -> str:
             return ""
         if path.is_dir():
             return "is a folder, and no file"
-        return "is no regular file" if path.exists() else "does not exist"
+        return "is not a regular file" if path.exists() else "does not exist"
     except (OSError, ValueError) as error:
         words = error.strerror if isinstance(error, OSError) and error.strerror else error
         return f"cannot be read: {words}"

@@ -117,7 +117,7 @@ def check_prior(name: str, first: str, second: str, tree: Tree) -> None:
         if frame not in tree.branches:
             names = list(tree.branches)
             raise DataError(
-                f"{label}: {frame!r} is no frame of this cell; those are {', '.join(names)}.",
+                f"{label}: {frame!r} must be a frame of this cell: {', '.join(names)}.",
                 culprits=[label],
                 next_step=did_you_mean(frame, names)
                 or "Name a prior A_from_B, as [prior.flange_a_from_cam_left].",

@@ -407,5 +407,8 @@ _FAULTS = {
         "Make room on that disk; a file on a network drive belongs onto a disk of this machine.",
     ),
     sqlite3.SQLITE_CORRUPT: ("is damaged", "Take an earlier copy of it."),
-    sqlite3.SQLITE_NOTADB: ("is no history: no SQLite file at all", "Name a history's file."),
+    sqlite3.SQLITE_NOTADB: (
+        "must be a history, but is not even a file of SQLite",
+        "Name a history's file.",
+    ),
 }

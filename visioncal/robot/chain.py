@@ -264,7 +264,7 @@ def _placement(row: DocumentTable) -> FloatArray:
     matrix = np.array([table.numbers("placement", 4) for table in tables])
     if fault := rigid_fault(matrix, NORM_TOLERANCE):
         raise DataError(
-            f"{row.label}: placement is no rigid transform [m]: {fault}.",
+            f"{row.label}: placement must be a rigid transform [m], but {fault}.",
             culprits=[f"{row.label}: placement"],
         )
     matrix[3] = LAST_ROW

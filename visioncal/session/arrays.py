@@ -105,7 +105,7 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
         # Entries may be rounded to three decimals.
         if fault := rigid_fault(matrix, 5e-3):
             name = f"base_from_flange[{at}]"
-            raise DataError(f"{name} is no rigid transform: {fault}.", culprits=[name])
+            raise DataError(f"{name} must be a rigid transform, but {fault}.", culprits=[name])
     stacked = np.array(matrices).reshape(-1, 4, 4)
     stacked[:, 3] = LAST_ROW
     return stacked

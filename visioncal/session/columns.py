@@ -49,13 +49,13 @@ _TEXTS = frozenset(
 # resolve microseconds, and are in milliseconds or less.
 _SIZES: Mapping[str, tuple[float, str]] = {
     "m": (1e7, "{0:g} m is beyond every robot cell; write metres ({0:g} mm?)"),
-    "rad": (1e4, "{0:g} rad is no angle of a joint; write radians"),
-    "s": (1e10, "{0:g} s is no time of a recording; write seconds"),
-    "rad_s": (1e5, "{0:g} rad/s is no speed of a joint"),
-    "rad_s2": (1e8, "{0:g} rad/s^2 is no acceleration of a joint"),
-    "nm": (1e6, "{0:g} Nm is no torque of a joint"),
-    "a": (1e6, "{0:g} A is no current of a motor"),
-    "n": (25_000.0, "{0:g} N is no force on a robot's flange; write newtons"),
+    "rad": (1e4, "{0:g} rad is beyond every joint; write radians"),
+    "s": (1e10, "{0:g} s is beyond every recording; write seconds"),
+    "rad_s": (1e5, "{0:g} rad/s is beyond every joint's speed"),
+    "rad_s2": (1e8, "{0:g} rad/s^2 is beyond every joint's acceleration"),
+    "nm": (1e6, "{0:g} Nm is beyond every joint's torque"),
+    "a": (1e6, "{0:g} A is beyond every motor's current"),
+    "n": (25_000.0, "{0:g} N is beyond every force on a robot's flange; write newtons"),
 }
 _RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
 # Limit in other columns, so that squares and products do not overflow.
@@ -72,16 +72,16 @@ def is_number(column: str) -> bool:
 def column_of(name: str) -> Column:
     """A column of views.csv or a stream with the plausible range of its numbers."""
     if name == "payload_kg":
-        return Column(name, 0.0, 2500.0, "{:g} kg is no payload; 0 to 2500 kg are taken".format)
+        return Column(name, 0.0, 2500.0, "{:g} kg must be a payload of 0 to 2500 kg".format)
     rate = _RATE.fullmatch(name)
     unit = rate[1] if rate else name.rpartition("_")[2] if is_number(name) else ""
     if unit == "c":
         words = (
-            "{:g} deg C is no temperature of a robot or its air; write degrees Celsius from -60 to "
-            "200, no kelvin"
+            "{:g} deg C must be a temperature of a robot or its air, -60 to 200 degrees Celsius, "
+            "and not in kelvin"
         )
         return Column(name, -60.0, 200.0, words.format)
-    most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is no number that a cell has"))
+    most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is beyond every number that a cell has"))
     return Column(name, -most, most, words.format)
 
 

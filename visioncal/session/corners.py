@@ -114,7 +114,7 @@ def parse_corners(text: str) -> CornerTable:
     sigmas = None
     if any(reader.texts(_SIGMA)):
         words = (
-            "{:g} px is no standard deviation of a corner, which lies between "
+            "{:g} px must be the standard deviation of a corner, between "
             f"{_LEAST_PX:g} and {_MOST_PX:g} px; leave out the rows of corners that do not count"
         )
         sigmas = reader.numbers(Column(_SIGMA, _LEAST_PX, _MOST_PX, words.format))[:, 0]

@@ -136,7 +136,7 @@ def read_cloud(data: bytes, path: str) -> FloatArray:
     except (ValueError, KeyError, IndexError, UnicodeDecodeError) as error:
         words = f"{error}".strip("'\n") or "it is damaged"
         raise DataError(
-            f"{path} is no cloud that can be read: {words}.",
+            f"{path} cannot be read as a cloud of points: {words}.",
             culprits=[path],
             next_step="Save it as binary .ply with x, y, z, or as .npy of (h, w, 3).",
         ) from None

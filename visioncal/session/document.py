@@ -420,7 +420,7 @@ def declaration_warnings(declaration: Declaration) -> Iterator[str]:
     for edge in declaration.prior:
         if not declaration.has_names and edge not in edges:
             hint = did_you_mean(edge, edges)
-            yield f"session.toml: prior.{edge} is no unknown edge and is ignored. {hint}".strip()
+            yield f"session.toml: prior.{edge} names no unknown edge and is ignored. {hint}".strip()
 
 
 def _unknown_keys(table: BaseModel, path: str) -> Iterator[str]:

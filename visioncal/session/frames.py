@@ -132,7 +132,7 @@ class _DeclaredTree:
                 if frame not in known:
                     what = f"{frame!r}" if frame == child else f"{child} hangs on {frame!r}, which"
                     raise _contradiction(
-                        f"{what} is no frame of this session; those are {', '.join(known)}",
+                        f"{what} must be a frame of this session: {', '.join(known)}",
                         child,
                         did_you_mean(str(frame), known)
                         or "A fixture is named fixture_NAME; cameras, robots, targets and "

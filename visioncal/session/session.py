@@ -118,7 +118,7 @@ class Session:
         recording = folder / "recording.rrd"
         if recording.is_file() and not (folder / "session.toml").exists():
             raise DataError(
-                f"{path} is no session, but a result.",
+                f"{path} must be a session, but is a result.",
                 culprits=[str(path)],
                 next_step=f"Its recording is the session: name {recording}.",
             )

@@ -70,8 +70,8 @@ def read_cell(name_or_path: str) -> NetworkOptions:
             for name, row in rows.items():
                 if not NAME.fullmatch(name) or name == CELL:
                     raise DataError(
-                        f"{key}.{name[:40]} is no name: letters, digits and _ after a letter are "
-                        f"needed, and not {CELL!r}.",
+                        f"{key}.{name[:40]} must be a name of letters, digits and _ after a "
+                        f"letter, and not {CELL!r}.",
                         culprits=[f"{key}.{name[:40]}"],
                     )
                 _check(kind, row, f"{key}.{name}.")

@@ -65,7 +65,8 @@ class Look:
                 fault = "its offset looks like millimetres, but must be in metres"
             if fault:
                 raise DataError(
-                    f"look at {self.time_s:g} s: {name} is no pose: {fault}.", culprits=[name]
+                    f"look at {self.time_s:g} s: {name} must be a pose, but {fault}.",
+                    culprits=[name],
                 )
         if (self.cam_from_target is None) == (self.corners is None):
             raise DataError(

@@ -114,7 +114,7 @@ def misspelt_keys(document: Mapping[str, Any]) -> Iterator[str]:
     """Hints for unknown keys of a target's description that resemble known ones."""
     for key in sorted(document.keys() - KEYS):
         if hint := did_you_mean(key, KEYS):
-            yield f"{key} is no known name and was not read. {hint}"
+            yield f"{key} is not known and was not read. {hint}"
 
 
 def target_from_document(document: Mapping[str, Any], name: str) -> Target:

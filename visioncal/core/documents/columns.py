@@ -224,7 +224,7 @@ def as_number(cell: str) -> float:
             next_step=f"Write {cell.replace(',', '.')} or {cell.replace(',', '')}, in all rows.",
         )
     if not math.isfinite(value):
-        raise DataError(f"{cell[:60]!r} is no finite number, such as -1234.5 or 1e-3")
+        raise DataError(f"{cell[:60]!r} must be a finite number, such as -1234.5 or 1e-3")
     return value
 
 
@@ -232,7 +232,7 @@ def as_whole(cell: str) -> int:
     """Reads a whole number, also as `3.0`, which some programs write; raises DataError."""
     cell = cell.removesuffix(".0")
     if not _INTEGER.fullmatch(cell) or len(cell) > 18:
-        raise DataError(f"{cell[:60]!r} is no whole number")
+        raise DataError(f"{cell[:60]!r} must be a whole number")
     return int(cell)
 
 

@@ -92,7 +92,7 @@ def parse_json(text: str, where: str, largest: float | None = None) -> object:
         )
     except json.JSONDecodeError as error:
         raise DataError(
-            f"{where}, line {error.lineno}, column {error.colno} is no JSON: {error.msg}.",
+            f"{where}, line {error.lineno}, column {error.colno} is not JSON: {error.msg}.",
             culprits=[where],
         ) from error
     except RecursionError as error:

@@ -57,11 +57,11 @@ def parse_yaml(text: str, where: str) -> object:
         value = loader.get_data() if loader.check_data() else None
     except yaml.MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise DataError(f"{where}{line} is no YAML: {error.problem}.", culprits=[where]) from error
+        raise DataError(f"{where}{line} is not YAML: {error.problem}.", culprits=[where]) from error
     # Tags on values of another kind give the others.
     except (yaml.YAMLError, ValueError, LookupError, TypeError) as error:
         reason = " ".join(str(error).split())
-        raise DataError(f"{where} is no YAML: {reason}.", culprits=[where]) from error
+        raise DataError(f"{where} is not YAML: {reason}.", culprits=[where]) from error
     except RecursionError as error:
         raise too_deep(where) from error
     check_values(value, where)
@@ -87,8 +87,7 @@ class _Loader(_BASE):  # type: ignore[misc] # which of two is chosen when import
             if not isinstance(key, yaml.ScalarNode) or key.value in content:
                 place = _place(self.where, key)
                 raise DataError(
-                    f"{place}: {shown(key.value)} is no key, or there twice; words, once each, are "
-                    "needed.",
+                    f"{place}: {shown(key.value)} must be a key, a word that is there once.",
                     culprits=[place],
                 )
             content[key.value] = self.construct_object(value, deep=True)
@@ -147,7 +146,7 @@ def parse_xml(data: bytes, where: str) -> Element:
             next_step="Remove the <!DOCTYPE ...>.",
         ) from error
     except (ParseError, ValueError, LookupError) as error:
-        raise DataError(f"{where} is no XML: {error}.", culprits=[where]) from error
+        raise DataError(f"{where} is not XML: {error}.", culprits=[where]) from error
     pending = [(root, 1)]
     while pending:
         element, depth = pending.pop()

@@ -31,7 +31,7 @@ def read_plain_text(path: Path) -> str:
     if b"\0" in data:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
         raise DataError(
-            f"{path}, line {line}: a NUL byte; it is no text file in UTF-8.",
+            f"{path}, line {line}: a NUL byte; the file must be text in UTF-8.",
             culprits=[str(path)],
             next_step=save_as_utf8("UTF-16"),
         )

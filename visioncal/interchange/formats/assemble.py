@@ -51,7 +51,7 @@ class FileImages(ListedImages[Path]):
         is_cloud = place.suffix.lower() in CLOUD_ENDINGS
         if data and not is_cloud and not looks_like_image(data):
             raise DataError(
-                f"{place} is no image (png, jpg, tif, bmp, webp).",
+                f"{place} must be an image (png, jpg, tif, bmp, webp).",
                 culprits=[str(place)],
                 next_step="Name each row's image with --image-column, or the folder with --images.",
             )

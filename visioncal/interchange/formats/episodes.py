@@ -66,7 +66,7 @@ def _of_video(path: Path, source: Path) -> Episode:
     )
     video.release()
     if count < 1.0:
-        words = f"{path} is no video that FFmpeg decodes."
+        words = f"{path} must be a video that FFmpeg decodes."
         raise DataError(words, culprits=[str(path)], next_step="Leave it out, or write it anew.")
 
     def load(at: int) -> bytes:

@@ -260,7 +260,7 @@ def image_groups(folder: Path) -> tuple[FileGroup, ...]:
     found = tuple(group for group in found if folder.is_dir() or folder in group.files)
     if not any(group.is_images for group in found):
         raise DataError(
-            f"{folder} has no images (png, jpg, tif, bmp, webp), or is no folder.",
+            f"{folder} must be a folder with images (png, jpg, tif, bmp, webp).",
             culprits=[str(folder)],
             next_step="Name the folder of the images with --images.",
         )

@@ -220,7 +220,7 @@ def _read(source: Path, requested: ImportOptions) -> ForeignRecording:
     mount: Mount = "eye-in-hand" if any(at in key for at in _WRISTS) else "eye-to-hand"
     if requested.robot_model is None:
         notes.append(
-            f"Robot type {kind!r} is no built-in arm: name its model with --robot-model."
+            f"Robot type {kind!r} is not a built-in arm: name its model with --robot-model."
             if arm is None
             else f"The flange is {read_robot_document(arm)['tip']} of the built-in model {arm}; "
             "--robot-model names another."

@@ -223,7 +223,7 @@ def _is_recording(path: Path) -> bool:
 
 def _foreign_format(source: Path, form: str | None, requested: ImportOptions) -> ForeignFormat:
     if not (source.is_file() or source.is_dir()):
-        fault = "is no regular file" if source.exists() else "does not exist"
+        fault = "is not a regular file" if source.exists() else "does not exist"
         raise DataError(
             f"{source} {fault}; it must be a file or a folder.",
             culprits=[str(source)],

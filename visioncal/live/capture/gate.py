@@ -45,7 +45,8 @@ class Consent:
         """How a command gets consent; raises DataError."""
         if not (yes or sys.stdin.isatty()):
             raise DataError(
-                f"{command}: nobody can be asked whether the arm may move: stdin is no terminal.",
+                f"{command}: nobody can be asked whether the arm may move, as stdin is not a "
+                "terminal.",
                 culprits=["--yes"],
                 next_step="Say --yes where the cell is clear and somebody holds the stop button.",
             )

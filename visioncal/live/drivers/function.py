@@ -50,7 +50,9 @@ class FunctionCamera:
         spec = spec_from_file_location(Path(file).stem, file) if Path(file).is_file() else None
         if spec is None or spec.loader is None:
             step = "Give a file and the name of its function, as python:grab.py:picture."
-            raise camera_error(f"camera python:{address}", "is no function of a Python file", step)
+            raise camera_error(
+                f"camera python:{address}", "must be a function of a Python file", step
+            )
         module = module_from_spec(spec)
         try:
             spec.loader.exec_module(module)
@@ -85,7 +87,7 @@ class FunctionCamera:
         is_shaped = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
         if image.dtype != np.uint8 or not is_shaped or not image.size:
             step = "Return (h, w) grey or (h, w, 3) blue, green, red of uint8."
-            words = f"returned {image.dtype} of shape {image.shape}, which is no picture"
+            words = f"must return a picture, but returned {image.dtype} of shape {image.shape}"
             raise camera_error(self.name, words, step)
         return image
 

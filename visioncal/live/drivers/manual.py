@@ -137,7 +137,7 @@ def form_name(form: str) -> str:
     if name not in POSE_FORMS:
         names = (*_OURS, *POSE_FORMS)
         raise DriverError(
-            f"There is no form of poses {form!r}; {', '.join(names)} are there.",
+            f"There is no form of poses {form!r}; the names are {', '.join(names)}.",
             culprits=["--pose-form"],
             next_step=did_you_mean(form, names),
         )

@@ -242,7 +242,7 @@ class SocketArm:
         is_number = number.isascii() and number.isdecimal() and len(number) < 6
         if len(parts) not in (1, 2) or not (is_number and 1 <= int(number) <= MOST_VIEWS):
             raise DataError(
-                f"{line[:20]!r} is no stop.",
+                f"{line[:20]!r} must be a stop.",
                 next_step=f"Needed is: number (1 to {MOST_VIEWS}) | pose, or number | pose | "
                 "joints deg.",
             )
@@ -290,7 +290,7 @@ class SocketArm:
             try:
                 return first.strip(_FILL).decode("utf-8")
             except UnicodeDecodeError:
-                link.send(b"error the line is no text in ASCII or UTF-8")
+                link.send(b"error the line must be text in ASCII or UTF-8")
         return None
 
     def _accept(self) -> None:

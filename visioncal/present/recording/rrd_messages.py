@@ -49,7 +49,7 @@ def scan(path: Path) -> tuple[MessageFrame, ...]:
         size = path.stat().st_size
         if not file.read(_START_BYTES).startswith(_MAGIC) or size < _START_BYTES:
             raise DataError(
-                f"{path} is no recording: it does not begin as an .rrd does.",
+                f"{path} must be a recording, but does not begin as an .rrd does.",
                 culprits=[str(path)],
                 next_step="Give the .rrd that visioncal wrote, or the session's folder.",
             )

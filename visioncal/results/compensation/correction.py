@@ -244,7 +244,8 @@ def _matrices(poses: Poses) -> FloatArray:
     for at, matrix in enumerate(matrices):
         if fault := rigid_fault(matrix):
             raise DataError(
-                f"correct: target {at} is no rigid transform: {fault}.", culprits=[f"target {at}"]
+                f"correct: target {at} must be a rigid transform, but {fault}.",
+                culprits=[f"target {at}"],
             )
         extent_m = np.abs(matrix[:3, 3]).max()
         if extent_m >= FAR_M:
@@ -275,7 +276,7 @@ def _seeds(q_seed: FloatArray | Sequence[float] | None, robot: Robot, count: int
         )
     if seeds.ndim == 1:
         if not np.isfinite(seeds).all():
-            raise DataError("correct: the seed has a joint that is no finite number.")
+            raise DataError("correct: each joint of the seed must be a finite number.")
         seeds = np.concatenate([seeds[None], np.full((max(count - 1, 0), size), np.nan)])[:count]
     turns = np.abs(seeds[:, ~robot.chain.prismatic])
     if (turns > WIDE_RAD).any():
