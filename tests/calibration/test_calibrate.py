@@ -36,6 +36,7 @@ from visioncal.simulation import (
     simulate,
     write_session,
 )
+from visioncal.vision.targets import corner_positions
 
 
 @pytest.fixture(scope="module")
@@ -278,6 +279,25 @@ def test_nothing_is_wrong_with_a_sound_session(sound):
     assert (done.status, done.err) == (0, "")
     assert f"visioncal calibrate {sound} -o out" in done.out
     assert re.search(r"in 15 images, over [5-9]\d % of their width and [5-9]\d % of", str(found))
+
+
+def test_views_that_leave_lens_and_mount_open_are_told_of_both():
+    board, rng = CellOptions().target, np.random.default_rng(3)
+    at_m = corner_positions(board) - corner_positions(board).mean(axis=0)
+    seen, poses = [], []
+    for angle in np.linspace(-1.2, 1.2, 10):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        shift_m = rng.uniform(-0.03, 0.03, 2)
+        # A camera square to the board at 0.4 m, of 900 px.
+        px = 900 * (at_m[:, :2] @ turn.T + shift_m) / 0.4 + [639.5, 399.5]
+        seen.append((np.arange(len(px)), px + rng.normal(0.0, 0.05, px.shape)))
+        cam_from_target = np.eye(4)
+        cam_from_target[:2, :2], cam_from_target[:3, 3] = turn, [*shift_m, 0.4]
+        poses.append(invert(cam_from_target))
+    session = Session.from_corners(seen, np.array(poses), board, (1280, 800))
+    first, second = visioncal.doctor(session).findings[:2]
+    assert "turn about the tool's z" in first.words
+    assert "intrinsics: the views leave the focal length open" in second.words
 
 
 def test_stops_that_are_too_few_to_check_a_result_are_said_as_the_verdict_says_them(sound):

@@ -299,7 +299,7 @@ def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
 
     with pytest.raises(DegenerateError) as refused:
         calibrate(session())
-    measure = "Where the arm cannot tilt, measure that offset for [prior.flange_from_probe]."
+    measure = "This arm cannot tilt: measure that offset for [prior.flange_from_probe]."
     assert refused.value.next_step.startswith(measure)
     prior = {"flange_from_probe": {"z_m": 0.05, "sigma_m": 5e-4}}
     found = calibrate(session(prior=prior))

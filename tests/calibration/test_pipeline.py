@@ -123,7 +123,7 @@ def without(cell, views):
     ("axis", "said", "step"),
     [
         ("z_m", "has a predicted sigma of 6", "Measure that to 4"),
-        ("x_m", "is not determined at all", "Where the arm cannot tilt, measure that offset"),
+        ("x_m", "is not determined at all", "; where the arm cannot tilt, measure that offset"),
     ],
 )
 def test_a_stated_prior_that_does_not_suffice_is_named(axis, said, step):
@@ -135,7 +135,7 @@ def test_a_stated_prior_that_does_not_suffice_is_named(axis, said, step):
         )
     known = f"[prior.flange_from_cam] counts, with {axis[0]} known to 6 mm."
     assert refused.value.message.endswith(known)
-    assert refused.value.next_step.startswith(step)
+    assert step in refused.value.next_step
     if axis == "z_m":
         # What it asks for suffices.
         needed_mm = float(refused.value.next_step.split()[3])

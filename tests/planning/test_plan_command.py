@@ -117,9 +117,10 @@ def test_the_program_drives_to_each_stop_by_way_of_what_lies_between(planned, do
 
 
 def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one_axis, tmp_path):
-    visioncal("calibrate", one_axis, "-o", tmp_path / "out").refused(
-        f"Run: visioncal plan '{one_axis}' --add 5"
-    )
+    refused = visioncal("calibrate", one_axis, "-o", tmp_path / "out")
+    # An arm of six axes is not told of those that cannot tilt.
+    command = f"about one axis of the tool. Run: visioncal plan '{one_axis}' --add 5"
+    refused.refused(f"tilted by 20 to 40 degrees about different axes, not only {command}")
     out = tmp_path / "plan"
     done = visioncal("plan", one_axis, "--add", 2, "-o", out, "--candidates", 60).good()
     assert "not determined before" in done.out

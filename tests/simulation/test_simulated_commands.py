@@ -270,7 +270,7 @@ def test_an_arm_of_four_axes_is_simulated_with_a_measured_height(mount, tmp_path
         assert off @ np.linalg.solve(edge.covariance[free, free], off) < MOST
     bare = replace(session, document={k: v for k, v in session.document.items() if k != "prior"})
     asked = raised(DegenerateError, "is not determined at all", calibrate, bare)
-    step = "Where the arm cannot tilt, measure that offset for [prior."
+    step = "This arm cannot tilt: measure that offset for [prior."
     assert asked.next_step.startswith(step)
 
 

@@ -142,8 +142,12 @@ class Turning:
         )
 
 
-def chain_words(problem: Problem, mount: Mount) -> CellWords:
-    """Wording of messages about one camera and one robot, whose unknowns begin with the camera."""
+def chain_words(problem: Problem, mount: Mount, *, can_tilt: bool | None = None) -> CellWords:
+    """Wording of messages about one camera and one robot, whose unknowns begin with the camera.
+
+    More views are advised, a measured offset beside them where the arm is not known, and that alone
+    where it is known to tilt about one axis at most.
+    """
     camera, *targets = problem.unknown
     sensor = "instrument" if mount == "instrument" else "camera"
     parent = "the base" if mount == "eye-in-hand" else "the tool"
@@ -163,16 +167,21 @@ def chain_words(problem: Problem, mount: Mount) -> CellWords:
             return f"Add views of {names[frame][0][4:]}, or take it out of the session."
         measured = ""
         carried, placed = edge_names(mount)
-        if turning is not None and turning.is_still and "offset" in open_part:
+        if turning is None or turning.is_enough or can_tilt:
+            return _advice(mount)
+        if turning.is_still and "offset" in open_part:
             measured = _of_straight(placed.replace("target", targets[0]), flange)
-        elif turning is not None and "offset along" in open_part:
+        elif "offset along" in open_part:
             # A caliper reaches what is on the flange, and no instrument's origin.
             name = (carried, placed)[mount == "instrument"]
             keys = [f"{axis}_m" for axis in "xyz" if open_part.endswith(f"'s {axis}")]
             keys *= mount != "instrument"
-            measured = f"Where the arm cannot tilt, measure that offset for [prior.{name}]"
-            measured += f" ({keys[0]}, and its sigma_m). " if keys else ". "
-        return f"{measured}{_advice(mount)}"
+            measured = f"measure that offset for [prior.{name}]"
+            measured += f" ({keys[0]}, and its sigma_m)" if keys else ""
+            if can_tilt is False:
+                return f"This arm cannot tilt: {measured}."
+            measured = f"where the arm cannot tilt, {measured}"
+        return f"{_advice(mount)[:-1]}; {measured}." if measured else _advice(mount)
 
     undetermined = _POINTS_OPEN if mount == "instrument" else _LENS_OPEN
     return CellWords(title(mount), names, motion, advice, undetermined)
@@ -185,12 +194,12 @@ def _of_straight(placed: str, flange: FloatArray) -> str:
     if not directions:
         return ""
     words = (
-        "Where the machine cannot turn (a gantry, a rail), measure where the target's origin is, "
+        "where the machine cannot turn (a gantry, a rail), measure where the target's origin is, "
         f"as by touching it, and state x_m, y_m, z_m and their sigma_m in [prior.{placed}]"
     )
     if directions == 1:
         words += ", and move along a second direction: one leaves the turn about it open"
-    return f"{words}. "
+    return words
 
 
 def title(mount: Mount) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline.explaining import more_views
-from visioncal.calibration.pipeline.judging import words_of
+from visioncal.calibration.pipeline.judging import poor_motion, words_of
 from visioncal.calibration.pipeline.run_state import RunState, initial_state
 from visioncal.calibration.pipeline.solving import initial_inliers
 from visioncal.calibration.pipeline.starting import find_start
@@ -24,7 +24,7 @@ from visioncal.calibration.suspects.misread_poses import misreadings, turned_boa
 from visioncal.calibration.suspects.outliers import farthest_by_arms
 from visioncal.calibration.suspects.rounded_poses import rounded
 from visioncal.core.arguments import typed
-from visioncal.core.errors import VisioncalError
+from visioncal.core.errors import DegenerateError, VisioncalError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
@@ -126,6 +126,9 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
         yield cause
     yield from read
     if error is not None and cause is None:
+        # Views that leave the lens open may leave the mount open, too: one remedy is for both.
+        if isinstance(error, DegenerateError) and (motion := poor_motion(run)) is not None:
+            yield motion
         yield _refused("refused", error)
     warnings = [
         warning
@@ -156,7 +159,7 @@ def _motion(run: RunState) -> Iterator[Finding]:
     try:
         start = find_start(read_cell(run), run)
         cell, problem = start.cell, start.problem
-        noise, words = starting_noise(problem), words_of(cell, problem)
+        noise, words = starting_noise(problem), words_of(cell, problem, can_tilt=run.can_tilt)
         px = {frame: look.pixel_px for frame, look in run.cameras.items() if look.pixel_px}
         check_determined(problem, start.state, noise, words, px)
         if cell.mount is None:

@@ -275,16 +275,16 @@ def check_answer(run: RunState) -> None:
         return
     fit = run.cell_fit.fit
     is_estimated = bool(fit.sigmas_px) and any(scene.estimated for scene in run.scenes.values())
-    words = words_of(run.cell_fit.cell, fit.problem)
+    words = words_of(run.cell_fit.cell, fit.problem, can_tilt=run.can_tilt)
     check_determined(
         *(fit.problem, fit.state, fit.noise, words, fit.sigmas_px), with_first_effect=is_estimated
     )
 
 
-def words_of(cell: Cell, part: Problem) -> CellWords:
+def words_of(cell: Cell, part: Problem, *, can_tilt: bool | None = None) -> CellWords:
     """The fault of a motion that leaves a frame undetermined, and its remedy."""
     if cell.mount is not None:
-        return chain_words(part, cell.mount)
+        return chain_words(part, cell.mount, can_tilt=can_tilt)
 
     def advice(frame: str, _: str) -> str:
         frame = frame.partition("@")[0]

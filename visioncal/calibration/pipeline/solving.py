@@ -86,7 +86,7 @@ def solve(
         # Along an undetermined direction the fit of lens and frames diverges.
         if start.cell.mount is not None and not observed.misread:
             noise = starting_noise(start.problem)
-            words = chain_words(start.problem, start.cell.mount)
+            words = chain_words(start.problem, start.cell.mount, can_tilt=observed.can_tilt)
             check_determined(start.problem, start.state, noise, words, only_open=True)
         raise
     return cell_fit if solver == "joint" else _by_closed_form(cell_fit, solver)

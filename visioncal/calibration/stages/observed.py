@@ -137,6 +137,11 @@ class Observed:
         return None if matched is None else matched.robot
 
     @property
+    def can_tilt(self) -> bool | None:
+        """Whether the only robot's flange rotates about several axes; None without a model."""
+        return None if self.robot is None else self.robot.can_tilt
+
+    @property
     def pixel_px(self) -> float | None:
         """Noise of a coordinate of the only camera's corners [px]."""
         return next((camera.pixel_px for camera in self.cameras.values()), None)
