@@ -392,6 +392,23 @@ def test_files_and_columns_that_are_missing_are_named_at_once(tmp_path):
         "a column point", "x_mm, y_mm, z_mm"
     )
     visioncal("plan", "ur5e").refused("--target, --camera, --cam, --board", "plan --example")
+    visioncal("plan").refused("SOURCE is missing", "visioncal plan --example prints one")
+    visioncal("history", out, "--add", out).refused("is a folder", "and --add the folder")
+    begun = visioncal("history", "--add", out)
+    begun.refused(f"visioncal history visioncal-history.db --add {out}")
+
+
+def test_what_is_no_session_yet_is_told_how_to_become_one(rendered, tmp_path):
+    pictures, table = tmp_path / "pictures", tmp_path / "log.csv"
+    shutil.copytree(rendered / "images", pictures)
+    table.write_text("X,Y,Z,W,P,R\n1,2,3,4,5,6\n")
+    named = f"{tmp_path}/log-session --images PICTURES --target"
+    visioncal("calibrate", table).refused(
+        "must be the folder of a session", f"convert {table} {named}"
+    )
+    visioncal("doctor", pictures).refused(f"convert TABLE {pictures}-session --images {pictures}")
+    shutil.copy(table, pictures)
+    visioncal("doctor", pictures).refused(f"convert {pictures} {pictures}-session --target")
 
 
 RECORDS = """

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import shlex
+import shutil
 import tomllib
 from dataclasses import replace
 
@@ -150,6 +151,15 @@ def test_names_of_columns_say_whose_poses_they_are_once_their_turns_are_found(ce
         # Rx, Ry, Rz are also a Techman's, and a program's.
         assert ("Robots that write so: fanuc, yaskawa" in done.err) == (form is None)
         assert (session.robots[""].form, session.name) == (form, folder.name)
+
+
+def test_a_table_by_hand_in_a_maker_s_columns_keeps_the_maker(cell, tmp_path):
+    cell.save(tmp_path / "cell")
+    source = table_of(cell, "fanuc", tmp_path / "t.csv")
+    shutil.copy(source, tmp_path / "cell/views.csv")
+    visioncal("calibrate", tmp_path / "cell").refused("poses are in X,Y,Z,W,P,R", "--guess --yes")
+    visioncal("convert", tmp_path / "cell", tmp_path / "read", "--guess", "--yes").good()
+    assert Session.load(tmp_path / "read").robots[""].form == "fanuc"
 
 
 def test_views_about_one_axis_are_asked_for_tilts_before_a_form(tmp_path):
@@ -422,4 +432,4 @@ def test_a_pixel_is_placed_from_a_pose_as_the_pendant_shows_it(work, of_maker, m
     ]
     # Half a metre from the camera, seen at up to 45 degrees.
     assert np.abs(np.subtract(*found)).max() < 5 * SHOWN
-    visioncal(*words, "--pose", "X 1 Y 2").refused("no pose that is known")
+    visioncal(*words, "--pose", "X 1 Y 2").refused("must be a pose in a known form")

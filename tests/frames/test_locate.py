@@ -606,6 +606,22 @@ def test_points_out_of_reach_of_a_calibrated_arm_are_refused(tmp_path):
     visioncal(*words, 1000).refused("is out of reach within the joints' limits")
 
 
+def test_one_image_of_a_camera_that_stands_still_shows_where_to_touch(tmp_path):
+    options = CellOptions(mount="eye-to-hand", views=12, seed=5)
+    cell_session(simulate(options), "fit", seen="corners").save(tmp_path / "fit")
+    visioncal("calibrate", tmp_path / "fit", "-o", tmp_path / "out", "--no-report").good()
+    look = simulate(replace(options, views=1, recording=1))
+    cell_session(look, "look").save(tmp_path / "look")
+    image = next((tmp_path / "look/images").iterdir())
+    words = ("touch-test", "-c", tmp_path / "out", *GAUGE, "--json")
+    points = json.loads(visioncal(*words, image).good().out)["points"]
+    board = look.transforms["base_from_cam"] @ look.cam_from_target[0]
+    places_m = corner_positions(options.target) @ board[:3, :3].T + board[:3, 3]
+    for point in points:
+        away_m = np.subtract(point["base_m"], places_m[int(point["name"].split()[1])])
+        assert 1e3 * np.linalg.norm(away_m) < point["radius95_mm"]
+
+
 def test_what_touches_is_the_only_tool_or_the_flange(proved):
     folder, look, _ = proved
     known = Calibration.load(folder / "out")

@@ -147,7 +147,7 @@ def test_files_that_cannot_be_used(tmp_path, monkeypatch):
     with closing(sqlite3.connect(foreign)) as other:
         other.execute("CREATE TABLE music (title TEXT)")
         other.commit()
-    refused(text, "no SQLite file")
+    refused(text, "must be a history")
     refused(foreign, "of another program")
     refused(tmp_path, "is a folder")
     refused(tmp_path / "no" / "history.db", "its folder does not exist")
@@ -282,7 +282,7 @@ def test_a_failing_entry_is_a_warning(site, tmp_path):
         check=True,
     )
     (site / "line" / SITE_FILE).unlink()
-    assert "no SQLite file" in done.stderr
+    assert "must be a history" in done.stderr
     assert json.loads(done.stdout)["schema"] == 2
 
 

@@ -436,7 +436,7 @@ def test_what_is_no_session_is_refused(tmp_path):
     raised(DataError, "nowhere.session.toml does not exist", Session.load, tmp_path / "nowhere")
     for name in ("notes.txt", "calibration.json", "recording.rrd"):
         (tmp_path / name).write_text("{}", encoding="utf-8")
-    raised(DataError, "notes.txt.session.toml does not exist", Session.load, tmp_path / "notes.txt")
+    raised(DataError, "notes.txt must be the folder", Session.load, tmp_path / "notes.txt")
     (pictures := tmp_path / "two words").mkdir()
     caught = raised(DataError, "two words.session.toml does not exist", Session.load, pictures)
     words = shlex.split(caught.next_step.partition("Run: visioncal ")[2])

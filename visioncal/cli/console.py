@@ -134,7 +134,8 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         }
         print_json({"error": document})
     say(error.message, "error: ", "bold red")
-    other_culprits = [culprit for culprit in error.culprits if culprit not in error.message]
+    said = f"{error.message} {next_step}"
+    other_culprits = [culprit for culprit in error.culprits if culprit not in said]
     # Short ones share a line.
     if all(len(name) < 12 for name in other_culprits):
         other_culprits = [", ".join(other_culprits)] if other_culprits else []

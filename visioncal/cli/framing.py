@@ -120,7 +120,9 @@ def _keep_and_report(place: _Place, frame: Frame, source: Path, options: FrameOp
     rotation = edge.rotation_words(form)
     rotation += f", sigma {figure(edge.sigma_deg)} deg" if frame.oriented else ""
     answer(f"{place.name}: {edge.place_words(3)}, sigma {figure(edge.sigma_mm)} mm; {rotation}")
-    fit = f"rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per axis"
+    noise = f"noise {figure(frame.noise_mm)} mm per axis"
+    is_explained = frame.noise_mm < 0.01 * frame.rms_mm
+    fit = f"rms {figure(frame.rms_mm)} mm, {'as the arm repeats' if is_explained else noise}"
     answer(f"{frame.method}: {fit}")
     before = None if place.result is None else place.result.frames.get(place.name)
     if written.files and before is not None:

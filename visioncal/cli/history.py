@@ -73,11 +73,12 @@ def history_command(options: HistoryOptions) -> None:
     file = options.file or options.history
     history = History(file) if file else History.of_site(Path.cwd())
     if history is None:
+        results = shlex.join(map(str, options.add or ("OUT",)))
         raise DataError(
             f"there is no {SITE_FILE} here or above.",
             culprits=["FILE"],
-            next_step="Name a history's file, or begin one where all sessions of the site are "
-            f"below: visioncal calibrate SESSION -o OUT --history {SITE_FILE}",
+            next_step="Name the FILE of a history, or begin one where all sessions of the site are "
+            f"below, with a result: visioncal history {SITE_FILE} --add {results}",
         )
     if options.add:
         found = [entry for out in options.add for entry in _stored(history, out, options.cell)]

@@ -50,10 +50,12 @@ class PlainCommand(TyperCommand):
                     names = [each.opts[-1] for each in missing]
                     names = [name if name.startswith("-") else name.upper() for name in names]
                     message = f"{listed(names)} {'is' if len(names) == 1 else 'are'} missing."
+            shows = any("--example" in each.opts for each in self.params)
             raise DataError(
                 message,
                 culprits=[*filter(None, names)],
-                next_step=f"{ctx.command_path} --help lists what it takes.",
+                next_step=f"{ctx.command_path} --help lists what it takes"
+                + (f"; {ctx.command_path} --example prints one that works." if shows else "."),
             ) from None
         paths = (param for param in self.params if isinstance(ctx.params.get(param.name), Path))
         path_options = {opt for path in paths for opt in path.opts}

@@ -336,7 +336,7 @@ def _by_image(
     return [(name, {"image": name}, located)]
 
 
-def _known_targets(result: Calibration) -> Mapping[str, Mapping[str, Any]]:
+def known_targets(result: Calibration) -> Mapping[str, Mapping[str, Any]]:
     """Documents of the targets that a result was made with, by name."""
     if result.cell is not None:
         return result.cell.targets
@@ -345,7 +345,7 @@ def _known_targets(result: Calibration) -> Mapping[str, Mapping[str, Any]]:
 
 def _only_target(result: Calibration, image: str) -> str | None:
     """The target that is looked for in an image without a word of it: the only one known."""
-    known = _known_targets(result)
+    known = known_targets(result)
     if len(known) != 1:
         return None
     say(f"{image}: looked for the board of the calibration; --target names another")
@@ -353,7 +353,7 @@ def _only_target(result: Calibration, image: str) -> str | None:
 
 
 def _target(words: str, result: Calibration) -> Target:
-    known = _known_targets(result)
+    known = known_targets(result)
     if words in known:
         return target_from_document(known[words], words or "target")
     # A pixel waits for no foreign format.

@@ -17,7 +17,7 @@ WORDS = {
     "intrinsics": "estimate the lens",
     "pnp": "locate the board in each view",
     "clock": "compare the clocks",
-    "joints": "check the joint angles",
+    "joints": "check poses and joint angles",
     "solve": "solve for all frames",
     "lenses": "fit lenses, boards and frames, with outliers left out",
     "arms": "fit the arms, and look again for outliers and moves",

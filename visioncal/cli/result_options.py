@@ -435,7 +435,8 @@ class FixtureOptions(FrameOptions):
 class TouchTestOptions(ActOptions):
     """Prove a calibration: touch what the camera locates, and enter the gaps.
 
-    The session has one image or more of a board as it lies now. Prints where to send the robot,
+    The session has one image or more of a board as it lies now; of a camera that stands still, one
+    image is enough. Prints where to send the robot,
     hovering first, corrected where the arm is calibrated. With all gaps, they are compared with
     what was predicted, and kept in the result and its report. Exit status 3: they are larger, or
     nothing was done as the calibration or the tool is bad.

@@ -18,13 +18,16 @@ from visioncal.cli.console import (
     warn,
 )
 from visioncal.cli.history import enter
+from visioncal.cli.locate import known_targets
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.result_options import TouchTestOptions
 from visioncal.core.conventions import POSE_FORMS, PoseForm, controller_form
 from visioncal.core.documents.pendants import pendant_words
 from visioncal.core.errors import DataError
+from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes
 from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.touch_test import (
     TouchPoint,
     TouchTargets,
@@ -38,11 +41,11 @@ from visioncal.results import Calibration, to_document
 from visioncal.results.compensation.correction import correct
 from visioncal.results.history import entries_of
 from visioncal.session import Session
+from visioncal.session.images import IMAGE_ENDINGS, MemoryImages
 
 
 def touch_test_command(options: TouchTestOptions) -> None:
     """Runs `visioncal touch-test`."""
-    loaded = Session.load(options.session)
     calibration = options.calibration
     result = load_result(calibration)
     if result.cell is not None:
@@ -53,6 +56,7 @@ def touch_test_command(options: TouchTestOptions) -> None:
             f"-c {shlex.quote(str(calibration))} --camera NAME --robot NAME say where the board "
             "is, touch it there, and compare.",
         )
+    loaded = _looked(options.session, result)
     touching = _touching(result, calibration, options.tool)
     misplaced_mm = None if options.tool == "none" else options.clearance_mm
     step = "Leave it out." if options.tool else "Say --tool none, too, or leave it out."
@@ -103,6 +107,30 @@ def touch_test_command(options: TouchTestOptions) -> None:
     else:
         answer(touch_test_finding(test).reason)
     report_written(written, quiet=options.as_json, status=0 if test.passed else EXIT_BAD)
+
+
+def _looked(path: Path, result: Calibration) -> Session:
+    """The session that shows the board; also of one image of a camera that stands still."""
+    is_image = path.is_file() and path.suffix.lower() in IMAGE_ENDINGS
+    if not is_image or result.mount != "eye-to-hand":
+        return Session.load(path)
+    data, known = read_bytes(path, MOST_IMAGE_BYTES), known_targets(result)
+    if len(known) != 1:
+        raise DataError(
+            f"{path} is one image, and the calibration does not know one board alone.",
+            culprits=[str(path)],
+            next_step="Name a session of this image, whose session.toml names the board.",
+        )
+    name, resolution = f"look{path.suffix}", list(CalibratedCamera.of(result).camera.resolution)
+    camera = {"resolution": resolution}
+    document = {"schema": 1, "name": path.stem, "mount": result.mount, "camera": camera}
+    return Session.assemble(
+        {**document, "target": "target.toml"},
+        ("view", "image"),
+        [("0", name)],
+        MemoryImages({name: data}),
+        target_document=next(iter(known.values())),
+    )
 
 
 def _touching(calibration: Calibration, path: Path, tool: str | None) -> Tool | None:

@@ -209,8 +209,11 @@ class PointsFit:
             f"; {direction.words} to {figure(np.rad2deg(direction.sigma))} deg"
             for direction in self.worst[1:]
         )
+        rms_m = float(np.sqrt(np.mean(off_m[self.agrees] ** 2)))
+        # Where the arm's own errors explain all, no noise of touches is left.
+        agreed_mm = 1e3 * max(self.noise_m, rms_m / np.sqrt(3.0))
         praise = (
-            f"{int(self.agrees.sum())} touches agree to {figure(1e3 * self.noise_m)} mm per axis, "
+            f"{int(self.agrees.sum())} touches agree to {figure(agreed_mm)} mm per axis, "
             f"and {offset.words}, the worst direction, is known to "
             f"{figure(1e3 * offset.sigma)} mm{rotation}."
         )
@@ -222,7 +225,7 @@ class PointsFit:
             method,
             self.source,
             datetime.now(UTC).isoformat(timespec="seconds"),
-            1e3 * float(np.sqrt(np.mean(off_m[self.agrees] ** 2))),
+            1e3 * rms_m,
             1e3 * self.noise_m,
             tuple(
                 Observation(label, used=used, reason=reason, kind=kind, residual_mm=off)

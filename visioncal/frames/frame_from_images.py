@@ -103,13 +103,14 @@ def seen_frame(
     if seen.scatter >= 10.0 and (has_poses or not needs_robot(eye, elsewhere)):
         alternative = place_target(eye, sights, looks, elsewhere)
         if alternative.rms_mm < 0.1 * seen.rms_mm:
+            lying = " A touch test wants an image of a board that lies where the robot works."
             raise DataError(
                 f"session {shown.source!r}: target {shown.target.name} moves by "
                 f"{figure(seen.rms_mm)} mm against the {parent}, and stands still to "
                 f"{figure(alternative.rms_mm)} mm against the {elsewhere}: it is on a {other}, not "
                 f"on a {kind}.",
                 culprits=[shown.source],
-                next_step=f"Say visioncal {_COMMANDS[other]} for it.",
+                next_step=f"Say visioncal {_COMMANDS[other]} for it.{lying * (other == 'tool')}",
             )
     own, common = (float(np.trace(array[3:, 3:])) for array in (seen.independent, seen.common))
     advice = (

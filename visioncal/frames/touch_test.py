@@ -176,7 +176,7 @@ def touch_test_finding(test: TouchTest) -> Finding:
     gaps = [point.gap_mm for point in test.points]
     radius = max(point.radius95_mm for point in test.points)
     words = (
-        f"Touched with {test.tool}, {len(gaps)} points have gaps of {figure(min(gaps))} to "
+        f"Touched with {test.named_tool}, {len(gaps)} points have gaps of {figure(min(gaps))} to "
         f"{figure(max(gaps))} mm; 95 % were predicted within {figure(radius)} mm."
     )
     if test.passed:

@@ -8,6 +8,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.refine import free_parameters_of_camera
+from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
@@ -21,6 +22,7 @@ from visioncal.estimation.solve import Solution
 from visioncal.estimation.unknowns import EDGE
 from visioncal.planning.cell import Box, Limits, PlanCell
 from visioncal.planning.information import RecordedStops
+from visioncal.robot.files import robot_names
 from visioncal.session import Session, frame_name
 from visioncal.vision.targets import extent_m, first_corners
 
@@ -46,6 +48,8 @@ def calibrate_partially(
     Returns:
         The run, and why it ended early; empty where it did not.
     """
+    if not session.robot_documents:
+        raise _missing_model_error(session)
     run = RunState(session, progress, level="hand-eye")
     for index, stage in enumerate(STAGES):
         if progress is not None:
@@ -206,7 +210,7 @@ def _posterior_edges(fit: Fit, mount: Mount) -> tuple[FloatArray, FloatArray]:
 def _missing_input_error(run: RunState) -> DataError:
     session, missing = run.session, []
     if run.robot is None:
-        missing.append("a model of its robot, which says where the arm reaches")
+        return _missing_model_error(session)
     if not session.boards:
         missing.append("a board (target)")
     if run.pixel_px is None or not run.scenes:
@@ -214,10 +218,19 @@ def _missing_input_error(run: RunState) -> DataError:
     return DataError(
         f"session {session.name!r}: stops cannot be added to it without {' and '.join(missing)}.",
         culprits=[f"session {session.name!r}"],
+    )
+
+
+def _missing_model_error(session: Session) -> DataError:
+    forms = {table.form for table in session.robots.values()}
+    own = [name for name in robot_names() if (form := controller_form(name)) and form.name in forms]
+    return DataError(
+        f"session {session.name!r}: stops cannot be added to it without a model of its robot, "
+        "which says where the arm reaches.",
+        culprits=[f"session {session.name!r}"],
         next_step="Name the arm in session.toml ([robot] model), or by --robot; that of a whole "
-        "cell in its own table, as model in [robots.a]."
-        if run.robot is None
-        else "",
+        "cell in its own table, as model in [robots.a]. Built in are "
+        f"{', '.join(own or robot_names())}; any other by its .urdf, or a DH table (.toml).",
     )
 
 

@@ -174,8 +174,8 @@ def entries_of(calibration: Calibration) -> Iterator[Entry]:
             at=_utc(test.created),
             kind="touched",
             status="good" if test.passed else "bad",
-            reason=f"Touched with {test.tool}: the largest gap is {max(gaps):.2f} mm, {outcome} "
-            "predicted.",
+            reason=f"Touched with {test.named_tool}: the largest gap is {max(gaps):.2f} mm, "
+            f"{outcome} predicted.",
             session=own.session,
             against=own.sha256,
         )
@@ -312,7 +312,7 @@ class History:
             code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF
             why, do = _FAULTS.get(code, (f"cannot be used: {error}", "Take an earlier copy of it."))
             if self.path.is_dir():
-                why, do = "is a folder", f"Name a file, such as {self.path / SITE_FILE}."
+                why, do = "is a folder", f"Name a file, such as {SITE_FILE}, and --add the folder."
             elif not self.path.parent.is_dir():
                 why, do = "cannot be created: its folder does not exist", "Create the folder first."
             raise self._refusal(why, do) from error

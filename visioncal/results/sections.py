@@ -266,6 +266,11 @@ class TouchTest(Section):
     passed: bool  # Whether the gaps are as small as predicted.
     points: tuple[TouchedPoint, ...]  # The touched points.
 
+    @property
+    def named_tool(self) -> str:
+        """The tool in a sentence."""
+        return "the flange" if self.tool == "flange" else self.tool
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationSections(ArmSections):

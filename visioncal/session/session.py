@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -35,7 +36,7 @@ from visioncal.session.document import (
     read_declaration,
 )
 from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
-from visioncal.session.images import FolderImages, ImageStore, MemoryImages
+from visioncal.session.images import IMAGE_ENDINGS, FolderImages, ImageStore, MemoryImages
 from visioncal.session.kinds import (
     COLUMN,
     check_images_can_be_used,
@@ -57,6 +58,27 @@ from visioncal.session.selecting import Choice, keep_views, select
 from visioncal.session.streams import Stream, check_stream, gap_warnings, read_streams
 from visioncal.session.table import View, check_times, parse_csv, read_views
 from visioncal.vision.boards.picture import with_weights
+
+
+def _conversion_of(path: Path) -> str:
+    """Advice for pictures and poses that are no session yet: a folder of both, or either alone."""
+    named = path.parent if path.suffix.lower() in IMAGE_ENDINGS else path
+    named = named if named.name.strip(".") else named.resolve()
+    made = shlex.quote(f"{named.with_suffix('') if named.is_file() else named}-session")
+    what, source, images = "A folder's pictures and poses", shlex.quote(str(named)), ""
+    endings = {file.suffix.lower() for file in islice(named.rglob("*.*"), 999) if file.is_file()}
+    if named.is_file():
+        what, images = "A table of poses and a folder of pictures", " --images PICTURES"
+    elif endings and endings.issubset(IMAGE_ENDINGS):
+        what, images = "A folder of pictures and a table of their poses", f" --images {source}"
+        source = "TABLE"
+    return (
+        f"{what} become a session by the name of their board (instead of charuco_9x6_30mm) and "
+        "the camera's mount (eye-to-hand where it is fixed). Run: visioncal convert "
+        f"{source} {made}{images} --target charuco_9x6_30mm --mount eye-in-hand && "
+        f"visioncal doctor {made}"
+    )
+
 
 _NO_VIEWS = TextTable("", ("view",), (), ())
 
@@ -131,19 +153,15 @@ class Session:
                 beside = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
                 found += [beside[name] for name in get_close_matches(path.name, beside, 1)]
             near = next((file.parent for file in found if file.is_file()), None)
-            if near is None and not (path.is_dir() and error.message.endswith("does not exist.")):
+            if near is None and not (path.exists() and error.message.endswith("does not exist.")):
                 raise
-            named = path if path.name.strip(".") else path.resolve()
-            source, made = (shlex.quote(f"{named}{end}") for end in ("", "-session"))
             step = (
                 f"Name the session's folder: {shlex.quote(str(near))}"
                 if near is not None
-                else "A folder of pictures and poses becomes a session by the name of their board "
-                "(instead of charuco_9x6_30mm) and the camera's mount (eye-to-hand where it is "
-                f"fixed). Run: visioncal convert {source} {made} --target charuco_9x6_30mm "
-                f"--mount eye-in-hand && visioncal doctor {made}"
+                else _conversion_of(path)
             )
-            raise DataError(error.message, culprits=error.culprits, next_step=step) from error
+            message = error.message if path.is_dir() else f"{path} must be the folder of a session."
+            raise DataError(message, culprits=error.culprits, next_step=step) from error
         document = parse_toml(text, "session.toml")
         streams = read_streams(path)
         # Streams are enough for identifying an arm's dynamics.

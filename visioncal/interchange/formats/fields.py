@@ -369,7 +369,7 @@ class Match:
     rows: IntArray  # (n,) the other's row of each; -1 for none.
 
 
-HOW = ("equal names", "equal numbers", "their times", "their order")
+HOW = ("equal names", "their numbers", "their times", "their order")
 
 
 def matched(first: Keys, second: Keys) -> Match | None:

@@ -38,7 +38,7 @@ from visioncal.interchange.formats.assemble import (
 from visioncal.interchange.formats.fields import fields_of_records
 from visioncal.interchange.formats.foreign import ForeignRecording, rows_of
 from visioncal.interchange.formats.mending import noting
-from visioncal.interchange.formats.poses import pose_names
+from visioncal.interchange.formats.poses import makers_of, pose_names
 from visioncal.session import Session, Stream
 from visioncal.session.columns import (
     MEASURED_CAM_POSE,
@@ -71,6 +71,7 @@ class DoubtfulSession:
     # The measured poses of the target as they are written; None for those of the session.
     camera: PoseNumbers | None = None
     knows_mount: bool = True  # Whether the mount is stated; else both are tried.
+    makers: tuple[str, ...] = ()  # Forms of poses that the names of their columns are of.
 
     @classmethod
     def of(cls, foreign: ForeignRecording) -> Self:
@@ -399,21 +400,22 @@ def load_for_rereading(path: Path) -> DoubtfulSession:
     A board too large for metres is read in millimetres; positions and rotations may be in columns
     or forms that sessions do not have. Raises DataError.
     """
-    plain, robot = _other_columns(path) or (None, None)
+    plain, robot, makers = _other_columns(path) or (None, None, ())
     file = path / "session.toml"
     name = str(read_toml(file, file.name).get("target")) if file.is_file() else ""
     stated = read_toml(path / name, name) if name.endswith(".toml") else {}
     sides = (stated.get(key) for key in ("square_m", "size_m"))
     side = next((side for side in sides if isinstance(side, int | float)), 0.0)
     if not LARGEST_M < side < 1e3 * LARGEST_M:
-        return DoubtfulSession(Session.load(path, table=plain), robot)
+        return DoubtfulSession(Session.load(path, table=plain), robot, makers=makers)
     session = Session.load(path, target_document=_scaled(stated, 1e-3), table=plain)
     note = f"{name} cannot be in metres: {side:g} is read as {side:g} mm."
-    return DoubtfulSession(replace(session, warnings=(note, *session.warnings)), robot)
+    session = replace(session, warnings=(note, *session.warnings))
+    return DoubtfulSession(session, robot, makers=makers)
 
 
-def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
-    """Reads positions and rotations of other columns or forms; None where there are none."""
+def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers, tuple[str, ...]] | None:
+    """Reads poses of other columns or forms, with the makers who name columns so; None if none."""
     if not (folder / "views.csv").is_file():
         return None
     table = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")
@@ -444,7 +446,7 @@ def _other_columns(folder: Path) -> tuple[TextTable, PoseNumbers] | None:
         pose = [*map(repr, position.tolist()), *_IDENTITY] if has_position else [""] * len(POSE)
         plain.append((*(row.get(name, "") for name in kept), *pose))
     robot = PoseNumbers(positions, rotations, Reading(form), places)
-    return replace(table, columns=(*kept, *POSE), rows=tuple(plain)), robot
+    return replace(table, columns=(*kept, *POSE), rows=tuple(plain)), robot, makers_of(names)
 
 
 def reread(
@@ -500,10 +502,7 @@ def reread(
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
         target = _rescaled(target, candidate)
         document["target"] = "target.toml"
-    sides = (reading.robot, candidate.recording.declared.robot)
-    if "robot" in document and len({(side.rotation, side.written) for side in sides}) > 1:
-        # Rotations of another form are not of the stated maker.
-        document["robot"] = {k: v for k, v in document["robot"].items() if k != "form"}
+    document |= _robot_table(doubtful, candidate)
     streams = {name: _reread_stream(stream, reading) for name, stream in session.streams.items()}
     reread = session.with_content(
         document=noting(session, document, changes),
@@ -515,6 +514,19 @@ def reread(
     mount = () if doubtful.knows_mount else (f"The mount is taken for {reading.mount}.",)
     notes = dict.fromkeys((*changes, *mount, *kept, *reread.warnings))
     return replace(reread, warnings=tuple(notes))
+
+
+def _robot_table(doubtful: DoubtfulSession, candidate: Candidate) -> dict[str, Any]:
+    """`[robot]` with the maker by the columns' names, without one whose rotations are others."""
+    stated = doubtful.session.document.get("robot")
+    table = stated or {}
+    found, declared = candidate.hypothesis.robot, candidate.recording.declared.robot
+    if (found.rotation, found.written) != (declared.rotation, declared.written):
+        table = {key: value for key, value in table.items() if key != "form"}
+    own = [name for name in doubtful.makers if POSE_FORMS[name].rotation == found.rotation]
+    if own:
+        table = {**table, "form": own[0]}
+    return {"robot": table} if own or stated is not None else {}
 
 
 def _reread_stream(stream: Stream, reading: Hypothesis) -> Stream:
