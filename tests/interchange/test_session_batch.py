@@ -1,7 +1,9 @@
 """Many sessions at once: what a worker gives, what its death costs, and what is kept."""
 
+import csv
 import html
 import os
+import re
 import signal
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,6 +20,7 @@ from visioncal.interchange.batch import run as batch_run
 from visioncal.interchange.batch.run import work
 from visioncal.interchange.outputs import RECORDING, REPORT
 from visioncal.results import Calibration, to_document
+from visioncal.results.compare import compare
 from visioncal.simulation import CellOptions, simulate, write_session
 
 BARE = (REPORT, RECORDING)
@@ -155,6 +158,22 @@ def test_the_command_says_what_became_of_the_sessions(fleet, tmp_path):
     assert (new / "week_1" / "report.html").exists()
     nothing = visioncal("batch", fleet / "empty", "-o", tmp_path / "nothing").refused()
     assert "session.toml does not exist" in nothing.out
+
+    # The same session agrees with its result to rounding; the cell of another seed is elsewhere.
+    words = ("batch", fleet / "robot_0", "-o", new, "--against", new / "week_0")
+    told = visioncal(*words).good().out
+    first, second = (re.search(rf"{name} +good +(.*)", told)[1] for name in ("week_0", "week_1"))
+    assert first.strip() == "nothing beyond noise"
+    assert second.startswith("flange_from_cam by ")
+    rows = [*csv.DictReader((new / "against.csv").read_text().splitlines())]
+    apart = compare(*(Calibration.load(new / name) for name in ("week_0", "week_1")))
+    found = [row for row in rows if row["session"] == "week_1"]
+    assert [row["transform"] for row in found] == [edge.name for edge in apart.edges]
+    for row, edge in zip(found, apart.edges, strict=True):
+        assert float(row["moved_mm"]) == pytest.approx(edge.moved_mm, rel=1e-5)
+        assert row["changed"] == ("yes" if edge.is_change else "no")
+    refused = visioncal("batch", fleet / "robot_0", "-o", new, "--against", tmp_path / "none")
+    refused.refused("does not exist")
 
 
 @contextmanager

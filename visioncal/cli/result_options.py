@@ -102,9 +102,11 @@ class BatchOptions(NeedOptions, ActOptions):
     Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
     them, the worst verdicts first. Existing results are kept: started again, an interrupted batch
     continues. Exit status 0: there are results, none of them bad; 3: one is bad; 2: there is none.
+    With --against each result is compared with that one: what changed beyond noise is printed, and
+    all differences with their sigmas are in against.csv.
     """
 
-    first: ClassVar = "out need_mm need_deg workers"
+    first: ClassVar = "out need_mm need_deg against workers"
     out: Path = out_folder(default=REQUIRED)
     sessions: list[str] | None = argument(
         "Sessions, recordings, their folders, or globs.", default=None
@@ -114,6 +116,7 @@ class BatchOptions(NeedOptions, ActOptions):
         "A Dask scheduler, as tcp://HOST:8786 (extra cluster).", metavar="ADDRESS"
     )
     level: str = option("As for calibrate.", default="auto", metavar="auto|hand-eye|offsets|...")
+    against: Path | None = option("A result that each is compared with.", metavar="OUT")
     no_report: bool = flag(f"Leave each {REPORT} out.")
     recordings: bool = flag("Also write each recording, with all images.")
 
