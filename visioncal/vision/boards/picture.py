@@ -38,8 +38,9 @@ _LONGEST_PX = 1600
 # Number of patches, features of an image and of the picture itself, whose clearest are finer than
 # an image shows, and features that agree where the picture is seen: twice those of a homography.
 _PATCHES, _FEATURES, _OWN_FEATURES, _FEWEST = 120, 2500, 20_000, 8
-# Long side of images that are searched, and pixels of a print that are registered.
-_SEARCHED_PX, _REGISTERED = 1000, 3e5
+# Long sides of the copies of images that are searched, the quicker one first, and pixels of a print
+# that are registered, within a factor of 2.25.
+_SEARCHED_PX, _REGISTERED = (500, 1000), 1.6e5
 # Correlation of a picture with itself, turned or shifted, from which on it looks the same, and the
 # least spread of its grey levels.
 _SAME, _PLAIN = 0.9, 4.0
@@ -143,12 +144,15 @@ class Picture(BoardKind):
         picture = _known(asked)
         if picture.unfit:
             return NotFound(f"the picture {picture.unfit}")
-        start = picture.matched(image, asked.weights_in)
-        found = start if isinstance(start, str) else self._registered(image, target, start)
-        if isinstance(found, DetectedCorners):
-            return found
+        reason = ""
+        for longest_px in _SEARCHED_PX:
+            start = picture.matched(image, asked.weights_in, longest_px)
+            found = start if isinstance(start, str) else self._registered(image, target, start)
+            if isinstance(found, DetectedCorners):
+                return found
+            reason = found
         turned = picture.matched(np.ascontiguousarray(image[:, ::-1]))
-        return NotFound(found if isinstance(turned, str) else "the picture is seen mirrored")
+        return NotFound(reason if isinstance(turned, str) else "the picture is seen mirrored")
 
     def _registered(
         self, image: Image, target: Target, start: tuple[FloatArray, FloatArray, FloatArray]
@@ -223,10 +227,13 @@ class _Known:
     unfit: str  # Why no pose is known by it; empty where it is.
 
     def matched(
-        self, image: Image, weights_in: Path | None = None
+        self, image: Image, weights_in: Path | None = None, longest_px: int = _SEARCHED_PX[-1]
     ) -> tuple[FloatArray, FloatArray, FloatArray] | str:
-        """(3, 3) from the print [m] to an image, (n, 3) features and (n, 2) pixels; or why not."""
-        seen = features_of(image)
+        """(3, 3) from the print [m] to an image, (n, 3) features and (n, 2) pixels; or why not.
+
+        The image is searched in a copy of `longest_px`; by kornia, too, in the largest alone.
+        """
+        seen = features_of(image, longest_px=longest_px)
         if len(seen.px) < _FEWEST:
             return "the picture is not seen: the image is plain"
         # From the image's: a picture has more, and several of them would share one of few.
@@ -234,10 +241,11 @@ class _Known:
         good = [
             (one.queryIdx, one.trainIdx) for one, two in pairs if one.distance < 0.8 * two.distance
         ]
-        found = self._agreeing(seen, np.array(good).reshape(-1, 2))
-        if found is None and is_installed():
+        tolerance_px = 3.0 * max(max(seen.shape) / longest_px, 1.0)
+        found = self._agreeing(seen, np.array(good).reshape(-1, 2), tolerance_px)
+        if found is None and longest_px == _SEARCHED_PX[-1] and is_installed():
             hard = hard_matches(seen, self.features, weights_in)
-            tries = (self._agreeing(seen, match) for match in hard)
+            tries = (self._agreeing(seen, match, tolerance_px) for match in hard)
             found = next((one for one in tries if one is not None), None)
         lack = f"the picture is not seen: {len(good)} features are like its own, and do not agree"
         if found is None and len(good) >= _FEWEST and not is_installed():
@@ -245,14 +253,13 @@ class _Known:
         return lack if found is None else found
 
     def _agreeing(
-        self, seen: Features, pairs: IntArray
+        self, seen: Features, pairs: IntArray, tolerance_px: float
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """The answer of `matched`, by (m, 2) indices of features; None where they do not agree."""
         if len(pairs) < _FEWEST:
             return None
         places = self.print_.texel_m * (self.features.px[pairs[:, 1]] + 0.5)
-        px, longest = seen.px[pairs[:, 0]], max(seen.shape)
-        tolerance_px = 3.0 * max(longest / _SEARCHED_PX, 1.0)
+        px = seen.px[pairs[:, 0]]
         flat, inside = cv2.findHomography(places, px, cv2.USAC_MAGSAC, tolerance_px)
         if flat is None or inside.sum() < max(_FEWEST, 0.15 * len(pairs)):
             return None
@@ -264,13 +271,13 @@ class _Known:
             return None
         off = cv2.perspectiveTransform(places[None], flat)[0] - px
         # So far a lens bends what is straight.
-        near = np.linalg.norm(off, axis=1) < 0.03 * longest
+        near = np.linalg.norm(off, axis=1) < 0.03 * max(seen.shape)
         return np.asarray(flat, float), np.pad(places, ((0, 0), (0, 1)))[near], px[near]
 
 
-def features_of(grey: Image, most: int = _FEATURES) -> Features:
-    """The clearest features of a (h, w) image, found in a reduced copy where it is large."""
-    shrink = min(1.0, _SEARCHED_PX / max(grey.shape))
+def features_of(grey: Image, most: int = _FEATURES, longest_px: int = _SEARCHED_PX[-1]) -> Features:
+    """The clearest features of a (h, w) image, found in a copy that is no longer than stated."""
+    shrink = min(1.0, longest_px / max(grey.shape))
     points, described = cv2.SIFT.create(nfeatures=most).detectAndCompute(
         _shrunk(grey, shrink), None
     )

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
+from scipy.special import ive
 
 from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Image
@@ -32,8 +33,8 @@ _EDGE = cv2.BORDER_REPLICATE
 # Side of the blocks within which derivatives by pose and lens are those of the middle [px].
 BLOCK_PX = 8
 # Gaussian of print and of reduced images before they are sampled [px]: the narrowest at which
-# sampling at each pixel aliases by less than noise does; and the narrowest blur after it, below
-# which a sampled kernel no longer changes with its sigma, so that no step would leave it.
+# sampling at each pixel aliases by less than noise does; and the narrowest of an image, as its
+# pixels alone are boxes of 0.29.
 _SAMPLED_PX, _SHARPEST_PX = 0.5, 0.32
 
 
@@ -96,7 +97,7 @@ class Seen:
     """How a print is seen: what an image determines."""
 
     cam_from_target: FloatArray  # (4, 4) in the middle of the exposure.
-    gauss_px: float = 1.0  # Sigma of the isotropic blur beyond that of sampling [px].
+    gauss_px: float = 1.0  # Sigma of the isotropic blur, that of the sensor's pixels included [px].
     disc_px: float = 0.0  # Radius of the disc of defocus [px]; 0 for none.
     # (6,) translation and rotation during the exposure, in the camera's frame [m, rad].
     twist: FloatArray = field(default_factory=lambda: np.zeros(6))
@@ -186,7 +187,7 @@ class Level:
         ]
         if factor > 1:
             # The box of the reduction alone would alias.
-            layers[0] = _gauss(layers[0], factor * float(np.sqrt(_SAMPLED_PX**2 - 1 / 12)))
+            layers[0] = _gauss(layers[0], factor**2 * (_SAMPLED_PX**2 - 1 / 12))
             layers = [_pixels(cv2.resize(a, (w, h), interpolation=cv2.INTER_AREA)) for a in layers]
         origin = low * factor + (factor - 1) / 2
         # Cubic between nodes, as lenses are smooth.
@@ -286,16 +287,22 @@ class Level:
             if moving:
                 layers[3:] += np.float32(at) * np.stack(parts[1:])
             place = on if 2 * k + 1 == count else place
-        layers, sigma = layers / np.float32(count), seen.gauss_px / self.factor
+        # The print's own Gaussian is a part of the blur where the image was not reduced by one.
+        own_px = _SAMPLED_PX * (self.factor == 1)
+        layers, variance = (
+            layers / np.float32(count),
+            (seen.gauss_px / self.factor) ** 2 - own_px**2,
+        )
         by_disc = []
         if seen.disc_px > 0.0:
             radius, sharp = seen.disc_px / self.factor, layers[0]
             layers = np.stack([_through(layer, _disc(radius)) for layer in layers])
             wider = _through(sharp, _disc(1.02 * radius)) - layers[0]
-            by_disc = [_gauss(wider, sigma) / np.float32(0.02 * seen.disc_px)]
-        by_sigma = _gauss_slope(layers[0], sigma)
-        layers = np.stack([_gauss(layer, sigma) for layer in layers])
-        slopes = [*layers[1:3], by_sigma / np.float32(self.factor), *by_disc, *layers[3:]]
+            by_disc = [_gauss(wider, variance) / np.float32(0.02 * seen.disc_px)]
+        layers = np.stack([_gauss(layer, variance) for layer in layers])
+        by_sigma = cv2.Laplacian(layers[0], cv2.CV_32F, borderType=_EDGE)
+        by_sigma *= seen.gauss_px / self.factor**2
+        slopes = [*layers[1:3], by_sigma, *by_disc, *layers[3:]]
         blurs = 1 + len(by_disc)
         shares = np.zeros((len(slopes), 6 + blurs + 6 * moving + len(lens), *depth.shape))
         by_pose = np.concatenate([-q, np.cross(q, (depth * ray)[None], axis=1)], axis=1)
@@ -343,27 +350,16 @@ def _bends(camera: Camera, px: FloatArray, columns: int) -> tuple[FloatArray, Fl
     return rays, -np.swapaxes(np.linalg.solve(by_ray, by_lens[:, :, :columns]), 1, 2)
 
 
-def _gauss(layer: Pixels, sigma: float) -> Pixels:
-    """A (h, w) layer through a Gaussian [px]."""
-    sigma = max(sigma, _SHARPEST_PX)
-    size = max(2 * int(3 * sigma + 0.5) + 1, 5)
-    return _pixels(cv2.GaussianBlur(layer, (size, size), sigma, borderType=_EDGE))
+def _gauss(layer: Pixels, variance: float) -> Pixels:
+    """A (h, w) layer through a Gaussian [px^2], by the kernel of Lindeberg (1990).
 
-
-def _gauss_slope(layer: Pixels, sigma: float) -> Pixels:
-    """The derivative of `_gauss` by its sigma, that of the sampled kernel itself.
-
-    A Laplacian of pixels misses a third of a sharp image's, and steps overshoot by as much.
+    Its variance is exact however small, even below 0, and its derivative by it half a Laplacian of
+    pixels. A sampled Gaussian hardly changes below a sigma of 0.3 px: no step would leave there.
     """
-    sigma = max(sigma, _SHARPEST_PX)
-    kernel = cv2.getGaussianKernel(max(2 * int(3 * sigma + 0.5) + 1, 5), sigma)
-    squares = (np.arange(len(kernel))[:, None] - len(kernel) // 2) ** 2.0
-    slope = kernel * (squares - np.sum(kernel * squares)) / sigma**3
-    along, down = (
-        cv2.sepFilter2D(layer, -1, one, other, borderType=_EDGE)
-        for one, other in ((slope, kernel), (kernel, slope))
-    )
-    return _pixels(along + down)
+    reach = int(3.5 * abs(variance) ** 0.5 + 1.5)
+    kernel = ive(np.arange(-reach, reach + 1), variance)
+    kernel /= kernel.sum()
+    return _pixels(cv2.sepFilter2D(layer, -1, kernel, kernel, borderType=_EDGE))
 
 
 def _through(layer: Pixels, kernel: Pixels) -> Pixels:
