@@ -9,7 +9,7 @@ from support.cells import calibrated, known_of, reporting, session_of, showing
 
 import visioncal
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses
-from visioncal.calibration.stages.error_sizes import estimate_error_sizes
+from visioncal.calibration.stages.error_sizes import error_sizes, solve_session
 from visioncal.core.transforms import invert, log
 from visioncal.estimation.lens_field import LensLevels, displacements
 from visioncal.session import Session
@@ -41,6 +41,11 @@ def test_a_lens_field_turns_no_long_session(real_data):
     assert square_of(path, edge) < chi2.ppf(0.999, 6)
 
 
+def sizes_of(known):
+    """The sizes of errors by what is known of a session."""
+    return error_sizes(known, solve_session(known))
+
+
 def field_of(cell, size_px, rng):
     """Corners displaced by a field of this size, in units of the whole image's lens model."""
     levels, lens = LensLevels(size_px, 0.2), cell.stated[""]
@@ -57,12 +62,12 @@ def field_of(cell, size_px, rng):
 
 def test_sizes_of_a_field_are_found_and_of_a_sound_cell_none():
     cell = simulate(CellOptions(views=30, seed=4))
-    found = estimate_error_sizes(estimate_lenses(known_of(cell, joints=False)))
+    found = sizes_of(estimate_lenses(known_of(cell, joints=False)))
     (sound,) = found.levels.values()
     assert (sound.field, sound.jitter, sound.gains) == (0.0, 0.0, (0.0, 0.0, 0.0))
     assert not found.lenses
     moved = field_of(cell, 0.3, np.random.default_rng(2))
-    found = estimate_error_sizes(estimate_lenses(known_of(moved, joints=False)))
+    found = sizes_of(estimate_lenses(known_of(moved, joints=False)))
     (levels,) = found.levels.values()
     # In units of the corners' noise. Of some dozen functions, the size is known to a third.
     assert 0.2 < levels.field * cell.options.pixel_sigma_px < 0.45
@@ -70,7 +75,7 @@ def test_sizes_of_a_field_are_found_and_of_a_sound_cell_none():
     # Corners of a stated noise have the same field, in units of that.
     px = 2.0 * cell.options.pixel_sigma_px
     stated = showing(moved, [replace(seen, stated_px=px) for seen in moved.corners])
-    found = estimate_error_sizes(estimate_lenses(known_of(stated, joints=False)))
+    found = sizes_of(estimate_lenses(known_of(stated, joints=False)))
     (levels,) = found.levels.values()
     assert 0.2 < levels.field * px < 0.45
 
@@ -91,7 +96,7 @@ def test_what_a_held_lens_is_off_by_counts():
     found = {seen.view: seen for seen in cell.corners}
     known = replace(known_of(cell, joints=False), session=off, cameras={})
     known = estimate_lenses(detect_targets(known, found))
-    (covariance,) = estimate_error_sizes(known).lenses.values()
+    (covariance,) = sizes_of(known).lenses.values()
     # By a size in pixels: half of one per cent of the focal length at least.
     assert np.sqrt(covariance[0, 0]) > 0.005 * longer[0]
 

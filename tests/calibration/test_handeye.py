@@ -7,13 +7,15 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.cells import calibrated, error_of, pairs_session
+from support.cells import calibrated, error_of, known_of, pairs_session, showing
 from support.edges import solved
 from support.misfits import misfit
 from support.refusals import raised
 
 import visioncal
-from visioncal.calibration.stages.init_frames import init_frames
+from visioncal.calibration.pipeline.starting import find_start
+from visioncal.calibration.run import STAGES
+from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.pnp import estimate_poses
 from visioncal.core.errors import DataError, DegenerateError
@@ -276,11 +278,13 @@ def poses_of(cell, corners=None):
     return estimate_poses(corners or corners_of(cell), [cell.options.target], cell.options.camera)
 
 
-def chosen_of(result, cell):
+def chosen_of(cell):
     """The views with the one pose that the robot's motion leaves to each."""
-    first = np.array([view.cam_from_target[0] for view in result.views])
-    problem = chain("eye-in-hand", cell.robot.base_from_flange, first)
-    return init_frames(problem, result.views, {"target": cell.options.target})
+    known = known_of(cell, joints=False)
+    for stage in STAGES:
+        if stage.name in ("intrinsics", "pnp"):
+            known = stage.run(known)
+    return find_start(read_cell(known), known, is_solved=False)
 
 
 def test_poses_follow_their_stated_covariance():
@@ -312,17 +316,17 @@ def test_both_planar_solutions_are_kept_while_ambiguous():
     result = poses_of(cell)
     rivals = [view for view in result.views if len(view.cam_from_target) == 2]
     assert len(rivals) >= 3
-    choice = chosen_of(result, cell)
+    choice = chosen_of(cell)
     wrong_by_image = 0
-    for view in choice.views:
+    for view in choice.poses:
         candidates = result.views[view.view].cam_from_target
         away = np.linalg.norm(log(invert(cell.cam_from_target[view.view]) @ candidates), axis=1)
         assert np.array_equal(view.cam_from_target[0], candidates[away.argmin()])
         wrong_by_image += int(away.argmin() != 0)
     # The image alone picks the mirrored pose in some views, or the test would show nothing.
     assert wrong_by_image >= 1
-    assert len(choice.views) >= 8
-    assert len(choice.views) + len(choice.rejections) == len(result.views)
+    assert len(choice.poses) >= 8
+    assert len(choice.poses) + len(choice.cell.reasons) == len(result.views)
 
 
 def test_wrong_corners_are_left_out_and_wrong_views_named():
@@ -353,10 +357,9 @@ def test_symmetric_boards_are_made_consistent_by_the_motion(size):
         corners[view_corners.view] = Corners(
             view_corners.view, ids[order], view_corners.px[order], view_corners.blur_px
         )
-    result = poses_of(cell, corners)
-    choice = chosen_of(result, cell)
-    assert not choice.rejections
-    camera = np.array([view.cam_from_target[0] for view in choice.views])
+    choice = chosen_of(showing(cell, corners.values()))
+    assert not choice.cell.reasons
+    camera = np.array([view.cam_from_target[0] for view in choice.poses])
     answer = SOLVERS["park"](cell.robot.base_from_flange, camera)
     placed = cell.robot.base_from_flange @ answer.x @ camera
     # Views agree to the noise, not to within a board's width.
@@ -364,7 +367,7 @@ def test_symmetric_boards_are_made_consistent_by_the_motion(size):
     # The camera's transform does not depend on which end is called first.
     assert np.linalg.norm(answer.x[:3, 3] - cell.transforms["flange_from_cam"][:3, 3]) < 1e-3
     positions = corner_positions(target)
-    for view, pose in zip(choice.views, camera, strict=True):
+    for view, pose in zip(choice.poses, camera, strict=True):
         points = positions[view.corners.ids] @ pose[:3, :3].T + pose[:3, 3]
         # Renumbered with their pose, the corners project onto themselves.
         away = project(cell.options.camera, points) - view.corners.px

@@ -11,7 +11,6 @@ from support.edges import inliers_of
 from support.problems import ROBOT_SIGMAS, away, observed, pose, swung, true_state, world
 from support.slopes import jacobian
 
-from visioncal.calibration.stages.init_frames import network_of
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.estimation import joint
@@ -46,6 +45,7 @@ from visioncal.estimation.solve import (
 from visioncal.estimation.steps import find_steps, frames_of
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.fit.consensus import Candidates
+from visioncal.fit.joining import Network
 from visioncal.simulation import CAMERAS, CellOptions, simulate
 from visioncal.vision.camera import intrinsics
 
@@ -72,7 +72,12 @@ def network(problem, **turned):
     shape = (len(problem.observations), 1)
     poses = problem.observations.measured[:, None]
     candidates = Candidates(poses, np.zeros(shape, dtype=np.int64), np.ones(shape, dtype=bool))
-    return network_of(problem, candidates, turned).connected()
+    seen = problem.observations
+    whole = Network(
+        problem.tree, problem.poses, seen.observers, seen.observed, seen.stops, seen.has_rotation,
+        candidates, turned, early=0.4,
+    )  # fmt: skip
+    return whole.connected()
 
 
 def started(problem):

@@ -86,7 +86,7 @@ def test_a_lens_that_starts_far_off_ends_in_no_traceback(monkeypatch):
             small = made(seed, stops=12, given=False)
             wild = Camera("brown", TABLE.size, np.array([focal, focal, 900.0, 200.0]), np.zeros(5))
             monkeypatch.setattr(
-                "visioncal.fit.start.start_lenses", lambda _, lens=wild: {"cam": lens}
+                "visioncal.fit.start.start_lenses", lambda *_, lens=wild: {"cam": lens}
             )
             try:
                 solve(small.cell)

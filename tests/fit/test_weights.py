@@ -74,7 +74,7 @@ def test_a_corner_that_only_the_fit_shows_is_left_out_then():
 def test_sound_corners_stay_as_they_are():
     for seed in range(20):
         cell = made(seed, stops=10).cell
-        found = first_weighed(cell, start_lenses(cell))
+        found = first_weighed(cell, start_lenses(cell, {}))
         assert not found.changed
         assert found.sound.all()
 
@@ -130,7 +130,7 @@ def test_exact_corners_are_not_weighed_by_their_rounding():
         return replace(corners, px=np.round(turned, 9 + row % 3))
 
     cell = made(0, stops=10).cell
-    lenses = {"cam": replace(start_lenses(cell)["cam"], distortion=np.zeros(5))}
+    lenses = {"cam": replace(start_lenses(cell, {})["cam"], distortion=np.zeros(5))}
     found = first_weighed(seen_otherwise(cell, exact), lenses)
     assert not found.changed
 

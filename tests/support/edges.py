@@ -4,12 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.estimation.chain import FLANGE
+from visioncal.estimation.chain import FLANGE, robot_part
+from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.observability import chain_words, check_determined, refuse_too_few
-from visioncal.estimation.outliers import InlierFit, closed_form, find_inliers
+from visioncal.estimation.outliers import InlierFit, find_inliers
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Noise, State
+from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.estimation.solve import covariance_of, fit_problem
+from visioncal.fit.consensus import Candidates, partial_hand_eye
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,16 +23,31 @@ class Solved:
     covariance: np.ndarray
 
 
+def mount_of(problem: Problem) -> str:
+    """The mount of a chain's camera."""
+    carried = problem.tree.branches["cam"].parent == FLANGE
+    return "eye-in-hand" if carried else "eye-to-hand"
+
+
+def sides_of(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """(m, 4, 4) parts of a chain by its robot and by its camera."""
+    seen = problem.observations
+    return robot_part(problem.poses[ROBOT][seen.stops], mount_of(problem)), seen.measured
+
+
 def inliers_of(problem: Problem) -> InlierFit:
-    """The observations of a chain that agree, found from a closed form of all."""
-    return find_inliers(problem, closed_form(problem, np.arange(len(problem))))
+    """The observations of a chain that agree, found from a consensus."""
+    robot, seen = sides_of(problem)
+    turns, valid = np.zeros((len(seen), 1), dtype=int), np.ones((len(seen), 1), dtype=bool)
+    edges, _ = partial_hand_eye(robot, Candidates(seen[:, None], turns, valid))
+    return find_inliers(problem, State(np.array([edges.x, edges.z]), problem.start_values))
 
 
 def solved(problem: Problem) -> Solved:
     """Solves for both edges of a chain with one target, refusing motion that is too poor."""
-    carried = problem.tree.branches["cam"].parent == FLANGE
-    mount = "eye-in-hand" if carried else "eye-to-hand"
+    mount = mount_of(problem)
     refuse_too_few(problem, mount)
-    fit = fit_problem(problem, closed_form(problem, np.arange(len(problem))))
+    edges = SOLVERS["park"](*sides_of(problem))
+    fit = fit_problem(problem, State(np.array([edges.x, edges.z]), problem.start_values))
     check_determined(problem, fit.state, fit.noise, chain_words(problem, mount))
     return Solved(fit.state, fit.noise, covariance_of(problem, fit))

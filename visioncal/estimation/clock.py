@@ -14,7 +14,7 @@ import numpy as np
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, evenly
-from visioncal.estimation.chain import chain
+from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.clock_correlation import (
     FEWEST_FRAMES,
     MOST_FRAMES,
@@ -23,6 +23,7 @@ from visioncal.estimation.clock_correlation import (
     WINDOW_S,
     ImageTimes,
 )
+from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.rolling_shutter import (
@@ -34,9 +35,8 @@ from visioncal.estimation.effects.rolling_shutter import (
 from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
-from visioncal.estimation.outliers import closed_form
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import Effect, State
+from visioncal.estimation.problem_parts import ROBOT, Effect, State
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.trajectory import Trajectory
 
@@ -317,9 +317,10 @@ def _iterated(
             return None
         if start is None:
             problem = clock_problem(covered.robot, covered.frames, offset_s)
-            start = closed_form(problem, np.arange(count))
-        if start is None:
-            raise RuntimeError("no closed form gives a start")
+            frames = covered.frames
+            robot = robot_part(problem.poses[ROBOT], frames.mount)
+            edges = SOLVERS["park"](robot, frames.cam_from_target)
+            start = State(np.array([edges.x, edges.z]), problem.start_values)
         problem, pulls = covered.problem(offset_s, readout_s, start.edges[0])
         solution = fit_problem(problem, State(start.edges, problem.start_values))
         # Limited to the correlation window: a longer step is beyond the linearisation.

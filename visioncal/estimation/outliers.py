@@ -18,14 +18,13 @@ import numpy as np
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_STOPS
 from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.transforms import invert, rotation_angle
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.moves import Move, explained_by_noise, find_move, moved
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import UNEVEN, Noise, State
-from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
+from visioncal.estimation.robust import Distances, half_of, nearest, settled, widened
 from visioncal.estimation.solve import (
     Solution,
     estimate_noise,
@@ -128,7 +127,7 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
     # The observations of the earliest stops.
     stops = problem.observations.stops
     last = max(EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:FEWEST_STOPS][-1]))
-    used, fit = _trimmed_core(problem, state, stops <= last)
+    used, fit = _core(problem, state, stops <= last)
     moves: list[Move] = []
     used, fit = widened(_ObservationSearch(problem), used, fit)
     while len(moves) < _MOST_MOVES:
@@ -143,6 +142,11 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
         used = np.where(involved, explained_by_noise(problem, fit, len(problem)), used)
         used, fit = _widened(problem, used, fit)
     return _converged(problem, used, fit, moves)
+
+
+def presumed_inliers(problem: Problem, state: State, used: Mask) -> InlierFit:
+    """(n,) presumed inliers with their fit, which no test has."""
+    return _inlier_fit(problem, used, fit_problem(problem.subset(used), state), ())
 
 
 def all_as_inliers(problem: Problem, state: State) -> InlierFit:
@@ -180,7 +184,7 @@ def find_inliers(
     all_rows = np.ones(len(problem), dtype=bool)
     if len(problem) > FEWEST_COMPARED:
         mask, fit = (
-            _trimmed_core(problem, state, all_rows)
+            _core(problem, state, all_rows)
             if used is None
             else (used, fit_problem(problem.subset(used), state, noise))
         )
@@ -195,44 +199,15 @@ def find_inliers(
     return _inlier_fit(problem, near, fit_problem(problem.subset(near), fit.state), ())
 
 
-def closed_form(problem: Problem, rows: IntArray) -> State | None:
-    """The unknowns by a hand-eye solver, if there are two edges with one robot between.
-
-    It solves from (m,) rows of the observations.
-    """
-    paths = [group.path for group in problem.groups]
-    if len(paths) != 1 or not problem.observations.has_rotation.all() or problem.points:
-        return None
-    steps = paths[0]
-    ends, between = (steps[0], steps[-1]), steps[1:-1]
-    is_complete = problem.unknown.keys() == {end.frame for end in ends}
-    if not is_complete or sum(bool(step.robot) for step in between) != 1:
-        return None
-    no_edges = State(np.zeros((0, 4, 4)), problem.start_values)
-    robot = invert(problem.product(between, no_edges, rows))
-    hand_eye = SOLVERS["park"](robot, problem.observations.measured[rows])
-    edges = {ends[0].frame: hand_eye.x, ends[1].frame: hand_eye.z}
-    return State(np.array([edges[name] for name in problem.unknown]), problem.start_values)
-
-
-def _trimmed_core(problem: Problem, state: State, among: Mask) -> tuple[Mask, Solution]:
-    """Least-trimmed-squares start among some observations, extended by all it predicts."""
-    rows, noise = np.flatnonzero(among), starting_noise(problem)
-    part = problem.subset(among)
-
-    def solve(mask: Mask, state: State) -> State:
-        edges = closed_form(part, np.flatnonzero(mask))
-        if edges is not None:
-            return edges
-        # The noise is held: gross outliers would pass for noise of a robot.
-        return solve_problem(part.subset(_of_pairs(part, mask, state)), state, noise)[0]
-
-    mask, start = trimmed_start(
-        [state], lambda at: _lever_distances(part, at), solve, half_of(len(rows))
-    )
-    search, mask = _ObservationSearch(part), _of_pairs(part, mask, start)
+def _core(problem: Problem, state: State, among: Mask) -> tuple[Mask, Solution]:
+    """The nearest half of some observations at a start, extended by all it predicts."""
+    rows, part = np.flatnonzero(among), problem.subset(among)
+    mask = nearest(_lever_distances(part, state), half_of(len(rows)))
+    search, mask = _ObservationSearch(part), _of_pairs(part, mask, state)
     every = np.ones(len(rows), dtype=bool)
-    mask, fit = widened(search, mask, search.fit_from(mask, start, turns=1), every)
+    # The noise is held at first: gross outliers would pass for noise of a robot.
+    state = solve_problem(part.subset(mask), state, starting_noise(problem))[0]
+    mask, fit = widened(search, mask, search.fit_from(mask, state, turns=1), every)
     used = among.copy()
     used[rows] = mask
     return used, fit

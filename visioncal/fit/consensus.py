@@ -14,7 +14,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 from visioncal.estimation.linalg import NULL_SHARE, covariance_from, eigenvalue_shares
-from visioncal.estimation.robust import ROUNDS, nearest, trimmed_start, trimmed_sum
+from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
 
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
 # probability (1 - 1/8)^40 = 0.5 %.
@@ -93,23 +93,6 @@ def _solve_edges(
     edges = solver(robot[rows], candidates.poses[rows, picks])
     predicted = invert(robot @ edges.x[..., None, :, :]) @ edges.z[..., None, :, :]
     return PairEdges(edges.x, edges.z, candidates.distances(predicted))
-
-
-def settled_distances(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
-    """Solves for both edges from all views and updates each view's candidate until none changes.
-
-    `robot` is (m, 4, 4), the robot's part of the chain, `picks` (m,) the initial choice.
-
-    Returns:
-        (m, k) distances of the candidates from the predictions [m].
-    """
-    rows = np.arange(len(robot))
-    for _ in range(ROUNDS):
-        edges = _solve_edges(robot, candidates, rows, picks, SOLVERS["park"])
-        if np.array_equal(edges.picks, picks):
-            break
-        picks = edges.picks
-    return edges.residuals
 
 
 def _trimmed_edges(

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.errors import ConvergenceError
 from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.candidates import candidates, of_stops, opened
 from visioncal.fit.fit import Fit, LeftOut
@@ -14,7 +13,7 @@ from visioncal.fit.held import with_held_boards, with_held_lenses, with_small_si
 from visioncal.fit.processes import ENOUGH_STOPS, Considered, consider, held_boards
 from visioncal.fit.refuse import refuse_open, refuse_unjoined
 from visioncal.fit.search import Effort, Search, nearest
-from visioncal.fit.start import Start, start_of
+from visioncal.fit.start import Start, at_rest, start_of
 from visioncal.fit.unknowns import (
     Edge,
     Key,
@@ -58,28 +57,19 @@ class CellFit:
 
 
 def solve(cell: Cell) -> CellFit:
-    """Fits a cell.
+    """Fits a cell; raises what `start_of` and `solve_from` raise."""
+    return solve_from(start_of(cell))
+
+
+@at_rest()
+def solve_from(start: Start) -> CellFit:
+    """Fits a cell from a start.
 
     Raises:
-        DataError: Too few views show a lens of which nothing is stated.
         DegenerateError: The sightings leave a direction of a frame open.
         ConvergenceError: The estimate does not come to rest.
     """
-    try:
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            return _solved(cell)
-    except np.linalg.LinAlgError as error:
-        raise ConvergenceError(
-            "cell: the estimate does not come to rest: poses and images do not belong together, or "
-            "a lens of which nothing is stated is far from where it started.",
-            next_step="Give matrix and distortion in [camera], or add tilted views; compare the "
-            "robot's poses with their images.",
-        ) from error
-
-
-def _solved(cell: Cell) -> CellFit:
-    start = start_of(cell)
-    refuse_unjoined(cell, start.cell)
+    refuse_unjoined(start.read, start.cell)
     effects = effects_of(start)
     search = Search.of(start.cell, unknowns_of(start, effects), start.sound)
     fit, left_out = search.run(state_of(start, effects), nearest(start))

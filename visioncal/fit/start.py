@@ -4,14 +4,15 @@ A flat board has two poses, and a symmetric one has the same image after a turn:
 until edges decide between them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visioncal.core.errors import DataError
+from visioncal.core.errors import ConvergenceError, DataError
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.number_format import counted
 from visioncal.core.transforms import apply, compose, invert
@@ -57,6 +58,7 @@ class _Options:
 class Start:
     """Where a fit starts."""
 
+    read: Cell  # With all sightings.
     # With the sightings that have a pose, by corners that agree within their views; turned boards
     # are numbered as they lie.
     cell: Cell
@@ -67,11 +69,40 @@ class Start:
     # (n,) sightings that may agree: most of their own corners do, and they are not those of a row
     # nearby.
     sound: Mask
+    # Frames that only boards connect that look the same turned, so that other poses fit as well.
+    ambiguous: tuple[str, ...] = ()
 
 
-def start_of(cell: Cell) -> Start:
-    """Starts a fit; sightings without a pose, or whose frames are not connected, are left out."""
-    lenses = start_lenses(cell.only(np.flatnonzero(~cell.held).tolist()))
+@contextmanager
+def at_rest() -> Iterator[None]:
+    """Reports matrices that are singular or not finite as a ConvergenceError."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            yield
+    except np.linalg.LinAlgError as error:
+        raise ConvergenceError(
+            "cell: the estimate does not come to rest: poses and images do not belong together, or "
+            "a lens of which nothing is stated is far from where it started.",
+            next_step="Give matrix and distortion in [camera], or add tilted views; compare the "
+            "robot's poses with their images.",
+        ) from error
+
+
+@at_rest()
+def start_of(cell: Cell, lenses: Mapping[str, Camera] | None = None, early: float = 1.0) -> Start:
+    """Starts a fit; sightings without a pose, or whose frames are not connected, are left out.
+
+    Args:
+        cell: The cell.
+        lenses: Lenses that are known, by camera, start as they are.
+        early: Share of the earliest stops that join frames; later, these may have moved.
+
+    Raises:
+        DataError: Too few views show a lens of which nothing is stated.
+        ConvergenceError: Views determine no pose.
+    """
+    read = cell
+    lenses = start_lenses(cell.only(np.flatnonzero(~cell.held).tolist()), lenses or {})
     weighed = first_weighed(cell, lenses)
     cell, sound = weighed.cell, weighed.sound & ~cell.held
     options = _options(cell, lenses)
@@ -81,7 +112,7 @@ def start_of(cell: Cell) -> Start:
     known = [option for option in options if option is not None]
     # Sightings that are held out help no fit.
     own = np.flatnonzero(~cell.held).tolist()
-    tied = _network(cell.only(own), [known[at] for at in own]).connected()
+    tied = _network(cell.only(own), [known[at] for at in own], early).connected()
     joined = [at for at, s in enumerate(cell.sightings) if tied.ties(*s.pair)]
     untied = {
         at: f"nothing ties {' or '.join(sighting.pair)} to the rest of the cell"
@@ -96,12 +127,15 @@ def start_of(cell: Cell) -> Start:
     edges = {name: tied.edges[name] for name in cell.unknown}
     seers = {sighting.seer for sighting in cell.sightings}
     lenses = {name: lens for name, lens in lenses.items() if name in seers}
-    sightings, distances, rivals = list(cell.sightings), np.zeros(len(known)), []
-    # By which symmetry the first view of each board is turned: that one keeps its numbers.
+    sightings, distances = list(cell.sightings), np.zeros(len(known))
+    rivals = [option.poses for option in known]
+    # By which symmetry the first view of each board is turned: that one, if a fit uses it, keeps
+    # its numbers.
     firsts, stated = dict[str, int](), {name for s in sightings if s.is_stated for name in s.pair}
     turnable = set(edges) - stated
     numbers = {name: rotations(cell.boards[name]) for name in pictured(cell)}
-    for at, (sighting, option) in enumerate(zip(cell.sightings, known, strict=True)):
+    for at in sorted(range(len(known)), key=cell.held.__getitem__):
+        sighting, option = cell.sightings[at], known[at]
         poses = {name: arm.poses[sighting.stop] for name, arm in cell.arms.items()}
         predicted = tied.predicted(*sighting.pair, poses)
         off = distances_m(option.poses, predicted)
@@ -123,15 +157,16 @@ def start_of(cell: Cell) -> Start:
                 ids = np.argsort(orders[turn])[sighting.evidence.ids]
                 sightings[at] = replace(sighting, evidence=replace(sighting.evidence, ids=ids))
         others = np.flatnonzero((option.turns == turn) & (np.arange(len(off)) != best))
-        rivals.append(option.poses[[best, *others]])
+        rivals[at] = option.poses[[best, *others]]
     for name, first in firsts.items():
         if first:
             edges[name] = edges[name] @ invert(rotation_transforms(cell.boards[name])[first])
-    return Start(cell.with_sightings(sightings), lenses, edges, distances, tuple(rivals), sound)
+    cell = cell.with_sightings(sightings)
+    return Start(read, cell, lenses, edges, distances, tuple(rivals), sound, tied.ambiguous)
 
 
-def start_lenses(cell: Cell) -> dict[str, Camera]:
-    """The stated lenses by camera, and those that corners determine (Zhang 2000).
+def start_lenses(cell: Cell, known: Mapping[str, Camera]) -> dict[str, Camera]:
+    """Lenses by camera: known and stated ones, and those that corners determine (Zhang 2000).
 
     Raises:
         DataError: Too few views show a lens of which nothing is stated.
@@ -140,8 +175,9 @@ def start_lenses(cell: Cell) -> dict[str, Camera]:
     # In the order of sightings: results do not depend on how names are hashed.
     for frame in dict.fromkeys(s.seer for s in cell.sightings if s.corners is not None):
         table = cell.cameras[frame]
-        if table.stated is not None:
-            found[frame] = table.stated
+        lens = known.get(frame, table.stated)
+        if lens is not None:
+            found[frame] = lens
             continue
         seen = [s for s in cell.sightings if s.seer == frame and s.corners is not None]
         # Corners on a line, or a few beside many, mislead the closed form of focal lengths.
@@ -290,7 +326,7 @@ def _off_px(lens: Camera, pose: FloatArray, points: FloatArray, px: FloatArray) 
     return float(np.sqrt(np.nanmean((found - px) ** 2)))
 
 
-def _network(cell: Cell, options: Sequence[_Options]) -> Network:
+def _network(cell: Cell, options: Sequence[_Options], early: float = 1.0) -> Network:
     """The sightings as a network; priors that state a whole pose come last."""
     seen = [at for at, one in enumerate(cell.sightings) if not one.is_stated]
     stated = [pair for pair in cell.pairs.items() if cell.sightings[pair[1][0]].is_stated]
@@ -308,6 +344,7 @@ def _network(cell: Cell, options: Sequence[_Options]) -> Network:
         {name: own for name, own in turns.items() if len(own) > 1},
         tuple(one for one in found if one is not None),
         frozenset(name for pair, _ in stated for name in pair),
+        early,
     )
 
 

@@ -27,6 +27,7 @@ def read_cell(
     corners: Mapping[int, Corners],
     sweeps: Sequence[Swept] = (),
     reports: Mapping[str, Reported] | None = None,
+    reference: str = "",
 ) -> Cell:
     """Reads a session.
 
@@ -36,6 +37,8 @@ def read_cell(
         corners: The corners in its images by view, each numbered on its own board.
         sweeps: What was seen while a robot moved.
         reports: What is known of robots' rows, by robot; of others, they are taken as they are.
+        reference: The cell's own frame; empty for the base of the robot that most sightings move
+            with.
 
     Raises:
         DataError: No row has an observation, or frames are ambiguous.
@@ -75,7 +78,7 @@ def read_cell(
                 sightings.append(one)
             else:
                 absent[view] = f"repeats view {first.view}"
-    tree = _tree(session, [*arms], sightings)
+    tree = _tree(session, [*arms], sightings, reference)
     sightings += stated_sightings(session.declaration, tree, sightings)
     rates = {(sweep.camera, sweep.flange): np.zeros((len(stations), 6)) for sweep in sweeps}
     stamps_s = np.full(len(stations), np.nan)
@@ -159,13 +162,15 @@ def _evidence(session: Session, row: Observation, corners: Corners | None) -> Ev
     )
 
 
-def _tree(session: Session, flanges: list[str], sightings: list[Sighting]) -> Tree:
-    """The tree; the base of the robot that most sightings move with is the cell's own frame."""
+def _tree(session: Session, flanges: list[str], sightings: list[Sighting], reference: str) -> Tree:
+    """The tree, with its reference."""
     branches = {
         name: Branch(parent, robot=name if name in flanges else "")
         for name, parent in session.frames.items()
     }
     tree = Tree(CELL, branches)
+    if reference:
+        return tree.with_known(reference, np.eye(4))
     passed = [step.robot for sight in sightings for step in tree.path(*sight.pair)]
     most = max(flanges, key=passed.count, default=None)
     if most is None:

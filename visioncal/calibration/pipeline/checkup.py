@@ -157,7 +157,7 @@ def _refused(kind: str, error: VisioncalError, more: Remedy | None = None) -> Fi
 def _motion(run: RunState) -> Iterator[Finding]:
     """Findings on too poor motion; of one camera and one robot on outliers and scatter, too."""
     try:
-        start = find_start(read_cell(run), run)
+        start = find_start(read_cell(run), run, is_solved=False)
         cell, problem = start.cell, start.problem
         noise, words = starting_noise(problem), words_of(cell, problem, can_tilt=run.can_tilt)
         px = {frame: look.pixel_px for frame, look in run.cameras.items() if look.pixel_px}

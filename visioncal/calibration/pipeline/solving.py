@@ -18,7 +18,7 @@ from visioncal.calibration.stages.arms import RobotArm, arm_effects, check_arms,
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
-from visioncal.calibration.stages.error_sizes import estimate_error_sizes, measured_sizes
+from visioncal.calibration.stages.error_sizes import error_sizes, measured_sizes
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.observed import Observed
@@ -38,6 +38,7 @@ from visioncal.estimation.outliers import (
     InlierFit,
     all_as_inliers,
     inliers_and_moves,
+    presumed_inliers,
     refine_inliers,
 )
 from visioncal.estimation.problem import Problem
@@ -79,7 +80,7 @@ def solve(
         check_level_is_possible(level, can=can)
     if solver != "joint":
         cell, level = replace(cell, priors=()), "hand-eye"
-    start = find_start(cell, observed)
+    start = find_start(cell, observed, is_solved=not observed.misread)
     try:
         cell_fit = _fit(start, observed, arms, level)
     except (VisioncalError, np.linalg.LinAlgError):
@@ -103,7 +104,7 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         # Misread poses determine neither lens, board and arm nor which views are outliers.
         return _of_misread(initial, observed)
     if observed.scenes and not inliers.problem.is_combined:
-        initial = replace(initial, sizes=estimate_error_sizes(observed))
+        initial = replace(initial, sizes=error_sizes(observed, start.solved))
     cell_fit = _fit_with_inliers(initial, observed)
     if cell_fit.inlier_fit.problem.is_combined and not observed.scenes:
         cell_fit = _with_likelier_noise(cell_fit, observed)
@@ -122,7 +123,7 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     nominal = cell_fit
     cell_fit, noise = _calibrate_arms(nominal, observed, final)
     is_measured = not observed.scenes and any(arm.model for arm in cell_fit.arms.values())
-    if is_measured and (sigmas := measured_sizes(observed)):
+    if is_measured and (sigmas := measured_sizes(start.solved)):
         # Boards of another size look as other lengths of an arm do.
         nominal = _with_sizes(nominal, sigmas)
         cell_fit, noise = _calibrate_arms(_fit_with_inliers(nominal, observed), observed, None)
@@ -365,7 +366,10 @@ def _with_effects(inliers: InlierFit, effects: Sequence[Effect]) -> InlierFit:
 
 
 def initial_inliers(start: Start) -> InlierFit:
-    """Finds the inliers, and the priors that they do not contradict."""
+    """Finds the inliers, and the priors that they do not contradict.
+
+    Of one robot and one camera, they are those of the one likelihood, if it comes to rest.
+    """
     cell, problem, state = start.cell, start.problem, start.state
     movable, observations = _movable_frames(cell, problem), problem.observations
     # Cameras may disagree about one stop by more than their corners say, and not before the lenses
@@ -380,11 +384,13 @@ def initial_inliers(start: Start) -> InlierFit:
         sizes = target_sizes(problem, dict.fromkeys(printed, PRINTED_SCALE))
         problem = problem.with_effects([sizes])
         state = State(state.edges, problem.start_values)
-    if not cell.priors:
-        inliers = inliers_and_moves(problem, state, movable)
+    loose = replace(problem, priors=with_loose_positions(cell.priors))
+    if cell.mount is None or (agreeing := start.agreeing) is None:
+        inliers = inliers_and_moves(loose, state, movable)
     else:
-        loose = replace(problem, priors=with_loose_positions(cell.priors))
-        inliers = _with_priors(cell, inliers_and_moves(loose, state, movable)).refitted()
+        inliers = presumed_inliers(loose, state, agreeing)
+    if cell.priors:
+        inliers = _with_priors(cell, inliers).refitted()
     # Sizes are estimated from the corners, with the lenses.
     fit = replace(inliers.fit, state=State(inliers.fit.state.edges, np.zeros(0)))
     return replace(inliers, problem=inliers.problem.with_effects(()), fit=fit)

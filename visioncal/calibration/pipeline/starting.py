@@ -1,23 +1,33 @@
-"""Start of a cell's fit: its problem, initial frames, and one pose chosen for each view."""
+"""Start of a cell's fit: its problem, initial frames, and one pose chosen for each view.
 
-from collections.abc import Sequence
+The mirrored solutions of a planar target, and the turns of a board with a rotational symmetry, look
+alike in one image; the robots' motion separates them.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.calibration.pipeline.connectivity import ambiguous_error, refuse_unconnected_robots
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.init_frames import init_frames
+from visioncal.calibration.stages.error_sizes import session_start
 from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.core.types import Target
+from visioncal.core.errors import DegenerateError, VisioncalError
+from visioncal.core.limits import CLEAR_RATIO
+from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.estimation.observability import refuse_too_few
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Observations, State
+from visioncal.fit.consensus import Candidates
+from visioncal.fit.solve import CellFit, solve_from
+from visioncal.fit.start import Start as Begun
 from visioncal.session import frame_name
 
 # Covariance, up to a level, of a pose that was given without one [rad^2, m^2].
 _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
+_AMBIGUOUS = "ambiguous: two poses of the target fit image and motion alike"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,14 +39,31 @@ class Start:
     problem: Problem  # The problem of these.
     state: State  # The initial frames.
     untied: tuple[str, ...]  # Frames that no observation links to the rest.
+    # The one likelihood of the session; None where it was not asked for or does not come to rest.
+    solved: CellFit | None = None
+
+    @property
+    def agreeing(self) -> Mask | None:
+        """(n,) rows that agree by the one likelihood."""
+        if self.solved is None:
+            return None
+        used = np.flatnonzero(self.solved.used).tolist()
+        views = {self.solved.fit.cell.sightings[at].view for at in used}
+        return np.array([row.view in views for row in self.cell.rows], dtype=bool)
 
 
-def find_start(cell: Cell, observed: Observed) -> Start:
+def find_start(cell: Cell, observed: Observed, *, is_solved: bool) -> Start:
     """Initialises all frames, and chooses each view's pose by them.
+
+    Args:
+        cell: The cell.
+        observed: The observations in it.
+        is_solved: Whether the one likelihood is fitted, too.
 
     Raises:
         DataError: No observation gave a pose.
-        DegenerateError: A robot is linked to nothing, or a frame may be in two places.
+        DegenerateError: A robot is linked to nothing, a frame may be in two places, or the motion
+            leaves most views ambiguous.
     """
     lost = {row.view for row in cell.rows} - observed.poses.keys()
     nothing = "nothing was found in its image"
@@ -47,22 +74,93 @@ def find_start(cell: Cell, observed: Observed) -> Start:
     problem = problem_of(cell, views)
     if cell.mount is not None:
         refuse_too_few(problem, cell.mount)
-    tied = init_frames(problem, views, targets_of(cell))
-    chosen = {view.view: view for view in tied.views}
-    cell = cell.without({rejection.view: rejection.reason for rejection in tied.rejections})
+    begun = session_start(observed, cell.reference, has_priors=bool(cell.priors))
+    solved = _solved(begun) if is_solved else None
+    edges = dict(begun.edges)
+    if solved is not None and cell.mount is not None:
+        # In a whole cell, frames may have moved since.
+        edges = {name: solved.fit.edge(name) for name in edges}
+    chosen, ambiguous = _chosen(cell, problem, views, edges)
+    cell = cell.without(dict.fromkeys(ambiguous, _AMBIGUOUS))
     branches, linked = cell.tree.branches, cell.connected_frames()
-    apart = [name for name in branches if name not in linked or name in tied.untied]
+    untied = set(cell.tree.unknown) - edges.keys()
+    apart = [name for name in branches if name not in linked or name in untied]
     refuse_unconnected_robots(cell, apart)
-    if tied.ambiguous:
-        raise ambiguous_error(cell, tied.ambiguous)
+    if begun.ambiguous:
+        raise ambiguous_error(cell, begun.ambiguous)
     cell = _without_frames(cell, apart)
     # Without their rows, the robots that saw nothing else are not linked either.
     while lone := [name for name in cell.tree.branches if name not in cell.connected_frames()]:
         cell, apart = _without_frames(cell, lone), [*apart, *lone]
     poses = tuple(chosen[row.view] for row in cell.rows)
     problem = problem_of(cell, poses)
-    untied = tuple(name for name in apart if not branches[name].robot)
-    return Start(cell, poses, problem, problem.start(tied.edges), untied)
+    loose = tuple(name for name in apart if not branches[name].robot)
+    return Start(cell, poses, problem, problem.start(edges), loose, solved)
+
+
+def _chosen(
+    cell: Cell, problem: Problem, views: Sequence[ViewPoses], edges: Mapping[str, FloatArray]
+) -> tuple[dict[int, ViewPoses], list[int]]:
+    """The pose of each view that fits the frames, by view, and the views that are ambiguous.
+
+    Raises:
+        DegenerateError: The motion leaves most views ambiguous.
+    """
+    candidates = Candidates.of(
+        [view.cam_from_target for view in views], [view.turns for view in views]
+    )
+    # The distances of views of unconnected frames have no meaning.
+    frames = {name: edges.get(name, np.eye(4)) for name in problem.unknown}
+    distances = candidates.distances(problem.predicted(problem.start(frames)))
+    is_ambiguous = _ambiguous(problem, candidates, distances, edges)
+    ambiguous = [view.view for view, is_one in zip(views, is_ambiguous, strict=True) if is_one]
+    if len(ambiguous) > len(views) / 2:
+        raise DegenerateError(
+            f"pnp: {len(ambiguous)} of {len(views)} views allow two poses of the target that the "
+            "robot's motion cannot distinguish.",
+            culprits=[f"view {view}" for view in ambiguous],
+            next_step="Add views tilted about different axes, or use a board without symmetry "
+            "(ChArUco, or an odd sum of columns and rows).",
+        )
+    targets, picks = targets_of(cell), distances.argmin(axis=1).tolist()
+    rows = zip(cell.rows, views, picks, strict=True)
+    chosen = {row.view: view.chosen(pick, targets.get(row.seen)) for row, view, pick in rows}
+    return chosen, ambiguous
+
+
+def _ambiguous(
+    problem: Problem,
+    candidates: Candidates,
+    distances: FloatArray,
+    edges: Mapping[str, FloatArray],
+) -> Mask:
+    """(n,) whether another candidate is as likely as the nearest, by distances (n, k) [m]."""
+    ordered, ambiguous = np.sort(distances, axis=1), np.zeros(len(distances), dtype=bool)
+    best, second = ordered[:, 0], ordered[:, 1:].min(axis=1, initial=np.inf)
+    untied = problem.unknown.keys() - edges.keys()
+    for group in problem.groups:
+        if not any(step.frame in untied for step in group.path):
+            typical_m = max(float(np.median(best[group.rows])), float(np.median(best)))
+            # Views that are far with any candidate are outliers.
+            is_near = best < CLEAR_RATIO**2 * typical_m
+            has_rival = second < CLEAR_RATIO * np.maximum(best, typical_m)
+            ambiguous[group.rows] = (is_near & has_rival)[group.rows]
+    poses = (candidates.valid & (candidates.turns == 0)).sum(axis=1)
+    stated = {name for prior in problem.priors for name in (prior.first, prior.second)}
+    for frame in edges.keys() - stated:
+        rows = problem.observations.involves(frame)
+        # Nothing else decides between the poses of a frame's only view.
+        ambiguous |= rows & (rows.sum() == 1) & (poses > 1)
+    return ambiguous
+
+
+def _solved(begun: Begun) -> CellFit | None:
+    """The one likelihood of a session; None where it does not come to rest."""
+    try:
+        return solve_from(begun)
+    except VisioncalError:
+        # The fit of poses says why.
+        return None
 
 
 def targets_of(cell: Cell) -> dict[str, Target]:

@@ -6,17 +6,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
-from visioncal.core.errors import VisioncalError
 from visioncal.core.types import Corners, FloatArray
 from visioncal.estimation.lens_field import LensLevels, lens_part
+from visioncal.estimation.outliers import EARLY_SHARE
 from visioncal.estimation.scene import BoardSizes
 from visioncal.fit.fit import Fit
 from visioncal.fit.held import doubted_boards
-from visioncal.fit.solve import CellFit, solve
+from visioncal.fit.solve import CellFit, solve_from
+from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
 from visioncal.model.effects import Effect, LensGrows, LensSteps
 from visioncal.session import frame_name
+from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import first_corners
 
@@ -57,12 +59,10 @@ class ErrorSizes:
     holds_scales: bool = False
 
 
-def estimate_error_sizes(observed: Observed) -> ErrorSizes:
-    """The sizes by a session's corners; none where they do not come to rest."""
-    try:
-        solved = solve_session(observed)
-    except VisioncalError:
-        # The fit of poses says why; what comes to no rest determines no board.
+def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
+    """The sizes by the one likelihood of a session; none where it does not come to rest."""
+    if solved is None:
+        # A fit without rest determines no board.
         return ErrorSizes(holds_scales=True)
     session = observed.timed
     fit, doubted = solved.fit, doubted_boards(solved.doubts)
@@ -108,12 +108,11 @@ def estimate_error_sizes(observed: Observed) -> ErrorSizes:
     return ErrorSizes(levels, lenses, boards, grown, zoomed, tuple(effects), held)
 
 
-def measured_sizes(observed: Observed) -> dict[str, float]:
+def measured_sizes(solved: CellFit | None) -> dict[str, float]:
     """Sigmas of the sizes of boards whose poses a program measured in images, by frame."""
-    try:
-        fit = solve_session(observed).fit
-    except VisioncalError:
+    if solved is None:
         return {}
+    fit = solved.fit
     boards = [
         one.seen
         for one in fit.cell.sightings
@@ -124,7 +123,18 @@ def measured_sizes(observed: Observed) -> dict[str, float]:
 
 def solve_session(observed: Observed) -> CellFit:
     """The one likelihood of what is known of a session; raises what `solve` raises."""
-    session = observed.timed
+    return solve_from(session_start(observed))
+
+
+def session_start(observed: Observed, reference: str = "", *, has_priors: bool = True) -> Start:
+    """Where the fit of a session starts: its lenses, frames, and the pose of each sighting.
+
+    Args:
+        observed: The observations.
+        reference: The cell's own frame; see `model.read_cell`.
+        has_priors: Whether what session.toml states of frames counts.
+    """
+    session, lenses = observed.timed, {name: at.camera for name, at in observed.lenses.items()}
     sweeps = [
         Swept(
             pair.camera,
@@ -139,15 +149,25 @@ def solve_session(observed: Observed) -> CellFit:
     for name, at in observed.robots.items():
         model = None if at.joints_rad is None or at.matched is None else at.matched.robot
         reports[name] = Reported(at.base_from_flange, at.joints_rad or {}, model)
-    cell = read_cell(session, _own_corners(observed), sweeps, reports)
-    # The fit of poses holds a lens; what it may be off by counts.
-    cameras = {
-        name: table.model_copy(update={"intrinsics": "auto"})
-        if table.intrinsics == "hold"
-        else table
-        for name, table in cell.cameras.items()
-    }
-    return solve(replace(cell, cameras=cameras))
+    cell = read_cell(session, _own_corners(observed), sweeps, reports, reference)
+    unused = {**observed.reasons, **observed.spared}
+    rows = enumerate(cell.sightings)
+    cell = cell.only(
+        at for at, one in rows if one.view not in unused and (has_priors or not one.is_stated)
+    )
+    cameras = dict(cell.cameras)
+    for name, table in cameras.items():
+        # The fit of poses holds a lens; what it may be off by counts.
+        other = table.model_copy(
+            update={"intrinsics": "auto"} if table.intrinsics == "hold" else {}
+        )
+        if name in observed.lenses and observed.lenses[name].estimated:
+            # The stated one may be another camera's.
+            other = other.model_copy(update={"matrix": None, "distortion": None})
+        cameras[name] = other
+    # Of one camera and one robot, a slip looks like a wrong pose.
+    early = EARLY_SHARE if is_whole_cell(observed.session) else 1.0
+    return start_of(replace(cell, cameras=cameras), lenses, early)
 
 
 def _own_corners(observed: Observed) -> dict[int, Corners]:
