@@ -1224,6 +1224,22 @@ def test_poses_beside_joints_are_the_target_s_where_nothing_else_was_seen(tmp_pa
     np.testing.assert_allclose(views[2].joints_rad, np.deg2rad(60.0 + np.arange(6)))
 
 
+def test_matrices_below_headings_of_one_log_are_the_robot_s_and_the_camera_s(tmp_path):
+    poses, _, _ = world()
+    seen = poses[::-1]
+    text = "started server\n"
+    for at, (flange, board) in enumerate(zip(poses, seen, strict=True)):
+        text += f"[ INFO] [149.{at:03d}]: Transform Pair Added\nL2Norm EE: 0.{at} vs Cam:0.1\n"
+        for name, pose in (("EE transform", flange), ("Cam transform", board)):
+            rows = "\n".join("  ".join(map(repr, row)) for row in pose.tolist())
+            text += f"{name}: \n{rows}\n"
+    write(tmp_path / "console.txt", text)
+    foreign = read_foreign(tmp_path / "console.txt", ImportOptions(mount="eye-to-hand"))
+    np.testing.assert_allclose(foreign.robot.poses(), poses, atol=1e-12)
+    assert foreign.camera is not None
+    np.testing.assert_allclose(foreign.camera.poses(), seen, atol=1e-12)
+
+
 @pytest.mark.parametrize("said", [(), ("--robot-columns", "x,y,z,rx,ry,rz")])
 def test_poses_of_six_columns_are_no_joint_angles_of_an_arm_of_six(tmp_path, said):
     poses = world()[0]

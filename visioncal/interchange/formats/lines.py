@@ -86,13 +86,22 @@ def _pictured(stop: _Lines) -> str:
 
 
 def arrays_in(lines: _Lines) -> dict[str, list[float]]:
-    """The numbers of lines by name."""
-    arrays = defaultdict[str, list[float]](list)
-    for name, numbers, line in ((*_numbers_in(line), line) for _, line in lines):
+    """The numbers of lines by name: their own, or that of the heading above, of two and more."""
+    arrays, heading = defaultdict[str, list[float]](list), "matrix"
+    entries = [(*_numbers_in(line), line) for _, line in lines]
+    above = list[str]()
+    for _, numbers, line in entries:
+        entry = None if numbers else _HEADED.fullmatch(line)
+        if entry and not entry[2]:
+            heading = " ".join(re.findall(r"[^\W\d]+", entry[1])) or "matrix"
+        above.append(heading)
+    headed = {top for top, (name, row, _) in zip(above, entries, strict=True) if row}
+    for top, (name, numbers, line) in zip(above, entries, strict=True):
+        named = top if name == "matrix" and len(headed - {"matrix"}) > 1 else name
         # A pose or a list that is written again replaces the first.
-        is_whole = len(numbers) in POSE_SIZES or (name != "matrix" and "[" in line)
-        is_again = is_whole and len(numbers) == len(arrays[name])
-        arrays[name] = numbers if is_again else arrays[name] + numbers
+        is_whole = len(numbers) in POSE_SIZES or (named != "matrix" and "[" in line)
+        is_again = is_whole and len(numbers) == len(arrays[named])
+        arrays[named] = numbers if is_again else arrays[named] + numbers
     return {name: row for name, row in arrays.items() if row}
 
 
