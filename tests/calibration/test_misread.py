@@ -281,6 +281,30 @@ def test_both_sides_in_millimetres_and_inverse_poses_of_the_camera_are_read_righ
         guess_reading(numbers(poses.true_robot[:3]), numbers(poses.camera.poses()[:3]), "")
 
 
+def test_two_readings_that_close_alike_are_both_named_and_none_is_taken(tmp_path):
+    poses = cell_poses(views=14)
+    turned = np.linalg.inv(poses.true_robot[:, :3, :3])
+    x, y, z, w = Rotation.from_matrix(turned).as_quat().T
+    # Inverse rotations, whose numbers x, y, z, w stand under the names w, x, y, z.
+    wrong = compose(
+        Rotation.from_quat(np.stack([y, z, w, x], axis=1)).as_matrix(), poses.true_robot[:, :3, 3]
+    )
+    guess = guessed(replace(poses, robot=numbers(wrong)))
+    assert guess.is_open
+    assert not guess.stands_out
+    assert "Nothing tells between these" in guess.sentence
+    assert "y, z, w, x" in guess.sentence
+    assert "positions taken as" in guess.sentence
+    session = pairs_session(poses.mount, wrong, poses.camera.poses())
+    (cause, *_) = visioncal.calibrate(session).verdict.causes
+    assert cause.kind == "misread_poses"
+    assert "--robot-form" in cause.do.words
+    session.save(tmp_path / "cell")
+    done = typed("convert", tmp_path / "cell", tmp_path / "fixed", "--guess", "--yes")
+    assert "Look how the program wrote the poses" in done.refused("close as first read").err
+    assert not guessed(poses).is_open
+
+
 SOUND = {
     "fair": {},
     "four views": {"views": 4},

@@ -19,8 +19,12 @@ from visioncal.calibration.stages import detect
 from visioncal.core.documents import tables
 from visioncal.interchange.formats import file_search, reading, rereading
 from visioncal.interchange.formats.foreign import ImportOptions
+from visioncal.interchange.formats.poses import pose_names, poses_from
+from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.registry import read_foreign
 from visioncal.interchange.formats.sources import describe
+from visioncal.robot import Robot
+from visioncal.robot.files import read_robot_document
 from visioncal.session import Session
 from visioncal.session.depth import ply_of, read_depth
 from visioncal.vision.boards.charuco import charuco_board
@@ -1238,6 +1242,50 @@ def test_matrices_below_headings_of_one_log_are_the_robot_s_and_the_camera_s(tmp
     np.testing.assert_allclose(foreign.robot.poses(), poses, atol=1e-12)
     assert foreign.camera is not None
     np.testing.assert_allclose(foreign.camera.poses(), seen, atol=1e-12)
+
+
+def test_a_header_in_a_comment_has_units_in_brackets_and_empty_ones(tmp_path):
+    poses, _, _ = world()
+    x, y, z, qx, qy, qz, qw = np.array([seven(pose) for pose in poses]).T
+    columns = [1e9 * np.arange(len(x)), 1e3 * x, 1e3 * y, 1e3 * z, qw, qx, qy, qz]
+    numbers = np.stack(columns, axis=1)
+    header = ", ".join(
+        [
+            "#timestamp",
+            *(f"p_RS_R_{axis} [mm]" for axis in "xyz"),
+            *(f"q_RS_{n} []" for n in "wxyz"),
+        ]
+    )
+    rows = (", ".join(map(repr, row)) for row in numbers.tolist())
+    write(tmp_path / "robot.csv", "\n".join([header, *rows]))
+    fields = read_fields(tmp_path / "robot.csv")
+    names = pose_names(fields, (), "robot", ())
+    found, notes, _ = poses_from(fields, names, ImportOptions().robot, "robot")
+    np.testing.assert_allclose(found.poses(), poses, atol=1e-12)
+    assert not notes
+
+
+@pytest.mark.parametrize("is_printed", [False, True])
+def test_joints_are_in_the_order_of_the_arm_s_names(tmp_path, is_printed):
+    """ROS writes the joints of a message in the order of the alphabet."""
+    poses, _, _ = world()
+    names = Robot.from_document(read_robot_document("ur5e")).joint_names
+    q = np.linspace(-1.0, 1.0, 6 * len(poses)).reshape(-1, 6)
+    order = np.argsort(names)
+    columns, cells = [names[at] for at in order], q[:, order].tolist()
+    if is_printed:
+        columns = [f"field.{of}{at}" for of in ("name", "position", "velocity") for at in range(6)]
+        cells = [[*np.array(names)[order].tolist(), *row, *6 * [0.1]] for row in cells]
+    seen = [f"marker_{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    rows = (
+        ",".join(map(str, [*row, *seven(pose)])) for row, pose in zip(cells, poses, strict=True)
+    )
+    write(tmp_path / "samples.csv", "\n".join([",".join([*columns, *seen]), *rows]))
+    said = ImportOptions(mount="eye-to-hand", robot_model="ur5e")
+    foreign = read_foreign(tmp_path / "samples.csv", said)
+    np.testing.assert_allclose(foreign.joints_rad, q, atol=1e-12)
+    assert foreign.camera is not None
+    np.testing.assert_allclose(foreign.camera.poses(), poses, atol=1e-12)
 
 
 @pytest.mark.parametrize("said", [(), ("--robot-columns", "x,y,z,rx,ry,rz")])

@@ -101,7 +101,10 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
         raise DataError(
             "Nothing was written: the chain does not close as first read, and no other reading "
             "stands out.",
-            next_step="Check that the poses and what the camera saw are of the same views and the "
+            next_step="Look how the program wrote the poses, and state that: --robot-form, "
+            "--robot-unit, --robot-inverse, or --robot-columns in the right order."
+            if guess.is_open
+            else "Check that the poses and what the camera saw are of the same views and the "
             "same robot, and that positions stand before rotations (where not, name the columns in "
             "that order: --robot-columns 4,5,6,1,2,3). Without --guess it is written as it is; "
             "visioncal doctor then looks for what happened midway.",

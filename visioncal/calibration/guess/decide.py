@@ -59,6 +59,11 @@ class Guess:
         """Whether another reading than the declared one is clearly right."""
         return self.best is not self.declared
 
+    @property
+    def is_open(self) -> bool:
+        """Whether several readings close the chain alike, and the declared one does not."""
+        return not self.stands_out and bool(_alike(self.declared, self.candidates))
+
 
 def guess_reading(
     robot: PoseNumbers,
@@ -239,9 +244,31 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
         closes += f"; the next, {rivals[0].words}, to {_figures(rivals[0])}"
     if _turns_about_one_axis(declared):
         return f"{ONE_AXIS} at most, which cannot distinguish readings. As first read, {closes}."
+    if alike := _alike(declared, ranked):
+        words = (
+            f"{', '.join(item.hypothesis.changes)} (to {_figures(item)})" for item in alike[:3]
+        )
+        listed = "; or with ".join(words)
+        return (
+            f"Robot and camera agree with {listed}. Nothing tells between these. As first read, "
+            f"they agree to {_figures(declared)}."
+        )
     if not declared.fit.closes:
         return f"No reading that was tried stands out: as first read, {closes}."
     return f"The poses fit as first read: {closes}."
+
+
+def _alike(declared: Candidate, ranked: Sequence[Candidate]) -> list[Candidate]:
+    """Readings that close the chain as well as the best, where the declared one does not.
+
+    A quaternion whose numbers are in another order turns as its inverse between two fixed frames,
+    so that two mistakes of rotations may look like axes of positions that are exchanged.
+    """
+    if declared.fit.closes or _turns_about_one_axis(declared):
+        return []
+    rivals = [item for item in ranked if item is not declared and item.fit.closes]
+    most = max((item.log_posterior for item in rivals), default=np.inf)
+    return [item for item in rivals if item.log_posterior > most - CLEAR]
 
 
 def _figures(candidate: Candidate) -> str:

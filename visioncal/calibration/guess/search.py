@@ -54,7 +54,7 @@ _TURNS_AGREE_RAD, _PRINTED, _FOLLOWED, _CONCENTRATED = 0.1, 0.03, 0.2, 4
 _DETERMINED = 1e-3
 # The screening and the first fits hand on at most so many readings, whose scores are near the best
 # one's but for a quarter of a degree, which noisy poses of few views add to any bound.
-_HANDED_ON, _SLACK = 100, 5e-3
+_HANDED_ON, _SLACK = 400, 5e-3
 # Quantile of the pairs' mismatch: with a quarter of the views wrong, 56 % of pairs are right.
 PAIRS_SHARE = 0.35
 
@@ -255,14 +255,20 @@ def _unwrapped(recording: Recording, *, keep_turns: bool) -> Iterator[Change]:
 
 
 def _of_another_size(
-    recording: Recording, candidates: Iterable[Candidate], rows: IntArray
+    recording: Recording, candidates: Sequence[Candidate], rows: IntArray
 ) -> list[Candidate]:
-    """The readings whose turns agree and whose distances do, once the camera's are multiplied."""
+    """The readings whose turns agree and whose distances do, once the camera's are multiplied.
+
+    The first candidate is the declared reading.
+    """
     scaled: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
+    declared = candidates[0]
     for item in candidates:
         if item.fit.rms[1] > _TURNS_AGREE_RAD:
             continue
-        scale, changed = _distance_scale(item), bool(item.hypothesis.changes)
+        # Signs and mirrors that turn both frames leave the chain as it is declared.
+        changed = not np.isclose(item.fit.score, declared.fit.score, rtol=1e-3)
+        scale = _distance_scale(item)
         if scale is None or abs(np.log(scale)) < (_PRINTED if changed else _FOLLOWED):
             continue
         whose = (

@@ -42,6 +42,10 @@ _LOST_TURNS = Remedy(
     "or degrees=True of SciPy), and write the poses anew; or convert the robot's own log. The "
     "session cannot be mended: whole turns about the last axis of the tool are lost."
 )
+_WHICH = Remedy(
+    "Look how the program wrote the poses, and convert the recording anew with that stated: "
+    "--robot-form, --robot-unit, --robot-inverse, or --robot-columns in the right order."
+)
 _UNRECORDED = Remedy(
     "Convert the recording itself again with --guess, if the session was made of one: angles that "
     "were misread cannot all be read anew from here. Or look how the poses were recorded, and how "
@@ -135,6 +139,8 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
         step = _MIRRORED if robot.mirrored else step
         yield Finding("misread_poses", guess.sentence, step)
+    elif guess.is_open:
+        yield Finding("misread_poses", guess.sentence, _WHICH)
     yield from unknown
 
 

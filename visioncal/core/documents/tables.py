@@ -246,7 +246,10 @@ def _header_in_comments(
     if not comment.startswith(_COMMENTS):
         return None
     names = comment.lstrip("#%/ ").rpartition(":")[2]
-    words = names.replace(separator, " ").replace(",", " ").split()
+    # Names may have blanks, and units in brackets: `#t, p_x [m], q_w []`.
+    words = [cell.strip() for cell in names.split(separator)]
+    if separator == " " or len(words) != width or not all(words):
+        words = names.replace(separator, " ").replace(",", " ").split()
     # A sentence may have as many words.
     is_whole = all(sum(map(word.count, "([")) == sum(map(word.count, ")]")) for word in words)
     fits = is_whole and len(words) == width and not any(is_number(word) for word in words)

@@ -35,6 +35,7 @@ _UNIT = re.compile(
     rf"|(?<=_)({'|'.join([*UNITS_M, *_ANGLES])}))",
     re.IGNORECASE,
 )
+_UNITLESS = re.compile(r"\s*+[\[(]\s*+[-1]?+\s*+[\])]$")
 
 
 def _set(words: str) -> set[str]:
@@ -44,6 +45,8 @@ def _set(words: str) -> set[str]:
 _POSITION_WORDS = _set("translation position pos ort posición tvec tvecs trans xyz t")
 _ROTATION_WORDS = _set("rotation orientation quaternion quat rotvec rot r ori winkel drehung angle")
 _ROTATION_WORDS |= _set("ángulo giro rotación rvec rvecs rpy euler vector matrix xyzw wxyz theta")
+# Of `p_RS_R_x` the last R is a frame.
+_PLACE = _set("p position")
 _POSE_WORDS = _set("pose poses transform transforms t h matrix")
 # Words of the parent frame and of the child frame, for the robot and for the camera.
 _FRAMES = {
@@ -85,6 +88,8 @@ _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
 
 def without_unit(name: str) -> tuple[str, str]:
     """A field's name without its unit, and that, or none: `rx(deg)`, `X [mm]`, `x_m`."""
+    # A number without a unit has empty brackets: `q_w []`.
+    name = _UNITLESS.sub("", name)
     match = _UNIT.fullmatch(name)
     return (match[1], (match[2] or match[3]).lower()) if match and match[1] else (name, "")
 
@@ -133,7 +138,7 @@ def possible_poses(
     turns: list[_Piece] = []
     for piece in (*_arrays(fields, taken), *_numbers(fields, taken)):
         words, name = {*piece.words}, piece.names[0].lower()
-        is_turn = piece.size == 3 and bool(_ROTATION_WORDS & words)
+        is_turn = piece.size == 3 and bool(_ROTATION_WORDS & words) and words.isdisjoint(_PLACE)
         named = _POSE_WORDS | _CHILD_FIRST | _FRAMES["robot"][1]
         is_named = bool(words & named) and not _NO_POSE.search(name)
         if is_turn or piece.appearance in ("rotation", "quaternion"):
@@ -206,7 +211,8 @@ def _without_names(
         return
     joints = {*joint_names(fields, ())}
     for parent, columns in column_groups(fields, taken).items():
-        if joints & {*columns} or len(columns) > _MOST_COLUMNS:
+        is_other = bool(joints & {*columns} or _NO_POSE.search(parent.lower()))
+        if is_other or len(columns) > _MOST_COLUMNS:
             continue
         flat = np.stack([fields.numbers[name] for name in columns], axis=1)
         for size, at in product((16, 12, 7, 6), range(len(columns) - 5)):
@@ -280,7 +286,7 @@ def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:
         )
         if {*named} == {*"xyzw"}:
             position, rotation = (), tuple("xyzw")
-        elif position and not rotation and _ROTATION_WORDS & {*words}:
+        elif position and not rotation and _ROTATION_WORDS & {*words} and words[0] not in _PLACE:
             position, rotation = (), position
         # Five and more of these are joints.
         if rotation and "q5" not in named:
@@ -375,10 +381,17 @@ _JOINTS = re.compile(
     r"(?:.*[._])?(?:joint_pose|joints?|joint_angles|joint_(?:positions?|values?|states?)|q)"
 )
 _JOINT_NAME = re.compile(
-    r"(?:.*\.)?(joint|axis|gelenk|achse|j|a|q)[ _]?([1-9])((?:[ _]?(?:pos|position|angle))?"
-    r"(?:[ _]*\W*(?:deg|rad|[°º])[a-z]*\W*)?)",
+    r"(?:.*\.)?((?:[^.]*_)?(?:joint|axis|gelenk|achse)|j|a|q)[ _]?([1-9])"
+    r"((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*(?:deg|rad|[°º])[a-z]*\W*)?)",
     re.IGNORECASE,
 )
+# Universal Robots' names, which ROS writes in the order of the alphabet.
+_OF_UR = (
+    *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
+    *("wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
+)
+# Numbers of joints that are no angles.
+_NO_ANGLE = re.compile("vel|speed|acc|effort|torque|curr|temp|target|desired|command")
 
 _ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)R(_|$)")
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
@@ -523,9 +536,16 @@ def _usual_form(names: Sequence[str], usual: str | None) -> str | None:
     return form.name if fits and (makers or all(map(str.isdecimal, names))) else None
 
 
-def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
-    """Finds the fields of joint angles: one list, or a field a joint numbered from one."""
+def joint_names(
+    fields: Fields, taken: Collection[str], known: Sequence[str] = _OF_UR
+) -> tuple[str, ...]:
+    """Finds the fields of joint angles: one list, or a field a joint, numbered from one or `known`.
+
+    Those of known names are in the order of these.
+    """
     if columns := joint_columns(tuple(fields.numbers)):
+        return columns
+    if columns := _joints_called(fields, taken, known):
         return columns
     lists = [
         name
@@ -547,6 +567,21 @@ def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
         if len(by_number) >= 5 and [*by_number] == [*range(1, len(by_number) + 1)]:
             return tuple(by_number.values())
     return ()
+
+
+def _joints_called(fields: Fields, taken: Collection[str], known: Sequence[str]) -> tuple[str, ...]:
+    """The only columns of some joints' names, with words before or after; empty unless one each."""
+    called = defaultdict[str, list[str]](list)
+    for name, numbers in fields.numbers.items():
+        plain = without_unit(name)[0].lower()
+        if numbers.ndim > 1 or name in taken or _NO_ANGLE.search(plain):
+            continue
+        plain = re.sub(r"[._ ](?:pos|position|angle|value|state)$", "", plain)
+        for joint in known:
+            if re.search(rf"(?:^|[._ /]){re.escape(joint.lower())}$", plain):
+                called[joint].append(name)
+    columns = [called[joint] for joint in known]
+    return tuple(names[0] for names in columns) if all(len(n) == 1 for n in columns) else ()
 
 
 def joints_from(
@@ -628,13 +663,10 @@ def _likely_rotation(
     if size == 9:
         return "matrix", ""
     if size == 4:
-        ends = (
-            names[0][-4:].lower()
-            if len(names) == 1
-            else "".join(name[-1].lower() for name in names)
-        )
+        plain = [without_unit(name)[0].lower() for name in names]
+        ends = plain[0][-4:] if len(names) == 1 else "".join(name[-1] for name in plain)
         # ABB numbers q1 to q4 from the scalar on, trackers q0 to q3.
-        is_abb = "".join(name[-2:].lower() for name in names) in ("q1q2q3q4", "q0q1q2q3")
+        is_abb = "".join(name[-2:] for name in plain) in ("q1q2q3q4", "q0q1q2q3")
         rotation = f"quaternion-{'wxyz' if is_abb or ends == 'wxyz' else 'xyzw'}"
         # Of a mapping, whose numbers were joined by their names.
         is_mapping = len(names) > 1 and "." in names[0] and {*ends} == {*"xyzw"}

@@ -120,7 +120,8 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
         Texts, small arrays, and lists that are no arrays; large arrays and nulls are left out.
     """
     if isinstance(record, Mapping):
-        flat: dict[str, object] = {}
+        flat: dict[str, object] = _by_joint(record, prefix)
+        record = {name: value for name, value in record.items() if not (flat and name in _MESSAGE)}
         plain = {str(name).lower(): value for name, value in record.items()}
         joined = next((names for names in map(str.split, _JOINED) if {*names} == {*plain}), None)
         are_numbers = all(type(value) in (int, float) for value in plain.values())
@@ -147,6 +148,38 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
             return {name: record} if numbers else flat
         return {name: record}
     return {name: array} if record is not None and array.size <= MOST_NUMBERS else {}
+
+
+# Lists of a joint each in a ROS message of joints, beside the joints' names.
+_MESSAGE = ("name", "position", "velocity", "effort")
+
+
+def _by_joint(record: Mapping[str, object], prefix: str) -> dict[str, object]:
+    """The angles of a message of joints by their names; empty for any other record."""
+    names, angles = record.get("name"), record.get("position")
+    if not (isinstance(names, list | tuple) and isinstance(angles, list | tuple | np.ndarray)):
+        return {}
+    numbers = [each for each in angles if isinstance(each, int | float | np.number)]
+    are_words = all(isinstance(name, str) and not is_number(name) for name in names)
+    if not (are_words and len(names) == len(numbers) == len(angles) > 1):
+        return {}
+    pairs = zip(names, numbers, strict=True)
+    return {f"{prefix}position.{name}": np.array(float(angle)) for name, angle in pairs}
+
+
+def _named_joints(fields: Fields) -> Fields:
+    """Columns `position0` with the word in `name0`, as a ROS message of joints is printed."""
+    called = dict[str, str]()
+    for name, cells in fields.texts.items():
+        match = re.fullmatch(r"(.*\.)?name_?([0-9]+)", name)
+        if match and len({*cells}) == 1 and cells[0] and not is_number(cells[0]):
+            for of in _MESSAGE[1:]:
+                called[f"{match[1] or ''}{of}{match[2]}"] = f"{match[1] or ''}{of}.{cells[0]}"
+    return replace(
+        fields,
+        numbers={called.get(name, name): value for name, value in fields.numbers.items()},
+        texts={called.get(name, name): value for name, value in fields.texts.items()},
+    )
 
 
 def _in_line(record: object) -> list[float]:
@@ -212,7 +245,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
         return [found]
     records = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     places = [table.place(index) for index in range(len(table.rows))]
-    fields = fields_of_records(records, places, path.stem, path.parent)
+    fields = _named_joints(fields_of_records(records, places, path.stem, path.parent))
     # Headings may have as many words as matrices have columns; a picture may stand in a sentence.
     is_odd = 2 * len(fields.numbers) < len(table.columns)
     pictured = IMAGE.search(text.splitlines()[table.lines[0] - 1])

@@ -210,10 +210,13 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
 
 
 def _joints(fields: Fields, requested: ImportOptions) -> tuple[str, ...]:
-    """The only columns beside each other that are as many as the joints of the user's robot."""
+    """Columns called as the joints of the user's robot; else the only ones that are as many."""
     if requested.robot_model is None:
         return ()
-    count = Robot.from_document(read_robot_document(requested.robot_model)).joint_count
+    robot = Robot.from_document(read_robot_document(requested.robot_model))
+    if called := joint_names(fields, (), robot.joint_names):
+        return called
+    count = robot.joint_count
     # Columns called x, y, z, or named by the user, are a pose.
     poses = pose_names(fields, requested.robot.names, "robot", (), by_shape=False)
     places = {*poses, *columns_named(fields, ("x", "y", "z"))}
