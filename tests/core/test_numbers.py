@@ -86,7 +86,22 @@ CHANCES = (0.5, 0.05, 1e-4, 1e-9)
 
 # Two ways to the same quantile: a few thousand units in the last place.
 def test_a_root_lies_within_the_tolerance():
-    assert abs(root_of(lambda value: value**3 - 2.0, 0.0, 2.0, 1e-9) - 2.0 ** (1 / 3)) < 1e-9
+    evaluated = []
+
+    def found(rising, root):
+        evaluated.clear()
+        at = root_of(lambda value: evaluated.append(value) or rising(value), -30.0, 2.0, 1e-9)
+        assert abs(at - root) < 1e-9
+
+    # Halving takes 35 evaluations.
+    found(lambda value: np.tanh(value - 1.03), 1.03)
+    assert len(evaluated) < 20
+    for steep in (lambda value: (value - 0.3) ** 9, lambda value: 1.0 if value > 0.3 else -1e-3):
+        found(steep, 0.3)
+        assert len(evaluated) < 140
+    # Where a function has no root, the bound that is nearest to one.
+    found(lambda _: 1.0, -30.0)
+    found(lambda _: -1.0, 2.0)
 
 
 @pytest.mark.parametrize("chance", CHANCES)

@@ -34,8 +34,26 @@ def t_chance(value: float, freedom: float) -> float:
 
 
 def root_of(rising: Callable[[float], float], low: float, high: float, tolerance: float) -> float:
-    """Where a rising function is zero between two bounds, by bisection."""
+    """Where a rising function is zero between two bounds, to half a tolerance.
+
+    Halves first, then by the chord between the bounds (Illinois: Dowell and Jarratt 1971), at least
+    half a tolerance within them, so that both close in, and each fourth time by halving: half as
+    many evaluations as by halving where a function is smooth, and never over four times as many.
+    """
+    wide, below, above, last, step = (high - low) / 16, np.nan, np.nan, 0, 0
     while high - low > tolerance:
-        middle = (low + high) / 2
-        low, high = (low, middle) if rising(middle) > 0.0 else (middle, high)
+        step += 1
+        share = below / (below - above)
+        chord = low + share * (high - low)
+        by_chord = high - low < wide and 0.0 < share < 1.0 and step % 4
+        at = chord if by_chord else (low + high) / 2
+        at = min(max(at, low + tolerance / 2), high - tolerance / 2)
+        value = rising(at)
+        side = 1 if value > 0.0 else -1
+        # The bound that stays a second time counts half.
+        if side > 0:
+            high, above, below = at, value, below / 2 if last == side else below
+        else:
+            low, below, above = at, value, above / 2 if last == side else above
+        last = side
     return (low + high) / 2
