@@ -121,7 +121,7 @@ PLANTED = {
 )
 def test_pictures_of_several_sizes_are_no_circle(place, name):
     cell = sound_session(place / "cell")
-    edit(cell, lambda text: "".join(text.splitlines(keepends=True)[:15]), "views.csv")
+    edit(cell, lambda text: "".join(text.splitlines(keepends=True)[:12]), "views.csv")
     PLANTED[name](cell)
     assert follow("doctor", "cell").last.status == 0
     assert follow("calibrate", "cell", "-o", "out").last.status == 0

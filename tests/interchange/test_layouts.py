@@ -1356,7 +1356,9 @@ def test_a_board_of_other_counts_is_named_before_the_form_is_asked_for(tmp_path)
 def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypatch):
     session = world()[2]
     shoot(tmp_path / "in", "img{:02d}.png")
-    poses = np.random.default_rng(0).normal(0.0, 0.5, (9, 6))
+    # Quaternions, which have fewer readings than angles, none of which agrees.
+    poses = np.random.default_rng(0).normal(0.0, 0.5, (9, 7))
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
     np.save(tmp_path / "in/poses.npy", poses)
     write(tmp_path / "board.toml", tomli_w.dumps(target_document(session.target)))
     find, searched = detect.find_corners, list[int]()
