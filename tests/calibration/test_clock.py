@@ -369,7 +369,7 @@ def test_what_is_open_about_the_clocks_counts(session):
     for stage in STAGES[:after]:
         known = stage.run(known)
     spreads = []
-    for sigma_s in (1e-6, 5e-3):
+    for sigma_s in (1e-6, 1e-4, 5e-3):
         clocks = {
             pair: replace(clocked, clock=replace(clocked.clock, sigma_s=sigma_s))
             for pair, clocked in known.clocks.items()
@@ -379,10 +379,11 @@ def test_what_is_open_about_the_clocks_counts(session):
             later = stage.run(later)
         budget = result_of(later).uncertainty.budget_mm
         spreads.append((budget["clock"], budget["total"]))
-    assert spreads[0][0] < 1e-3
-    # The used views themselves tell the offset to better than 5 ms, but not for nothing.
-    assert spreads[1][1] > spreads[0][1]
-    assert spreads[1][0] > spreads[0][0]
+    # The used views themselves tell the offset to 0.1 ms, but not for nothing: of one that is known
+    # to 5 ms before, their noise counts, and no longer the clock's.
+    (known_to_a_us, no_better, far_worse), totals = zip(*spreads, strict=True)
+    assert max(known_to_a_us, far_worse) < 1e-3 < no_better
+    assert totals[0] < totals[1] < totals[2]
 
 
 def test_views_with_poses_of_their_own_ask_no_stream(session):

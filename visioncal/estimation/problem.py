@@ -480,7 +480,7 @@ class Problem:
         jacobian = -self._moved(state)[1]
         jacobian[~self.observations.has_rotation, :3] = 0.0
         if self.is_combined:
-            return np.broadcast_to(np.eye(6), jacobian.shape)
+            return self._combined_shapes
         return jacobian
 
     def _linearised(self, state: State, *, ideal: bool) -> Linear:
@@ -506,7 +506,7 @@ class Problem:
         by_flanges = by_predicted @ errors
         by_errors = by_flanges
         if self.is_combined:
-            by_errors = np.broadcast_to(np.eye(6), errors.shape)
+            by_errors = self._combined_shapes
         return Linear(residuals, tuple(blocks), by_errors, by_flanges, self.size)
 
     def change_of(self, frame: str, state: State) -> FloatArray:
@@ -528,6 +528,12 @@ class Problem:
             else:
                 changes[group.rows] = rest @ error[group.rows] @ invert(rest)
         return changes
+
+    @property
+    def _combined_shapes(self) -> FloatArray:
+        """(n, 6, 6) Jacobian of the residuals by the combined noise of robot and camera."""
+        shapes = self.observations.shapes
+        return np.broadcast_to(np.eye(6), (len(self), 6, 6)) if shapes is None else shapes
 
     def _variances(self, noise: Noise) -> FloatArray:
         """(n, 1, 1) factors of the observations' own covariances at some noise."""

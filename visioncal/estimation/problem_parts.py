@@ -32,6 +32,9 @@ class Observations:
     has_rotation: Mask  # (n,) whether its rotation was measured; else its position alone.
     # (n,) whether its covariance is a guess, with unknown differences between observations.
     is_uneven: Mask
+    # (n, 6, 6) by which noise of one level acts on each, in its own axes; None where it acts on all
+    # alike, or is of the flange.
+    shapes: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.stops)

@@ -414,7 +414,7 @@ def of_pose_alone(heads: FloatArray) -> FloatArray:
 
 
 # Noise of poses that were measured by images (at a metre), by the rows that have it.
-_NOISES = (
+MEASURED_NOISES = (
     ("rad", slice(0, 2)), ("roll", slice(2, 3)), ("m", slice(3, 5)), ("depth", slice(5, 6)),
 )  # fmt: skip
 
@@ -510,12 +510,12 @@ def _measured_parts(
             rows[at, 3:, 3:6], rows[at, 3:, 7] = pose[:3, :3], evidence.place_m - pose[:3, 3]
             rows[at] /= evidence.sigma_m or 1.0
             rows[at, [3 + axis for axis in range(3) if axis not in evidence.axes]] = 0.0
-    noises: Sequence[tuple[str, slice]] = _NOISES
+    noises: Sequence[tuple[str, slice]] = MEASURED_NOISES
     if is_of_board:
         at_sight = [
             s.evidence.matrix for s in pair.sightings if isinstance(s.evidence, MeasuredPose)
         ]
-        rows = _by_sight(rows, np.array(at_sight), pair.middle)
+        rows = sight_weights(np.array(at_sight), pair.middle) @ rows
     else:
         rows = np.delete(rows, 6, axis=2)
         sigmas = first.sigmas if isinstance(first, MeasuredPose) else (1.0, place_m)
@@ -534,15 +534,15 @@ def _measured_parts(
     return tuple(parts), {("shape", seen): np.arange(6, 7)} if is_of_board else {}
 
 
-def _by_sight(rows: FloatArray, poses: FloatArray, middle: FloatArray) -> FloatArray:
-    """Rows (k, 6, w) of poses about a board's middle, in axes of which the last is along the sight.
+def sight_weights(poses: FloatArray, middle: FloatArray) -> FloatArray:
+    """(k, 6, 6) factors of residuals of (k, 4, 4) measured poses, for noise of one size each.
 
-    An image determines tilt and distance less surely than the turn about the line of sight and what
-    is across it. The smaller the board is in it, the worse: rows are in units of what noise is at a
-    metre, from where it grows with the distance, and along the sight with its square. Both are of
-    the (k, 4, 4) poses as measured, so that noise does not depend on the unknowns.
+    They are about a board's (3,) middle, in axes of which the last is along the sight. An image
+    determines tilt and distance less surely than the turn about the line of sight and what is
+    across it. The smaller the board is in it, the worse: the noise is that at a metre, from where
+    it grows with the distance, and along the sight with its square. Both are of the poses as
+    measured, so that noise does not depend on the unknowns.
     """
-    rows = adjoint(invert(compose(np.eye(3), middle))) @ rows
     places = apply(poses, middle[None])[:, 0]
     # One at no distance is wrong: it gets a millimetre.
     far = np.maximum(np.linalg.norm(places, axis=1), 1e-3)
@@ -550,6 +550,7 @@ def _by_sight(rows: FloatArray, poses: FloatArray, middle: FloatArray) -> FloatA
     across = np.cross([0.0, 1.0, 0.0], along)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     axes = np.stack([across, np.cross(along, across), along], axis=1) @ poses[:, :3, :3]
-    turned = axes[:, None] @ rows.reshape(len(rows), 2, 3, -1)
-    noise = far[:, None] ** np.array([1, 1, 1, 1, 1, 2])
-    return np.asarray(turned.reshape(rows.shape) / noise[:, :, None])
+    weights = np.zeros((len(poses), 6, 6))
+    weights[:, :3, :3] = weights[:, 3:, 3:] = axes
+    weights /= (far[:, None] ** np.array([1, 1, 1, 1, 1, 2]))[:, :, None]
+    return np.asarray(weights @ adjoint(invert(compose(np.eye(3), middle))))

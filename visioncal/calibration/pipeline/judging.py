@@ -65,7 +65,7 @@ def findings_of(run: RunState) -> Findings:
     return Findings(
         _pairs(connected, explained, answer, alone=run.mount is not None),
         _sensors(connected, run),
-        _arms(answer),
+        _arms(run),
         _worst(run),
         (*contested(run, found_in(run)), *run.warnings),
         run.notes,
@@ -221,9 +221,10 @@ def _sensors(views: Sequence[ViewResult], run: RunState) -> list[Sensor]:
     return sensors
 
 
-def _arms(answer: FitAssessment) -> list[JudgedArm]:
-    problem, cell_fit = answer.fit.problem, answer.cell_fit
-    arms = []
+def _arms(run: RunState) -> list[JudgedArm]:
+    answer, cell_fit = run.assessment, run.cell_fit
+    problem, arms = answer.fit.problem, []
+    budget = {} if run.mount is None else run.uncertainty.budget_mm
     for index, (robot, intervals) in enumerate(zip(problem.robots, answer.intervals, strict=True)):
         arm, found = cell_fit.arms[robot], answer.arms[robot].sections.arm
         accuracy = None if found is None else found.workspace_sigma_mm
@@ -233,6 +234,8 @@ def _arms(answer: FitAssessment) -> list[JudgedArm]:
         judged = JudgedArm(
             len(stops),
             has_posture_errors=arm.errors is not None and arm.errors.is_significant,
+            # The greater part of the variance.
+            are_lasting=budget.get("arm", 0.0) > 0.7 * budget.get("total", np.inf),
             workspace_mm=None if accuracy is None else accuracy.median,
             modelled=model is not None,
             repeatability=REPEATABILITY if model is None else model.repeatability,

@@ -27,7 +27,7 @@ from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.unknowns import ARM, BOARD, EDGE, LENS
+from visioncal.estimation.unknowns import ARM, BOARD, EDGE, LENS, SIZE
 from visioncal.results import (
     HELD_BACK,
     Calibration,
@@ -226,12 +226,13 @@ def _joint_fit(run: RunState) -> JointFit | None:
 def _fitted_stops(run: RunState, by_noise: FloatArray) -> FittedStops | None:
     """The residuals of each board at each stop; None where a frame or a clock moved."""
     assessment, beside = run.assessment, run.cell_fit.other_effects
-    growing = {effect.name for effect in of_random_effects(beside)}
-    if assessment.moved or len(growing) < len(beside):
+    unknown = {effect.name for effect in of_random_effects(beside)} | {SIZE}
+    if assessment.moved or any(effect.name not in unknown for effect in beside):
         return None
-    # Of what grew with time or reach, a check knows nothing: it is in the residuals.
+    # Of what grew with time or reach, and of a size by which poses were measured, a check knows
+    # nothing: it is in the residuals.
     whole, state = assessment.fit.problem, assessment.fit.state
-    problem = whole.with_effects([part for part in whole.effects if part.name not in growing])
+    problem = whole.with_effects([part for part in whole.effects if part.name not in unknown])
     values = [whole.values_of(part.name, state) for part in problem.effects]
     linear = problem.linear(State(state.edges, np.concatenate([np.zeros(0), *values])))
     views = np.array([row.view for row in run.cell_fit.cell.rows])[run.cell_fit.inlier_fit.used]

@@ -18,7 +18,11 @@ from visioncal.calibration.stages.arms import RobotArm, arm_effects, check_arms,
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
-from visioncal.calibration.stages.error_sizes import error_sizes, measured_sizes
+from visioncal.calibration.stages.error_sizes import (
+    MeasuredErrors,
+    error_sizes,
+    measured_errors,
+)
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.observed import Observed
@@ -51,6 +55,7 @@ from visioncal.estimation.solve import (
     starting_noise,
 )
 from visioncal.estimation.steps import find_steps, joints_of
+from visioncal.estimation.unknowns import SIZE
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
 # any arm's repeatability.
@@ -81,8 +86,10 @@ def solve(
     if solver != "joint":
         cell, level = replace(cell, priors=()), "hand-eye"
     start = find_start(cell, observed, is_solved=not observed.misread)
+    measured = measured_errors(None if observed.scenes else start.solved)
+    start = _with_shapes(start, measured)
     try:
-        cell_fit = _fit(start, observed, arms, level)
+        cell_fit = _fit(start, observed, arms, level, measured.sizes)
     except (VisioncalError, np.linalg.LinAlgError):
         # Along an undetermined direction the fit of lens and frames diverges.
         if start.cell.mount is not None and not observed.misread:
@@ -93,7 +100,29 @@ def solve(
     return cell_fit if solver == "joint" else _by_closed_form(cell_fit, solver)
 
 
-def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> CellFit:
+def _with_shapes(start: Start, measured: MeasuredErrors) -> Start:
+    """The start with the noise of measured poses by distance and line of sight; itself of others.
+
+    A program that finds a board in an image tells neither: tilt and distance of a single marker are
+    less sure by ten times than what is across the sight.
+    """
+    problem, rows = start.problem, start.cell.rows
+    if not problem.is_combined or not all(row.view in measured.noise for row in rows):
+        return start
+    covariance = np.array([measured.noise[row.view] for row in rows])
+    variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=(0, 2))
+    shapes = np.linalg.cholesky(covariance) / np.sqrt(np.repeat(variances, 3))
+    observations = replace(problem.observations, shapes=shapes)
+    return replace(start, problem=replace(problem, observations=observations))
+
+
+def _fit(
+    start: Start,
+    observed: Observed,
+    arms: Mapping[str, RobotArm],
+    level: str,
+    sizes: Mapping[str, float],
+) -> CellFit:
     """Alternates between inliers, lenses and boards, and arms."""
     cell, poses = start.cell, start.poses
     misread = observed.misread
@@ -122,11 +151,12 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
     nominal = cell_fit
     cell_fit, noise = _calibrate_arms(nominal, observed, final)
-    is_measured = not observed.scenes and any(arm.model for arm in cell_fit.arms.values())
-    if is_measured and (sigmas := measured_sizes(start.solved)):
-        # Boards of another size look as other lengths of an arm do.
-        nominal = _with_sizes(nominal, sigmas)
-        cell_fit, noise = _calibrate_arms(_fit_with_inliers(nominal, observed), observed, None)
+    if sizes:
+        # Boards of another size look as other lengths of an arm do. Slopes by a size are those at
+        # the poses of the fit before, which a size of some percent moves.
+        for _ in range(2):
+            nominal = _fit_with_inliers(_with_sizes(nominal, sizes), observed)
+        cell_fit, noise = _calibrate_arms(nominal, observed, None)
     if level != "hand-eye":
         # The many unknowns of functions of the joints would slow each update of the inliers down.
         arms = _choose_levels(cell_fit, noise, functions=True)
@@ -138,12 +168,17 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
 
 def _with_sizes(cell_fit: CellFit, sigmas: Mapping[str, float]) -> CellFit:
     """The fit beside sizes of targets, whose poses a program measured."""
-    inliers = cell_fit.inlier_fit
-    sizes = target_sizes(inliers.problem, sigmas)
-    problem = inliers.problem.with_effects([*inliers.problem.effects, sizes])
-    values = np.append(inliers.fit.state.values, sizes.values)
-    sized = problem.sized_at(State(inliers.fit.state.edges, values)).effects[-1]
-    return replace(cell_fit, other_effects=(*cell_fit.other_effects, sized))
+    problem, state = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.fit.state
+    sizes, columns = target_sizes(problem, sigmas), problem.effect_columns
+    values = np.append(state.values, sizes.values)
+    if SIZE in columns:
+        values = state.values
+        sizes = replace(sizes, values=problem.values_of(SIZE, state))
+    kept = [effect for effect in problem.effects if effect.name != SIZE]
+    problem = problem.with_effects([*kept, sizes])
+    sized = problem.sized_at(State(state.edges, values)).effects[-1]
+    others = (effect for effect in cell_fit.other_effects if effect.name != SIZE)
+    return replace(cell_fit, other_effects=(*others, replace(sized, values=np.zeros(len(sizes)))))
 
 
 def _of_misread(cell_fit: CellFit, observed: Observed) -> CellFit:
@@ -181,7 +216,10 @@ def _with_likelier_noise(cell_fit: CellFit, observed: Observed) -> CellFit:
     def misfit(found: InlierFit) -> float:
         """Negative log-likelihood of the same observations."""
         part, fit = found.problem.subset(inliers.used), found.fit
-        return robot_likelihood(part, fit.state, fit.noise).white[1]
+        misfit = robot_likelihood(part, fit.state, fit.noise).white[1]
+        # It is that of errors by which noise acts, in whose units the residuals are.
+        is_shaped = part.is_combined and part.observations.shapes is not None
+        return misfit + float(np.linalg.slogdet(part.ideal_errors(fit.state))[1].sum()) * is_shaped
 
     return other if misfit(inliers) - misfit(other.inlier_fit) > CONTRADICTION else cell_fit
 

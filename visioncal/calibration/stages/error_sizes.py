@@ -12,6 +12,7 @@ from visioncal.estimation.outliers import EARLY_SHARE
 from visioncal.estimation.scene import BoardSizes
 from visioncal.fit.fit import Fit
 from visioncal.fit.held import doubted_boards
+from visioncal.fit.linearise import MEASURED_NOISES, sight_weights
 from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
@@ -20,7 +21,7 @@ from visioncal.model.effects import Effect, LensGrows, LensSteps
 from visioncal.session import frame_name
 from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.camera import intrinsics
-from visioncal.vision.targets import first_corners
+from visioncal.vision.targets import corner_positions, first_corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,17 +109,41 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
     return ErrorSizes(levels, lenses, boards, grown, zoomed, tuple(effects), held)
 
 
-def measured_sizes(solved: CellFit | None) -> dict[str, float]:
-    """Sigmas of the sizes of boards whose poses a program measured in images, by frame."""
+@dataclass(frozen=True, eq=False)
+class MeasuredErrors:
+    """Errors of boards' poses that a program measured in images; none where no fit converges."""
+
+    # (6, 6) covariance about the target of each pose's residual, by view, with the noise of the
+    # flange from stop to stop.
+    noise: Mapping[int, FloatArray] = field(default_factory=dict)
+    sizes: Mapping[str, float] = field(default_factory=dict)  # Sigmas of scales, by frame.
+
+
+def measured_errors(solved: CellFit | None) -> MeasuredErrors:
+    """The errors of measured poses by the one likelihood of a session without images."""
     if solved is None:
-        return {}
+        return MeasuredErrors()
     fit = solved.fit
-    boards = [
-        one.seen
-        for one in fit.cell.sightings
-        if isinstance(one.evidence, MeasuredPose) and one.evidence.is_of_board
-    ]
-    return {name: fit.sizes[f"scale {name}"] for name in boards if f"scale {name}" in fit.sizes}
+    noise, sizes = dict[int, FloatArray](), dict[str, float]()
+    of_flange = np.zeros((6, 6))
+    for frame in fit.cell.arms:
+        if f"rad {frame}" in fit.sizes:
+            rad, metres = fit.sizes[f"rad {frame}"], fit.sizes[f"m {frame}"]
+            of_flange += np.diag(np.repeat([rad, metres], 3) ** 2)
+    for one in fit.cell.sightings:
+        pose = one.evidence
+        if not isinstance(pose, MeasuredPose) or not pose.is_of_board:
+            continue
+        if f"scale {one.seen}" in fit.sizes:
+            sizes[one.seen] = fit.sizes[f"scale {one.seen}"]
+        sigmas = np.zeros(6)
+        for name, rows in MEASURED_NOISES:
+            sigmas[rows] = fit.sizes[f"{name} {one.seer}"]
+        board = fit.cell.boards.get(one.seen)
+        middle = np.zeros(3) if board is None else corner_positions(board).mean(axis=0)
+        factor = np.linalg.inv(sight_weights(pose.matrix[None], middle)[0]) * sigmas
+        noise[one.view] = factor @ factor.T + of_flange
+    return MeasuredErrors(noise, sizes)
 
 
 def solve_session(observed: Observed) -> CellFit:

@@ -60,6 +60,8 @@ class JudgedArm:
     lower_bounds: tuple[float, float] | None = None
     # Whether it has posture-dependent errors, which have a finding of their own.
     has_posture_errors: bool = False
+    # Whether most of what is uncertain comes from errors that last from stop to stop.
+    are_lasting: bool = False
     # Median predicted position sigma of a calibrated arm's tool over the workspace; None for a
     # nominal arm [mm].
     workspace_mm: float | None = None

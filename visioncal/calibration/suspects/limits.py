@@ -19,6 +19,10 @@ from visioncal.results import Rms, ViewResult
 _LIMITS = CalibrationLimits()
 # Views that are named.
 _LISTED = 3
+_LOOK_AT_BOTH = (
+    "More views alike will not help: give images in place of poses of a marker, or a larger "
+    "marker; then record joint angles with the arm's model."
+)
 
 
 def collect_findings(judged: Findings) -> list[Finding]:
@@ -201,6 +205,9 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
     )
     if any(warning.do == NO_JOINTS for warning in judged.warnings):
         step, by = NO_JOINTS, "by the arm's own errors"
+    elif any(arm.are_lasting for arm in judged.arms):
+        # They are no finding where chance may explain them, or no arm errs by as much.
+        step, by = Remedy(_LOOK_AT_BOTH), "by errors that last from view to view"
     elif _is_of_board(judged) and is_of_board:
         step, by = MEASURE_BOARD, "by how well the board's size is stated"
     words = (
