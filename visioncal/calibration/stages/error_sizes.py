@@ -37,10 +37,10 @@ class FoundEffect:
 
 @dataclass(frozen=True)
 class Zoom:
-    """A lens whose focal length changed at once."""
+    """A lens whose focal length changed, by more than one that warms up."""
 
-    station: int  # The first after it.
-    share: float  # Of the focal length by which it is longer from there on.
+    station: int | None  # The first after it changed at once; None where it crept.
+    share: float  # Of the focal length by which it is longer from there on, or at the end.
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +52,8 @@ class ErrorSizes:
     lenses: Mapping[str, FloatArray] = field(default_factory=dict)
     boards: Mapping[str, BoardSizes] = field(default_factory=dict)  # By the session's name.
     grown: tuple[FoundEffect, ...] = ()  # Lenses that grow.
-    # Lenses that changed at once, by camera: the fit has them as lenses that vary from view to
-    # view, since what is linear at one lens is not so at another.
+    # Other lenses that changed, by camera: the fit has them as lenses that vary from view to view,
+    # since what is linear at one lens is not so at another.
     zoomed: Mapping[str, Zoom] = field(default_factory=dict)
     opened: tuple[Effect, ...] = ()  # Of frames that move.
     # Whether boards keep their stated sizes: errors of arms are confounded with them.
@@ -93,18 +93,15 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
         own = abs(float(found.values[0])) / (4.0 * _noise_px(fit, name))
         jitter = float(np.hypot(levels[name].jitter, own))
         levels[name] = replace(levels[name], jitter=jitter)
-    zoomed = dict[str, Zoom]()
-    for effect in fit.unknowns.effects:
-        if isinstance(effect, LensSteps) and _size(fit, effect.name):
-            name, others = effect.frame, levels[effect.frame]
-            share = -float(fit.state.values["effect", effect.name][0])
-            stops = np.array([one.stop for one in fit.cell.sightings if one.seer == name])
-            before = float(np.mean(stops < effect.stop))
-            jitter = abs(share) * np.sqrt(before * (1.0 - before)) / _noise_px(fit, name)
-            gains = (*others.gains[:2], max(others.gains[2], _gain(fit, effect.name)))
-            jitter = float(np.hypot(others.jitter, jitter))
-            levels[name] = replace(others, jitter=jitter, gains=gains)
-            zoomed[name] = Zoom(fit.cell.stations[effect.stop], share)
+    zoomed, grew = dict[str, Zoom](), {at.effect.frame: abs(float(at.values[0])) for at in grown}
+    for effect, zoom, rms in _changed(fit):
+        name, others = effect.frame, levels[effect.frame]
+        jitter = float(np.hypot(others.jitter, rms / _noise_px(fit, name)))
+        gains = (*others.gains[:2], max(others.gains[2], _gain(fit, effect.name)))
+        levels[name] = replace(others, jitter=jitter, gains=gains)
+        # A step beside a larger growth is what its course differs by.
+        if abs(zoom.share) > grew.get(name, 0.0):
+            zoomed[name], grew[name] = zoom, abs(zoom.share)
     effects = (at for at in fit.unknowns.effects if at.place == "edge" and _size(fit, at.name))
     return ErrorSizes(levels, lenses, boards, grown, zoomed, tuple(effects), held)
 
@@ -244,6 +241,21 @@ def _grown(fit: Fit) -> Iterator[FoundEffect]:
         key: Key = ("effect", effect.name)
         estimate, covariance = fit.state.values[key], fit.covariance(key)
         yield FoundEffect(effect, columns, estimate, covariance, _gain(fit, effect.name))
+
+
+def _changed(fit: Fit) -> Iterator[tuple[Effect, Zoom, float]]:
+    """Lenses that changed at once or crept, and by which share of the focal length (rms)."""
+    for effect in fit.unknowns.effects:
+        size = _size(fit, effect.name)
+        if isinstance(effect, LensSteps) and size:
+            share = -float(fit.state.values["effect", effect.name][0])
+            stops = np.array([one.stop for one in fit.cell.sightings if one.seer == effect.frame])
+            before = float(np.mean(stops < effect.stop))
+            zoom = Zoom(fit.cell.stations[effect.stop], share)
+            yield effect, zoom, abs(share) * float(np.sqrt(before * (1.0 - before)))
+        elif isinstance(effect, LensGrows) and size > effect.most:
+            share = float(fit.state.values["effect", effect.name][0])
+            yield effect, Zoom(None, share), abs(share) / 4.0
 
 
 def _gain(fit: Fit, name: str) -> float:

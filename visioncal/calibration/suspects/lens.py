@@ -24,7 +24,7 @@ from visioncal.model.effects.effect import SIGNIFICANT
 from visioncal.results.compare import intrinsics_names
 from visioncal.vision.camera import intrinsics, normalise, project, with_intrinsics
 
-# Changes of intrinsics or corners below this show in no image [px].
+# Changes of intrinsics or corners below this show in no image, and in no pick [px].
 _LEAST_MOVE_PX = 0.1
 # Another model of a lens leaves so much less: more than an even field does.
 _BETTER = 1.1
@@ -181,15 +181,17 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             if gain > SIGNIFICANT
         ]
         if (zoom := run.cell_fit.sizes.zoomed.get(name)) is not None:
-            way, cell = "longer" if zoom.share > 0.0 else "shorter", run.cell_fit.cell
-            yield Finding(
-                "focus",
-                f"{of} changed at once, as where it was zoomed, refocused or hit: "
-                f"{cell.start_words(zoom.station)}, its focal length is "
-                f"{figure(100.0 * abs(zoom.share))} % {way}. The result counts it as scatter.",
-                cell.or_separately("Fix zoom and focus", zoom.station),
-                mahalanobis_sq=changes[1],
-            )
+            share = f"{figure(100.0 * abs(zoom.share))} % "
+            share += "longer" if zoom.share > 0.0 else "shorter"
+            words = f"{of} crept, as where focus or zoom give way: its focal length became {share}."
+            do, cell = Remedy("Fix zoom and focus, and record again."), run.cell_fit.cell
+            if zoom.station is not None:
+                first = cell.start_words(zoom.station)
+                do = cell.or_separately("Fix zoom and focus", zoom.station)
+                words = f"{of} changed at once, as where it was zoomed, refocused or hit: {first}, "
+                words += f"its focal length is {share}."
+            words += " The result counts it as scatter."
+            yield Finding("focus", words, do, mahalanobis_sq=changes[1])
         elif how:
             yield Finding(
                 "focus",
@@ -216,7 +218,8 @@ def _of_fisheye(run: RunState, name: str, of: str) -> Finding | None:
         )
     except VisioncalError:
         return None
-    if fisheye_px * _BETTER > taken_px:
+    gained_px = np.sqrt(max(taken_px**2 - fisheye_px**2, 0.0))
+    if fisheye_px * _BETTER > taken_px or gained_px < _LEAST_MOVE_PX:
         return None
     return Finding(
         "lens_model",

@@ -13,7 +13,7 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect, Named, Stood
-from visioncal.model.effects.lens_grows import TIME_CONSTANTS
+from visioncal.model.effects.lens_grows import TIME_CONSTANTS, still_to_come
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +75,7 @@ class _Creep(_Moves, Named):
 
     def left(self, moments: Moments) -> FloatArray:
         """See `_Moves`."""
-        over = moments.progress[:, None, None] + 1.0
-        if self.rate == 0.0:
-            return np.asarray(1.0 - over)
-        end = np.exp(-self.rate)
-        return np.asarray((np.exp(-self.rate * over) - end) / (1.0 - end))
+        return still_to_come(moments, self.rate)[:, None, None]
 
 
 @dataclass(frozen=True, eq=False)

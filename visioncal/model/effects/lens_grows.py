@@ -14,6 +14,15 @@ from visioncal.model.effects.effect import Effect, LensEffect, Named
 TIME_CONSTANTS = 3.0
 
 
+def still_to_come(moments: Moments, rate: float) -> FloatArray:
+    """(k,) share of what goes on over the session, and fades by a rate, after each moment."""
+    over = moments.progress + 1.0
+    if rate == 0.0:
+        return np.asarray(1.0 - over)
+    end = np.exp(-rate)
+    return np.asarray((np.exp(-rate * over) - end) / (1.0 - end))
+
+
 @dataclass(frozen=True, eq=False)
 class LensGrows(LensEffect, Named):
     """Growth of the focal lengths, and shifts of the centre by as many pixels, until the end.
@@ -23,17 +32,19 @@ class LensGrows(LensEffect, Named):
 
     kind, bounds, count, most = "lens grows", (1e-2, 1e-7, 0.1), 3, 3e-3
     do = "Let the camera run for half an hour before it is calibrated and used."
+    rate: float = TIME_CONSTANTS  # By which it fades, over the session; zero of an even one.
 
     @classmethod
     def of_lens(cls, camera: str, lens: Camera) -> Iterator[Effect]:
-        """See `Named`."""
-        yield cls(camera, lens)
+        """As what warms up; evenly."""
+        for rate in (TIME_CONSTANTS, 0.0):
+            yield cls(camera, lens, rate)
 
     @classmethod
     def says(cls, values: FloatArray) -> str:
         """See `Named`."""
         way = "grew" if values[0] > 0.0 else "shrank"
-        share = figure(100.0 * abs(float(values[0])) * (1.0 - np.exp(-TIME_CONSTANTS)))
+        share = figure(100.0 * abs(float(values[0])))
         return (
             f"The lens's focal length {way} by {share} % during the session, as of a camera that "
             "warms up. The result is that of its end."
@@ -42,7 +53,7 @@ class LensGrows(LensEffect, Named):
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
-        left = np.exp(-TIME_CONSTANTS * (moments.progress + 1.0)) - np.exp(-TIME_CONSTANTS)
+        left = still_to_come(moments, self.rate)
         found, focal = self.none(moments), self.lens.matrix[:2]
         found[:, :2, 0] = -np.outer(left, focal)
         found[:, 2, 1] = found[:, 3, 2] = -left * np.mean(focal)
