@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.boards import any_page, raster
 from support.commands import visioncal
 from support.misfits import misfit
@@ -171,6 +172,14 @@ def test_a_guard_and_locate_look_for_the_picture_in_images(target, tmp_path, mon
     assert status == 2
     assert all(answer["holds"] for answer in answers[:-1])
     assert "label.png: the picture is not seen" in answers[-1]["error"]["message"]
+    pose = cell.robot.base_from_flange[0]
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    typed = "--pose=" + ",".join(str(value) for value in (*pose[:3, 3], *quaternion))
+    cv2.imwrite("mirrored.png", cv2.flip(cv2.imread("0.png", 0), 1))
+    refused = visioncal("locate", "mirrored.png", "-c", ".", typed)
+    assert refused.status == 2
+    assert "the picture is seen mirrored" in refused.err
+    assert "Look at mirrored.png: is target" in refused.err
     status, answers = judged(0.003)
     assert (status, answers[-2]["holds"]) == (3, False)
 

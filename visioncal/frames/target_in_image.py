@@ -71,6 +71,8 @@ def target_pose_candidates(
             raise DataError(
                 f"{label}: target {target.name}: {corners.reason}{'; ' if cause else ''}{cause}.",
                 culprits=[label],
+                next_step=f"Look at {label}: is target {target.name} in it, sharp, near enough and "
+                "not mirrored? Take it again, or name the target that it shows.",
             )
     positions = corner_positions(target)
     ids = corners.ids

@@ -200,7 +200,7 @@ def nothing_seen(observed: Observed) -> DataError:
     return DataError(
         f"session {observed.session.name!r}: no view shows the target, or enough of it{why}.",
         culprits=observed.lost_views,
-        next_step=f"Look at {image}: is the whole board in it, sharp, near enough and not "
-        "mirrored, and is it the one that the session declares? visioncal target check IMAGE says "
-        "what it shows.",
+        next_step=f"Look at {image}: is the whole target in it, sharp, near enough and not "
+        "mirrored, and is it the one that the session declares? visioncal target check IMAGE names "
+        "the board, if it shows one.",
     )
