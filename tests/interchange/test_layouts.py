@@ -18,7 +18,8 @@ from support.samples import made_up
 from visioncal.calibration.stages import detect
 from visioncal.core.documents import tables
 from visioncal.interchange.formats import file_search, reading, rereading
-from visioncal.interchange.formats.foreign import ImportOptions
+from visioncal.interchange.formats.columns import foreign_from
+from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.poses import pose_names, poses_from
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.registry import read_foreign
@@ -1228,14 +1229,20 @@ def test_poses_beside_joints_are_the_target_s_where_nothing_else_was_seen(tmp_pa
     np.testing.assert_allclose(views[2].joints_rad, np.deg2rad(60.0 + np.arange(6)))
 
 
-def test_matrices_below_headings_of_one_log_are_the_robot_s_and_the_camera_s(tmp_path):
+@pytest.mark.parametrize("said", ["console", "OpenCV", "headings alone"])
+def test_matrices_below_headings_of_one_log_are_the_robot_s_and_the_camera_s(tmp_path, said):
     poses, _, _ = world()
-    seen = poses[::-1]
-    text = "started server\n"
+    seen, text = poses[::-1], "started server\n" if said == "console" else ""
     for at, (flange, board) in enumerate(zip(poses, seen, strict=True)):
-        text += f"[ INFO] [149.{at:03d}]: Transform Pair Added\nL2Norm EE: 0.{at} vs Cam:0.1\n"
+        if said == "console":
+            text += f"[ INFO] [149.{at:03d}]: Transform Pair Added\nL2Norm EE: 0.{at} vs Cam:0.1\n"
+        text += f"Pose {at}\n" * (said == "OpenCV")
         for name, pose in (("EE transform", flange), ("Cam transform", board)):
             rows = "\n".join("  ".join(map(repr, row)) for row in pose.tolist())
+            if said == "OpenCV":
+                # As C++ prints a cv::Mat.
+                rows = ";\n ".join(", ".join(map(repr, row)) for row in pose.tolist())
+                rows = f"[{rows}]"
             text += f"{name}: \n{rows}\n"
     write(tmp_path / "console.txt", text)
     foreign = read_foreign(tmp_path / "console.txt", ImportOptions(mount="eye-to-hand"))
@@ -1263,6 +1270,44 @@ def test_a_header_in_a_comment_has_units_in_brackets_and_empty_ones(tmp_path):
     found, notes, _ = poses_from(fields, names, ImportOptions().robot, "robot")
     np.testing.assert_allclose(found.poses(), poses, atol=1e-12)
     assert not notes
+
+
+def test_messages_in_a_text_are_read_as_documents(tmp_path):
+    """As `rostopic echo` prints them; and an angle about an axis, as an Ensenso's."""
+    poses, _, _ = world()
+    parts, records = [], []
+    for pose in poses:
+        x, y, z, qx, qy, qz, qw = map(float, seven(pose))
+        place = f"  position: \n    x: {x!r}\n    y: {y!r}\n    z: {z!r}\n"
+        turn = f"  orientation: \n    x: {qx!r}\n    y: {qy!r}\n    z: {qz!r}\n    w: {qw!r}\n"
+        parts.append(f'header: \n  seq: 100\n  frame_id: "link_base"\npose: \n{place}{turn}')
+        vector = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
+        angle = float(np.linalg.norm(vector))
+        rotation = {"Angle": angle, "Axis": (vector / angle).tolist()}
+        records.append({"Pattern": {"Rotation": rotation, "Translation": [x, y, z]}})
+    write(tmp_path / "robot.txt", "---\n".join(parts))
+    write(tmp_path / "board.json", json.dumps(records))
+    said = ImportOptions(mount="eye-to-hand", camera_file=tmp_path / "board.json")
+    foreign = read_foreign(tmp_path / "robot.txt", said)
+    np.testing.assert_allclose(foreign.robot.poses(), poses, atol=1e-12)
+    assert foreign.camera is not None
+    np.testing.assert_allclose(foreign.camera.poses(), poses, atol=1e-12)
+
+
+def test_numbered_columns_of_a_pose_and_of_joints_are_read(tmp_path):
+    """As UR's own programs call them."""
+    poses, _, _ = world()
+    columns = ["timestamp", *(f"actual_{of}_{n}" for of in ("q", "TCP_pose") for n in range(6))]
+    q = np.linspace(-1.0, 1.0, 6 * len(poses)).reshape(-1, 6)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    rows = np.column_stack([5.0 * np.arange(len(q)), q, poses[:, :3, 3], turns]).tolist()
+    lines = (" ".join(map(repr, row)) for row in rows)
+    write(tmp_path / "rtde.csv", "\n".join([" ".join(columns), *lines]))
+    said = ImportOptions(robot=PoseImportOptions(form="ur"))
+    fields = read_fields(tmp_path / "rtde.csv")
+    foreign = foreign_from(fields, said)
+    np.testing.assert_allclose(foreign.robot.poses(), poses, atol=1e-12)
+    np.testing.assert_allclose(foreign.joints_rad, q, atol=1e-12)
 
 
 @pytest.mark.parametrize("is_printed", [False, True])

@@ -229,6 +229,14 @@ def search(recording: Recording) -> list[Candidate]:
             refined.append(reading)
     found = fitted(recording, refined, rows, STARTS)
     first, *others = (replace(item, labels=labels[item.hypothesis]) for item in found)
+    if first.fit.closes:
+        # Two changes that turn both frames leave the chain as it is declared.
+        others = [
+            item
+            for item in others
+            if recording.is_likely(item.hypothesis) != recording.is_likely(declared)
+            or not np.isclose(item.fit.score, first.fit.score, rtol=1e-6)
+        ]
     others += _of_another_size(recording, [first, *others], rows)
     others.sort(key=lambda item: -item.log_posterior)
     return [first, *others]

@@ -67,7 +67,7 @@ def _read_easy_handeye(path: Path, requested: ImportOptions) -> ForeignRecording
     """Reads samples: `robot` and `tracking` as geometry_msgs/Transform, in one list or two."""
     file = _easy_handeye_file(path) or path
     document = mapping(read_yaml(file), str(file))
-    samples = document.get("samples")
+    samples = document.get("samples", document if {*_SAMPLE_LISTS} <= {*document} else None)
     if isinstance(samples, Mapping):
         # As the services of ROS 1 have them, with or without a header.
         robot, camera = (

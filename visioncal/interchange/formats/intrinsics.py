@@ -50,10 +50,11 @@ def read_target_description(words: str) -> Mapping[str, Any]:
             read = {name: _READ[name](text) for name, text in groups if text is not None}
             document = {"kind": kind, **read}
     if document is None:
-        if not words.lower().endswith(".toml") and words not in target_names():
+        is_file = words.lower().endswith((".toml", ".yaml", ".yml"))
+        if not is_file and words not in target_names():
             raise DataError(
                 f"There is no target {words[:80]!r}: it must be a name "
-                f"({', '.join(target_names())}), the path of a .toml, or a "
+                f"({', '.join(target_names())}), the path of a .toml or of Kalibr's .yaml, or a "
                 f"description: {FORMS}.",
                 culprits=[words[:80]],
             )

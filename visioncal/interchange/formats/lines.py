@@ -68,7 +68,13 @@ def _stops(lines: _Lines) -> list[_Lines]:
         words = Counter(line for (_, line), count in zip(lines, counts, strict=True) if not count)
         # Of headings those that differ are the stops'.
         once = np.array([words[line] == 1 for _, line in lines], dtype=bool)
-        marks = once if 2 * once.sum() >= words.total() else counts == 0
+        same = {count for count in words.values() if count > 1}
+        first = next(iter(words), "")
+        if not once.any() and len(words) > 1 and len(same) == 1:
+            # Headings in turn: the first begins a stop.
+            once = np.array([line == first for _, line in lines], dtype=bool)
+        is_regular = same == {once.sum()} or 2 * once.sum() >= words.total()
+        marks = once if is_regular else counts == 0
         marks = np.array(named) == most if count > 2 else marks
     if 2 * len(own := np.flatnonzero(marks & (counts > 0))) > marks.sum():
         return [lines[at:end] for at, end in pairwise([*own.tolist(), len(lines)])]

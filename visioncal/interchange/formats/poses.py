@@ -2,7 +2,7 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 
@@ -284,6 +284,9 @@ def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:
             next((part for part in known if {*part} <= named.keys()), ())
             for known in (_POSITION_NAMES, _ROTATION_NAMES)
         )
+        if _POSE_WORDS & {*words} and (columns := _counted(named)):
+            flat = np.stack([fields.numbers[name] for name in columns], axis=1)
+            yield _Piece(columns, tuple(words), len(columns), appearance(flat))
         if {*named} == {*"xyzw"}:
             position, rotation = (), tuple("xyzw")
         elif position and not rotation and _ROTATION_WORDS & {*words} and words[0] not in _PLACE:
@@ -295,6 +298,15 @@ def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:
         if position:
             names = tuple(named[each] for each in position)
             yield _Piece(names, (*words, "position"), 3, "")
+
+
+def _counted(named: Mapping[str, str]) -> tuple[str, ...]:
+    """Columns whose last words are numbers from zero or one, as many as a pose has; else empty."""
+    numbers = sorted(int(word) for word in named if word.isdecimal())
+    first = numbers[0] if numbers else 2
+    is_whole = numbers == [*range(first, first + len(numbers))] and len(numbers) == len(named)
+    fits = is_whole and first < 2 and len(numbers) in _OF_POSES[:5] and len(numbers) > 5
+    return tuple(named[str(number)] for number in numbers) if fits else ()
 
 
 def _by_prefix(fields: Fields, taken: Collection[str]) -> dict[str, dict[str, str]]:
@@ -381,7 +393,7 @@ _JOINTS = re.compile(
     r"(?:.*[._])?(?:joint_pose|joints?|joint_angles|joint_(?:positions?|values?|states?)|q)"
 )
 _JOINT_NAME = re.compile(
-    r"(?:.*\.)?((?:[^.]*_)?(?:joint|axis|gelenk|achse)|j|a|q)[ _]?([1-9])"
+    r"(?:.*\.)?((?:[^.]*_)?(?:joint|axis|gelenk|achse)|(?:actual_)?q|j|a)[ _]?([0-9])"
     r"((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*(?:deg|rad|[°º])[a-z]*\W*)?)",
     re.IGNORECASE,
 )
@@ -489,11 +501,14 @@ def _split(
         of_rotation = (names[0] if rotation_first else names[1],)
     if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
         raise DataError(
-            f"{fields.name}: {', '.join(names)} have {sum(sizes)} numbers; a pose has 16 or 12 "
-            "(matrix), 7 (quaternion) or 6 (three angles). There are " + fields.listing() + ".",
+            f"{fields.name}: the {sum(sizes)} numbers of {', '.join(names)} are no pose, which has "
+            "16 or 12 (matrix), 7 (quaternion) or 6 (three angles). There are "
+            f"{fields.listing()}.",
             culprits=list(names),
             next_step=f"Name the fields of the {whose}'s poses with --{whose}-"
-            f"{named_by(fields.places[0])}.",
+            f"{named_by(fields.places[0])}."
+            + " What only moves, as a gantry, or only turns, as a gimbal about a fixed point, has "
+            "zeros for the other three: add these columns." * (sum(sizes) == 3),
         )
     # The numbers of a mapping have names of their own.
     inner = tuple(name for name in fields.numbers if name.startswith(f"{of_rotation[0]}."))
@@ -563,8 +578,11 @@ def joint_names(
         if match and is_whole and name not in taken:
             counted[match.group(1, 3)][int(match[2])] = name
     for by_number in counted.values():
-        # Four numbers q1 ... may be a quaternion.
-        if len(by_number) >= 5 and [*by_number] == [*range(1, len(by_number) + 1)]:
+        # Four numbers q1 ... may be a quaternion. UR's programs count from zero.
+        if len(by_number) >= 5 and [*by_number] in (
+            [*range(len(by_number))],
+            [*range(1, len(by_number) + 1)],
+        ):
             return tuple(by_number.values())
     return ()
 

@@ -121,6 +121,8 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
     """
     if isinstance(record, Mapping):
         flat: dict[str, object] = _by_joint(record, prefix)
+        if (vector := _about_axis(record)) is not None:
+            return {prefix.rstrip(".") or "value": vector}
         record = {name: value for name, value in record.items() if not (flat and name in _MESSAGE)}
         plain = {str(name).lower(): value for name, value in record.items()}
         joined = next((names for names in map(str.split, _JOINED) if {*names} == {*plain}), None)
@@ -165,6 +167,17 @@ def _by_joint(record: Mapping[str, object], prefix: str) -> dict[str, object]:
         return {}
     pairs = zip(names, numbers, strict=True)
     return {f"{prefix}position.{name}": np.array(float(angle)) for name, angle in pairs}
+
+
+def _about_axis(record: Mapping[str, object]) -> FloatArray | None:
+    """The rotation vector of a mapping of an angle [rad] and an axis; None of any other one."""
+    plain = {str(name).lower(): value for name, value in record.items()}
+    with suppress(ValueError, TypeError):
+        if {*plain} == {"angle", "axis"}:
+            axis, angle = (np.array(plain[name], dtype=float) for name in ("axis", "angle"))
+            if axis.shape == (3,) and not angle.shape and np.linalg.norm(axis) > 0.0:
+                return np.asarray(angle * axis / np.linalg.norm(axis))
+    return None
 
 
 def _named_joints(fields: Fields) -> Fields:
@@ -222,7 +235,8 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
         return rows_of_document(rows_of_xml(read_xml(path)), path)
     # Points that a program declares look like keys and values.
     is_program = path.suffix.lower() in PROGRAMS
-    for literals in () if is_program else (_literals(text, path), _braced(text), _keyed(text)):
+    read = (_messages, _literals, lambda text, _: _braced(text), lambda text, _: _keyed(text))
+    for literals in () if is_program else (each(text, path) for each in read):
         with suppress(DataError):
             return rows_of_document(literals, path)
     if declared := () if is_program or "=" not in text else declared_poses(text, path):
@@ -519,6 +533,16 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
         if match and (nested or isinstance(value, np.ndarray)):
             rows[int(match[2])][match[1] or "matrix"] = value
     return dict(sorted(rows.items()))
+
+
+def _messages(text: str, path: Path) -> list[object]:
+    """Documents of YAML in a text, as `rostopic echo` prints one message after the other."""
+    parts = [part for part in re.split(r"^---\s*$", text, flags=re.MULTILINE) if part.strip()]
+    if len(parts) < 3 or not all(re.match(r"\s*\w+:", part) for part in parts):
+        return []
+    with suppress(DataError):
+        return [parse_yaml(part, str(path)) for part in parts]
+    return []
 
 
 def _literals(text: str, path: Path) -> list[object]:

@@ -390,7 +390,7 @@ def _untested(
                 next_step=(f"{_MOVE}say" if why.startswith(ONE_AXIS) else "Say")
                 + f" --{whose}-form {forms}.{joints if whose == 'robot' else ''}",
             )
-    note = f"Forms of poses that the source does not state were not tested: {why}."
+    note = f"The form of the poses, which the source does not state, stays as first read: {why}."
     return replace(foreign, notes=(*foreign.notes, note))
 
 
