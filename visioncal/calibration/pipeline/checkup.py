@@ -195,11 +195,16 @@ def _motion(run: RunState) -> Iterator[Finding]:
     if too_few_digits is not None:
         yield too_few_digits
     elif 1e3 * metres > max(limits.sigma_mm[0], limits.repeatability * repeats_mm):
+        whose = "industrial arms repeat" if run.robot is None else "this arm repeats"
+        causes = "the board is of another size than stated, the lens is not this camera's"
+        if not run.scenes:
+            causes = "the marker has few pixels or its other pose was taken, the mount is wrong"
+        servo = ", or this is a servo arm, which repeats worse" * (run.robot is None)
         yield Finding(
             "scatter",
             f"The views disagree by {mm_and_deg(1e3 * metres, np.rad2deg(rad))} from stop to stop, "
-            f"and such arms repeat to {repeats_mm:g} mm: the board is of another size than stated, "
-            "the lens is not this camera's, or the poses are not of these images.",
+            f"and {whose} to {repeats_mm:g} mm: {causes}, the poses are not of these "
+            f"{'images' if run.scenes else 'rows'}{servo}.",
             Remedy("Calibrate: the verdict weighs the causes.", CALIBRATE),
         )
 
