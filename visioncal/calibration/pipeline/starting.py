@@ -27,6 +27,8 @@ from visioncal.session import frame_name
 
 # Covariance, up to a level, of a pose that was given without one [rad^2, m^2].
 _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
+# Share of the rows that agree, below which something may have moved.
+_MOST_AGREE = 0.9
 _AMBIGUOUS = "ambiguous: two poses of the target fit image and motion alike"
 
 
@@ -44,12 +46,16 @@ class Start:
 
     @property
     def agreeing(self) -> Mask | None:
-        """(n,) rows that agree by the one likelihood."""
+        """(n,) rows that agree by the one likelihood; None where that does not tell.
+
+        Where many do not agree, something may have moved, which no single row shows.
+        """
         if self.solved is None:
             return None
         used = np.flatnonzero(self.solved.used).tolist()
         views = {self.solved.fit.cell.sightings[at].view for at in used}
-        return np.array([row.view in views for row in self.cell.rows], dtype=bool)
+        agreeing = np.array([row.view in views for row in self.cell.rows], dtype=bool)
+        return agreeing if np.mean(agreeing) >= _MOST_AGREE else None
 
 
 def find_start(cell: Cell, observed: Observed, *, is_solved: bool) -> Start:
@@ -77,7 +83,7 @@ def find_start(cell: Cell, observed: Observed, *, is_solved: bool) -> Start:
     begun = session_start(observed, cell.reference, has_priors=bool(cell.priors))
     solved = _solved(begun) if is_solved else None
     edges = dict(begun.edges)
-    if solved is not None and cell.mount is not None:
+    if solved is not None and cell.mount is not None and np.mean(solved.used) >= _MOST_AGREE:
         # In a whole cell, frames may have moved since.
         edges = {name: solved.fit.edge(name) for name in edges}
     chosen, ambiguous = _chosen(cell, problem, views, edges)

@@ -19,7 +19,6 @@ from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
 from visioncal.model.effects import Effect, LensGrows, LensSteps
 from visioncal.session import frame_name
-from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions, first_corners
 
@@ -187,9 +186,7 @@ def session_start(observed: Observed, reference: str = "", *, has_priors: bool =
             # The stated one may be another camera's.
             other = other.model_copy(update={"matrix": None, "distortion": None})
         cameras[name] = other
-    # Of one camera and one robot, a slip looks like a wrong pose.
-    early = EARLY_SHARE if is_whole_cell(observed.session) else 1.0
-    return start_of(replace(cell, cameras=cameras), lenses, early)
+    return start_of(replace(cell, cameras=cameras), lenses, EARLY_SHARE)
 
 
 def _own_corners(observed: Observed) -> dict[int, Corners]:
