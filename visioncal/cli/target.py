@@ -157,6 +157,7 @@ def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
         "same_markers": list(identity.larger),
         "marker_ids": list(identity.marker_ids),
         "mirrored": identity.is_mirrored,
+        "negative": identity.is_negative,
         "notes": list(identity.notes),
     }
     if board.marker_m:

@@ -1,7 +1,8 @@
-"""A session's images as its camera took them: mirrored back, turned back and of one size."""
+"""A session's images as its camera took them: mirrored and turned back, positive, of one size."""
 
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import PurePath
 
 import cv2
@@ -50,13 +51,16 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
     for board, target in session.boards.items():
         mine = [view for view in present if session.board_of(view) == board]
         some = [images[view.image] for view in spread(mine) if view.image in images]
-        try:
-            mirrored = identify([*map(grey_of, some)], target).is_mirrored if some else False
-        except DataError:
-            mirrored = False
-        for name in {view.image for view in mine if mirrored} & images.keys():
-            images[name] = np.ascontiguousarray(images[name][:, ::-1])
-            done[name].append("mirrored back")
+        shown = None
+        with suppress(DataError):
+            shown = identify([*map(grey_of, some)], target) if some else None
+        for name in {view.image for view in mine if shown is not None} & images.keys():
+            if shown is not None and shown.is_mirrored:
+                images[name] = np.ascontiguousarray(images[name][:, ::-1])
+                done[name].append("mirrored back")
+            if shown is not None and shown.is_negative:
+                images[name] = np.asarray(cv2.bitwise_not(images[name]), np.uint8)
+                done[name].append("turned from negatives")
     mended = _with(session, images, done)
     upside_down = _half_turned(mended, progress)
     for view in (view for view in present if view.number in upside_down):
@@ -64,8 +68,8 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
         done[view.image].append("turned by a half")
     if not any(done.values()):
         raise DataError(
-            f"session {session.name!r}: nothing was written, as no image is mirrored, turned or of "
-            "another size.",
+            f"session {session.name!r}: nothing was written, as no image is mirrored, turned, a "
+            "negative or of another size.",
             next_step="visioncal doctor says what else is wrong.",
         )
     if any(view.text.get("depth") for view in present if done.get(view.image)):

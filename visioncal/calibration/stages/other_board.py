@@ -97,6 +97,18 @@ def other_board(
             ),
             numbers,
         )
+    if identity.is_negative and not found:
+        return Finding(
+            "negative_images",
+            f"The board is printed in white on black, or the images are negatives: a "
+            f"{describe(identity)} (view {numbers[0]}).",
+            Remedy(
+                "Write a copy of the session with light and dark exchanged, and calibrate it; "
+                "where the print is as it should be, turn the negative off in the camera's driver.",
+                MEND_IMAGES,
+            ),
+            numbers,
+        )
     if not found:
         return None
     stated = board_words(declared)

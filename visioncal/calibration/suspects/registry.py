@@ -61,7 +61,7 @@ def _unconnected(run: RunState) -> Iterator[Finding]:
 
 def _unseen(run: RunState) -> Iterator[Finding]:
     cause = unseen_cause(run) if run.reasons else None
-    if cause is not None and cause.kind in ("other_board", "mirrored_images"):
+    if cause is not None and cause.kind in ("other_board", "mirrored_images", "negative_images"):
         yield cause
 
 
@@ -102,6 +102,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("corner_numbers", chance=FACT),
     Suspect("other_board", _unseen, FACT, hides=("lost_views",)),
     Suspect("mirrored_images", chance=FACT, hides=("lost_views",)),
+    Suspect("negative_images", chance=FACT, hides=("lost_views",)),
     Suspect("unshown_rows", chance=FACT),
     Suspect("image_sizes", chance=FACT, hides=("lost_views",)),
     Suspect("other_lens", chance=FACT),

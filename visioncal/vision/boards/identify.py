@@ -47,6 +47,8 @@ class Identity:
     notes: tuple[str, ...] = ()  # Remarks, in sentences.
     is_mirrored: bool = False  # Whether only the mirror images of the pictures show it.
     shown: int = 1  # Number of the images that show it.
+    # Whether only negatives of the images show it, as of a print in white on black.
+    is_negative: bool = False
 
     @property
     def is_single(self) -> bool:
@@ -93,6 +95,11 @@ def identify(images: Image | Sequence[Image], declared: Target | None = None) ->
         identity = next(look.boards(), None) or look.single()
         if identity is not None:
             return identity
+    for shown in sets:
+        negatives = [np.asarray(cv2.bitwise_not(picture), np.uint8) for picture in shown]
+        identity = next(_Look(negatives, declared).boards(), None)
+        if identity is not None and identity.board.dictionary:
+            return replace(identity, is_negative=True)
     # Wider edges hide the bits of small markers.
     why = poor_image_reason(pictures[0], 6.0)
     height, width = pictures[0].shape
@@ -434,4 +441,6 @@ def describe(identity: Identity) -> str:
         details.append(f"circles of {board.diameter_m:.2f} of the distance of rows")
     if not identity.is_single:
         details.append(f"{identity.corners_seen} of {identity.corners} corners seen")
-    return ", ".join(details) + ", in mirrored pictures" * identity.is_mirrored
+    details += ["in mirrored pictures"] * identity.is_mirrored
+    details += ["in negatives"] * identity.is_negative
+    return ", ".join(details)
