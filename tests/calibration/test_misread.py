@@ -305,6 +305,19 @@ def test_two_readings_that_close_alike_are_both_named_and_none_is_taken(tmp_path
     assert not guessed(poses).is_open
 
 
+def test_turns_that_agree_beside_places_that_do_not_are_those_of_a_wrong_arm():
+    poses = cell_poses(views=20)
+    robot = poses.true_robot.copy()
+    # A table of the arm with a wrong length: places are off along a link that turns with the arm.
+    robot[:, :3, 3] += Rotation.from_rotvec(
+        np.stack([np.zeros(20), *(2.0 * robot[:, at, 3] for at in (0, 1))], axis=1) * 3.0
+    ).apply([0.25, 0.0, 0.0])
+    session = pairs_session(poses.mount, robot, poses.camera.poses())
+    verdict = visioncal.calibrate(session).verdict
+    assert verdict.status == "bad"
+    assert "wrong length or sign in the model or table" in verdict.causes[0].do.words
+
+
 SOUND = {
     "fair": {},
     "four views": {"views": 4},

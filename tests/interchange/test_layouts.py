@@ -1310,6 +1310,20 @@ def test_numbered_columns_of_a_pose_and_of_joints_are_read(tmp_path):
     np.testing.assert_allclose(foreign.joints_rad, q, atol=1e-12)
 
 
+def test_two_files_of_poses_ask_whose_they_are_with_the_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    poses, _, _ = world()
+    for name, turned in (("TrackerToFiducial", poses[::-1]), ("RobotBaseToTip", poses)):
+        vectors = Rotation.from_matrix(turned[:, :3, :3]).as_rotvec()
+        rows = np.hstack([turned[:, :3, 3], vectors]).tolist()
+        write(tmp_path / f"in/{name}.txt", "\n".join(" ".join(map(repr, row)) for row in rows))
+    followed = follow("convert", "in", "out", "--mount", "eye-to-hand")
+    assert "whose they are is not said" in followed.runs[0].refused().err
+    assert len(followed.runs) == 2
+    view = Session.load(tmp_path / "out").views[0]
+    np.testing.assert_allclose(view.base_from_flange().as_matrix(), poses[0], atol=1e-9)
+
+
 @pytest.mark.parametrize("is_printed", [False, True])
 def test_joints_are_in_the_order_of_the_arm_s_names(tmp_path, is_printed):
     """ROS writes the joints of a message in the order of the alphabet."""

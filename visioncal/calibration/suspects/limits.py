@@ -19,6 +19,9 @@ from visioncal.results import Rms, ViewResult
 _LIMITS = CalibrationLimits()
 # Views that are named.
 _LISTED = 3
+# From here on places disagree by more than arms, markers and lenses err [mm], where that is so many
+# times as much as turns do on the lever.
+_FAR_MM, _MUCH_FARTHER = 20.0, 10.0
 _LOOK_AT_BOTH = (
     "More views alike will not help: give images in place of poses of a marker, or a larger "
     "marker; then record joint angles with the arm's model."
@@ -96,13 +99,21 @@ def _unexplained_words(away: Rms) -> str:
         "what was seen (a marker of few pixels, blur, a lens or a board that is not as stated)",
     ]
     # Turns are seen worse than places, and arms err by both alike.
-    if np.deg2rad(away.deg or 0.0) * LEVER_M > 1e-3 * away.mm:
+    turned_mm = 1e3 * LEVER_M * np.deg2rad(away.deg or 0.0)
+    if turned_mm > away.mm:
         sides.reverse()
-    return (
+    tried = (
         "Other units or conventions of the poses, rows that are apart, exchanged or repeated, "
-        "steps and drift were tried and do not explain it. Look at the worst views, for "
-        f"{sides[0]}; then for {sides[1]}."
+        "steps and drift were tried and do not explain it. "
     )
+    # No arm, marker or lens errs by centimetres and turns as it should.
+    if away.deg is not None and away.mm > _FAR_MM and _MUCH_FARTHER * turned_mm < away.mm:
+        return (
+            f"{tried}Turns agree, and places do not: look for a wrong length or sign in the model "
+            "or table by which joint angles became the robot's poses, for a rail or lift that is "
+            "in no pose, and for positions in another frame than the rotations."
+        )
+    return f"{tried}Look at the worst views, for {sides[0]}; then for {sides[1]}."
 
 
 def _residual(view: ViewResult) -> str:

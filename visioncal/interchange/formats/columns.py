@@ -48,7 +48,7 @@ from visioncal.interchange.formats.poses import (
     without_unit,
 )
 from visioncal.interchange.formats.reading import read_fields
-from visioncal.interchange.formats.sources import describe, proposed, unknown
+from visioncal.interchange.formats.sources import describe, proposed, tables_apart, unknown
 from visioncal.session.columns import INSTRUMENT_POSITION
 
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
@@ -82,6 +82,10 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         raise faults[0]
     (rank, first), *others = sorted(found, key=lambda each: each[0])
     is_clear = not others or others[0][0] > rank
+    is_seeing = first.images or {"meas_x_m", "point"} & first.columns.keys()
+    apart = None if is_seeing or first.camera is not None else tables_apart(source, requested)
+    if apart is not None:
+        raise apart
     if not is_clear:
         first = replace(
             first, doubt=unknown(source, requested, [each for _, each, _ in readings[:1]])

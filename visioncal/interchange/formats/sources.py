@@ -46,6 +46,7 @@ from visioncal.robot.files import read_robot_document
 
 # Readings of one source that are tested, and names of rows that are a robot's.
 _MOST_READINGS, _NAMED = 16, re.compile("pose|robot|arm", re.IGNORECASE)
+_OF_ROBOT = re.compile("robot|arm|gripper|flange|tcp|hand", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,6 +254,31 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         f"{source.words()}\nWhich of these are the robot's poses is not known.",
         culprits=[str(source.path)],
         next_step=step or "Write the poses into a CSV with a header, a row a view.",
+    )
+
+
+def tables_apart(source: Source, requested: ImportOptions) -> DataError | None:
+    """The error of a folder with two files of poses, the robot's and the camera's; None of others.
+
+    Nothing in them says whose they are; the names of the files may.
+    """
+    files = [
+        (part.group.files[0], fields)
+        for part in source.parts
+        for fields in part.rows
+        if len(part.group.files) == 1 and possible_poses(fields)
+    ]
+    if len(files) != 2 or len(files[0][1]) != len(files[1][1]):
+        return None
+    files.sort(key=lambda each: _OF_ROBOT.search(each[0].stem) is None)
+    (robot, fields), (camera, _) = files
+    command = [str(robot) if word == str(source.path) else word for word in requested.command]
+    return DataError(
+        f"{source.path} has {len(fields)} poses in {robot.name} and as many in {camera.name}: "
+        "whose they are is not said.",
+        culprits=[str(robot), str(camera)],
+        next_step=f"Name the file of the robot, and that of the camera with --camera-file:\n"
+        f"{shlex.join([*command, '--camera-file', str(camera)])}",
     )
 
 
