@@ -382,7 +382,7 @@ def test_noise_refuses_nothing():
     found = calibrate(turned(35.0, noise=30.0)[1])
     assert found.verdict.status == "bad"
     assert any("Weakly determined by the motion" in reason for reason in found.verdict.reasons)
-    assert reason(found, "Left out of the fit, views disagree")
+    assert reason(found, "Where the others predict them, views are off")
 
 
 def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():

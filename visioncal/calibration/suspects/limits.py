@@ -82,8 +82,8 @@ def _scatter(judged: Findings) -> Iterator[Finding]:
         named = ", ".join(f"view {view.view} ({_residual(view)})" for view in worst)
         yield Finding(
             UNEXPLAINED,
-            f"Left out of the fit, views disagree with the others by {', '.join(words)}, rms; the "
-            f"worst are {named}.",
+            f"Where the others predict them, views are off by {', '.join(words)}, rms; the worst "
+            f"are {named}.",
             Remedy(_unexplained_words(judged.held_out), REVIEW),
             tuple(view.view for view in worst),
             is_fatal=is_fatal,
