@@ -336,6 +336,31 @@ def test_a_held_distortion_that_does_not_fit_is_named_and_freed_by_what_is_advis
     assert mahalanobis_sq(cell, freed) < 2.74
 
 
+BENT = [-0.28, 0.09, 0.0012, -0.0009, -0.015]
+
+
+@pytest.mark.parametrize(
+    ("true", "off_px", "stated", "words"),
+    [
+        (BENT, (0, 0, 0, 0), [*BENT[:2], BENT[4], *BENT[2:4]], f"write distortion = {BENT}"),
+        ([0.0] * 5, (0, 0, 0, 0), BENT, "The pictures are rectified"),
+        (BENT, (0, 0, 80, 60), BENT, "begins 80 px to the right and 60 px below"),
+    ],
+    ids=["another order", "rectified", "cropped"],
+)
+def test_a_lens_that_was_misread_is_named_with_its_right_reading(true, off_px, stated, words):
+    camera = replace(CAMERAS["wide"], distortion=np.array(true))
+    cell = simulate(replace(FINE, camera=camera, seed=4))
+    known = calibrated(cell, session=with_camera(cell, off_px, distortion=stated))
+    (cause, *_) = known.verdict.causes
+    assert cause.kind == "lens"
+    assert words in cause.words
+    assert mahalanobis_sq(cell, known) < 2.74
+    # Another one is of rectified pictures, too, but of no order and no part.
+    other = calibrated(cell, session=with_camera(cell, off_px, distortion=[0.1, *stated[1:]]))
+    assert (words in other.verdict.causes[0].words) == (not any(true))
+
+
 def test_a_fisheye_camera_goes_the_whole_way():
     surprises = []
     for seed in range(2):

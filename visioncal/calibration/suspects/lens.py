@@ -26,6 +26,9 @@ from visioncal.vision.camera import intrinsics, normalise, project, with_intrins
 
 # Changes of intrinsics or corners below this show in no image, and in no pick [px].
 _LEAST_MOVE_PX = 0.1
+# A part of a picture begins farther from its corner than any centre is wrong [px]; what is left of
+# the move where stated intrinsics were misread.
+_CROPPED_PX, _EXPLAINED = 10.0, 0.1
 # Another model of a lens leaves so much less: more than an even field does.
 _BETTER = 1.1
 _NEW_LENS = Remedy(
@@ -97,6 +100,7 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
         is_wrong &= has_changed(assessment.sized, columns)
         if is_wrong and moved_px > _LEAST_MOVE_PX:
             words = f"The given intrinsics do not fit these images and were refined: {moved}"
+            words += _misread(stated, refined, stack.px, moved_px)
             yield Finding("lens", words, _NEW_LENS)
         else:
             allowed = "within what is stated, or no more than images or a board's size explain"
@@ -121,6 +125,33 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
                 _FREE_LENS,
                 mahalanobis_sq=squared,
             )
+
+
+def _misread(stated: Camera, refined: Camera, px: FloatArray, moved_px: float) -> str:
+    """How stated intrinsics fit after all, as a sentence; empty where no way is known.
+
+    Another program's order of five coefficients, pictures that are rectified, or a part of them.
+    """
+    ways, moves = dict[str, Camera](), refined.matrix[2:] - stated.matrix[2:]
+    if stated.model == "brown" and stated.distortion.any():
+        flat = np.zeros(len(stated.distortion))
+        words = "The pictures are rectified: write distortion = [0, 0, 0, 0, 0]."
+        ways[words] = replace(stated, distortion=flat)
+    if stated.model == "brown" and len(stated.distortion) == 5:
+        other = stated.distortion[[0, 1, 3, 4, 2]]
+        words = "They are in the order k1, k2, k3, p1, p2, and OpenCV's is k1, k2, p1, p2, k3: "
+        words += f"write distortion = [{', '.join(f'{value:.6g}' for value in other)}]."
+        ways[words] = replace(stated, distortion=other)
+    if np.abs(moves).max() > _CROPPED_PX:
+        right, below = (-moves).round().tolist()
+        words = (
+            f"The pictures are a part of this lens's, which begins {right:g} px to the right and "
+            f"{below:g} px below: subtract these from the centre in matrix."
+        )
+        ways[words] = replace(stated, matrix=np.append(stated.matrix[:2], refined.matrix[2:]))
+    left = {words: _moved_px(lens, refined, px)[0] for words, lens in ways.items()}
+    best = min(left, key=left.__getitem__, default="")
+    return f" {best}" if best and left[best] < _EXPLAINED * moved_px else ""
 
 
 def _moved_px(stated: Camera, other: Camera, px: FloatArray) -> tuple[float, float]:
