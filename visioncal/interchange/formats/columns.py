@@ -18,6 +18,7 @@ from visioncal.interchange.formats.fields import (
     named_by,
     stamp_name,
     unit_by_size,
+    without_unit,
 )
 from visioncal.interchange.formats.file_search import (
     FileGroup,
@@ -38,15 +39,8 @@ from visioncal.interchange.formats.foreign import (
     Side,
     Unstated,
 )
-from visioncal.interchange.formats.poses import (
-    columns_named,
-    joint_names,
-    joints_from,
-    makers_of,
-    pose_names,
-    poses_from,
-    without_unit,
-)
+from visioncal.interchange.formats.joints import joint_names, joints_from
+from visioncal.interchange.formats.poses import columns_named, makers_of, pose_names, poses_from
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.sources import describe, proposed, tables_apart, unknown
 from visioncal.session.columns import INSTRUMENT_POSITION

@@ -13,6 +13,7 @@ from typing import Self
 
 import numpy as np
 
+from visioncal.core.choices import UNITS_M
 from visioncal.core.conventions import ROTATION_FORMS
 from visioncal.core.documents.pendants import is_marked_pose, line_numbers, read_pose
 from visioncal.core.documents.tables import is_number
@@ -33,6 +34,26 @@ POSE_SIZES = (6, 7, 12, 16)
 def named_by(place: str) -> str:
     """End of the name of the option that names fields: the `columns` of a table, else a `key`."""
     return "columns" if ", line " in place else "key"
+
+
+# An ordinal indicator is common for the degree sign, too.
+DEGREES = ("deg", "degrees", "°", "º")
+ANGLES = (*DEGREES, "rad", "radians")
+# q1_rad is a joint; q1 alone is part of a quaternion.
+_UNIT = re.compile(
+    rf"(?!q[0-9])(.*?)[ _]*+(?:[(\[] *({'|'.join([*UNITS_M, *ANGLES])}) *[)\]]"
+    rf"|(?<=_)({'|'.join([*UNITS_M, *ANGLES])}))",
+    re.IGNORECASE,
+)
+_UNITLESS = re.compile(r"\s*+[\[(]\s*+[-1]?+\s*+[\])]$")
+
+
+def without_unit(name: str) -> tuple[str, str]:
+    """A field's name without its unit, and that, or none: `rx(deg)`, `X [mm]`, `x_m`."""
+    # A number without a unit has empty brackets: `q_w []`.
+    name = _UNITLESS.sub("", name)
+    match = _UNIT.fullmatch(name)
+    return (match[1], (match[2] or match[3]).lower()) if match and match[1] else (name, "")
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,8 @@ from visioncal.interchange.formats.foreign import (
     Unstated,
     rows_of,
 )
-from visioncal.interchange.formats.poses import joint_names, joints_from, pose_names, poses_from
+from visioncal.interchange.formats.joints import joint_names, joints_from
+from visioncal.interchange.formats.poses import pose_names, poses_from
 from visioncal.interchange.formats.reading import ENDINGS, read_rows
 from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION
 from visioncal.session.kinds import known_instruments

@@ -9,12 +9,13 @@ from itertools import combinations, product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.choices import UNITS_M
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, Reading
 from visioncal.core.documents.pendants import forms_named
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
+    ANGLES,
+    DEGREES,
     Fields,
     appearance,
     is_headerless,
@@ -22,20 +23,10 @@ from visioncal.interchange.formats.fields import (
     position_first,
     split_matrices,
     unit_by_size,
+    without_unit,
 )
 from visioncal.interchange.formats.foreign import PoseImportOptions, Side, Unstated
-from visioncal.session.columns import joint_columns
-
-# An ordinal indicator is common for the degree sign, too.
-_DEGREES = ("deg", "degrees", "°", "º")
-_ANGLES = (*_DEGREES, "rad", "radians")
-# q1_rad is a joint; q1 alone is part of a quaternion.
-_UNIT = re.compile(
-    rf"(?!q[0-9])(.*?)[ _]*+(?:[(\[] *({'|'.join([*UNITS_M, *_ANGLES])}) *[)\]]"
-    rf"|(?<=_)({'|'.join([*UNITS_M, *_ANGLES])}))",
-    re.IGNORECASE,
-)
-_UNITLESS = re.compile(r"\s*+[\[(]\s*+[-1]?+\s*+[\])]$")
+from visioncal.interchange.formats.joints import joint_names
 
 
 def _set(words: str) -> set[str]:
@@ -84,14 +75,6 @@ _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
     ("q0", "q1", "q2", "q3"),
     *dict.fromkeys(tuple(form.names.split()) for form in POSE_FORMS.values()),
 )
-
-
-def without_unit(name: str) -> tuple[str, str]:
-    """A field's name without its unit, and that, or none: `rx(deg)`, `X [mm]`, `x_m`."""
-    # A number without a unit has empty brackets: `q_w []`.
-    name = _UNITLESS.sub("", name)
-    match = _UNIT.fullmatch(name)
-    return (match[1], (match[2] or match[3]).lower()) if match and match[1] else (name, "")
 
 
 def words_of(name: str) -> list[str]:
@@ -389,22 +372,6 @@ def ranked_poses(
     return [groups[rank] for rank in sorted(groups)]
 
 
-_JOINTS = re.compile(
-    r"(?:.*[._])?(?:joint_pose|joints?|joint_angles|joint_(?:positions?|values?|states?)|q)"
-)
-_JOINT_NAME = re.compile(
-    r"(?:.*\.)?((?:[^.]*_)?(?:joint|axis|gelenk|achse)|(?:actual_)?q|j|a)[ _]?([0-9])"
-    r"((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*(?:deg|rad|[°º])[a-z]*\W*)?)",
-    re.IGNORECASE,
-)
-# Universal Robots' names, which ROS writes in the order of the alphabet.
-_OF_UR = (
-    *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
-    *("wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
-)
-# Numbers of joints that are no angles.
-_NO_ANGLE = re.compile("vel|speed|acc|effort|torque|curr|temp|target|desired|command")
-
 _ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)R(_|$)")
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
 
@@ -443,12 +410,12 @@ def poses_from(
     else:
         positions, rotations, of_rotation = _split(fields, names, blocks, whose)
         rotation, doubt = _likely_rotation(
-            rotations, of_rotation, requested, whose, degrees=bool(units & {*_DEGREES})
+            rotations, of_rotation, requested, whose, degrees=bool(units & {*DEGREES})
         )
         notes += [doubt] * bool(doubt)
         unstated |= {"angles"} if requested.form is None and rotations.shape[1] == 3 else set()
         unstated |= {"rotation"} if "does not say" in doubt else set()
-    lengths = units - {"", *_ANGLES}
+    lengths = units - {"", *ANGLES}
     unit = requested.unit or (lengths.pop() if len(lengths) == 1 else None)
     form = POSE_FORMS.get(requested.form or "")
     # So far no arm reaches, whatever the unit of a maker's form is.
@@ -547,88 +514,8 @@ def _usual_form(names: Sequence[str], usual: str | None) -> str | None:
             next_step=f"Say whose they are, as --robot-form {makers[0]}.",
         )
     fits = len(names) == 3 + ROTATION_FORMS[form.rotation].size
-    fits &= {*units[3:]} <= {"", *(_DEGREES if form.rotation.endswith("-deg") else ("rad",))}
+    fits &= {*units[3:]} <= {"", *(DEGREES if form.rotation.endswith("-deg") else ("rad",))}
     return form.name if fits and (makers or all(map(str.isdecimal, names))) else None
-
-
-def joint_names(
-    fields: Fields, taken: Collection[str], known: Sequence[str] = _OF_UR
-) -> tuple[str, ...]:
-    """Finds the fields of joint angles: one list, or a field a joint, numbered from one or `known`.
-
-    Those of known names are in the order of these.
-    """
-    if columns := joint_columns(tuple(fields.numbers)):
-        return columns
-    if columns := _joints_called(fields, taken, known):
-        return columns
-    lists = [
-        name
-        for name, numbers in fields.numbers.items()
-        if numbers.ndim > 1
-        and name not in taken
-        and _JOINTS.fullmatch(without_unit(name)[0].lower())
-    ]
-    if len(lists) == 1:
-        return (lists[0],)
-    counted: dict[tuple[str, ...], dict[int, str]] = defaultdict(dict)
-    for name, numbers in fields.numbers.items():
-        match = _JOINT_NAME.fullmatch(name)
-        is_whole = numbers.ndim == 1 and bool(np.isfinite(numbers).all())
-        if match and is_whole and name not in taken:
-            counted[match.group(1, 3)][int(match[2])] = name
-    for by_number in counted.values():
-        # Four numbers q1 ... may be a quaternion. UR's programs count from zero.
-        if len(by_number) >= 5 and [*by_number] in (
-            [*range(len(by_number))],
-            [*range(1, len(by_number) + 1)],
-        ):
-            return tuple(by_number.values())
-    return ()
-
-
-def _joints_called(fields: Fields, taken: Collection[str], known: Sequence[str]) -> tuple[str, ...]:
-    """The only columns of some joints' names, with words before or after; empty unless one each."""
-    called = defaultdict[str, list[str]](list)
-    for name, numbers in fields.numbers.items():
-        plain = without_unit(name)[0].lower()
-        if numbers.ndim > 1 or name in taken or _NO_ANGLE.search(plain):
-            continue
-        plain = re.sub(r"[._ ](?:pos|position|angle|value|state)$", "", plain)
-        for joint in known:
-            if re.search(rf"(?:^|[._ /]){re.escape(joint.lower())}$", plain):
-                called[joint].append(name)
-    columns = [called[joint] for joint in known]
-    return tuple(names[0] for names in columns) if all(len(n) == 1 for n in columns) else ()
-
-
-def joints_from(
-    fields: Fields, names: Sequence[str], *, degrees: bool
-) -> tuple[FloatArray, tuple[str, ...]]:
-    """Reads joint angles from fields, in degrees where the options, the names or their size say so.
-
-    Returns:
-        (n, j) angles [rad], and notes on assumptions.
-
-    Raises:
-        DataError: There are no such fields, a row lacks some, or they are too large for the radians
-            of their names.
-    """
-    joints = np.hstack([fields.column(name) for name in names])
-    bad = ~np.isfinite(joints).all(axis=1)
-    ends = [name.rsplit(".", 1)[-1].lower() for name in names]
-    largest = np.abs(joints).max(initial=0.0)
-    is_named = degrees or all(any(unit in end for unit in _DEGREES) for end in ends)
-    # Joints may make several turns.
-    is_large = not is_named and bool(largest > 10 * 2 * np.pi)
-    fault = "a joint angle is missing or infinite" if bad.any() else ""
-    if is_large and any("rad" in end for end in ends):
-        fault = f"joint angles up to {largest:.0f} are no radians: say --joint-unit deg"
-    if fault:
-        place = fields.places[int(np.argmax(bad))]
-        raise DataError(f"{place}: {fault}.", culprits=[place])
-    note = f"Joint angles up to {largest:.0f} are no radians, and are taken for degrees."
-    return np.deg2rad(joints) if is_named or is_large else joints, (note,) if is_large else ()
 
 
 def check_radians(

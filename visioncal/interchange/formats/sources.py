@@ -27,10 +27,10 @@ from visioncal.interchange.formats.fields import (
 from visioncal.interchange.formats.file_search import FileGroup, groups_in
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.intrinsics import LENS_KEYS, lenses_in
+from visioncal.interchange.formats.joints import joint_names
 from visioncal.interchange.formats.poses import (
     column_groups,
     columns_named,
-    joint_names,
     pose_names,
     possible_poses,
     ranked_poses,

@@ -12,15 +12,9 @@ from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 from visioncal.frames.touches import NominalPoints, TouchRows, touches_of
 from visioncal.interchange.formats.columns import foreign_from, view_numbers
-from visioncal.interchange.formats.fields import Fields, named_by
+from visioncal.interchange.formats.fields import Fields, named_by, without_unit
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
-from visioncal.interchange.formats.poses import (
-    check_radians,
-    columns_named,
-    pose_names,
-    poses_from,
-    without_unit,
-)
+from visioncal.interchange.formats.poses import check_radians, columns_named, pose_names, poses_from
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.session import Session
 from visioncal.session.columns import POSE, joint_columns
