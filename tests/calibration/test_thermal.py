@@ -306,11 +306,11 @@ def test_correct_goes_by_the_temperatures_and_kelvin_is_no_celsius(learnt, tmp_p
     # The warm arm is at the target with the joints that the target was made of.
     assert [sent[f"q{at}_rad"] for at in range(1, 7)] == pytest.approx(q[0], abs=1e-6)
     kelvin = ",".join(["300"] * 6)
-    run("correct", table, "--against", tmp_path, "--temperatures", kelvin).refused("no kelvin")
+    run("correct", table, "--against", tmp_path, "--temperatures", kelvin).refused("not in kelvin")
     session.save(tmp_path / "warm")
     path = tmp_path / "warm" / "streams" / "heat.csv"
     head, *rows = (line.split(",") for line in path.read_text(encoding="utf-8").splitlines())
     rows = [[stamp, *(repr(float(it) + 273.15) for it in told)] for stamp, *told in rows]
     path.write_text("\n".join(map(",".join, [head, *rows])) + "\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"heat\.csv, line 2, column temp1_c: .*no kelvin"):
+    with pytest.raises(DataError, match=r"heat\.csv, line 2, column temp1_c: .*not in kelvin"):
         Session.load(tmp_path / "warm")
