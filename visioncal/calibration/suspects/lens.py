@@ -211,7 +211,11 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             for percent, words, gain in zip(percents, when, changes, strict=True)
             if gain > SIGNIFICANT
         ]
-        if (zoom := run.cell_fit.sizes.zoomed.get(name)) is not None:
+        zoom, moves = run.cell_fit.sizes.zoomed.get(name), run.cell_fit.inlier_fit.moves
+        if zoom is not None and any((name, zoom.station) == (at.frame, at.stop) for at in moves):
+            # A bump of the camera explains it, which is named.
+            continue
+        if zoom is not None:
             share = f"{figure(100.0 * abs(zoom.share))} % "
             share += "longer" if zoom.share > 0.0 else "shorter"
             words = f"{of} crept, as where focus or zoom give way: its focal length became {share}."
