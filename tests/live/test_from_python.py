@@ -109,7 +109,7 @@ def test_a_function_of_a_file_is_a_camera_of_the_command(tmp_path):
         assert (camera.frame().image == 7).all()
     for address, words in (
         (f"{file}:photo", "AttributeError.*photo"),
-        (f"{tmp_path}/none.py:picture", "must be a function of a Python file.*python:grab.py:picture"),
+        (f"{tmp_path}/none.py:picture", "function of a Python file.*python:grab.py:picture"),
         ("picture", "must be a function of a Python file"),
     ):
         raised(DriverError, words, open_camera, f"python:{address}", DeviceSetup())
