@@ -4,7 +4,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 
-from visioncal.calibration.guess import Candidate
+from visioncal.calibration.guess import POSE_OPTIONS, Candidate
 from visioncal.cli.console import print_table, say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.session_options import ConvertOptions, RobotPoseOptions
@@ -101,8 +101,7 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
         raise DataError(
             "Nothing was written: the chain does not close as first read, and no other reading "
             "stands out.",
-            next_step="Look how the program wrote the poses, and state that: --robot-form, "
-            "--robot-unit, --robot-inverse, or --robot-columns in the right order."
+            next_step=f"Look how the program wrote the poses, and state that: {POSE_OPTIONS}."
             if guess.is_open
             else "Check that the poses and what the camera saw are of the same views and the "
             "same robot, and that positions stand before rotations (where not, name the columns in "

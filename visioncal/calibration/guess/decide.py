@@ -38,6 +38,8 @@ _SHUFFLES, _MOST_SCORE = 8, 0.3
 _BY_LENGTH = 10.0
 # How the sentence begins where the motion leaves the reading open.
 ONE_AXIS = "All views turn about one axis"
+# How a person states what several readings leave open, in options of `convert`.
+POSE_OPTIONS = "--robot-form, --robot-unit, --robot-inverse, or --robot-columns in the right order"
 # Poses of two readings that differ by less than this share of the residuals are the same.
 _SAME = 0.3
 

@@ -6,6 +6,7 @@ from itertools import islice
 
 import numpy as np
 
+from visioncal.calibration.guess.decide import POSE_OPTIONS
 from visioncal.calibration.guess.fit import robust_fits
 from visioncal.calibration.guess.search import FEWEST_ROWS, PAIRS_SHARE, relative_angles, thinned
 from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
@@ -44,7 +45,7 @@ _LOST_TURNS = Remedy(
 )
 _WHICH = Remedy(
     "Look how the program wrote the poses, and convert the recording anew with that stated: "
-    "--robot-form, --robot-unit, --robot-inverse, or --robot-columns in the right order."
+    f"{POSE_OPTIONS}."
 )
 _UNRECORDED = Remedy(
     "Convert the recording itself again with --guess, if the session was made of one: angles that "

@@ -288,7 +288,7 @@ def _counted(named: Mapping[str, str]) -> tuple[str, ...]:
     numbers = sorted(int(word) for word in named if word.isdecimal())
     first = numbers[0] if numbers else 2
     is_whole = numbers == [*range(first, first + len(numbers))] and len(numbers) == len(named)
-    fits = is_whole and first < 2 and len(numbers) in _OF_POSES[:5] and len(numbers) > 5
+    fits = is_whole and first < 2 and len(numbers) in _OF_POSES and len(numbers) > 5
     return tuple(named[str(number)] for number in numbers) if fits else ()
 
 
