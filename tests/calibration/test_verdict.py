@@ -283,7 +283,7 @@ def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> No
     flanges = cell.robot.base_from_flange @ late
     verdict = calibrated(reporting(cell, base_from_flange=flanges)).verdict
     assert ids(verdict)[:1] == ["late_poses"]
-    assert "empty the columns x_m" in verdict.causes[0].do.words
+    assert "--by-joints" in verdict.causes[0].do.command
     # Where both are right, or the joints are the late ones, nothing is said of that.
     sound = calibrated(cell).verdict
     assert "late_poses" not in {found.kind for found in sound.findings}

@@ -51,6 +51,7 @@ def convert_command(options: ConvertOptions) -> None:
             turned=options.turned,
             positions=options.positions,
             mends_images=options.mend_images,
+            by_joints=options.by_joints,
         )
     for warning in session.warnings:
         say(f"note: {warning}")

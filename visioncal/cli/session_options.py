@@ -411,6 +411,9 @@ class ConvertOptions(RobotPoseOptions):
         "Views whose positions are made of other columns: 0,4-6:x,-y,z+rail_m.",
         parse=places_in,
     )
+    by_joints: bool = _doubt(
+        "Take the poses of the joint angles, not the reported ones.", "--by-joints", default=False
+    )
     mend_images: bool = _doubt(
         "Mirror, turn and scale images back.", "--mend-images", default=False
     )

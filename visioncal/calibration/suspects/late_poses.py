@@ -9,7 +9,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
 from visioncal.core.types import MOUNTS
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy
+from visioncal.core.verdict import Finding, mending
 from visioncal.estimation.chain import robot_part
 
 # Poses are those of the joint angles [m, rad].
@@ -37,11 +37,10 @@ def _found(run: RunState) -> Iterator[Finding]:
             f"The images agree with the joint angles to {by_angles.figures}, and with the "
             f"reported poses to {by_report.figures}: these were read at another instant, or are "
             "commanded ones.",
-            Remedy(
-                "Log poses and joint angles at one instant, while the arm stands. Or empty the "
-                "columns x_m, y_m, z_m, qx, qy, qz and qw of views.csv, and calibrate again: the "
-                "poses are then those of the joints.",
-                CALIBRATE,
+            mending(
+                "the poses are those of the joint angles (next time, log both at one instant, "
+                "while the arm stands)",
+                "--by-joints",
             ),
             until_mm=0.0,
         )

@@ -185,3 +185,29 @@ def write_positions(
     sums_of = ("".join(f"{factor:+g} {name} " for factor, name in axis).strip() for axis in axes)
     note = f"the positions of views {ranges(chosen)} are {', '.join(sums_of)}"
     return _with_cells(session, cells, note)
+
+
+def without_reported_poses(session: Session) -> Session:
+    """Empties the reported poses of views with joint angles, which then give the poses.
+
+    Raises:
+        DataError: No view has joint angles, or a robot has no model.
+    """
+    rows = [view for view in session.views if view.joints_rad is not None]
+    unmodelled = sorted({*session.robots} - session.robot_documents.keys())
+    if not rows or unmodelled:
+        missing = f"a model of the robot {' and '.join(filter(None, unmodelled))}".rstrip()
+        missing = missing if rows else "joint angles (q1_rad, q2_rad ...) in views.csv"
+        raise DataError(
+            f"Session {session.name!r} needs {missing} for poses by its joints.",
+            culprits=["--by-joints"],
+            next_step="Name [robot] model in session.toml." if rows else "Record them.",
+        )
+    cells = {
+        view.number: {name: view.cell(name) for name in session.columns} for view in session.views
+    }
+    for view in rows:
+        cells[view.number] |= dict.fromkeys({*POSE} & {*session.columns}, "")
+    views = ranges([view.number for view in rows])
+    note = f"the poses of views {views} are those of the joint angles, not the reported ones"
+    return _with_cells(session, cells.values(), note)

@@ -24,6 +24,7 @@ from visioncal.interchange.formats.mending import (
     exchange_views,
     shift_views,
     turn_boards,
+    without_reported_poses,
     write_positions,
 )
 from visioncal.interchange.formats.metrology import METROLOGY
@@ -76,6 +77,7 @@ def convert(
     turned: tuple[tuple[int, ...], tuple[float, ...]] | None = None,
     positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = None,
     mends_images: bool = False,
+    by_joints: bool = False,
 ) -> Session:
     """Writes a session or a foreign recording as a session's folder or as a recording.
 
@@ -97,6 +99,7 @@ def convert(
         positions: Views whose positions are sums of columns, and these sums by axis: pairs of a
             factor and a column's name.
         mends_images: Whether images are mirrored, turned and scaled back: see `mend_images`.
+        by_joints: Whether the robot's poses are those of its joint angles, not the reported ones.
 
     Returns:
         The session.
@@ -149,6 +152,8 @@ def convert(
     )
     for mend, asked in mends:
         session = session if asked is None else mend(session, *asked)
+    if by_joints:
+        session = without_reported_poses(session)
     if mends_images:
         session = mend_images(session, requested.progress)
     write_session(session, dest)
