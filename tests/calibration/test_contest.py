@@ -118,6 +118,19 @@ def test_creeping_is_not_sure_where_a_step_does_as_well(seed):
         assert cause.by_limit or cause.is_share or cause.kind == "moved_at_once"
 
 
+@pytest.mark.parametrize("seed", [2, slow(1)])
+def test_a_camera_that_slowly_turns_is_no_lens_that_surely_changed(seed):
+    """By a milliradian: its picture moves by a pixel, as by a lens whose centre does."""
+    cell = simulate(CellOptions(views=30, seed=seed, pixel_sigma_px=0.3))
+    camera, twists = cell.transforms["flange_from_cam"], np.zeros((30, 6))
+    twists[:, 0] = np.linspace(0.0, 1e-3, 30)
+    flange = cell.robot.base_from_flange @ camera @ exp(twists) @ invert(camera)
+    (cause, *_) = calibrated(reporting(cell, base_from_flange=flange)).verdict.causes
+    assert cause.by_limit
+    assert "as these views leave it open:" in cause.words
+    assert re.search("what the flange carries crept|The load on the flange crept", cause.words)
+
+
 def test_nothing_is_accused_of_more_than_it_can_do():
     """A base that creeps by 40 mm, and as is likelier, whatever else follows the order of views."""
     cell = simulate(FINE)

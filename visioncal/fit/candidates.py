@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from visioncal.core.limits import CheckLimits
 from visioncal.core.types import evenly
 from visioncal.fit import processes
 from visioncal.fit.fit import Fit
@@ -38,6 +39,8 @@ from visioncal.model.effects import (
     Weight,
 )
 
+# Log-likelihood ratio by which a rival is as good as ruled out.
+_RULED_OUT = float(np.log(CheckLimits.ruled_out))
 # Most stops after which a frame may have been moved, and a lens.
 _STEPS, _ZOOMS = 12, 60
 
@@ -84,7 +87,22 @@ def opened(
         unknowns = unknowns.with_members(one.member)
         values[one.member.key] = np.zeros(one.member.count)
         if one.effect is not None:
-            unknowns = replace(unknowns, effects=(*unknowns.effects, one.effect))
+            kind, known, rivals = one.effect.kind, unknowns.rivals, set[str]()
+            # An effect may be the rest of one whose rival it was.
+            rivals.update(*({first, *own} for first, own in known.items() if kind in own))
+            rivals |= {
+                other.effect.kind
+                for other in clear
+                if other.effect is not None
+                and other.lens in ("", one.lens)
+                and other.gain > one.gain - _RULED_OUT
+            }
+            rivals.discard(kind)
+            unknowns = replace(
+                unknowns,
+                effects=(*unknowns.effects, one.effect),
+                rivals={**known, kind: frozenset(rivals | known.get(kind, set()))},
+            )
         if one.field is not None:
             field, table = one.field, fit.cell.cameras[one.lens]
             px = np.concatenate([pair.px for pair in images_of(pairs, one.lens)])

@@ -130,6 +130,8 @@ class Unknowns:
     # Pairs of sizes [rad], [m], whose ratio has a prior.
     ratios: tuple[tuple[str, str], ...] = ()
     closed: frozenset[str] = frozenset()  # Sizes that are held at their lower bounds.
+    # By kinds of effects that a search opened: kinds of others that would have done about as well.
+    rivals: Mapping[str, frozenset[str]] = field(default_factory=dict)
 
     @cached_property
     def slices(self) -> Mapping[Key, slice]:

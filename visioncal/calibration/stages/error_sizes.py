@@ -22,6 +22,16 @@ from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions, first_corners
 
+# Effects in words.
+_INSTEAD = {
+    "base creeps": "the base, or what stands in it, crept",
+    "mount creeps": "what the flange carries crept",
+    "base steps": "the base, or what stands in it, moved at once",
+    "mount steps": "what the flange carries moved at once",
+    "lens grows": "the lens crept",
+    "lens steps": "the lens changed at once",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class FoundEffect:
@@ -55,8 +65,15 @@ class ErrorSizes:
     # since what is linear at one lens is not so at another.
     zoomed: Mapping[str, Zoom] = field(default_factory=dict)
     opened: tuple[Effect, ...] = ()  # Of frames that move.
+    rivals: Mapping[str, frozenset[str]] = field(default_factory=dict)  # See `Unknowns.rivals`.
     # Whether boards keep their stated sizes: errors of arms are confounded with them.
     holds_scales: bool = False
+
+    def instead_of(self, kind: str) -> str:
+        """The rivals of a kind of effects, as a sentence behind others; empty without any."""
+        words = (_INSTEAD.get(rival, rival) for rival in sorted(self.rivals.get(kind, ())))
+        listed = " or ".join(words)
+        return f" Or else, as these views leave it open: {listed}." if listed else ""
 
 
 def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
@@ -102,7 +119,8 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
         if abs(zoom.share) > grew.get(name, 0.0):
             zoomed[name], grew[name] = zoom, abs(zoom.share)
     effects = (at for at in fit.unknowns.effects if at.place == "edge" and _size(fit, at.name))
-    return ErrorSizes(levels, lenses, boards, grown, zoomed, tuple(effects), held)
+    opened, rivals = tuple(effects), fit.unknowns.rivals
+    return ErrorSizes(levels, lenses, boards, grown, zoomed, opened, rivals, held)
 
 
 @dataclass(frozen=True, eq=False)

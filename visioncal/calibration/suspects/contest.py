@@ -66,12 +66,19 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         # Turns count by what they move at a typical distance.
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
         share = max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0)
-        is_proven = bool(finding.mahalanobis_sq) and _proves(run, trial)
+        is_proven, instead = bool(finding.mahalanobis_sq) and _proves(run, trial), ""
+        if finding.kind in KINDS:
+            # The fit here knows of a lens what the one likelihood of all corners found, which is no
+            # rival's: there they were tried.
+            kind, sizes = KINDS[finding.kind].kind, run.cell_fit.sizes
+            is_proven &= kind in sizes.rivals and not sizes.rivals[kind]
+            instead = sizes.instead_of(kind)
         if finding.kind in STEPS:
             is_stepped |= is_proven
             is_proven &= not _may_be_of_arm(run)
         yield replace(
             finding,
+            words=finding.words + instead,
             without_it=f"Applied and refitted, it leaves noise of {after} an axis; else it is "
             f"{before}.",
             is_proven=is_proven,

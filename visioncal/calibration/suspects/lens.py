@@ -211,7 +211,8 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             for percent, words, gain in zip(percents, when, changes, strict=True)
             if gain > SIGNIFICANT
         ]
-        zoom, moves = run.cell_fit.sizes.zoomed.get(name), run.cell_fit.inlier_fit.moves
+        sizes, moves = run.cell_fit.sizes, run.cell_fit.inlier_fit.moves
+        zoom = sizes.zoomed.get(name)
         if zoom is not None and any((name, zoom.station) == (at.frame, at.stop) for at in moves):
             # A bump of the camera explains it, which is named.
             continue
@@ -226,6 +227,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
                 words = f"{of} changed at once, as where it was zoomed, refocused or hit: {first}, "
                 words += f"its focal length is {share}."
             words += " The result counts it as scatter."
+            words += sizes.instead_of("lens grows" if zoom.station is None else "lens steps")
             yield Finding("focus", words, do, mahalanobis_sq=changes[1])
         elif how:
             yield Finding(

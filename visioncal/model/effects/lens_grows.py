@@ -44,10 +44,12 @@ class LensGrows(LensEffect, Named):
     def says(cls, values: FloatArray) -> str:
         """See `Named`."""
         way = "grew" if values[0] > 0.0 else "shrank"
-        share = figure(100.0 * abs(float(values[0])))
+        changed = f"{way} by {figure(100.0 * abs(float(values[0])))} %"
+        if (shift := float(np.linalg.norm(values[1:]))) > abs(float(values[0])):
+            changed += f", and its centre moved by {figure(np.rad2deg(shift))} deg,"
         return (
-            f"The lens's focal length {way} by {share} % during the session, as of a camera that "
-            "warms up. The result is that of its end."
+            f"The lens's focal length {changed} during the session, as of a camera that warms up. "
+            "The result is that of its end."
         )
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
