@@ -1,5 +1,6 @@
 """Fixtures that several tests share."""
 
+import gc
 import os
 
 # A test a core: threads of theirs would only wait for one another. Read as libraries are loaded.
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from markupsafe import Markup, escape
 from support.result_schema import faults_below
+from support.searched import SEARCHES
 
 from visioncal.live.drivers import ur, ur_net
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -31,6 +33,16 @@ settings.register_profile(
     "steady", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("steady")
+
+
+# Modules and tests stay: to look for garbage among them takes a third of the collection's time.
+gc.disable()
+
+
+def pytest_collection_finish():
+    """Leaves what was collected out of what is looked through for garbage."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture
@@ -100,6 +112,16 @@ def figures(request):
         plotting = "visioncal.present.report.plotting"
         patch.setattr(f"{plotting}.Figure", lambda *_, **__: Undrawn())
         patch.setattr(f"{plotting}._svg", described)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def searches(request):
+    """Searches a picture once where its search is not the subject."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name != "vision":
+            for module, name, found in SEARCHES:
+                patch.setattr(module, name, found)
         yield
 
 

@@ -240,8 +240,7 @@ def test_a_planted_mistake_is_named(make, mount, views):
         assert not any("sorted as text" in change.words for change in tried)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("order", ["xyz", "ZYZ"])
+@pytest.mark.parametrize(("order", "mount"), list(zip(("xyz", "ZYZ"), MOUNTS, strict=True)))
 def test_angles_in_degrees_that_lost_turns_are_named_and_not_made_up(tmp_path, mount, order):
     poses = cell_poses(mount)
     told = misread(f"euler-{order}-deg", "m", Reading(f"euler-{order}-rad"))(poses)

@@ -150,15 +150,15 @@ PACKED = [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "MESSAGE"), ("mcap", "ST
 
 
 @pytest.mark.parametrize(("form", "compression"), PACKED)
-def test_few_bytes_do_not_fill_the_memory(
-    form, compression, source, rendered, tmp_path, monkeypatch
-):
+def test_few_bytes_do_not_fill_the_memory(form, compression, with_depth, tmp_path, monkeypatch):
+    # Images of 64 kB.
+    source = Session.load(with_depth)
     data = np.zeros(3_000_000, np.uint8)
     change = setting("Image", "data", data, lambda at: at == 3)
     options, ending = {"form": form, "compression": compression}, ".bag" * (form == "ros1")
-    sound = bag(tmp_path / f"a{ending}", source, rendered, **options)
+    sound = bag(tmp_path / f"a{ending}", source, with_depth, **options)
     assert len(convert(sound, tmp_path / "a-out", requested=BOARD).views) == len(source.views)
-    path = bag(tmp_path / f"b{ending}", source, rendered, change=change, **options)
+    path = bag(tmp_path / f"b{ending}", source, with_depth, change=change, **options)
     monkeypatch.setattr(bags, "MOST_IMAGE_BYTES", 2_000_000)
     words = "over 2 MB, decompressed"
     raised(DataError, words, convert, path, tmp_path / "out", requested=BOARD)

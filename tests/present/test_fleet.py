@@ -2,13 +2,14 @@
 
 import pytest
 from support import browser
+from support.marks import slow
 from support.pages import Page
 from support.site import NOW, STORIES, entries
 
 from visioncal.present.report.fleet import page_of_history
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", [0, slow(2)])
 def test_five_stories_are_the_first_five_rows(seed, tmp_path):
     text = page_of_history(entries(seed), "Site", NOW)
     page = Page(text)

@@ -53,11 +53,16 @@ def _quaternions(name: str, words: str, order: Sequence[int]) -> RotationForm:
 
 
 def _rotation_vectors(name: str, words: str, unit_rad: float) -> RotationForm:
+    def read(numbers: FloatArray) -> FloatArray:
+        finite = _finite_rows(numbers)
+        safe = np.where(finite[:, None], numbers, 0.0)
+        return _without(Rotation.from_rotvec(safe * unit_rad).as_matrix(), ~finite)
+
     return RotationForm(
         name,
         words,
         3,
-        lambda numbers: _finite(numbers, lambda array: Rotation.from_rotvec(array * unit_rad)),
+        read,
         lambda rotations: Rotation.from_matrix(rotations).as_rotvec() / unit_rad,
     )
 
@@ -77,11 +82,29 @@ def _euler(order: str, unit: str) -> RotationForm:
         f"euler-{order}-{unit}",
         f"Euler angles {order} about {about} axes in {'degrees' if degrees else 'radians'}",
         3,
-        lambda numbers: _finite(
-            numbers, lambda array: Rotation.from_euler(order, array, degrees=degrees)
-        ),
+        lambda numbers: _composed(order, np.deg2rad(numbers) if degrees else numbers),
         write,
     )
+
+
+def _composed(order: str, angles: FloatArray) -> FloatArray:
+    """(n, 3, 3) rotations of Euler angles (n, 3) [rad], several times as fast as SciPy's of many.
+
+    Those about fixed axes are those about moving ones in reverse order.
+    """
+    finite = _finite_rows(angles)
+    safe = np.where(finite[:, None], angles, 0.0)
+    cosines, sines = np.cos(safe), np.sin(safe)
+    rotations = np.eye(3)
+    for at in range(3) if order.isupper() else range(2, -1, -1):
+        axis = "xyz".index(order[at].lower())
+        second, third = (axis + 1) % 3, (axis + 2) % 3
+        turns = np.zeros((len(angles), 3, 3))
+        turns[:, axis, axis] = 1.0
+        turns[:, second, second] = turns[:, third, third] = cosines[:, at]
+        turns[:, third, second], turns[:, second, third] = sines[:, at], -sines[:, at]
+        rotations = rotations @ turns
+    return _without(rotations, ~finite)
 
 
 def _matrices(name: str, words: str, *, transposed: bool) -> RotationForm:
@@ -99,11 +122,6 @@ def _matrices(name: str, words: str, *, transposed: bool) -> RotationForm:
     return RotationForm(
         name, words, 9, read, lambda rotations: oriented(rotations).reshape(-1, 9).copy()
     )
-
-
-def _finite(numbers: FloatArray, build: Callable[[FloatArray], Rotation]) -> FloatArray:
-    finite = _finite_rows(numbers)
-    return _without(build(np.where(finite[:, None], numbers, 0.0)).as_matrix(), ~finite)
 
 
 def _finite_rows(numbers: FloatArray) -> Mask:
