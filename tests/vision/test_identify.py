@@ -231,6 +231,19 @@ def test_a_checkerboard_of_another_count_is_named(tmp_path, monkeypatch):
     assert "checkerboard" not in followed.last.said
 
 
+@pytest.mark.parametrize("seed", [3, *map(slow, range(4, 8))])
+def test_dots_that_a_projector_throws_on_a_checkerboard_are_no_marks(seed):
+    """As of a depth camera: a dot of 2 px in a quarter of all places, brighter on white."""
+    rng = np.random.default_rng(seed)
+    board = print_of("checkerboard", rng)
+    dots = cv2.resize(1.0 + (rng.random((240, 320)) < 0.25), (640, 480), interpolation=0)
+    shown = []
+    for image in photographs(board, rng, size=(640, 480), fill=(0.7, 0.8)):
+        lit = np.minimum(0.5 * image * dots, 255.0).astype(np.uint8)
+        shown.append(cv2.GaussianBlur(lit, (0, 0), 0.7))
+    assert is_named(board, identify(shown))
+
+
 def changed_images(folder, change, every=1):
     """Changes each of so many images of a session."""
     for path in sorted((folder / "images").iterdir())[::every]:

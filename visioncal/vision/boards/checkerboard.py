@@ -28,8 +28,8 @@ _MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
 # parts of larger ones.
 _FEWEST = ((4, 4), (3, 3))
 # Shares of a square at which its grey levels are compared, and their range in units of contrast
-# from which on it is not plain: light and noise leave a tenth.
-_INSIDE, _MARKS = (0.25, 0.4, 0.6, 0.75), 0.4
+# from which on it is not plain: light and noise leave a tenth. What is averaged there.
+_INSIDE, _MARKS, _DOTS = (0.25, 0.4, 0.6, 0.75), 0.4, 0.25
 
 
 class Checkerboard(Board):
@@ -211,6 +211,9 @@ def _has_tips(image: Image, grid: FloatArray) -> bool:
 
 def _has_marks(image: Image, grid: FloatArray) -> bool:
     """Whether the squares of a (rows, columns, 2) grid are no plain ones, as those of markers."""
+    # Dots that a projector throws on it are smaller than the marks of any marker.
+    side = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=2)))
+    image = np.asarray(cv2.blur(image, (max(round(_DOTS * side), 1),) * 2), np.uint8)
     corners = grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
     shares = [(x, y) for x in _INSIDE for y in _INSIDE]
     places = [
