@@ -23,6 +23,7 @@ from visioncal.calibration.guess.fit import STARTS, robust_fits
 from visioncal.calibration.guess.joints import guess_joints
 from visioncal.calibration.guess.readings import changes
 from visioncal.calibration.guess.search import in_one_turn
+from visioncal.calibration.guess.unwrapping import in_one_place
 from visioncal.calibration.run import STAGES
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import DataError, DegenerateError
@@ -728,5 +729,26 @@ def test_of_rivals_of_a_symmetric_board_those_turn_as_the_robot_does():
     mixed = np.random.default_rng(3).integers(0, 2, len(rivals))
     rivals = rivals[np.arange(len(rivals))[:, None], [[one, 1 - one] for one in mixed]]
     chosen = in_one_turn(poses.true_robot[:, :3, :3], rivals)
+    assert chosen is not None
     # All of them may be turned, which is another frame of the board.
     assert len({*(chosen ^ mixed).tolist()}) == 1
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_of_rivals_of_a_symmetric_board_those_are_where_the_robot_is(mount):
+    """Beside rotations that were made of a rotation vector, taken for roll, pitch and yaw."""
+    poses, half = cell_poses(mount, views=14), np.diag([-1.0, -1.0, 1.0, 1.0])
+    half[:2, 3] = 0.1, 0.06
+    mixed = np.random.default_rng(3).integers(0, 2, 14)
+    seen = poses.camera.poses()
+    rivals = np.stack([seen, seen @ half], axis=1)
+    rivals = rivals[np.arange(14)[:, None], [[one, 1 - one] for one in mixed]]
+    vectors = Rotation.from_matrix(poses.true_robot[:, :3, :3]).as_rotvec()
+    turned = Rotation.from_euler("xyz", vectors).as_matrix()
+    assert in_one_turn(turned, rivals[..., :3, :3]) is None
+    chosen = in_one_place(1e3 * poses.true_robot[:, :3, 3], rivals, mount)
+    assert len({*(chosen ^ mixed).tolist()}) == 1
+    robot = numbers(compose(turned, poses.true_robot[:, :3, 3]))
+    guess = guessed(replace(poses, robot=robot, camera=numbers(rivals[np.arange(14), chosen])))
+    assert "rotation vector" in guess.sentence
+    assert "taken for Euler angles" in guess.sentence

@@ -305,7 +305,7 @@ def _distance_scale(candidate: Candidate) -> float | None:
     return 1.0 / inverse if inverse > 0.0 else None
 
 
-def in_one_turn(robot: FloatArray, camera: FloatArray) -> IntArray:
+def in_one_turn(robot: FloatArray, camera: FloatArray) -> IntArray | None:
     """Of rivals of each pose of a target those that turn from view to view as the robot does.
 
     Args:
@@ -314,6 +314,7 @@ def in_one_turn(robot: FloatArray, camera: FloatArray) -> IntArray:
 
     Returns:
         (m,) indices of the rivals. Turns of the target that are the same in all views stay open.
+        None where rows do not turn alike, as of misread angles.
     """
     count, rivals = camera.shape[:2]
     some = thinned(np.arange(count))
@@ -332,9 +333,7 @@ def in_one_turn(robot: FloatArray, camera: FloatArray) -> IntArray:
             chosen = costs.argmin(axis=1)
         if (total := float(costs.min(axis=1).sum())) < least:
             best, least = chosen, total
-    # Rows that do not turn alike, as of misread angles, choose none.
-    is_alike = least < 0.5 * _TURNS_AGREE_RAD * count * len(some)
-    return best if is_alike else np.zeros(count, dtype=np.int64)
+    return best if least < 0.5 * _TURNS_AGREE_RAD * count * len(some) else None
 
 
 def _undone(

@@ -7,18 +7,21 @@ the last axis of Euler angles are turns of the tool, and stay open.
 """
 
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 
 from visioncal.calibration.guess.fit import CLOSING_SCORE
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS
 from visioncal.core.transforms import invert, nearest_rotation, rotation_angle
-from visioncal.core.types import FloatArray, Mount
+from visioncal.core.types import FloatArray, IntArray, Mount
 
 _TURN = 2.0 * np.pi
-# Rotations by angles 57 times as large are alike to this [rad], by chance in one view of 150. So
+# Rotations by angles 57 times as large are alike to half a radian, by chance in one view of 150. So
 # many views decide, but for a few that may be wrong, as may be the first.
-_ALIKE_RAD, _CHECKED, _WRONG = 0.5, 8, 2
+_ALIKE, _CHECKED, _WRONG = float(np.cos(0.5)), 8, 2
+# Views whose rivals are all tried together: five determine the places. Their random choices.
+_PLACING, _PLACINGS = 6, 12
 
 
 def _forms(*, keep_turns: bool) -> Iterator[tuple[str, str]]:
@@ -77,6 +80,50 @@ def unwrapped(
     return best
 
 
+def in_one_place(positions: FloatArray, camera: FloatArray, mount: Mount) -> IntArray | None:
+    """Of rivals of each pose of a target those by which the robot's positions place what is seen.
+
+    Args:
+        positions: (n, 3) positions of the flange, in any unit and order of axes.
+        camera: (n, c, 4, 4) `cam_from_target` by c rivals.
+        mount: How the camera is mounted.
+
+    Returns:
+        (n,) indices of the rivals; None where the positions determine none.
+    """
+    count, rivals = camera.shape[:2]
+    if count <= _CHECKED:
+        return None
+    seen = invert(camera) if mount == "eye-in-hand" else camera
+    rows = np.stack([_place_rows(positions, seen[:, at]) for at in range(rivals)], axis=1)
+    # A turn of the target that is the same in all views stays open.
+    choices = np.array([(0, *rest) for rest in product(range(rivals), repeat=_PLACING - 1)])
+    rng, least, best = np.random.default_rng(0), np.inf, None
+    for _ in range(_PLACINGS):
+        some = rng.choice(count, _PLACING, replace=False)
+        sides = rows[some, choices].reshape(-1, 3 * _PLACING, 15), seen[some, choices, :3, 3]
+        square = np.swapaxes(sides[0], 1, 2) @ sides[0]
+        square += 1e-12 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(15)
+        across = np.swapaxes(sides[0], 1, 2) @ sides[1].reshape(len(choices), -1, 1)
+        solutions = np.linalg.solve(square, across)[:, None, None]
+        away = np.linalg.norm((rows @ solutions)[..., 0] - seen[:, :, :3, 3], axis=-1)
+        nearest = np.median(away.min(axis=2), axis=1)
+        if (at := int(nearest.argmin())) >= 0 and nearest[at] < least:
+            least, best = float(nearest[at]), away[at].argmin(axis=1)
+    if best is None or not len(_turned_as_seen(positions, seen[np.arange(count), best])):
+        return None
+    return np.asarray(best)
+
+
+def _place_rows(positions: FloatArray, seen: FloatArray) -> FloatArray:
+    """(n, 3, 15) rows by which places of what is seen are linear; see `_turned_as_seen`."""
+    rows = np.zeros((len(seen), 3, 15))
+    for axis in range(3):
+        rows[:, axis, 3 * axis : 3 * axis + 3] = positions - positions.mean(axis=0)
+    rows[:, :, 9:12], rows[:, :, 12:] = -np.eye(3), -seen[:, :3, :3]
+    return rows
+
+
 def _turned_as_seen(positions: FloatArray, seen: FloatArray) -> FloatArray:
     """(n, 3, 3) rotations of the flange, but for one of its tool, by its positions alone.
 
@@ -84,10 +131,7 @@ def _turned_as_seen(positions: FloatArray, seen: FloatArray) -> FloatArray:
     in its turned positions. Of (n, 4, 4) poses of the camera in the target, or the other way round;
     empty where positions do not determine them.
     """
-    rows = np.zeros((len(seen), 3, 15))
-    for axis in range(3):
-        rows[:, axis, 3 * axis : 3 * axis + 3] = positions - positions.mean(axis=0)
-    rows[:, :, 9:12], rows[:, :, 12:] = -np.eye(3), -seen[:, :3, :3]
+    rows = _place_rows(positions, seen)
     weights = np.ones(len(seen))
     for _ in range(10):
         sides = rows * weights[:, None, None], seen[:, :3, 3] * weights[:, None]
@@ -110,13 +154,31 @@ def _with_turns(
 ) -> FloatArray | None:
     """(n, 3, 3) rotations with their whole turns; None where the views show none that fit."""
     taken, written = (ROTATION_FORMS[form] for form in forms)
-    tools = turned[first].T @ written.read(_rivals(taken.write(recorded[[first]])[0], *forms))
-    wrong = 0
-    for view in [at for at in range(len(recorded)) if at != first][:_CHECKED]:
-        again = taken.read(written.write(turned[view] @ tools))
-        near = rotation_angle(np.swapaxes(again, 1, 2) @ recorded[view]) < _ALIKE_RAD
-        tools, wrong = (tools[near], wrong) if near.any() else (tools, wrong + 1)
-    if wrong > _WRONG:
+    others = [at for at in range(len(recorded)) if at != first][:_CHECKED]
+
+    def agreeing(numbers: FloatArray, axes: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Numbers (k, 3) of the first view whose tools turn some axes as others did; the tools."""
+        tools, wrong = turned[first].T @ written.read(numbers), 0
+        for view in others:
+            again = taken.read(written.write(turned[view] @ tools))
+            alike = np.sum(again[:, :, axes] * recorded[view][:, axes], axis=(1, 2))
+            # The cosine of a turn, or the trace of the rotation between both.
+            near = alike > (1.0 + 2.0 * _ALIKE if len(axes) == 3 else _ALIKE)
+            tools, numbers = (tools[near], numbers[near]) if near.any() else (tools, numbers)
+            wrong += not near.any()
+        kept = slice(0 if wrong > _WRONG else None)
+        return numbers[kept], tools[kept]
+
+    numbers = _rivals(taken.write(recorded[[first]])[0], *forms)
+    if forms[1].startswith("euler-") and forms[0].startswith("euler-"):
+        # The last turn leaves its own axis where it is; turns of it are those of the tool.
+        axis = "XYZ".index(forms[1].split("-")[1][2])
+        numbers, _ = agreeing(numbers, [axis])
+        turns = np.outer(_TURN * np.arange(-29, 30), np.eye(3)[2])
+        numbers = (numbers[:_CHECKED, None] + turns).reshape(-1, 3)
+        numbers = numbers[np.abs(numbers[:, 2]) <= 180.0]
+    numbers, tools = agreeing(numbers, [0, 1, 2]) if len(numbers) else (numbers, numbers)
+    if not len(numbers):
         return None
     expected = written.write(turned @ tools[0])
     rivals = np.array([_solutions(angles, forms[0]) for angles in taken.write(recorded)])
@@ -147,8 +209,10 @@ def _rivals(angles: FloatArray, taken: str, written: str) -> FloatArray:
         size = max(float(np.linalg.norm(angles)), 1e-9)
         every = np.outer(size + turns, angles / size)
     else:
+        # Turns about the last axis are turns of the tool.
+        last = turns if written.startswith("rotation-vector") else np.zeros(1)
         grids = [
-            np.stack(np.meshgrid(*(angle + turns for angle in each), indexing="ij"), axis=-1)
+            np.stack(np.meshgrid(*each[:2, None] + turns, each[2] + last, indexing="ij"), axis=-1)
             for each in _solutions(angles, taken)
         ]
         every = np.concatenate(grids).reshape(-1, 3)

@@ -7,10 +7,12 @@ import numpy as np
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.guess.readings import SideReading
 from visioncal.calibration.guess.search import in_one_turn
+from visioncal.calibration.guess.unwrapping import in_one_place
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.conventions import PoseNumbers, Reading
-from visioncal.core.types import FloatArray
+from visioncal.core.transforms import compose
+from visioncal.core.types import MOUNTS, FloatArray, Mount
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
@@ -54,9 +56,12 @@ def guess_from_camera_poses(
 
 
 def alike_turning(
-    robot: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses]
+    robot: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
 ) -> dict[int, FloatArray]:
-    """`cam_from_target` by view with a (3, 3) rotation of the robot: the rival that turns alike."""
+    """`cam_from_target` by view with a (4, 4) pose of the robot: the rival that agrees with it.
+
+    By the turns of both, or by the robot's positions where no turns agree.
+    """
     views = [at for at in sorted(seen) if at in robot and np.isfinite(robot[at]).all()]
     if not views:
         return {}
@@ -66,8 +71,12 @@ def alike_turning(
         [seen[view].cam_from_target[np.minimum(each, len(seen[view].cam_from_target) - 1)]
          for view in views]
     )  # fmt: skip
-    turned = np.array([robot[view] for view in views])
-    chosen = in_one_turn(turned, rivals[..., :3, :3])
+    poses = np.array([robot[view] for view in views])
+    chosen = in_one_turn(poses[:, :3, :3], rivals[..., :3, :3])
+    for name in sorted(MOUNTS, key=mount.__ne__) if chosen is None and most > 1 else ():
+        # The mount may be mistaken, too.
+        chosen = in_one_place(poses[:, :3, 3], rivals, name) if chosen is None else chosen
+    chosen = np.zeros(len(views), dtype=np.int64) if chosen is None else chosen
     return {view: rivals[at, chosen[at]] for at, view in enumerate(views)}
 
 
@@ -100,9 +109,9 @@ def _camera_numbers(run: RunState, robot: PoseNumbers) -> PoseNumbers:
     """Poses of one board, of each view by its image that which turns as the robot, or measured."""
     by_view, views = run.poses_of_one_board, run.session.views
     poses = np.full((len(views), 4, 4), np.nan)
-    turned = SideReading(robot.reading.rotation).rotations(robot)
-    by_robot = {view.number: turn for view, turn in zip(views, turned, strict=True)}
-    seen = alike_turning(by_robot, by_view)
+    taken = compose(SideReading(robot.reading.rotation).rotations(robot), robot.positions)
+    by_robot = {view.number: pose for view, pose in zip(views, taken, strict=True)}
+    seen = alike_turning(by_robot, by_view, run.session.mount)
     for at, view in enumerate(views):
         if view.number in by_view:
             poses[at] = seen.get(view.number, by_view[view.number].cam_from_target[0])

@@ -147,7 +147,7 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
 
 def _unrecorded(run: RunState) -> Iterator[Finding]:
     """The finding that the robot's poses are not those of the images, whatever the frames are."""
-    views, both = _both_sides(run.base_from_flange, run.poses_of_one_board)
+    views, both = _both_sides(run.base_from_flange, run.poses_of_one_board, run.session.mount)
     kept = thinned(np.arange(len(both)))
     views, both = views[kept], both[kept]
     if len(both) < FEWEST_ROWS:
@@ -215,7 +215,7 @@ def closes(
     base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
 ) -> bool:
     """Whether the chain of one robot closes as declared; true with too few views to show it."""
-    _, both = _both_sides(base_from_flange, seen)
+    _, both = _both_sides(base_from_flange, seen, mount)
     robot, camera = np.moveaxis(both, 1, 0)
     return (
         len(robot) < FEWEST_ROWS
@@ -224,11 +224,10 @@ def closes(
 
 
 def _both_sides(
-    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses]
+    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
 ) -> tuple[IntArray, FloatArray]:
     """(m,) views, and (m, 2, 4, 4) poses of the robot and of the target by each image alone."""
-    turned = {view: pose[:3, :3] for view, pose in base_from_flange.items()}
-    alike = alike_turning(turned, seen)
+    alike = alike_turning(base_from_flange, seen, mount)
     both = [(base_from_flange[view], pose) for view, pose in alike.items()]
     return np.array([*alike], dtype=int), np.array(both).reshape(-1, 2, 4, 4)
 
