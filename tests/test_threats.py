@@ -116,17 +116,38 @@ def test_the_trap_is_sprung_by_what_imports_from_the_current_folder(trap):
     assert "json" in trap.read_text("utf-8")
 
 
-@pytest.mark.parametrize(
-    ("name", "words"), [*calls()], ids=lambda word: word.replace(" ", "_")[:20]
-)
-def test_no_command_runs_code_of_the_current_folder(name, words, trap, program, inputs):
+# All in one process, whose path of imports no command changes: a module of the current folder would
+# be imported by the first that needs it.
+EACH = """
+import json, os, sys
+from visioncal.cli import main
+if __name__ == "__main__":
+    before = [*sys.path]
+    for folder, *words in json.loads(sys.argv[1]):
+        os.chdir(folder)
+        sys.argv[1:] = words
+        try:
+            main()
+        except SystemExit as stop:
+            assert not stop.code, words
+        assert sys.path == before, words
+"""
+
+
+def test_no_command_runs_code_of_the_current_folder(trap, inputs, tmp_path):
+    typed, program = list[list[str]](), tmp_path / "bin/visioncal"
+    program.parent.mkdir()
     shutil.copytree(inputs / "pairs", "session")
     shutil.copytree(inputs / "pairs_out", "out")
-    words = re.sub(r"[\[{]([\w./]+)[\]}]", lambda found: str(inputs / found[1]), words)
-    words = words.replace("SESSION", "session").replace("OUT", "out").replace("NEW", "new")
+    for at, (name, called) in enumerate(calls()):
+        words = re.sub(r"[\[{]([\w./]+)[\]}]", lambda found: str(inputs / found[1]), called)
+        words = words.replace("SESSION", "session").replace("OUT", "out").replace("NEW", "new")
+        folder = shutil.copytree(Path.cwd(), tmp_path / f"{at}")
+        typed.append([str(folder), *name.split(), *shlex.split(words)])
+    program.write_text(EACH, "utf-8")
     done = subprocess.run(
-        [*program, *name.split(), *shlex.split(words)], capture_output=True, text=True, check=False,
-        stdin=subprocess.DEVNULL,
+        [sys.executable, str(program), json.dumps(typed)], capture_output=True, text=True,
+        check=False, stdin=subprocess.DEVNULL,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert trap.read_text("utf-8") == ""
