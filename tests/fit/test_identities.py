@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from support.marks import seeds
 from support.small_cells import TABLE, made
 from support.without_poses import without_poses
 
@@ -291,18 +292,19 @@ def test_the_budget_sums_to_the_covariance():
 
 
 @pytest.mark.parametrize(("given", "in_hand"), [(True, True), (False, True), (True, False)])
-def test_errors_are_as_large_as_the_covariance_says(given, in_hand):
+@pytest.mark.parametrize("draws", seeds(30, 60))
+def test_errors_are_as_large_as_the_covariance_says(given, in_hand, draws):
     squares = []
-    for seed in range(60):
+    for seed in draws:
         small = made(seed, stops=12, given=given, in_hand=in_hand)
         # Errors that last, which these arms do not have, would add to it.
         fit = replace(solve(small.cell).fit, considered=None, shift=None)
         assert fit.used.all() or fit.used.sum() >= 11
         away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
         squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away))
-    # The mean of 60 of six degrees, but that noise levels of 12 stops are known to a sixth only:
-    # a t distribution of 60 degrees of freedom or more, a share of 1.04.
-    low, high = chi2.ppf([0.001, 0.999], 360) / 60
+    # Means of six degrees, but that noise levels of 12 stops are known to a sixth only: a t
+    # distribution of 60 degrees of freedom or more, a share of 1.04.
+    low, high = chi2.ppf([0.001, 0.999], 6 * len(draws)) / len(draws)
     assert low < np.mean(squares) / 1.04 < high
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from support.cells import reporting
+from support.marks import seeds
 from support.wrong_arms import CARRIED, GOOD, SAGGING, WRONG_LINKS, away_m
 
 from visioncal.core.transforms import invert, log
@@ -108,9 +109,10 @@ def assert_honest(squares, directions):
 
 
 @pytest.mark.parametrize("payloads", [CARRIED, ()])
-def test_springs_are_found_within_their_covariance(payloads):
+@pytest.mark.parametrize("draws", seeds(4, 8))
+def test_springs_are_found_within_their_covariance(payloads, draws):
     squares = []
-    for seed in range(8):
+    for seed in draws:
         options = replace(SAGGING, payloads=payloads, seed=seed, mount=MOUNTS[seed % 2])
         made = simulate(options)
         fit = solve(cell_of(made)).fit
@@ -120,9 +122,10 @@ def test_springs_are_found_within_their_covariance(payloads):
     assert_honest(squares, 6)
 
 
-def test_play_of_stops_from_both_sides_is_found_within_its_covariance():
+@pytest.mark.parametrize("draws", seeds(4, 8))
+def test_play_of_stops_from_both_sides_is_found_within_its_covariance(draws):
     squares = []
-    for seed in range(8):
+    for seed in draws:
         made = simulate(
             replace(GOOD, views=40, backlash_rad=PLAY, seed=seed, mount=MOUNTS[seed % 2])
         )
@@ -133,10 +136,11 @@ def test_play_of_stops_from_both_sides_is_found_within_its_covariance():
     assert_honest(squares, 6)
 
 
-def test_play_is_found_by_the_order_of_the_stops_alone():
+@pytest.mark.parametrize("draws", seeds(4, 8))
+def test_play_is_found_by_the_order_of_the_stops_alone(draws):
     """Joints of a servo stand on the side from which they came, and no column says which."""
     squares = []
-    for seed in range(8):
+    for seed in draws:
         made = simulate(replace(GOOD, views=30, branches=True, seed=seed, mount=MOUNTS[seed % 2]))
         q = made.robot.joints
         came = -np.sign(np.diff(q, axis=0, prepend=q[:1]))

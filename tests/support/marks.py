@@ -19,3 +19,8 @@ def crossed(many, few):
     """
     quick = {*zip(many, cycle(few), strict=False)}
     return [pair if pair in quick else slow(*pair) for pair in product(many, few)]
+
+
+def seeds(few, many):
+    """The first seeds of a statistical test, and more of them that are left to the long run."""
+    return [pytest.param(range(few), id=f"{few} seeds"), slow(range(many))]
