@@ -88,8 +88,17 @@ class _Record:
     @cached_property
     def copies(self) -> Mask:
         """(m,) views in whose row the robot's pose before is there once more."""
-        same = np.abs(np.diff(self.robot, axis=0)).max(axis=(1, 2)) < _SAME
-        return np.append(False, same)[self.rows]
+        return _same_as_before(self.robot)[self.rows]
+
+    @cached_property
+    def lingering(self) -> Mask:
+        """(m,) views in which the pose of the target before is there once more."""
+        return _same_as_before(self.camera[:, 0])
+
+
+def _same_as_before(poses: FloatArray) -> Mask:
+    """(n,) mask of (n, 4, 4) poses that are the one before."""
+    return np.append(False, np.abs(np.diff(poses, axis=0)).max(axis=(1, 2)) < _SAME)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +188,8 @@ def likeliest(run: RunState) -> Undoing | None:
     record = _Record.of(run)
     if len(record.rows) <= FEWEST_COMPARED + 1:
         return None
-    own, fresh = record.paired(np.arange(len(record.views))), ~record.copies
+    own = record.paired(np.arange(len(record.views)))
+    fresh = ~record.copies & ~record.lingering
     declared = _Edges.by(record, own, fresh)
     if declared is None:
         return None
@@ -207,27 +217,35 @@ def likeliest(run: RunState) -> Undoing | None:
 
 
 def _copied(record: _Record, apart: FloatArray, own: IntArray, agrees: Mask) -> Iterator[Undoing]:
-    """Poses that are there once more though the camera saw another view."""
+    """Poses of the robot, or of the target, that are there once more though the other moved."""
     closes = apart[agrees].mean() < CLOSING_SCORE**2
-    copied = record.copies & ~agrees & (own >= 0)
-    if not copied.any() or not closes:
-        return
-    # Where the robot stands still between views, equal poses say little.
-    chance = max(float((record.copies & agrees).mean()), _EQUAL)
-    views = tuple(record.views[record.rows[copied]].tolist())
-    others = record.views[record.rows[~copied]].tolist()
-    whose = f"{view_words(views).capitalize()} {'have' if len(views) > 1 else 'has'}"
-    yield Undoing(
-        _MISTAKE - len(views) * float(np.log(chance)),
-        Finding(
-            "copied_poses",
-            f"{whose} the robot's pose of the row before once more, to the last digit, though the "
-            "images differ: the log repeated a pose that was read before. Left out.",
-            or_alone("Record them anew, or calibrate the other views alone.", others),
-            views,
+    for copies, pose, but in (
+        (
+            record.copies,
+            "the robot's pose",
+            "the images differ: the log repeated a pose that was read before",
         ),
-        "the robot's pose is that of the row before, once more",
-    )
+        (record.lingering, "the target's pose", "the robot moved: the last that was seen lingered"),
+    ):
+        copied = copies & ~agrees & (own >= 0)
+        if not copied.any() or not closes:
+            continue
+        # Where the robot stands still between views, equal poses say little.
+        chance = max(float((copies & agrees).mean()), _EQUAL)
+        views = tuple(record.views[record.rows[copied]].tolist())
+        others = record.views[record.rows[~copied]].tolist()
+        whose = f"{view_words(views).capitalize()} {'have' if len(views) > 1 else 'has'}"
+        yield Undoing(
+            _MISTAKE - len(views) * float(np.log(chance)),
+            Finding(
+                "copied_poses",
+                f"{whose} {pose} of the row before once more, to the last digit, though {but}. "
+                "Left out.",
+                or_alone("Record them anew, or calibrate the other views alone.", others),
+                views,
+            ),
+            f"{pose} is that of the row before, once more",
+        )
 
 
 def _flipped(
