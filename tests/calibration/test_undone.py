@@ -253,6 +253,19 @@ def test_a_mistake_is_named_and_its_command_mends_it(tmp_path, monkeypatch, kind
     assert last.status == 0, last.said
 
 
+@pytest.mark.parametrize(("views", "mount"), crossed([5, 6, 7], MOUNTS))
+def test_one_flipped_view_of_few_is_named(views, mount):
+    """Twelve cells each, of which at most one may hide it; no sound one is accused."""
+    named = []
+    for seed in range(12):
+        sound = poses_of(mount, views, seed)
+        for robot, boards in (sound, flipped(*sound, some=(3,))):
+            found = likeliest(located(pairs_session(mount, robot, boards)))
+            named.append(found and (found.found.kind, found.found.views))
+    assert not any(named[::2])
+    assert named[1::2].count(("flipped_poses", (3,))) >= 11
+
+
 @pytest.mark.parametrize("by", [1, 3, -1, -2])
 def test_rows_are_any_few_apart(by):
     session = pairs_session(MOUNTS[0], *shifted(*poses_of(MOUNTS[0], 30), 15, by))

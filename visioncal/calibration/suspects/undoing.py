@@ -43,6 +43,8 @@ _WRONG = float(np.log(0.05)) - 6.0 * float(np.log(2.0))
 _MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
 # A turn of a board differs by less from a quarter or half one [rad]; copies of poses by less.
 _NEAR_RAD, _SAME = 0.1, 1e-9
+# Of so few views, one that is wrong leaves a fit none to be told by.
+_FEW = 7
 # Views are alike within so many medians.
 _UNEVEN = 7.0
 
@@ -116,7 +118,7 @@ class _Edges:
     ) -> Self | None:
         """The edges that most of some paired rows agree on; None with too few."""
         some = np.flatnonzero(among & (pairs >= 0))
-        if len(some) <= FEWEST_COMPARED:
+        if len(some) < FEWEST_COMPARED:
             return None
         sides = record.robot[pairs[some]][None], record.camera[some, 0][None]
         fit = robust_fits(*sides, starts, share=_KEPT)[0]
@@ -186,7 +188,7 @@ def likeliest(run: RunState) -> Undoing | None:
     if run.mount in (None, "instrument") or run.misread or waits_for_clock(run.session):
         return None
     record = _Record.of(run)
-    if len(record.rows) <= FEWEST_COMPARED + 1:
+    if len(record.rows) < FEWEST_COMPARED:
         return None
     own = record.paired(np.arange(len(record.views)))
     fresh = ~record.copies & ~record.lingering
@@ -261,6 +263,17 @@ def _flipped(
     other = compose(mirror @ seen[..., :3, :3] @ np.diag([1.0, 1.0, -1.0]), seen[..., :3, 3])
     mirrored = replace(edges, record=replace(record, camera=other)).of(own)
     odds, wrong = _chosen(own, apart, mirrored, base)
+    for at in range(len(own)) if len(own) <= _FEW else ():
+        # One view in a few bends the fit.
+        camera = record.camera.copy()
+        camera[at] = other[at]
+        alone = _Edges.by(replace(record, camera=camera), own, own >= 0)
+        if alone is not None:
+            squares = alone.of(own)
+            (log,), (agrees,) = _evidence(squares[None])
+            gain = EVIDENCE * float(log - base) + _MISTAKE - float(np.log(len(own)))
+            if gain > odds and squares[agrees].mean() < CLOSING_SCORE**2:
+                odds, wrong = gain, np.arange(len(own)) == at
     views = tuple(record.views[record.rows[wrong]].tolist())
     if not views:
         return
