@@ -37,14 +37,7 @@ from visioncal.simulation import (
     simulate_warm_up,
 )
 from visioncal.simulation.arms import heated_poses
-from visioncal.simulation.layout import (
-    BoardAt,
-    CameraAt,
-    Moved,
-    NetworkOptions,
-    RobotAt,
-    Swept,
-)
+from visioncal.simulation.layout import BoardAt, CameraAt, Moved, NetworkOptions, RobotAt, Swept
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 MOUNTS = ("eye-in-hand", "eye-to-hand")

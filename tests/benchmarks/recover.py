@@ -18,10 +18,7 @@ from visioncal.verification import verify
 from visioncal.verification.recovery import BASE, MOUNT, causes_found, moved_along, parted, recover
 
 PICKS = few(40, 8)
-ARMS = {
-    "off by 0.5 mm and 1 mrad": {},
-    "exact": {"dh_sigma_m": 0.0, "dh_sigma_rad": 0.0},
-}
+ARMS = {"off by 0.5 mm and 1 mrad": {}, "exact": {"dh_sigma_m": 0.0, "dh_sigma_rad": 0.0}}
 KNOCKS = ("slipped encoder", "moved base", "new flange")
 # A tool beside the camera, in the old flange's frame [m].
 TOOL = np.array([-0.05, 0.03, 0.15])

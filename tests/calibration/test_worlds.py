@@ -347,10 +347,7 @@ WORLDS: dict[str, World] = {
         joints=True,
         seed=4,
         kinds=("board_shape",),
-        words=(
-            "longer along its y than along its x, by 0.1 %",
-            "rows and columns meet at 89.91",
-        ),
+        words=("longer along its y than along its x, by 0.1 %", "rows and columns meet at 89.91"),
     ),
     "size within what is stated": World(
         replace(FINE, board_scale=1.002),
@@ -371,9 +368,7 @@ WORLDS: dict[str, World] = {
     "wrong arm": World(WRONG_ARM, kinds=("arm_errors",), slack=1.3),
     "wrong arm with joints": World(WRONG_ARM, joints=True, never=ARM, slack=1.3),
     "coarse noise": World(
-        replace(FINE, robot_sigma_rad=5e-4, robot_sigma_m=3e-4),
-        never=ARM,
-        slack=1.3,
+        replace(FINE, robot_sigma_rad=5e-4, robot_sigma_m=3e-4), never=ARM, slack=1.3
     ),
     # Off by hardly more than the arm repeats to, in all parameters alike: offsets of the joints
     # explain most of what twelve views show, and would leave the first and last link for exact.

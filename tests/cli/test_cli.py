@@ -341,10 +341,7 @@ def test_examples_work(pairs, tmp_path, monkeypatch):
     for name in ("tcp", "fixture", "correct"):
         Path(f"{name}.csv").write_text(visioncal(name, "--example").good().out)
     visioncal("tcp", "tcp.csv", "-o", "frames.json", "--name", "tip").good()
-    for source, name, *more in (
-        ("tcp", "tcp.csv"),
-        ("fixture", "fixture.csv", "--tool", "none"),
-    ):
+    for source, name, *more in (("tcp", "tcp.csv"), ("fixture", "fixture.csv", "--tool", "none")):
         done = visioncal(source, name, *more, "--json").good()
         (frame,) = json.loads(done.out).values()
         assert frame["verdict"]["status"] == "good"

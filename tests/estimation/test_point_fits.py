@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.misfits import misfit
-from support.parts import (
-    even,
-    noise_of,
-    pairs_of,
-    placed,
-    some_drawing,
-    some_frame,
-)
+from support.parts import even, noise_of, pairs_of, placed, some_drawing, some_frame
 from support.refusals import raised
 from support.slopes import jacobian
 from support.touched import POINTS, TIP, TURN, Job, error_of, relabelled, slipped

@@ -9,14 +9,7 @@ from support.whole_cells import OPTIONS, recorded
 
 from visioncal.core.transforms import invert, log
 from visioncal.fit.assemble import mixed_model
-from visioncal.fit.processes import (
-    _alone,
-    _boards,
-    _tried_of,
-    consider,
-    judged,
-    processes,
-)
+from visioncal.fit.processes import _alone, _boards, _tried_of, consider, judged, processes
 from visioncal.fit.search import Search
 from visioncal.fit.solve import solve
 from visioncal.fit.unknowns import State
@@ -119,9 +112,7 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     for sigma in (3e-4, 1e-2):
         member = fit.unknowns["shape", "target"]
         prior = replace(board.held, sigma=sigma)
-        unknowns = fit.unknowns.with_members(
-            replace(member, priors=(prior, *member.priors[1:])),
-        )
+        unknowns = fit.unknowns.with_members(replace(member, priors=(prior, *member.priors[1:])))
         mixed = mixed_model(cell, unknowns, fit.linearised, fit.grams, fit.used)
         best = mixed.at(fit.estimate.logs)
         values.append(-0.5 * best.value - np.log(sigma))

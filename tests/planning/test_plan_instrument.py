@@ -121,10 +121,7 @@ def test_stops_are_added_to_a_session_and_what_was_recorded_counts(tmp_path):
         ((ARM, "--mount", "instrument"), "--cam, --board, --instrument are needed"),
         ((ARM, "--mount", "instrument", "--add", 3), "holds no recorded session"),
         ((ARM, "--mount", "instrument", *TRACKER, "--target", "x"), "sees no board"),
-        (
-            (ARM, "--mount", "instrument", "--probe", "pose", *AT500),
-            "reads rotations is not known",
-        ),
+        ((ARM, "--mount", "instrument", "--probe", "pose", *AT500), "reads rotations is not known"),
     ],
 )
 def test_what_is_missing_is_named(arguments, words, tmp_path):

@@ -75,11 +75,7 @@ def test_the_condition_goes_with_every_output(result, tmp_path):
     own = figure(rounded_up(result.verdict.good_for_mm_uncorrected))
     assert f"within {own} mm" in condition.sentence
     write_certificate(tmp_path / "page.html", result, None, {})
-    said = [
-        (tmp_path / "page.html").read_text(),
-        result._repr_html_(),
-        verdict_markdown(result),
-    ]
+    said = [(tmp_path / "page.html").read_text(), result._repr_html_(), verdict_markdown(result)]
     assert all("belong to the calibrated arm" in text for text in said)
     for form in ("ur", "kuka", "abb", "ros", "urdf", "easy-handeye", "opencv", "text"):
         written = document(result, form)

@@ -45,10 +45,7 @@ class PlayedCamera:
 
 
 if __name__ == "__main__":
-    devices.CAMERAS = {
-        **devices.CAMERAS,
-        "played": lambda folder, _: PlayedCamera(Path(folder)),
-    }
+    devices.CAMERAS = {**devices.CAMERAS, "played": lambda folder, _: PlayedCamera(Path(folder))}
     from visioncal.cli.app import main
 
     main()

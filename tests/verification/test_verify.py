@@ -8,14 +8,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 from support.beyond import with_field
-from support.cells import (
-    board_numbers,
-    calibrated,
-    known_of,
-    pairs_session,
-    reporting,
-    session_of,
-)
+from support.cells import board_numbers, calibrated, known_of, pairs_session, reporting, session_of
 from support.commands import visioncal
 from support.later import ANYHOW, Change, again, knock, known_again, usual
 from support.misfits import misfit

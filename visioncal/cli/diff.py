@@ -80,7 +80,4 @@ def _print_lens(lens: LensChange) -> None:
 def _outcome(test: Significance) -> tuple[str, str]:
     percent = 100 * test.p_value
     chance = f"{percent:.0f} %" if percent > 10.0 else f"{figure(percent)} %"
-    return (
-        "under 0.01 %" if percent < 0.01 else chance,
-        "changed" if test.is_change else "noise",
-    )
+    return ("under 0.01 %" if percent < 0.01 else chance, "changed" if test.is_change else "noise")

@@ -169,9 +169,7 @@ class DynamicsGainsOptions:
         "Its centre of mass in the flange's frame (mm).", form="x,y,z", default=REQUIRED
     )
     inertia: tuple[float, ...] = numbers_option(
-        "Its inertia about that centre (kg m^2).",
-        form="xx,xy,yy,xz,yz,zz",
-        default="0,0,0,0,0,0",
+        "Its inertia about that centre (kg m^2).", form="xx,xy,yy,xz,yz,zz", default="0,0,0,0,0,0"
     )
     cutoff_hz: float | None = cutoff_option()
     named: str | None = robot_name()

@@ -75,9 +75,7 @@ def opened(
     """Opens both devices, the arm unless it is given, and closes them at the end of the block."""
     requested = DeviceSetup(options.resolution, options.exposure_us, options.gain, options.focus)
     chosen = given or open_arm(
-        *(str(options.arm), asked, options.pose_form),
-        moves=is_moved,
-        answers=sys.stdin.isatty(),
+        *(str(options.arm), asked, options.pose_form), moves=is_moved, answers=sys.stdin.isatty()
     )
     with closing(chosen) as arm:
         if is_moved and not isinstance(arm, MovingArm):

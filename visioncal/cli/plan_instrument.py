@@ -20,11 +20,7 @@ from visioncal.core.version import __version__
 from visioncal.frames.touches import robot_noise
 from visioncal.interchange.outputs import PLAN, PROGRAM, write_stops
 from visioncal.planning.cell import TYPICAL_NOISE, InstrumentCell
-from visioncal.planning.instrument import (
-    STABLE,
-    InstrumentPlan,
-    plan_for_instrument,
-)
+from visioncal.planning.instrument import STABLE, InstrumentPlan, plan_for_instrument
 from visioncal.planning.plan import Stop
 from visioncal.planning.plan_file import joints_in_degrees, ur_program
 from visioncal.planning.purposes import purpose_of
@@ -74,10 +70,7 @@ def plan_instrument(options: PlanOptions, source: Source, kept: Kept) -> str:
         "purpose": purpose.name,
         "judged": purpose.errors,
         "criterion": {"name": criterion, "value": plan.design.sigma_mm},
-        "predicted": {
-            "sigma_mm": plan.design.predicted.mm,
-            "sigma_deg": plan.design.predicted.deg,
-        },
+        "predicted": {"sigma_mm": plan.design.predicted.mm, "sigma_deg": plan.design.predicted.deg},
         "condition": {"phi_t_phi": plan.condition(), "parameters": plan.parameters},
         "joints": list(cell.robot.joint_names),
         "stops": [{"view": at.view, "q": at.q.tolist(), "via_q": at.via.tolist()} for at in stops],

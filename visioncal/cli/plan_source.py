@@ -15,10 +15,7 @@ from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.interchange.outputs import CALIBRATION
 from visioncal.interchange.result_files import content_of, load_stored
-from visioncal.planning.cell import (
-    Box,
-    Limits,
-)
+from visioncal.planning.cell import Box, Limits
 from visioncal.results import Calibration
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session

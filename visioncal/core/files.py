@@ -117,9 +117,7 @@ def opened(path: Path) -> Iterator[BinaryIO]:
     """An open regular file; raises DataError where there is none, or it cannot be read."""
     if why_not := absence(path):
         raise DataError(
-            f"{path} {why_not}.",
-            culprits=[str(path)],
-            next_step="Check the path and its spelling.",
+            f"{path} {why_not}.", culprits=[str(path)], next_step="Check the path and its spelling."
         )
     try:
         with path.open("rb") as file:

@@ -22,11 +22,7 @@ _SHOWN, LEAST_LIKELY, _LIKELY, _EVEN = 3, 0.05, 0.2, 0.5
 SURE = 0.99
 # Smaller than any need [mm]: for findings on what is left out of a result, which do not impair it.
 LEAST_NEED_MM = 1e-3
-_HEADLINES = {
-    "good": "Good: ready to use",
-    "check": "Check before use",
-    "bad": "Bad: do not use",
-}
+_HEADLINES = {"good": "Good: ready to use", "check": "Check before use", "bad": "Bad: do not use"}
 # Kinds of what is no doubt: praise, remarks, and that a bad result's accuracy is unknown.
 AGREEMENT, NOTE, NO_ACCURACY = "agreement", "note", "no_accuracy"
 # Kind of what verify finds where depth is not what it was.

@@ -179,11 +179,7 @@ def _plan(identified: Identified, words: str) -> Remedy:
 
 def judge(identified: Identified) -> Verdict:
     """Judges identified dynamics by their predictions, and by what the motion determined."""
-    judged = [
-        *_of_lag(identified),
-        *_of_prediction(identified),
-        *_of_range(identified),
-    ]
+    judged = [*_of_lag(identified), *_of_prediction(identified), *_of_range(identified)]
     statuses = {status for status, _ in judged}
     worst: VerdictStatus = (
         "bad" if "bad" in statuses else "check" if "check" in statuses else "good"

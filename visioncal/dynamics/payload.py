@@ -205,10 +205,7 @@ class Gains:
 
 @on_one_blas_thread
 def drive_gains(
-    base: BaseModel,
-    empty: Sequence[Conditioned],
-    loaded: Sequence[Conditioned],
-    body: FloatArray,
+    base: BaseModel, empty: Sequence[Conditioned], loaded: Sequence[Conditioned], body: FloatArray
 ) -> Gains:
     """Estimates the drive gains.
 

@@ -13,12 +13,7 @@ from visioncal.core.verdict import AGAIN, Finding, Remedy
 from visioncal.estimation.pivot import PivotFit, Touches, TouchKind, fit_pivot
 from visioncal.estimation.placing import assumed_words
 from visioncal.frames.fixture import FitSettings, PointsFit
-from visioncal.frames.touches import (
-    TouchRows,
-    flange_poses,
-    refuse_copies,
-    robot_noise,
-)
+from visioncal.frames.touches import TouchRows, flange_poses, refuse_copies, robot_noise
 from visioncal.results import Calibration, Edge, Frame
 from visioncal.robot import Robot
 

@@ -15,14 +15,7 @@ from visioncal.results import Calibration
 from visioncal.results.arm import StoredRobot
 from visioncal.results.lens import StoredCamera
 from visioncal.robot import Robot
-from visioncal.robot.collision import (
-    SLACK_M,
-    Body,
-    Collisions,
-    arm_bodies,
-    camera_body,
-    capsule,
-)
+from visioncal.robot.collision import SLACK_M, Body, Collisions, arm_bodies, camera_body, capsule
 from visioncal.session.kinds import Instrument
 from visioncal.vision.targets import (
     corner_positions,

@@ -21,14 +21,7 @@ from visioncal.core.files import one_line, read_text, sha256
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.planning.cell import PlanCell
-from visioncal.planning.plan import (
-    ACCURACY,
-    Plan,
-    PlannedStop,
-    PlanRequest,
-    Stop,
-    StoredPurpose,
-)
+from visioncal.planning.plan import ACCURACY, Plan, PlannedStop, PlanRequest, Stop, StoredPurpose
 from visioncal.robot import Robot
 from visioncal.robot.conversion import has_ur_axes
 from visioncal.session.columns import POSE, pose_row

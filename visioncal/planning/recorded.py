@@ -62,11 +62,7 @@ def calibrate_partially(
 
 
 def start_from_session(
-    run: RunState,
-    refusal: str = "",
-    *,
-    limits: Limits | None = None,
-    boxes: tuple[Box, ...] = (),
+    run: RunState, refusal: str = "", *, limits: Limits | None = None, boxes: tuple[Box, ...] = ()
 ) -> SessionStart:
     """Prepares a session as the start of a plan.
 

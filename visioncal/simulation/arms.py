@@ -298,10 +298,7 @@ def forward(arm: DhArm, joints: FloatArray) -> FloatArray:
 
 
 def loaded_joints(
-    arm: DhArm,
-    compliance: Sequence[float],
-    joints: FloatArray,
-    payloads: Sequence[Payload] = (),
+    arm: DhArm, compliance: Sequence[float], joints: FloatArray, payloads: Sequence[Payload] = ()
 ) -> FloatArray:
     """True joint angles under load.
 

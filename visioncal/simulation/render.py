@@ -170,10 +170,7 @@ def render(scene: RenderScene, index: int) -> Image:
 
 
 def light_on(
-    scene: RenderScene,
-    cam_from_target: FloatArray,
-    *,
-    shows_board: bool = True,
+    scene: RenderScene, cam_from_target: FloatArray, *, shows_board: bool = True
 ) -> Float32Array:
     """Light on the sensor.
 

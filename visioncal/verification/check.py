@@ -28,11 +28,7 @@ from visioncal.session import Session
 from visioncal.session.selecting import Choice
 from visioncal.verification.calibration_prior import CalibrationPrior
 from visioncal.verification.change_hypotheses import CAMERA, NOISE, PAIRS, causes_of
-from visioncal.verification.prediction import (
-    PredictedStops,
-    board_changes,
-    predict_stops,
-)
+from visioncal.verification.prediction import PredictedStops, board_changes, predict_stops
 
 _LIMITS = CheckLimits()
 # Prior sigma of a board that was moved on purpose, around where it is seen [rad and m].

@@ -37,13 +37,7 @@ from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult
 from visioncal.results.sections import FittedArm, FittedStops, NoiseIntervals
 from visioncal.results.views import rms_of
 from visioncal.session import Session
-from visioncal.verification.change_hypotheses import (
-    BOARD,
-    BOTH,
-    CAMERA,
-    JOINT,
-    nominal_model,
-)
+from visioncal.verification.change_hypotheses import BOARD, BOTH, CAMERA, JOINT, nominal_model
 from visioncal.verification.check import Check, PossibleChange, verify
 from visioncal.verification.messages import change_words
 

@@ -112,10 +112,7 @@ _Loader.yaml_constructors = {
     f"{_STANDARD}float": lambda _, node: float(node.value),
     f"{_STANDARD}bool": lambda _, node: _CONSTANTS[node.value.lower()],
     f"{_STANDARD}seq": lambda loader, node: loader.construct_sequence(node, deep=True),
-    **dict.fromkeys(
-        (f"{_STANDARD}{kind}" for kind in ("map", "opencv-matrix")),
-        _Loader.mapping,
-    ),
+    **dict.fromkeys((f"{_STANDARD}{kind}" for kind in ("map", "opencv-matrix")), _Loader.mapping),
 }
 for _kind, _form in _FORMS.items():
     _Loader.add_implicit_resolver(f"{_STANDARD}{_kind}", re.compile(_form), None)

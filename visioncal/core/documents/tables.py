@@ -185,9 +185,7 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
     )
 
 
-def _below_titles(
-    rows: list[tuple[int, tuple[str, ...]]],
-) -> list[tuple[int, tuple[str, ...]]]:
+def _below_titles(rows: list[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tuple[str, ...]]]:
     """Rows without what stands above: titles of other widths, or rows filled in few cells.
 
     Units in a row of their own join the names.

@@ -14,11 +14,7 @@ _SEEN, _WANTED = (60, 200, 60), (0, 150, 255)
 
 
 def live_picture(
-    image: Image,
-    target: Target,
-    corners: Corners | None,
-    lens: Camera,
-    wanted: FloatArray | None,
+    image: Image, target: Target, corners: Corners | None, lens: Camera, wanted: FloatArray | None
 ) -> bytes:
     """Draws found corners and the wanted place of the board into a picture.
 

@@ -38,13 +38,7 @@ from visioncal.simulation.arms import ArmOptions, DhArm, arm_named, forward
 
 # `none` mends all others.
 Fault: TypeAlias = Literal[
-    "none",
-    "protective-stop",
-    "emergency-stop",
-    "power-off",
-    "remote-off",
-    "link-lost",
-    "silent",
+    "none", "protective-stop", "emergency-stop", "power-off", "remote-off", "link-lost", "silent"
 ]
 # Starting takes a second, but much longer on a busy computer [s].
 _START_S = 60.0

@@ -9,13 +9,7 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Table, TableRow
-from visioncal.verification import (
-    NOISE,
-    Check,
-    Trigger,
-    change_words,
-    listed_changes,
-)
+from visioncal.verification import NOISE, Check, Trigger, change_words, listed_changes
 
 # Words for the states of triggers, in the order of the table.
 _STATES = {"fired": "now", "unknown": "not known", "quiet": "not yet"}

@@ -48,9 +48,7 @@ _LOCK = Lock()
 _Given = ParamSpec("_Given")
 
 
-def drawn(
-    draw: Callable[_Given, tuple[Figure, str] | None],
-) -> Callable[_Given, Markup]:
+def drawn(draw: Callable[_Given, tuple[Figure, str] | None]) -> Callable[_Given, Markup]:
     """Decorates a function that returns a figure and its description, or None for no figure.
 
     The result is an `<svg>` element that scales with its container; empty without a figure.
