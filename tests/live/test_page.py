@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.browser import CHROMIUM
 from support.commands import visioncal as command
-from support.page import free_port, opened, served
+from support.page import choose, free_port, opened, served
 
 import visioncal
 from visioncal import Calibration, Session
@@ -50,13 +50,6 @@ def typed(page, folder: Path, view, line: str, place: int) -> None:
     row(page, place).wait_for()
     # Pressed twice, it is one view.
     assert row(page, place + 1).count() == 0
-
-
-def choose(page, label: str, words: str) -> None:
-    field = page.get_by_label(label, exact=True)
-    field.click()
-    field.fill(words)
-    field.press("Enter")
 
 
 @pytest.fixture(scope="module")

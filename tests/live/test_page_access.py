@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.browser import CHROMIUM
 from support.commands import visioncal as command
-from support.page import PATIENT_MS, opened, served
+from support.page import PATIENT_MS, choose, opened, served
 
 from visioncal import Session
 
@@ -48,13 +48,6 @@ def cell(tmp_path_factory) -> Path:
     command("simulate", folder / "seen", "--views", 8, "--with-intrinsics", "--seed", 4)
     command("calibrate", folder / "seen", "-o", folder / "result")
     return folder
-
-
-def choose(page, label: str, words: str) -> None:
-    field = page.get_by_label(label, exact=True)
-    field.click()
-    field.fill(words)
-    field.press("Enter")
 
 
 @pytest.mark.parametrize("names", [HOSTILE[:1], HOSTILE], ids=["one", "all"])

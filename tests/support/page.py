@@ -107,3 +107,11 @@ def opened(browser, url: str):
         # One that stays asks for its process, and draws its pictures, for ever.
         context.close()
     assert not faults, faults
+
+
+def choose(page, label: str, words: str) -> None:
+    """Types words into the field of a label."""
+    field = page.get_by_label(label, exact=True)
+    field.click()
+    field.fill(words)
+    field.press("Enter")
