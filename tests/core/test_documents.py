@@ -243,6 +243,11 @@ def test_tables_are_read_as_spreadsheets_write_them(file, encoding):
     assert [*table.rows[0]] == ["1.5", "2"]
 
 
+def test_tables_are_read_as_a_chinese_spreadsheet_writes_them(file):
+    table = read_table(file("a.csv", "序号,位置X(mm),姿态RX(°)\n1,5.5,2\n".encode("gbk")))
+    assert table.columns == ("序号", "位置X(mm)", "姿态RX(°)")
+
+
 def test_files_that_are_none_of_text_or_too_large(file, tmp_path):
     raised(DataError, "line 2: a NUL byte", read_json, file("a.json", b"[\n\0]"))
     # A hole in the file: nothing is written to the disk.

@@ -255,6 +255,15 @@ def printed_lists(folder: Path) -> Recording:
     return recording
 
 
+def scripted(folder: Path) -> Recording:
+    """Lists in a Python program that solves by them."""
+    text = "import numpy as np\nK = np.array([[900.0, 0, 640], [0, 900.0, 360], [0, 0, 1]])\n"
+    for name, poses in (("robot_poses", BASE_FROM_FLANGE), ("marker_in_cam", CAM_FROM_TARGET)):
+        rows = ",\n    ".join(map(repr, quaternions(poses).tolist()))
+        text += f"{name} = np.array([  # x y z, x y z w\n    {rows},\n])\n"
+    return _in_hand(folder / "handeye.py", f"{text}print(robot_poses.shape)\n")
+
+
 def headed_units(folder: Path) -> Recording:
     """A header in a comment, with the units of its columns."""
     angles = Rotation.from_matrix(BASE_FROM_FLANGE[:, :3, :3]).as_euler("xyz", degrees=True)
@@ -397,7 +406,7 @@ RECORDINGS: Mapping[str, Callable[[Path], Recording]] = {
         industrial, kinematics, visp, zivid, easy_handeye, moveit_json, views_json,
         views_npz, opencv_matrices, kuka_csv, plain_table, stacked_npz, keyed_json,
         images_and_table, matrices_below, matrices_in_rows, numbered_yaml,
-        lettered_quaternions, printed_lists, headed_units, ros_poses, visp_seen,
+        lettered_quaternions, printed_lists, scripted, headed_units, ros_poses, visp_seen,
         alternating, halves, counted_rows,
     )
 }  # fmt: skip

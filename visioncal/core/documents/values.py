@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,13 @@ DECIMAL = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 # The same with a decimal comma.
 DECIMAL_COMMA = r"[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?"
 
+# Two of the usual characters of GBK on end: in Windows-1252 four letters with accents.
+_HAN = re.compile(rb"(?:[\xb0-\xd7][\xa1-\xfe]){2}")
 _SHOWN = 60  # characters of a value in a message
 
 
 def read_plain_text(path: Path) -> str:
-    """Reads a bounded text file in UTF-8, UTF-16 with its mark, or otherwise Windows-1252.
+    """Reads a bounded text file in UTF-8, UTF-16 with its mark, GBK, or otherwise Windows-1252.
 
     Numbers read the same in Windows-1252 and similar encodings of spreadsheets. Raises DataError.
     """
@@ -38,6 +41,9 @@ def read_plain_text(path: Path) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
+        with suppress(UnicodeDecodeError):
+            if _HAN.search(data):
+                return data.decode("gb18030")
         return data.decode("cp1252", "replace")
 
 

@@ -74,6 +74,7 @@ class FileGroup:
     label: str  # Their path in the source: `images/img_#.png`.
     files: tuple[Path, ...]  # In natural order.
     numbers: tuple[int, ...] = ()  # The number by which they differ; empty without one.
+    is_source: bool = False  # Whether it is the source itself, which may be a Python program.
 
     @property
     def name(self) -> str:
@@ -91,7 +92,7 @@ class FileGroup:
         """Whether they have the ending of numbers, or an unknown one and numbers in them."""
         words = self.label.lower()
         if words.endswith((*ENDINGS, *_NO_DATA, *IMAGE_ENDINGS)):
-            return words.endswith(ENDINGS)
+            return words.endswith((*ENDINGS, ".py") if self.is_source else ENDINGS)
         return len(re.findall(r"[0-9]\.[0-9]", head(self.files[0]))) > 5
 
     @cached_property
@@ -129,7 +130,7 @@ class FileGroup:
 def groups_in(source: Path) -> tuple[FileGroup, ...]:
     """The files of a source in groups of one kind, down to `_DEPTH` folders below it; pure."""
     if not source.is_dir():
-        return (FileGroup(source.name, (source,)),)
+        return (FileGroup(source.name, (source,), is_source=True),)
     alike: dict[tuple[str, str], list[Path]] = defaultdict(list)
     every = [*islice(_walked(source, _DEPTH), _FEW_FILES)]
     if len(every) == _FEW_FILES:

@@ -235,7 +235,13 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
         return rows_of_document(rows_of_xml(read_xml(path)), path)
     # Points that a program declares look like keys and values.
     is_program = path.suffix.lower() in PROGRAMS
-    read = (_messages, _literals, lambda text, _: _braced(text), lambda text, _: _keyed(text))
+    read = (
+        _scripted,
+        _messages,
+        _literals,
+        lambda text, _: _braced(text),
+        lambda text, _: _keyed(text),
+    )
     for literals in () if is_program else (each(text, path) for each in read):
         with suppress(DataError):
             return rows_of_document(literals, path)
@@ -556,6 +562,31 @@ def _literals(text: str, path: Path) -> list[object]:
             records.append(_listed(ast.literal_eval(_PYTHON.sub(lambda m: _NAMES_OF[m[0]], line))))
     check_values(records, str(path))
     return records if len(records) == len(lines) else []
+
+
+# A list that a Python program assigns to a name, over several lines.
+_ASSIGNED = re.compile(r"^\w+ *= *(?:\w+\.)?(?:as)?(?:array\()?\[ *(?:#.*)?$", re.MULTILINE)
+
+
+def _scripted(text: str, path: Path) -> dict[str, object]:
+    """Lists of views that a Python program assigns to names, also as arrays of NumPy."""
+    found = dict[str, object]()
+    if path.suffix.lower() != ".py" and not _ASSIGNED.search(text):
+        return found
+    with suppress(ValueError, SyntaxError, MemoryError, RecursionError):
+        for node in ast.walk(ast.parse(text)):
+            if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Name):
+                continue
+            value = node.value
+            if isinstance(value, ast.Call) and ast.unparse(value.func).endswith("array"):
+                value = value.args[0] if value.args else value
+            with suppress(ValueError, TypeError):
+                listed = _listed(ast.literal_eval(value))
+                # A list of four may be a matrix.
+                if isinstance(listed, list) and len(listed) > 4:
+                    found[node.targets[0].id] = listed
+    check_values(found, str(path))
+    return found
 
 
 def _listed(value: object) -> object:
