@@ -19,7 +19,7 @@ from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.random_effects import KINDS
 from visioncal.core.transforms import exp, invert, log
 from visioncal.results import Calibration
-from visioncal.simulation import CAMERAS, CellOptions, SimulatedCell, cell_session, simulate
+from visioncal.simulation import BOARDS, CAMERAS, CellOptions, SimulatedCell, cell_session, simulate
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions
 
@@ -30,6 +30,7 @@ LITTLE_WRONG = replace(FINE, views=30, dh_sigma_m=2e-4, dh_sigma_rad=2e-4)
 # As a user has it who states no lens.
 OPEN = CellOptions(views=18, state_intrinsics=False, pixel_sigma_px=0.1, seed=1)
 GROWING = frozenset(KINDS)
+LONE_TAGS = replace(BOARDS["aprilgrid"], kind="gridboard", dictionary="DICT_APRILTAG_36h11")
 
 
 def unchanged(cell: SimulatedCell) -> SimulatedCell:
@@ -317,6 +318,12 @@ WORLDS: dict[str, World] = {
     ),
     # Lenses beyond their models.
     "wavy lens": World(replace(FINE, robot_sigma_m=1e-5), wavy, kinds=("lens_field",), of=PLACE),
+    "wavy lens before lone tags": World(
+        replace(FINE, robot_sigma_m=1e-5, target=LONE_TAGS),
+        wavy,
+        kinds=("lens_field",),
+        words=("Or else the corners of lone tags were found off",),
+    ),
     "focus follows the distance": World(FINE, breathing, kinds=("focus",)),
     "lens zoomed once": World(
         FINE,

@@ -29,6 +29,8 @@ _LEAST_MOVE_PX = 0.1
 # A part of a picture begins farther from its corner than any centre is wrong [px]; what is left of
 # the move where stated intrinsics were misread.
 _CROPPED_PX, _EXPLAINED = 10.0, 0.1
+# Boards whose corners are those of single squares.
+_LONE = ("gridboard", "marker")
 # Another model of a lens leaves so much less: more than an even field does.
 _BETTER = 1.1
 _NEW_LENS = Remedy(
@@ -193,14 +195,18 @@ def _beyond(run: RunState) -> Iterator[Finding]:
                 continue
             optics, field_px = fit.linearised.camera_parameters, levels.field * noise_px
             focal_px = float(np.mean(optics.camera(name).matrix[:2]))
+            words = "corners of one part of the image are off alike, by "
+            words = f"{of} departs from its model: {words}{figure(field_px)} px."
+            advice = "Give matrix and distortion of a model that fits the lens, or keep to the "
+            advice += "middle of the image."
+            if any(board.kind in _LONE for board in run.session.boards.values()):
+                words += " Or else the corners of lone tags were found off: blur and light shift "
+                words += "them, unlike those where squares meet."
+                advice += " Or take a ChArUco board or an AprilGrid."
             yield Finding(
                 "lens_field",
-                f"{of} departs from its model: corners of one part of the image are off alike, by "
-                f"{figure(field_px)} px. The result counts it, and belongs to this lens.",
-                Remedy(
-                    "Give matrix and distortion of a model that fits the lens, or keep the work in "
-                    "the middle of the image."
-                ),
+                f"{words} The result counts it, and belongs to this lens.",
+                Remedy(advice),
                 mahalanobis_sq=field,
                 up_to_mm=1e3 * field_px / focal_px * distance_m,
             )
