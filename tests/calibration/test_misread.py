@@ -716,6 +716,8 @@ def test_distances_that_are_several_times_too_long_are_mended_by_the_printed_com
     followed = follow("calibrate", "cell", "-o", "out")
     assert "times as large" in followed.runs[0].out
     assert followed.last.status == 0
+    # Nobody measured the size.
+    assert Session.load("cell-fixed").document["camera"]["scale_sigma"] == 0.01
     x = Calibration.load(tmp_path / "out").transforms["base_from_cam"].as_matrix()
     true = SOLVERS["park"](invert(poses.true_robot), poses.camera.poses()).x
     # Two fits of the same poses differ by less than their noise of half a millimetre.

@@ -46,6 +46,26 @@ def tags(seed, mount, *, views=25, side_m=0.05, far_m=(0.35, 0.8), arm=(2e-4, 1e
     return pairs_session(mount, np.array(robot), np.array(seen)), name, x
 
 
+def test_how_well_the_scale_of_measured_poses_is_known_may_be_stated():
+    """Distances that are too long by half a percent, to a tag in the hand."""
+    found = []
+    for seed in range(4):
+        rng = np.random.default_rng([seed, 11])
+        x, z = exp(np.array([2.2, 0.3, 0.2, 0.9, -0.2, 1.0])), exp(rng.normal(0.0, 0.1, 6))
+        low, high = [-0.5, -0.5, -1.5, -0.1, -0.1, 0.7], [0.5, 0.5, 1.5, 0.1, 0.1, 0.9]
+        poses = rng.uniform(low, high, (14, 6))
+        seen = compose(exp(np.pad(poses[:, :3], ((0, 0), (0, 3))))[:, :3, :3], poses[:, 3:])
+        robot = x @ seen @ invert(z)
+        seen = seen @ exp(rng.normal(size=(14, 6)) * np.repeat([3e-3, 3e-4], 3))
+        seen[:, :3, 3] *= 1.005
+        session = pairs_session("eye-to-hand", robot, seen)
+        camera = {"camera": {"scale_sigma": 0.01}}
+        session = session.with_content(document={**session.document, **camera})
+        found.append(misfit(visioncal.calibrate(session).edges["base_from_cam"], x))
+    # Ten times as much where the scale is taken for known.
+    assert sum(found) < chi2_limit(1e-3, 6 * len(found))
+
+
 KINDS = [{}, {"far_m": (0.7, 1.3), "views": 40}, {"arm": (3e-3, 1e-3)}]
 
 

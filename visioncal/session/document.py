@@ -89,6 +89,8 @@ class CameraTable(TableModel):
     # Of depth pictures: their unit [m], and whether they have distances along z or along the ray.
     depth_unit_m: Positive | None = None
     depth_of: Literal["z", "ray"] = "z"
+    # Of measured poses (`cft_`): standard deviation of their scale, the size of the target.
+    scale_sigma: Annotated[Positive, Field(le=0.2)] | None = None
 
     @property
     def model(self) -> CameraKind:

@@ -150,6 +150,9 @@ def measured_errors(solved: CellFit | None) -> MeasuredErrors:
             continue
         if f"scale {one.seen}" in fit.sizes:
             sizes[one.seen] = fit.sizes[f"scale {one.seen}"]
+        table = fit.cell.cameras.get(one.seer)
+        if table is not None and table.scale_sigma is not None:
+            sizes[one.seen] = table.scale_sigma
         sigmas = np.zeros(6)
         for name, rows in MEASURED_NOISES:
             sigmas[rows] = fit.sizes[f"{name} {one.seer}"]

@@ -502,6 +502,9 @@ def reread(
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
         target = _rescaled(target, candidate)
         document["target"] = "target.toml"
+    if candidate.hypothesis.camera.scale != 1.0 and not candidate.recording.is_measured:
+        # Of the target's size nothing is known but what these poses gave.
+        document["camera"] = {**session.document.get("camera", {}), "scale_sigma": _BY_POSES}
     document |= _robot_table(doubtful, candidate)
     streams = {name: _reread_stream(stream, reading) for name, stream in session.streams.items()}
     reread = session.with_content(
