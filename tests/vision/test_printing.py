@@ -16,9 +16,8 @@ from visioncal.core.types import Target
 from visioncal.vision.boards import DetectedCorners, find_target
 from visioncal.vision.boards.kind import BoardRequest
 from visioncal.vision.printing.drawing import to_png, to_svg
-from visioncal.vision.printing.page import EDGE_MM, arrange, pages_named
+from visioncal.vision.printing.page import EDGE_MM, arrange, pages_named, requested_target
 from visioncal.vision.printing.pattern import draw_pattern
-from visioncal.vision.printing.request import requested_target
 from visioncal.vision.targets import corner_positions, load_target, target_names
 
 TARGETS = Path(__file__).parents[2] / "targets"

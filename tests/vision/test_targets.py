@@ -36,9 +36,8 @@ from visioncal.simulation.textures import draw_sheet
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target
 from visioncal.vision.boards.charuco import Charuco, charuco_board
 from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA, BoardRequest
-from visioncal.vision.printing.page import pages_named
+from visioncal.vision.printing.page import pages_named, requested_target
 from visioncal.vision.printing.pattern import draw_pattern
-from visioncal.vision.printing.request import requested_target
 from visioncal.vision.targets import (
     corner_positions,
     load_target,

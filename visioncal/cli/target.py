@@ -20,8 +20,7 @@ from visioncal.vision.boards.imaging import read_image
 from visioncal.vision.boards.kind import BoardRequest, metres, side_metres
 from visioncal.vision.boards.picture import kept_picture, unfit
 from visioncal.vision.printing.files import write_board
-from visioncal.vision.printing.page import arrange, pages_named
-from visioncal.vision.printing.request import requested_target
+from visioncal.vision.printing.page import arrange, pages_named, requested_target
 from visioncal.vision.targets import (
     load_target,
     target_document,

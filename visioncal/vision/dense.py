@@ -18,6 +18,7 @@ from scipy.spatial.distance import pdist
 
 from visioncal.core.types import Camera, FloatArray, Image, IntArray, Target
 from visioncal.vision.boards import DetectedCorners, find_target, kind_of
+from visioncal.vision.boards.imaging import resized
 from visioncal.vision.patches import places_of, started, usual_lens, usual_sigma
 from visioncal.vision.printing.pattern import light_of
 from visioncal.vision.register.fit import Registered, register
@@ -128,9 +129,9 @@ def _pixels(image: Image, target: Target) -> Iterator[tuple[IntArray, FloatArray
     ids, columns = np.arange(len(places)), len(np.unique(places[:, 0]))
     for side_px, sigma_px in _SEARCHES:
         factor = max(1, round(max(image.shape) / side_px))
-        small = cv2.resize(image, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+        small = resized(image, 1 / factor)
         if sigma_px:
-            small = cv2.GaussianBlur(small, (0, 0), sigma_px)
+            small = np.asarray(cv2.GaussianBlur(small, (0, 0), sigma_px), np.uint8)
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
         found, px = cv2.findChessboardCornersSB(small, (columns, len(ids) // columns), flags=flags)
         if found:

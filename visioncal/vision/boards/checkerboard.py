@@ -148,12 +148,7 @@ def _grids(image: Image, size: tuple[int, int], *, quick: bool) -> Iterator[Floa
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     found, px = cv2.findChessboardCorners(image, size, flags=flags)
     if found:
-        grid = px.reshape(rows, columns, 2)
-        sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-        half = max(int(min(sides) / 4), 2)
-        settled = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
-        fine_px = cv2.cornerSubPix(image, px, (half, half), (-1, -1), settled)
-        yield fine_px.reshape(rows, columns, 2).astype(np.float64)
+        yield px.reshape(rows, columns, 2).astype(np.float64)
 
 
 def square_corners(target: Target, inset: int) -> FloatArray:

@@ -3,7 +3,7 @@
 from collections import deque
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -183,7 +183,9 @@ class CircleGrid(Board):
                 board = Target("board", self.name, columns, rows, 1.0, 0.001, asymmetric=asymmetric)
                 order = _order(places, px, board) if min(columns, rows) >= 3 else None
                 if order is not None:
-                    share = _diameter(blobs.at(members[order]), self.corners(board)[:, :2])
+                    share = _diameter(
+                        chosen_rows(blobs, members[order]), self.corners(board)[:, :2]
+                    )
                     # Blurred squares of a checkerboard are wider.
                     if share < _NAMED * (1.4 if asymmetric else 1.0):
                         board = replace(board, diameter_m=share)
@@ -243,10 +245,6 @@ class Blobs:
     moments: FloatArray
     fill: FloatArray
 
-    def at(self, chosen: IntArray) -> Self:
-        """Some of the blobs."""
-        return chosen_rows(self, chosen)
-
     @property
     def diameters(self) -> FloatArray:
         """(n,) diameters of circles of the same area [px]."""
@@ -292,12 +290,12 @@ def find_blobs(image: Image) -> Blobs:
         moments.append(((radius + 0.5) / radius) ** 2 * covariance)
     blobs = Blobs(np.reshape(centres, (-1, 2)), np.reshape(moments, (-1, 2, 2)), np.array(fills))
     # Blobs larger than the threshold's window also have an inner edge close to the outer one.
-    blobs = blobs.at(np.argsort(-blobs.diameters, kind="stable"))
+    blobs = chosen_rows(blobs, np.argsort(-blobs.diameters, kind="stable"))
     pairs = cKDTree(blobs.px).query_pairs(2.0) if len(blobs.px) else set()
     widths = blobs.diameters
     # A blob's inner edge is at least half as wide as its outer one.
     inner = [max(pair) for pair in pairs if widths[max(pair)] > 0.5 * widths[min(pair)]]
-    return blobs.at(np.setdiff1d(np.arange(len(blobs.px)), inner))
+    return chosen_rows(blobs, np.setdiff1d(np.arange(len(blobs.px)), inner))
 
 
 def _lattice(blobs: Blobs) -> tuple[IntArray, IntArray]:

@@ -16,7 +16,7 @@ from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.boards import KINDS, kind_of
 from visioncal.vision.boards.aprilgrid import DARKER, ENLARGED
 from visioncal.vision.boards.gridboard import GridBoard
-from visioncal.vision.boards.imaging import check_grey, poor_image_reason
+from visioncal.vision.boards.imaging import check_grey, poor_image_reason, resized
 from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA, DetectedCorners, NotFound
 from visioncal.vision.boards.layout import FAMILIES, Marker, decoded, holding, side_share
 from visioncal.vision.targets import board_words
@@ -89,7 +89,8 @@ def identify(images: Image | Sequence[Image], declared: Target | None = None) ->
         check_grey(picture, "image")
     sets = [pictures]
     if max(picture.size for picture in pictures) > _MANY_PX:
-        sets = [[*map(_reduced, pictures)], pictures]
+        small = [resized(each, min((_ENOUGH_PX / each.size) ** 0.5, 1.0)) for each in pictures]
+        sets = [small, pictures]
     for shown in sets:
         look = _Look(shown, declared)
         identity = next(look.boards(), None) or look.single()
@@ -113,12 +114,6 @@ def identify(images: Image | Sequence[Image], declared: Target | None = None) ->
         next_step="Take a sharp picture of the whole board, with white around it, evenly lit, "
         "nearer, and tilted by less than 60 degrees.",
     )
-
-
-def _reduced(image: Image) -> Image:
-    scale = min((_ENOUGH_PX / image.size) ** 0.5, 1.0)
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

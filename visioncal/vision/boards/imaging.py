@@ -118,6 +118,14 @@ def encode_png(image: Image | Image16) -> bytes:
     return bytes(cv2.imencode(".png", pixels)[1].tobytes())
 
 
+def resized(image: Image, by: float) -> Image:
+    """A (h, w) image with sides by a factor as long; itself where that is 1."""
+    if by == 1.0:
+        return image
+    way = cv2.INTER_AREA if by < 1.0 else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(image, None, fx=by, fy=by, interpolation=way), np.uint8)
+
+
 def shrunk(image: Image, factor: int) -> Image:
     """A (h, w) image reduced by a whole factor; rows and columns that are left over are cut off."""
     # OpenCV halves an image four times as fast as it reduces it by any other factor.

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from visioncal.core.types import FloatArray, Image, IntArray
+from visioncal.vision.boards.imaging import resized
 from visioncal.vision.boards.kind import DetectedCorners, NotFound, aruco_dictionary
 from visioncal.vision.boards.template import SQUARE, refine_tags
 
@@ -75,7 +76,7 @@ def decoded(
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     dictionaries = [aruco_dictionary(names[-1]) for names in FAMILIES.values()]
     detector = cv2.aruco.ArucoDetector(dictionaries, parameters)
-    corners, ids, _, family_indices = detector.detectMarkersMultiDict(_scaled(image, scale))
+    corners, ids, _, family_indices = detector.detectMarkersMultiDict(resized(image, scale))
     families, found = list(FAMILIES), list[Marker]()
     for px, number, index in zip(
         corners, np.ravel(ids) if corners else (), np.ravel(family_indices), strict=False
@@ -143,7 +144,7 @@ def read_markers(
     if refined:
         given.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(dictionary), given)
-    px, ids, _ = detector.detectMarkers(_scaled(image, scale))
+    px, ids, _ = detector.detectMarkers(resized(image, scale))
     found = [] if ids is None else [int(number) for number in np.ravel(ids)]
     return found, (np.asarray(np.reshape(px, (-1, 4, 2)), dtype=float) + 0.5) / scale - 0.5
 
@@ -154,13 +155,6 @@ def _parameters(border: int, darker: float | None) -> "cv2.aruco.DetectorParamet
     if darker is not None:
         parameters.adaptiveThreshConstant = darker
     return parameters
-
-
-def _scaled(image: Image, scale: float) -> Image:
-    if scale == 1.0:
-        return image
-    large = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    return np.asarray(large, np.uint8)
 
 
 def once(ids: Iterable[int], px: Iterable[FloatArray]) -> dict[int, FloatArray]:

@@ -21,10 +21,8 @@ from visioncal.vision.boards.kind import (
     size_of,
 )
 from visioncal.vision.boards.layout import read_markers
-from visioncal.vision.boards.template import refine_tags
+from visioncal.vision.boards.template import SQUARE, refine_tags
 
-# A marker's corners, clockwise from its upper left, in units of its side.
-CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 # Dictionary of Kalibr's pages, which is the usual one of tags.
 APRILGRID_DICTIONARY = "DICT_APRILTAG_36h11"
 
@@ -54,7 +52,7 @@ class MarkerKind(BoardKind):
 
     def corners(self, target: Target) -> FloatArray:
         """(4, 3) corners [m], clockwise from its upper left."""
-        return np.asarray(target.square_m * (CLOCKWISE - np.array([0.5, 0.5, 0.0])))
+        return target.square_m * np.pad(SQUARE - 0.5, ((0, 0), (0, 1)))
 
     def words(self, target: Target, size: str) -> str:
         """The marker in a few words."""

@@ -19,7 +19,7 @@ from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes
 from visioncal.core.types import FloatArray, Image, IntArray, Target
-from visioncal.vision.boards.imaging import decode_image
+from visioncal.vision.boards.imaging import decode_image, resized
 from visioncal.vision.boards.kind import (
     BoardKind,
     DetectedCorners,
@@ -202,7 +202,7 @@ def kept_picture(path: Path) -> str:
         raise DataError(f"{path} is {grey}.", culprits=[str(path)])
     shrink = _LONGEST_PX / max(grey.shape)
     if shrink < 1.0:
-        grey = _shrunk(grey, shrink)
+        grey = resized(grey, shrink)
     elif data.startswith(b"\xff\xd8\xff"):
         return base64.b64encode(data).decode()
     _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 95])
@@ -279,7 +279,7 @@ def features_of(grey: Image, most: int = _FEATURES, longest_px: int = _SEARCHED_
     """The clearest features of a (h, w) image, found in a copy that is no longer than stated."""
     shrink = min(1.0, longest_px / max(grey.shape))
     points, described = cv2.SIFT.create(nfeatures=most).detectAndCompute(
-        _shrunk(grey, shrink), None
+        resized(grey, shrink), None
     )
     described = np.zeros((0, 128)) if described is None else described
     root = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
@@ -303,7 +303,7 @@ def unfit(grey: Image, features: int | None = None) -> str:
     """Why no pose is known by a picture (h, w), as a part of a sentence; empty where one is."""
     if grey.std() < _PLAIN or (len(features_of(grey).px) if features is None else features) < 60:
         return "is too plain: it has too few features to be found by"
-    small = _shrunk(grey, 48 / max(grey.shape)).astype(float)
+    small = resized(grey, 48 / max(grey.shape)).astype(float)
     if _alike(small, small[::-1, ::-1]):
         return "looks the same turned by a half: its pose would have two answers"
     square = np.asarray(cv2.resize(small, (48, 48)), float)
@@ -318,10 +318,6 @@ def unfit(grey: Image, features: int | None = None) -> str:
             if far and _alike(a, b):
                 return "repeats itself: shifted, it looks the same"
     return ""
-
-
-def _shrunk(grey: Image, by: float) -> Image:
-    return np.asarray(cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _alike(a: FloatArray, b: FloatArray) -> bool:

@@ -124,10 +124,6 @@ class Print:
     # (n, 2, 2) from the board to each corner's own axes and units; None if these are the board's.
     axes: FloatArray | None = None
 
-    def at(self, chosen: IntArray) -> Self:
-        """The print around some of the corners."""
-        return chosen_rows(self, chosen)
-
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
@@ -219,9 +215,6 @@ class _Windows:
             np.concatenate([smoother[:, :1], slopes, smoother[:, 3:]], axis=1),
         )
 
-    def at(self, chosen: IntArray) -> Self:
-        return chosen_rows(self, chosen)
-
     def length_px(self, shift: FloatArray) -> FloatArray:
         """(n,) lengths of shifts (n, 2) [squares] in the image [px]."""
         return np.asarray(np.linalg.norm((self.jacobian @ shift[..., None])[..., 0], axis=1))
@@ -276,9 +269,6 @@ class _GaussNewtonStep:
             inverse[:, 2:4, 2:4] * variance_scale,
             np.sqrt(variance) / np.abs(contrast[:, 0]),
         )
-
-    def at(self, chosen: IntArray) -> Self:
-        return chosen_rows(self, chosen)
 
     def replace(self, chosen: IntArray, others: Self) -> None:
         for field in fields(self):
@@ -382,7 +372,7 @@ def _refine_corners(
     # Wide, as circles may be larger than stated.
     wide = pattern if pattern.radii is None else replace(pattern, radii=1.4 * pattern.radii)
     windows = _Windows.cut(smooth, board, px, all_corners, indices, wide, axis)
-    blur_px, grown = _estimate_blur(windows.at(sample), pattern.at(sample))
+    blur_px, grown = _estimate_blur(chosen_rows(windows, sample), chosen_rows(pattern, sample))
     if pattern.radii is not None:
         pattern = replace(pattern, radii=pattern.radii + grown)
         windows = _Windows.cut(smooth, board, px, all_corners, indices, pattern, windows.axis)
@@ -410,7 +400,7 @@ def _refine_corners(
     first, without_gradients = _steps(windows, pattern, no_shift, blur_px, (gradients, None))
     unlit = np.flatnonzero(~(first.misfit < without_gradients.misfit))
     gradients[unlit] = 0.0
-    first.replace(unlit, without_gradients.at(unlit))
+    first.replace(unlit, chosen_rows(without_gradients, unlit))
     shift, step = _fit_positions(windows, pattern, blur_px, gradients, first, tolerances_px[1])
     refined_px = windows.shifted(shift)
     good = _accepted(windows, step, refined_px - px, last_px[1])
@@ -478,7 +468,8 @@ def _fit_positions(
         if not moving.size:
             break
         lights = (None if slopes is None else slopes[moving],)
-        (step,) = _steps(windows.at(moving), pattern.at(moving), shift[moving], blur_px, lights)
+        some = chosen_rows(windows, moving), chosen_rows(pattern, moving)
+        (step,) = _steps(*some, shift[moving], blur_px, lights)
         latest.replace(moving, step)
     return shift, latest
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Target
-from visioncal.vision.boards import kind_of
+from visioncal.vision.boards import KINDS, kind_of
+from visioncal.vision.boards.kind import BoardRequest
 from visioncal.vision.printing.pattern import Pattern, draw_pattern
+from visioncal.vision.targets import target_from_document
 
 # Width and height in portrait [mm] (ISO 216; ANSI Y14.1).
 _PAGES_MM = {
@@ -24,6 +26,8 @@ _PAGES_MM = {
 }
 _OWN_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*x\s*(\d+(?:\.\d+)?)(?:\s*mm)?", re.IGNORECASE)
 _LEAST_MM, _MOST_MM = 20.0, 3000.0
+# Smaller squares are limited by the printer's resolution [mm].
+_SMALLEST_MM = 5
 
 # Margin that office printers leave white.
 EDGE_MM = 5.0
@@ -216,3 +220,33 @@ def _lines(target: Target, width_mm: float) -> tuple[str, ...]:
         "Print at 100 %, not fitted to the page, and check both rulers. " + measure,
     )
     return tuple(line for text in texts for line in textwrap.wrap(text, letters))
+
+
+def requested_target(request: BoardRequest, pages: tuple[Page, ...]) -> Target:
+    """Builds the requested target.
+
+    Args:
+        request: Requirements. An open side becomes the largest in whole millimetres that fits one
+            of the pages; an open marker side three quarters of its square's, in whole millimetres.
+        pages: Pages that it may be printed on.
+
+    Raises:
+        DataError: A requirement is missing or cannot be met.
+    """
+    if request.square_mm is not None:
+        return _described(request, request.square_mm)
+    smallest = _described(request, _SMALLEST_MM)
+    largest = largest_side_mm(smallest, pages)
+    if largest < _SMALLEST_MM:
+        # Raises an error with the required size.
+        arrange(smallest, pages)
+    return _described(request, largest)
+
+
+def _described(request: BoardRequest, square_mm: float) -> Target:
+    document = {"kind": request.kind, **KINDS[request.kind].requested(request, square_mm)}
+    target = target_from_document(document, request.name or request.kind)
+    if request.name:
+        return target
+    name = kind_of(target).file_name(target, f"{1e3 * target.square_m:g}mm")
+    return target_from_document(document, name)
