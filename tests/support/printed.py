@@ -231,11 +231,15 @@ def _inside(points, polygon):
     return (cross >= 0).all(axis=1) | (cross <= 0).all(axis=1)
 
 
-def photographed_cell(picture, described, views, seed=6, covered=0.0, paper_m=0.0, **cell):
+def photographed_cell(
+    picture, described, views, seed=6, covered=0.0, paper_m=0.0, looks=(), **cell
+):
     """A simulated cell's session whose board is a picture, and the cell.
 
-    `described` is the target or its .toml; `paper_m` of the picture are around what it states.
+    `described` is the target or its .toml; `paper_m` of the picture are around what it states;
+    `looks` are those of all views, in place of every second one covered.
     """
+    looks = looks or [Look(covered=covered * (at % 2)) for at in range(views)]
     wide = CAMERAS["wide"]
     # A quarter of the pixels.
     camera = replace(wide, resolution=(640, 400), matrix=wide.matrix / 2)
@@ -245,10 +249,9 @@ def photographed_cell(picture, described, views, seed=6, covered=0.0, paper_m=0.
     width_m = float(np.ptp(extent_m(target), axis=0)[0]) + 2 * paper_m
     images = [
         photographed(
-            picture, width_m, camera, pose, Look(covered=covered * (at % 2)), at,
-            (-paper_m, -paper_m),
+            picture, width_m, camera, pose, look, at, (-paper_m, -paper_m)
         )
-        for at, pose in enumerate(simulated.cam_from_target)
+        for at, (pose, look) in enumerate(zip(simulated.cam_from_target, looks, strict=True))
     ]  # fmt: skip
     flanges = simulated.robot.base_from_flange
     told = {"resolution": list(camera.resolution)}

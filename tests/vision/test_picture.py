@@ -171,7 +171,8 @@ def test_a_guard_and_locate_look_for_the_picture_in_images(target, tmp_path, mon
     status, answers = judged(0.0)
     assert status == 2
     assert all(answer["holds"] for answer in answers[:-1])
-    assert "label.png: the picture is not seen" in answers[-1]["error"]["message"]
+    assert "the picture is not seen" in answers[-1]["error"]["message"]
+    assert "Look at label.png: is target" in answers[-1]["error"]["next"]
     pose = cell.robot.base_from_flange[0]
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
     typed = "--pose=" + ",".join(str(value) for value in (*pose[:3, 3], *quaternion))

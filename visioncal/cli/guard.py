@@ -13,7 +13,6 @@ import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration.stages.detect import corners_in
 from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, say
 from visioncal.cli.result_options import GuardOptions
 from visioncal.core.documents.jsons import parse_json, parse_stored
@@ -21,12 +20,12 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import MOST_BYTES, read_text, write_atomically
 from visioncal.core.transforms import compose
 from visioncal.core.types import Corners, FloatArray, Target
+from visioncal.frames.target_in_image import corners_seen
 from visioncal.interchange.result_files import load_result
 from visioncal.results import select_matching
 from visioncal.session import Session
 from visioncal.verification.guard import Guard, Look
 from visioncal.verification.scene_guard import scene_looks
-from visioncal.vision.boards import NotFound
 from visioncal.vision.boards.imaging import read_image
 
 
@@ -164,10 +163,7 @@ def _found(path: Path, content: Mapping[str, Any], targets: Mapping[str, Target]
             culprits=["target"],
             next_step="Name it as target; where there is none, send cam_from_target.",
         )
-    found = corners_in(read_image(path), targets[names[0]])
-    if isinstance(found, NotFound):
-        raise DataError(f"{path}: {found.reason}.", culprits=["image"])
-    return found
+    return corners_seen(read_image(path), targets[names[0]], str(path))
 
 
 def _pose(value: Any) -> FloatArray:  # noqa: ANN401 - of JSON

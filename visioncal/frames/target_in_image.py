@@ -38,6 +38,20 @@ class PoseCandidates:
     warnings: tuple[str, ...]  # Warnings on the image, in sentences.
 
 
+def corners_seen(image: Image, target: Target, label: str) -> Corners:
+    """A target's corners in a (h, w) grey image, called `label`; raises DataError without it."""
+    corners = corners_in(image, target)
+    if isinstance(corners, NotFound):
+        cause = poor_image_reason(image, MAX_BLUR_PX)
+        raise DataError(
+            f"{label}: target {target.name}: {corners.reason}{'; ' if cause else ''}{cause}.",
+            culprits=[label],
+            next_step=f"Look at {label}: is target {target.name} in it, sharp, near enough and "
+            "not mirrored? Take it again, or name the target that it shows.",
+        )
+    return corners
+
+
 def target_pose_candidates(
     eye: CalibratedCamera,
     seen: Corners | Image,
@@ -60,20 +74,10 @@ def target_pose_candidates(
         DataError: The target is not in the image, its corners do not determine a pose, or they do
             not fit any pose of it.
     """
-    corners: Corners | NotFound
-    if isinstance(seen, Corners):
-        corners = seen
-    else:
+    if not isinstance(seen, Corners):
         check_image_size(eye, seen, label)
-        corners = corners_in(seen, target)
-        if isinstance(corners, NotFound):
-            cause = poor_image_reason(seen, MAX_BLUR_PX)
-            raise DataError(
-                f"{label}: target {target.name}: {corners.reason}{'; ' if cause else ''}{cause}.",
-                culprits=[label],
-                next_step=f"Look at {label}: is target {target.name} in it, sharp, near enough and "
-                "not mirrored? Take it again, or name the target that it shows.",
-            )
+        seen = corners_seen(seen, target, label)
+    corners = seen
     positions = corner_positions(target)
     ids = corners.ids
     if len(ids) and not (int(ids.min()) >= 0 and int(ids.max()) < len(positions)):

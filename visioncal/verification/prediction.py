@@ -224,7 +224,8 @@ def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Sessi
                 f"{label}: target {shown_name or target.name!r} must be one of those of "
                 f"the calibration ({names}){has}.",
                 "Describe and name it as in the calibration's session, or verify with views of "
-                "that target alone.",
+                "that target alone. By another target, as a part's label: visioncal calibrate of "
+                "these views, and visioncal diff of both results.",
             )
     if len(calibrated) < 2 and len(shown) < 2:
         return session

@@ -247,10 +247,9 @@ class _Known:
             hard = hard_matches(seen, self.features, weights_in)
             tries = (self._agreeing(seen, match, tolerance_px) for match in hard)
             found = next((one for one in tries if one is not None), None)
-        lack = f"the picture is not seen: {len(good)} features are like its own, and do not agree"
-        if found is None and len(good) >= _FEWEST and not is_installed():
-            lack += " (more views that are tilted or covered are found with visioncal[kornia])"
-        return lack if found is None else found
+        if found is None:
+            return f"the picture is not seen: {len(good)} features are like it, and do not agree"
+        return found
 
     def _agreeing(
         self, seen: Features, pairs: IntArray, tolerance_px: float
