@@ -130,11 +130,14 @@ class Look:
 def photographed(print_, width_m, camera, pose, look=Look(), seed=0, corner_m=(0.0, 0.0)):
     """(h, w) grey picture of a print (h, w), of that width, its corner at `corner_m`."""
     rng = np.random.default_rng([seed, 7])
-    (w, h), s = camera.resolution, SAMPLES
+    w, h = camera.resolution
     matrix = np.diag([*camera.matrix[:2], 1.0])
     matrix[:2, 2] = camera.matrix[2:]
     texel = width_m / print_.shape[1]
     size = np.array(print_.shape[::-1]) * texel
+    # Of texels finer than sub-pixels some would be left out, and edges along rows be 0.04 px off.
+    depth = pose[2] @ [*(size / 2 + corner_m), 0, 1]
+    s = max(SAMPLES, round(float(depth / camera.matrix[0] / texel / 1.5)))
     ends = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size + np.array(corner_m)
     bounds = cv2.projectPoints(
         np.pad(ends, ((0, 0), (0, 1))),
@@ -153,13 +156,6 @@ def photographed(print_, width_m, camera, pose, look=Look(), seed=0, corner_m=(0
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 60, 1e-10)
     rays = cv2.undistortPointsIter(px, matrix, camera.distortion, None, None, criteria)
     rays = np.concatenate([rays[:, 0], np.ones((len(px), 1))], axis=1)
-    # A sub-pixel sees the mean of what it covers: single texels of it alias where edges lie along
-    # rows, which moves them by 0.04 px and more.
-    depth = pose[2] @ [*(size / 2 + corner_m), 0, 1]
-    by = max(1, round(float(depth / camera.matrix[0] / s / texel)))
-    down, along = (by * (side // by) for side in print_.shape)
-    print_, texel = print_[:down, :along], by * texel
-    print_ = cv2.resize(print_, (along // by, down // by), None, 0, 0, cv2.INTER_AREA)
     paper = np.pad(print_.astype(np.float32), 2, mode="edge")
     covers = _covers(rng, look.covered, size, corner_m)
     total, moments = 0.0, 31 if look.twist else 1

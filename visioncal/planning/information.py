@@ -37,9 +37,8 @@ from visioncal.estimation.workspace import postures
 from visioncal.planning.cell import AnyCell, PlanCell, seen_from
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
-from visioncal.vision.boards import kind_of
 from visioncal.vision.camera import project
-from visioncal.vision.targets import corner_positions
+from visioncal.vision.targets import corner_positions, is_seen_in_part
 
 # Number of cells over which a plan is averaged: the guess, and draws from its uncertainty.
 WORLDS = 4
@@ -355,7 +354,7 @@ def _predicted_corners(
     px = project(cell.camera, points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
     size = np.array(cell.camera.resolution)
     visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
-    in_part = kind_of(cell.target).is_seen_in_part
+    in_part = is_seen_in_part(cell.target)
     # A partly visible ChArUco board is detected by six corners.
     fewest = min(6, len(positions)) if in_part else len(positions)
     shows = visible.sum(axis=1) >= fewest

@@ -10,8 +10,7 @@ from visioncal.core.transforms import apply, compose
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.simulation.boards import Sheet, centre_m, corners_m, outline_m
 from visioncal.simulation.optics import rays, sees
-from visioncal.vision.boards import kind_of
-from visioncal.vision.targets import extent_m
+from visioncal.vision.targets import extent_m, is_seen_in_part
 
 Motion: TypeAlias = Literal["free", "one_axis", "translation"]
 
@@ -51,7 +50,7 @@ class Viewpoints:
         rotation = self._rotations(count, rng)
         distance = rng.uniform(*self.distance_m, size=count)
         # Largest share of views that may be cut.
-        share = self.cut_views if kind_of(self.board.target).is_seen_in_part else 0
+        share = self.cut_views if is_seen_in_part(self.board.target) else 0
         may_be_cut = rng.random(count) < share
         reach = np.where(may_be_cut, 0.4, 0.3)[:, None]
         aim = (0.5 + reach * rng.uniform(-1.0, 1.0, size=(count, 2))) * np.array(

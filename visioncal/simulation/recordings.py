@@ -49,8 +49,7 @@ from visioncal.simulation.layout import (
 from visioncal.simulation.optics import inaccurate_camera, project, sees
 from visioncal.simulation.poses import LEAST_SHARE, MARGIN_PX, Viewpoints, filling_m
 from visioncal.simulation.postures import mounted, mounted_single, postures_of, postures_single
-from visioncal.vision.boards import kind_of
-from visioncal.vision.targets import rotation_transforms
+from visioncal.vision.targets import is_seen_in_part, rotation_transforms
 
 # Corners closer to the image's edge are not detected [px].
 EDGE_PX = 2.0
@@ -238,7 +237,7 @@ def _shown(cell: SimulatedCell, camera: str, board: str, pose: FloatArray) -> Ma
     seen = np.asarray(facing.all(axis=1) & (directions[:, :, 2] > _LEAST_COSINE).all(axis=1))
     if seen.any():
         share = sees(cell.camera(camera).camera, points[seen], MARGIN_PX).mean(axis=1)
-        seen[seen] = share >= (LEAST_SHARE if kind_of(sheet.target).is_seen_in_part else 1.0)
+        seen[seen] = share >= (LEAST_SHARE if is_seen_in_part(sheet.target) else 1.0)
     at_board = [board_at.name for board_at in layout.boards].index(board)
     if isinstance(options, CellOptions):
         # The board that a stop aims at is in view.
@@ -447,7 +446,7 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
     passage = Passage.through(robot.joints[: swept.stops], swept)
     recorded = passage.reported(robot.arm, rng)
     camera, board = cell.camera(swept.camera), cell.board(swept.target)
-    min_corners = 12 if kind_of(board.target).is_seen_in_part else len(corners_m(board))
+    min_corners = 12 if is_seen_in_part(board.target) else len(corners_m(board))
     seen_from = pushed.seen_from(swept.robot, swept.camera, swept.target)
     used_views = [sight.view for sight in cell.sights] + [reading.view for reading in cell.readings]
     first_view = 1 + max([*used_views, *(row[0] for row in cell.pose_rows)], default=-1)

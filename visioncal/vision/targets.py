@@ -189,6 +189,11 @@ def first_corners(targets: Sequence[Target]) -> IntArray:
     return np.cumsum([0, *counts], dtype=np.int64)[:-1]
 
 
+def is_seen_in_part(target: Target) -> bool:
+    """Whether some of its corners can be detected without the others."""
+    return kind_of(target).is_seen_in_part
+
+
 def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
     """Low and high x, y of the printed pattern in the target's frame, (2,) each [m]."""
     return kind_of(target).extent_m(target)
