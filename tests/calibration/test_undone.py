@@ -4,7 +4,7 @@ Cells of poses measured with noise, without images.
 """
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -106,6 +106,12 @@ def unsigned(robot, boards):
     return robot, boards
 
 
+def in_two_units(robot, boards, some, factor):
+    robot = robot.copy()
+    robot[[*some], :3, 3] *= factor
+    return robot, boards
+
+
 PLANTED = {
     "shifted_rows": (shifted, [*range(10, 22)], "From view 10 on, images and poses are 2 rows"),
     "turned_board": (turned, [1, 4, 5, 8, 11, 13, 16, 19], "turned by 180 deg"),
@@ -115,6 +121,16 @@ PLANTED = {
         lingering,
         [1, 8, 13, 15, 16, 19],
         "the robot moved: the last that was seen",
+    ),
+    "mixed_units from a row on": (
+        partial(in_two_units, some=range(8, 24), factor=1e3),
+        [*range(8, 24)],
+        "a thousand times as large",
+    ),
+    "mixed_units here and there": (
+        partial(in_two_units, some=(2, 3, 11, 17), factor=1e-3),
+        [2, 3, 11, 17],
+        "a thousandth as large",
     ),
 }
 
@@ -167,6 +183,22 @@ def test_poses_that_are_misread_and_rows_apart_are_mended_one_after_the_other(
     for name, edge in sound.edges.items():
         # A view or two without partner are missing.
         np.testing.assert_allclose(found.edges[name].matrix, edge.matrix, atol=2e-3)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_angles_of_one_maker_that_were_stated_as_anothers_are_named(tmp_path, monkeypatch, mount):
+    monkeypatch.chdir(tmp_path)
+    robot, boards = poses_of(mount)
+    for stated, own in (("xyz", "ZYX"), ("ZYX", "xyz")):
+        angles = Rotation.from_matrix(robot[:, :3, :3]).as_euler(own)
+        rotations = Rotation.from_euler(stated, angles).as_matrix()
+        pairs_session(mount, compose(rotations, robot[:, :3, 3]), boards).save(tmp_path / stated)
+        cause = visioncal.calibrate(tmp_path / stated).verdict.causes[0]
+        assert "A, B, C of KUKA and W, P, R of FANUC" in cause.words
+        assert follow("calibrate", stated, "-o", f"out-{stated}").last.status == 0
+        for name, edge in calibrated(mount).edges.items():
+            mended = visioncal.calibrate(tmp_path / f"{stated}-fixed").edges[name]
+            np.testing.assert_allclose(mended.matrix, edge.matrix, atol=1e-6)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -217,10 +217,11 @@ def _changes_of_side(part: Literal["robot", "camera"], side: SideReading) -> Ite
     yield Change(f"{whose} rotations transposed", part, {"transposed": True})
 
 
-def rewritten(robot: PoseNumbers) -> Iterator[Change]:
+def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change]:
     """Rotations of the robot that were written after others were misread as angles.
 
-    Tried are the orders of angles that robot makers use, about moving and about fixed axes.
+    Tried are the orders of angles that robot makers use, about moving and about fixed axes; of one
+    maker's taken for another's alone where asked.
     """
     form = ROTATION_FORMS[robot.reading.rotation]
     if form.size == 3:
@@ -228,12 +229,13 @@ def rewritten(robot: PoseNumbers) -> Iterator[Change]:
     forms = [form.rotation.split("-") for form in POSE_FORMS.values()]
     used = sorted({form[1] for form in forms if form[0] == "euler"}, key=str.swapcase)[::-1]
     # Those that makers use come first: others are the same numbers in another order.
-    orders = dict.fromkeys([*used, *map(str.upper, used), *map(str.lower, used)])
+    both = [] if by_makers else [*map(str.upper, used), *map(str.lower, used)]
+    orders = dict.fromkeys([*used, *both])
     degrees = [f"euler-{order}-deg" for order in orders]
     pairs = [*product(degrees, degrees)]
     rotations = form.read(robot.rotations)
     turned = rotation_angle(rotations[np.isfinite(rotations).all(axis=(1, 2))])
-    if turned.max(initial=0.0) < _RADIANS_AS_DEGREES_RAD:
+    if not by_makers and turned.max(initial=0.0) < _RADIANS_AS_DEGREES_RAD:
         radians = [name.replace("-deg", "-rad") for name in degrees]
         pairs += [*product(radians, degrees), ("rotation-vector", "rotation-vector-deg")]
     known = [rotations]
@@ -246,4 +248,6 @@ def rewritten(robot: PoseNumbers) -> Iterator[Change]:
                 f"the robot's rotations as {ROTATION_FORMS[name].words}, which were taken for "
                 f"{ROTATION_FORMS[written].words}"
             )
+            if {name, written} == {"euler-ZYX-deg", "euler-xyz-deg"}:
+                words += ", or the reverse (A, B, C of KUKA and W, P, R of FANUC)"
             yield Change(words, "robot", {"rotation": name, "written": written}, 2)

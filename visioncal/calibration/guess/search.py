@@ -205,10 +205,14 @@ def search(recording: Recording) -> list[Candidate]:
     mismatch = _mismatch(recording, rows)
     plain = [*changes(declared, recording.is_measured, len(recording.robot))]
     near = list[Hypothesis]()
-    # Rewritten rotations are tried where no other reading is sure; all may turn by the same angles.
+    # One maker's angles in reverse order, taken for another's, are the inverse in a mirrored frame,
+    # as is a quaternion in another order with two signs of positions: the former is likelier. Other
+    # rewritten rotations are tried where no reading is sure; all may turn by the same angles.
+    some = recording.robot.rows(rows)
+    of_makers = [*rewritten(some, by_makers=True)]
     for pairs in (
-        [*product((None,), plain), *combinations(plain, 2)],
-        product((None, *plain), [*rewritten(recording.robot.rows(rows))]),
+        [*product((None,), (*plain, *of_makers)), *combinations(plain, 2)],
+        product((None, *plain), [*rewritten(some)]),
     ):
         likely = [*filter(recording.is_likely, _undone(declared, pairs))]
         near += _near(likely, [*map(mismatch, likely)]) if likely else []

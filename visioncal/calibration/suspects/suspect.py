@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
 # Kinds that several modules name.
 ARM_ERRORS, UNEXPLAINED = "arm_errors", "unexplained"
-UNDONE = ("shifted_rows", "turned_board", "flipped_poses", "copied_poses", "lost_sign")
+UNDONE = (
+    *("shifted_rows", "turned_board", "flipped_poses", "copied_poses", "lost_sign"),
+    "mixed_units",
+)
 # All that explains that views disagree, or that the flange is off.
 CHAIN = "chain"
 STEPS = ("moved_at_once", "joint_slipped", "board_changed")

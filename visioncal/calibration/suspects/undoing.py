@@ -47,6 +47,9 @@ _NEAR_RAD, _SAME = 0.1, 1e-9
 _FEW = 7
 # Views are alike within so many medians.
 _UNEVEN = 7.0
+# A flange is nearer to the base than this, and farther from its origin [m]; other positions are in
+# another unit.
+_FARTHEST_M, _NEAREST_M = 20.0, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +214,7 @@ def likeliest(run: RunState) -> Undoing | None:
         *_copied(record, apart, own, agrees),
         *_flipped(record, best, own, apart, float(base)),
         *_signed(record, best, own, apart, float(base)),
+        *_mixed_units(record, own, float(base)),
         *_turned(record, best, own, apart, float(base)),
         *_shifted(record, every, pairs, float(base)),
     ]
@@ -335,6 +339,46 @@ def _signed(
                 f"In {view_words(views)} {short}: with its own, they agree with the others. They "
                 "were left out.",
                 mending("it has its own", f"--positions {ranges(views)}:{axes}"),
+                views,
+            ),
+            short,
+        )
+
+
+def _mixed_units(record: _Record, own: IntArray, base: float) -> Iterator[Undoing]:
+    """Views whose position is in millimetres where the others' are in metres, or the reverse.
+
+    The sizes of the positions tell the rows of either unit, however many they are.
+    """
+    flanges = robot_part(record.robot, record.mount)
+    sizes_m = np.linalg.norm(flanges[:, :3, 3], axis=1)
+    for factor, wrong, unit in (
+        (1e-3, sizes_m > _FARTHEST_M, "a thousand times as large"),
+        (1e3, sizes_m < _NEAREST_M, "a thousandth as large"),
+    ):
+        rows = wrong[own] & (own >= 0)
+        if np.sum(rows) < 1 or np.sum(~rows & (own >= 0)) < 1:
+            continue
+        scaled = compose(
+            flanges[:, :3, :3], flanges[:, :3, 3] * np.where(wrong, factor, 1.0)[:, None]
+        )
+        edges = _Edges.by(replace(record, robot=robot_part(scaled, record.mount)), own, own >= 0)
+        if edges is None:
+            continue
+        squares = edges.of(own)
+        (log,), (agrees,) = _evidence(squares[None])
+        if squares[agrees].mean() > CLOSING_SCORE**2 or np.sum(agrees & rows) < 0.6 * np.sum(rows):
+            continue
+        views = tuple(record.views[record.rows[rows]].tolist())
+        short = f"the robot's position is {unit} as in the others, as where it is in another unit"
+        axes = ",".join(f"{factor:g}*{name}_m" for name in "xyz")
+        yield Undoing(
+            EVIDENCE * float(log - base) + _MISTAKE,
+            Finding(
+                "mixed_units",
+                f"In {view_words(views)} {short}: in the same one, they agree with the others. "
+                "They were left out.",
+                mending("all have one unit", f"--positions {ranges(views)}:{axes}"),
                 views,
             ),
             short,

@@ -390,7 +390,8 @@ def _untested(
                 next_step=(f"{_MOVE}say" if why.startswith(ONE_AXIS) else "Say")
                 + f" --{whose}-form {forms}.{joints if whose == 'robot' else ''}",
             )
-    note = f"The form of the poses, which the source does not state, stays as first read: {why}."
+    note = f"The form of the poses stays as first read: {why}."
+    note += " Convert with --guess --yes to read them so." if why.startswith("With ") else ""
     return replace(foreign, notes=(*foreign.notes, note))
 
 
