@@ -149,6 +149,20 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert away_m < 2.5e-4
 
 
+@pytest.mark.parametrize("frame", ["cam_right", "target_floor"])
+def test_a_frame_that_creeps_was_not_bumped_again_and_again(frame):
+    cell = simulate(replace(PLAIN, moved=(Moved(frame, creeps=True, shift_m=0.012),), seed=3))
+    found = solved(cell)
+    assert not found.cell.moved
+    assert all(view.used for view in found.views)
+    assert f"{frame} by 12 mm and 0.5" in reason(found, "crept during the session")
+    # The result is that of its end.
+    for ends in (("base_a", "base_b"), ("base_a", frame)):
+        away_m, squared = off(cell, found, *ends)
+        assert squared < MOST
+        assert away_m < 5e-4
+
+
 def test_a_robot_whose_poses_are_misread_is_named_first(three):
     def turned(view):
         """With w first: what other programs write into the same columns."""

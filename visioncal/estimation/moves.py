@@ -1,8 +1,8 @@
-"""Frames that moved during the session by more than noise: a bumped camera, a displaced board.
+"""Frames that moved during the session by more than noise: a bumped camera, a board that sags.
 
-From some stop on, all observations of a frame agree on one other pose of it. Such a move is found
-by the number of observations that only it explains. `steps` finds those within the noise of single
-observations.
+From some stop on, all observations of a frame agree on one other pose of it, or it crept all the
+time. Such motion is found by the number of observations that only it explains. `steps` finds what
+is within the noise of single observations.
 """
 
 from collections.abc import Sequence
@@ -13,15 +13,20 @@ import numpy as np
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit
 from visioncal.core.transforms import adjoint, exp, invert, log
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import State
+from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution, by_noise_alone
 
 # Least share of the following observations explained; others may have moved, too, or be wrong.
 _LEAST_SHARE = 0.25
 # Number of observations whose implied change is tried as a candidate.
 _CANDIDATES = 24
+# Name of the effect of a frame that creeps, before its owner's.
+CREEP = "creep"
+# Share of the session that two observations lie apart at least, whose difference tells a speed.
+_APART = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +85,103 @@ def fitted_change(
     return log(between), jacobian @ known @ jacobian.T
 
 
+def still_to_come(progress: FloatArray, rate: float) -> FloatArray:
+    """(k,) share of what goes on over the session, and fades by a rate, after each moment.
+
+    `progress` (k,) is -1 at the session's first stop, and 0 at its last.
+    """
+    over = progress + 1.0
+    if rate == 0.0:
+        return np.asarray(1.0 - over)
+    end = np.exp(-rate)
+    return np.asarray((np.exp(-rate * over) - end) / (1.0 - end))
+
+
+def _progress(stops: IntArray, problem: Problem) -> FloatArray:
+    """(n,) share of the session at stops: -1 at its first, 0 at its last."""
+    counts = [len(poses) for poses in problem.poses.values()]
+    last = max(counts, default=int(problem.observations.stops.max()) + 1) - 1
+    return np.asarray(stops / max(last, 1) - 1.0)
+
+
+def creep_effect(problem: Problem, state: State, frame: str, rate: float = 0.0) -> Effect:
+    """Motion of a frame up to its pose at the last stop, a twist in its own axes there.
+
+    It fades by a rate over the session; by zero it is even.
+    """
+    jacobian = problem.linear(state, ideal=True).jacobian[:, :, problem.edge_columns(frame)]
+    left = still_to_come(_progress(problem.observations.stops, problem), rate)
+    flat = PriorInformation.flat(6)
+    return Effect.free(f"{CREEP} of {frame}", flat, jacobian * left[:, None, None])
+
+
+def creep_effects(problem: Problem) -> tuple[Effect, ...]:
+    """The effects of a problem's frames that creep, in the order in which they were found."""
+    return tuple(at for at in problem.effects if at.name.partition(" of ")[0] == CREEP)
+
+
+def creeping(problem: Problem) -> tuple[str, ...]:
+    """Frames of a problem that creep."""
+    return tuple(at.name.partition(" of ")[2] for at in creep_effects(problem))
+
+
+def with_creep(
+    problem: Problem, state: State, frame: str, change: FloatArray
+) -> tuple[Problem, State]:
+    """The problem in which a frame creeps by a (6,) twist, and its state: it was in the middle."""
+    edges = state.edges.copy()
+    edges[problem.unknown[frame]] = edges[problem.unknown[frame]] @ exp(-0.5 * change)
+    wide = problem.with_effects([*problem.effects, creep_effect(problem, state, frame)])
+    return wide, State(edges, np.append(state.values, change))
+
+
+def find_creep(
+    problem: Problem, fit: Solution, agrees: Mask, frame: str
+) -> tuple[int, FloatArray] | None:
+    """How many more observations agree where a frame creeps, and its (6,) twist; None for few.
+
+    See `with_creep`. Observations agree by what they are of, since the frame may be all that ties
+    its observers. Its speed is the median of those of their pairs (Theil 1950, Sen 1968).
+    """
+    rows = problem.observations.involves(frame)
+    part, among = problem.subset(rows), len(problem)
+    changes, covariance = _implied_changes(part, fit, frame)
+    left, groups = -_progress(part.observations.stops, problem), [at.rows for at in part.groups]
+    speeds = list[FloatArray]()
+    for own in groups:
+        first, second = np.nonzero(left[own][:, None] - left[own] > _APART)
+        between = log(invert(changes[own[second]]) @ changes[own[first]])
+        speeds.append(between / (left[own[first]] - left[own[second]])[:, None])
+    speed = np.median(np.concatenate(speeds), axis=0) if sum(map(len, speeds)) else np.zeros(6)
+    ends, weights = changes @ exp(-left[:, None] * speed), np.linalg.inv(covariance)
+    count = 0
+    for own in groups:
+        middle = own[np.argsort(np.linalg.norm(ends[own, :3, 3], axis=1))[len(own) // 2]]
+        away = log(invert(ends[middle]) @ ends[own])
+        # Two of them differ.
+        squares = np.einsum("ni,nij,nj->n", away, weights[own], away) / 2.0
+        count += int((squares < _noise_limit(among)).sum())
+    return (count - int(agrees[rows].sum()), speed) if count >= 2 * FEWEST_VIEWS else None
+
+
+def _implied_changes(part: Problem, fit: Solution, frame: str) -> tuple[FloatArray, FloatArray]:
+    """(n, 4, 4) changes of a frame that single observations imply, and their (n, 6, 6) covariances.
+
+    Each is on the right of the frame's edge.
+    """
+    linear = part.linear(fit.state, ideal=True)
+    inverse = np.linalg.inv(linear.jacobian[:, :, part.edge_columns(frame)])
+    covariance = inverse @ part.total_covariance(linear, fit.noise) @ np.swapaxes(inverse, 1, 2)
+    return part.change_of(frame, fit.state), covariance
+
+
 def find_move(
     problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
 ) -> tuple[str, int, FloatArray] | None:
     """Frame, stop and (6,) change of the move that explains most outliers; None for too few.
 
-    A pushed robot base is no move: its observations stay outliers. `agrees` is the (n,) inlier
-    mask.
+    Of a frame that creeps, where that explains more, the stop is -1. A pushed robot base is no
+    move: its observations stay outliers. `agrees` is the (n,) inlier mask.
     """
     bases = {base for base in problem.tree.bases.values() if base in problem.unknown}
     found = []
@@ -96,24 +191,24 @@ def find_move(
             rows = np.isfinite(problem.change_of(frame, fit.state)[:, 0, 0])
         if np.sum(~agrees[rows]) >= FEWEST_VIEWS:
             found += [(*step, frame) for step in _best_move(problem, fit, agrees, frame, rows)]
+            may_creep = frame not in (*bases, *creeping(problem)) and "@" not in frame
+            crept = find_creep(problem, fit, agrees, frame) if may_creep else None
+            if crept is not None and crept[0] >= FEWEST_VIEWS:
+                found.append((crept[0], -1, crept[1], frame))
     if not found:
         return None
+    # Of equal ones the first: what moved at once.
     _, stop, change, frame = max(found, key=lambda step: step[0])
-    return None if frame in bases else (frame, stop, log(change))
+    return None if frame in bases else (frame, stop, change)
 
 
 def _best_move(
     problem: Problem, fit: Solution, agrees: Mask, frame: str, rows: Mask
 ) -> list[tuple[int, int, FloatArray]]:
-    """The move of a frame that explains most: further observations, first stop, (4, 4) change."""
+    """The move of a frame that explains most: further observations, first stop, (6,) change."""
     part = problem.subset(rows)
     order = np.argsort(part.observations.stops, kind="stable")
-    changes = part.change_of(frame, fit.state)[order]
-    # Covariances of the changes that the observations imply.
-    linear = part.linear(fit.state, ideal=True)
-    inverse = np.linalg.inv(linear.jacobian[:, :, part.edge_columns(frame)])
-    residual_covariance = part.total_covariance(linear, fit.noise)
-    covariance = (inverse @ residual_covariance @ np.swapaxes(inverse, 1, 2))[order]
+    changes, covariance = (of_rows[order] for of_rows in _implied_changes(part, fit, frame))
     stops, explained = part.observations.stops[order], agrees[rows][order]
     outliers = np.flatnonzero(~explained)
     tried = outliers[np.linspace(0, len(outliers) - 1, min(_CANDIDATES, len(outliers))).astype(int)]
@@ -141,4 +236,4 @@ def _best_move(
     weights = np.linalg.inv(covariance[after])
     weighted_sum = np.einsum("nij,nj->i", weights, differences[candidate, after])
     mean = np.linalg.solve(weights.sum(axis=0), weighted_sum)
-    return [(gain, int(stops[begin]), changes[tried[candidate]] @ exp(mean))]
+    return [(gain, int(stops[begin]), log(changes[tried[candidate]] @ exp(mean)))]

@@ -2,8 +2,8 @@
 
 An observation is an inlier or outlier as a whole (an image of another stop, a pose of another row),
 by its Mahalanobis distance from the prediction of all others. A frame that moved during the session
-is no outlier: from some stop on, all its observations agree on one other pose. It is then two
-frames, and no observation is lost.
+is no outlier: from some stop on, all its observations agree on one other pose, and it is then two
+frames; or it crept, and its motion is an effect. No observation is lost.
 
 Where frames may have moved, the search begins with the earliest stops, before later moves.
 """
@@ -20,7 +20,16 @@ from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.moves import Move, explained_by_noise, find_move, moved
+from visioncal.estimation.moves import (
+    CREEP,
+    Move,
+    creep_effect,
+    creeping,
+    explained_by_noise,
+    find_move,
+    moved,
+    with_creep,
+)
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import UNEVEN, Noise, State
@@ -33,7 +42,7 @@ from visioncal.estimation.solve import (
     solve_problem,
     starting_noise,
 )
-from visioncal.estimation.steps import find_steps, frames_of
+from visioncal.estimation.steps import candidates_of, find_steps
 
 # Share of the earliest stops with which the search begins.
 EARLY_SHARE = 0.4
@@ -135,7 +144,14 @@ def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = (
         found = find_move(problem, fit, relative_squares < 1.0, movable)
         if found is None:
             break
-        problem, fit, move = moved(problem, fit, *found)
+        frame, stop, change = found
+        if stop < 0:
+            # Its observations agreed with nothing: the search begins anew.
+            problem, state = with_creep(problem, fit.state if moves else state, frame, change)
+            used, fit = _core(problem, state, stops <= last)
+            used, fit = widened(_ObservationSearch(problem), used, fit)
+            continue
+        problem, fit, move = moved(problem, fit, frame, stop, change)
         movable = (*movable, move.twin)
         moves.append(move)
         involved = problem.observations.involves(move.twin)
@@ -163,12 +179,24 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
         return find_inliers(problem, agreed.fit.state, agreed.used, agreed.fit.noise)
     used, fit = _refined(problem, *_widened(problem, agreed.used, agreed.fit))
     while len(moves) < _MOST_MOVES:
-        part = problem.subset(used)
-        if not (slight := find_steps(part, fit, frames_of(part, movable))):
+        part, crept = problem.subset(used), creeping(problem)
+        # Nothing creeps evenly: the rest of it is no move at once.
+        still = [name for name in movable if name.partition("@")[0] not in crept]
+        creeps = [
+            creep_effect(problem, fit.state, name).take(np.flatnonzero(used))
+            for name in still
+            if "@" not in name
+        ]
+        if not (slight := find_steps(part, fit, candidates_of(part, still, creeps))):
             break
-        problem, fit, move = moved(problem, fit, slight[0].of, slight[0].stop, slight[0].value)
-        movable = (*movable, move.twin)
-        moves.append(move)
+        frame, stop, value = slight[0].of, slight[0].stop, slight[0].value
+        if slight[0].kind == CREEP:
+            problem, state = with_creep(problem, fit.state, frame, value)
+            fit = replace(fit, state=state)
+        else:
+            problem, fit, move = moved(problem, fit, frame, stop, value)
+            movable = (*movable, move.twin)
+            moves.append(move)
         used, fit = _refined(problem, *_widened(problem, used, fit))
     return _converged(problem, used, fit, moves)
 

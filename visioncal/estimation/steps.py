@@ -19,7 +19,7 @@ from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import ROUNDING, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
-from visioncal.estimation.moves import fitted_change, moved
+from visioncal.estimation.moves import CREEP, fitted_change, moved
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
@@ -48,7 +48,7 @@ _MOST_EXPLAINED = 0.99
 class Candidate:
     """A possible change during the session."""
 
-    kind: str  # `FRAME`, `JOINT`, `SIZE` or `DRIFT`.
+    kind: str  # `FRAME`, `JOINT`, `SIZE`, `DRIFT` of a base, or `CREEP` of another frame.
     of: str  # The frame; of a joint or a drift the robot, as the problem names it.
     stops: IntArray  # The stops from which on it may have changed.
     effect: Effect | None = None  # The change as an effect on all stops; None for a frame's pose.
@@ -72,7 +72,7 @@ class Step:
 
     @property
     def kind(self) -> str:
-        """Kind of the change: `FRAME`, `JOINT`, `SIZE` or `DRIFT`."""
+        """Kind of the change, as of its candidate."""
         return self.candidate.kind
 
     @property
@@ -87,6 +87,15 @@ def frames_of(problem: Problem, frames: Sequence[str]) -> list[Candidate]:
         Candidate(FRAME, frame, _between(problem, problem.observations.involves(frame)))
         for frame in frames
     ]
+
+
+def candidates_of(
+    problem: Problem, frames: Sequence[str], creeps: Sequence[Effect]
+) -> list[Candidate]:
+    """Frames that may have moved at once, and effects of those that may have crept."""
+    first = np.array([int(problem.observations.stops.min())])
+    crept = [Candidate(CREEP, at.name.partition(" of ")[2], first, at) for at in creeps]
+    return [*frames_of(problem, frames), *crept]
 
 
 def joints_of(problem: Problem, offsets: Mapping[str, FloatArray]) -> list[Candidate]:

@@ -1,5 +1,6 @@
 """Effects beside noise: opened one at a time, where the score of a fit without it is clear."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -29,6 +30,7 @@ from visioncal.model.effects import (
     Breathing,
     Effect,
     FocusJitter,
+    FrameCreeps,
     Heat,
     LensSteps,
     MountCreeps,
@@ -120,6 +122,7 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """All that are not open yet, with their scores."""
     yield from beside_zooms(fit, scored(fit, effects_of_lenses(fit), sole_flange(fit)))
     yield from of_arms(fit, pairs)
+    yield from scored(fit, creeps_of_frames(fit))
     for flange in fit.unknowns.erring:
         yield from scored(fit, effects_of_frames(fit, flange), flange)
     for camera in fit.unknowns.lenses:
@@ -226,6 +229,18 @@ def effects_of_frames(fit: Fit, flange: str) -> Iterator[Effect]:
         is_swept = any(sweep.flange == flange for sweep in fit.cell.sweeps)
         for kind in NAMED:
             yield from kind.of_flange(flange, Stood(poses, stood, is_swept))
+
+
+def creeps_of_frames(fit: Fit) -> Iterator[Effect]:
+    """Creep of cameras and targets beside others on the same base or flange."""
+    cell = fit.cell
+    parents = {name: cell.tree.branches[name].parent for name in cell.unknown}
+    counts = Counter(parents.values())
+    for name in (name for name in (*cell.cameras, *cell.boards) if name in parents):
+        seen = [cell.sightings[at] for at in np.flatnonzero(fit.used)]
+        stops = {one.stop for one in seen if name in one.pair}
+        if counts[parents[name]] > 1 and len(stops) >= processes.ENOUGH_STOPS:
+            yield FrameCreeps(name)
 
 
 def steps(fit: Fit, flange: str) -> Iterator[Effect]:

@@ -192,6 +192,8 @@ class Moved:
     from_stop: int | None = None  # First stop after the push; None for half way.
     shift_m: float = 0.005  # Length of the displacement, in a random direction [m].
     turn_rad: float = 0.01  # Angle of the rotation, about a random axis [rad].
+    # Whether it creeps by so much instead, evenly up to its place at the last stop.
+    creeps: bool = False
 
 
 @dataclass(frozen=True)

@@ -223,7 +223,10 @@ def parent_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
         twist *= np.array([[push.turn_rad], [push.shift_m]]) / np.linalg.norm(
             twist, axis=1, keepdims=True
         )
-        poses[push.frame][start:] = poses[push.frame][start:] @ exp(twist.ravel())
+        share = np.repeat([0.0, 1.0], [start, layout.stops - start])
+        if push.creeps:
+            share = np.linspace(1.0, 0.0, layout.stops)
+        poses[push.frame] = poses[push.frame] @ exp(share[:, None] * twist.ravel())
     return poses
 
 

@@ -37,8 +37,10 @@ from visioncal.estimation.chain import scatter
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import noise_intervals
+from visioncal.estimation.moves import creep_effect, creeping
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import fit_problem
 from visioncal.estimation.steps import Step
 from visioncal.estimation.unknowns import EDGE, LENS, Unknown
@@ -308,13 +310,17 @@ def _problem(cell_fit: CellFit, observed: Observed, views: Sequence[ViewPoses]) 
     for move in cell_fit.inlier_fit.moves:
         later = observations.stops >= move.stop
         observations = observations.renamed(move.frame, move.twin, later)
-    clock_errors = {effect.name: effect for effect in clock_effects(cell_fit.cell, observed.clocks)}
+    problem = replace(problem, observations=observations, points=fitted.points)
+    edges = State(cell_fit.fit.state.edges, np.zeros(0))
+    creeps = [creep_effect(problem, edges, frame) for frame in creeping(fitted)]
+    own = {
+        effect.name: effect for effect in (*clock_effects(cell_fit.cell, observed.clocks), *creeps)
+    }
     effects = [
-        clock_errors.get(effect.name)
+        own.get(effect.name)
         or replace(
             effect, by_sensor=None, rows_concerned=None if effect.rows_concerned is None else none
         )
         for effect in fitted.effects
     ]
-    problem = replace(problem, observations=observations, points=fitted.points)
     return problem.with_effects(effects)

@@ -34,9 +34,10 @@ from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, VisioncalError
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.types import Mask
-from visioncal.estimation.arm import rows_of
+from visioncal.estimation.arm import LEVER_M, rows_of
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import fit_jointly, target_sizes
+from visioncal.estimation.moves import creep_effect, creep_effects
 from visioncal.estimation.observability import chain_words, check_determined
 from visioncal.estimation.outliers import (
     InlierFit,
@@ -56,6 +57,7 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.steps import find_steps, joints_of
 from visioncal.estimation.unknowns import SIZE
+from visioncal.model.effects import FrameCreeps
 
 # Arms are relinearised at most so often, or until their errors change by less, which is far below
 # any arm's repeatability.
@@ -127,8 +129,8 @@ def _fit(
     cell, poses = start.cell, start.poses
     misread = observed.misread
     inliers = all_as_inliers(start.problem, start.state) if misread else initial_inliers(start)
-    clock_errors = clock_effects(cell, observed.clocks)
-    initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, clock_errors)
+    others = (*clock_effects(cell, observed.clocks), *creep_effects(inliers.problem))
+    initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, others)
     if misread:
         # Misread poses determine neither lens, board and arm nor which views are outliers.
         return _of_misread(initial, observed)
@@ -144,8 +146,7 @@ def _fit(
     rows = None if corners is None else cell_fit.all_rows(corners)
     if found := random_effects(cell_fit.inlier_fit, cell_fit.arms, cell_fit.sizes, corners, rows):
         gains = {effect.name: gain for effect, gain in found.items()}
-        effects = (*clock_errors, *found)
-        with_effects = replace(cell_fit, other_effects=effects, gains=gains)
+        with_effects = replace(cell_fit, other_effects=(*others, *found), gains=gains)
         cell_fit = _fit_with_inliers(with_effects, observed)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
     final = None if cell.mount is None or cell.priors else cell_fit.inlier_fit
@@ -274,9 +275,12 @@ def _calibrate_arms(
             updated_inliers(cell_fit.cell, before.with_noise(noise)), cell_fit.arms, before.used
         )
         noise = inliers.fit.noise
+        creeps = creep_effects(inliers.problem)[len(creep_effects(before.problem)) :]
+        cell_fit = replace(cell_fit, other_effects=(*cell_fit.other_effects, *creeps))
         # Other inliers, or other moved frames, may allow another calibration level.
         if (
-            before.problem.unknown.keys() == inliers.problem.unknown.keys()
+            not creeps
+            and before.problem.unknown.keys() == inliers.problem.unknown.keys()
             and np.array_equal(before.used, inliers.used)
             and before.problem.priors == inliers.problem.priors
         ):
@@ -408,20 +412,21 @@ def initial_inliers(start: Start) -> InlierFit:
 
     Of one robot and one camera, they are those of the one likelihood, if it comes to rest.
     """
-    cell, problem, state = start.cell, start.problem, start.state
+    cell, problem = start.cell, start.problem
     movable, observations = _movable_frames(cell, problem), problem.observations
     # Cameras may disagree about one stop by more than their corners say, and not before the lenses
     # are fitted alone: a board shrunk to nothing would reconcile them, or a robot's noise of
     # decimetres, and all stops would be explained.
     problem = _with_camera_levels(cell, start.poses, problem)
+    problem, state = _with_creeps(start, problem)
     # Targets whose corners were seen: other poses have no known covariance.
     pairs = zip(observations.observed, observations.sensors.tolist(), strict=True)
     printed = [target for target, sensor in pairs if sensor < 0 and movable]
     if printed:
         # Otherwise all observations of a board of another size would be outliers.
         sizes = target_sizes(problem, dict.fromkeys(printed, PRINTED_SCALE))
-        problem = problem.with_effects([sizes])
-        state = State(state.edges, problem.start_values)
+        problem = problem.with_effects([*problem.effects, sizes])
+        state = State(state.edges, np.append(state.values, sizes.values))
     loose = replace(problem, priors=with_loose_positions(cell.priors))
     if cell.mount is None or (agreeing := start.agreeing) is None:
         inliers = inliers_and_moves(loose, state, movable)
@@ -430,8 +435,32 @@ def initial_inliers(start: Start) -> InlierFit:
     if cell.priors:
         inliers = _with_priors(cell, inliers).refitted()
     # Sizes are estimated from the corners, with the lenses.
-    fit = replace(inliers.fit, state=State(inliers.fit.state.edges, np.zeros(0)))
-    return replace(inliers, problem=inliers.problem.with_effects(()), fit=fit)
+    problem, state = inliers.problem, inliers.fit.state
+    moved = {move.frame for move in inliers.moves}
+    creeps = [at for at in creep_effects(problem) if at.name.partition(" of ")[2] not in moved]
+    values = [np.zeros(0), *(problem.values_of(effect.name, state) for effect in creeps)]
+    fit = replace(inliers.fit, state=State(state.edges, np.concatenate(values)))
+    return replace(inliers, problem=problem.with_effects(creeps), fit=fit)
+
+
+def _with_creeps(start: Start, problem: Problem) -> tuple[Problem, State]:
+    """The problem at its start with the frames that creep, by the one likelihood."""
+    state = start.state
+    if start.solved is None or start.cell.mount is not None:
+        return problem, state
+    fit = start.solved.fit
+    for effect in fit.unknowns.effects:
+        if effect.name in fit.unknowns.closed or effect.frame not in problem.unknown:
+            continue
+        if isinstance(effect, FrameCreeps):
+            edges, frame = state.edges.copy(), effect.frame
+            edges[problem.unknown[frame]] = fit.edge(frame)
+            state = State(edges, state.values)
+            creep = creep_effect(problem, state, frame, effect.rate)
+            values = fit.state.values["effect", effect.name] / np.repeat([LEVER_M, 1.0], 3)
+            problem = problem.with_effects([*problem.effects, creep])
+            state = State(edges, np.append(state.values, values))
+    return problem, state
 
 
 def updated_inliers(cell: Cell, inliers: InlierFit) -> InlierFit:

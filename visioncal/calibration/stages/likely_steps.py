@@ -12,6 +12,7 @@ from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.arm import ArmErrors, stops_of
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import target_sizes
+from visioncal.estimation.moves import creeping
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.solve import Solution, fit_problem
@@ -97,7 +98,10 @@ def likely_steps(
     robots = [robot for robot in problem.robots if len(stops_of(problem, robot)) >= FEWEST_STOPS]
     if not robots:
         return ()
-    candidates = frames_of(problem, tuple(problem.unknown)) + sizes_of(problem, fit)
+    # Nothing creeps evenly: the rest of it is no move at once.
+    crept = creeping(problem)
+    still = [name for name in problem.unknown if name.partition("@")[0] not in crept]
+    candidates = frames_of(problem, still) + sizes_of(problem, fit)
     candidates += joints_of(problem, {name: offsets[name] for name in robots if name in offsets})
     candidates += [drift_of(problem, robot) for robot in robots]
     # A push shifts positions alone, and dominates their noise.

@@ -12,10 +12,11 @@ from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, some_of, view_words
-from visioncal.core.transforms import invert, log, mean_transform, pose_difference
+from visioncal.core.transforms import exp, invert, log, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import TWIST_UNITS
+from visioncal.estimation.moves import creep_effects, creeping
 from visioncal.estimation.outliers import InlierFit
 from visioncal.results import Moved
 from visioncal.robot import Robot
@@ -90,6 +91,23 @@ def moved_finding(moved: Moved) -> Finding:
         f"{moved.frame} where it stood last, and as {moved.before} where it stood before.",
         Remedy(f"Fasten {moved.frame}, and record again."),
     )
+
+
+def crept_findings(cell_fit: CellFit) -> Iterator[Finding]:
+    """Finding that frames of a whole cell crept."""
+    problem, state = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.fit.state
+    effects = creep_effects(problem)
+    ends = (exp(problem.values_of(effect.name, state)) for effect in effects)
+    away = [pose_difference(np.eye(4), end) for end in ends]
+    crept = sorted(zip(away, creeping(problem), strict=True), reverse=True)
+    if crept:
+        words = ", ".join(f"{frame} by {mm_and_deg(*by)}" for by, frame in crept)
+        yield Finding(
+            "frame_creeps",
+            f"Frames crept during the session, as where mounts give way: {words}. The result has "
+            "each where it stood last.",
+            Remedy(f"Fasten {some_of([frame for _, frame in crept])}, and record again."),
+        )
 
 
 def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[int, str]]:

@@ -19,7 +19,7 @@ from visioncal.calibration.suspects import (
     steps,
     turned_views,
 )
-from visioncal.calibration.suspects.outliers import EXCHANGED, moved_finding
+from visioncal.calibration.suspects.outliers import EXCHANGED, crept_findings, moved_finding
 from visioncal.calibration.suspects.suspect import (
     ARM_ERRORS,
     FACT,
@@ -41,6 +41,7 @@ def _outliers(run: RunState) -> Iterator[Finding]:
         yield replace(fault.found, without_it=without(fault.found.views, held_out.words))
     if run.mount is None:
         yield from map(moved_finding, run.assessment.moved)
+        yield from crept_findings(run.cell_fit)
 
 
 def _contradicted(run: RunState) -> Iterator[Finding]:
@@ -71,6 +72,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     *(Suspect(kind, None, 1e-6, order=-1) for kind in UNDONE),
     Suspect("something_moved", chance=1e-4),
     Suspect("moved_frame", chance=1e-4),
+    Suspect("frame_creeps", chance=1e-4),
     Suspect("wrong_views", chance=1e-3),
     Suspect("holdout", chance=1e-3),
     # Arms, steps, lenses and boards.

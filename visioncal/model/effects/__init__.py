@@ -7,6 +7,7 @@ from visioncal.model.effects.breathing import Breathing as Breathing
 from visioncal.model.effects.clock import Clock as Clock
 from visioncal.model.effects.creep import BaseCreeps as BaseCreeps
 from visioncal.model.effects.creep import BaseSteps as BaseSteps
+from visioncal.model.effects.creep import FrameCreeps as FrameCreeps
 from visioncal.model.effects.creep import MountCreeps as MountCreeps
 from visioncal.model.effects.creep import MountSteps as MountSteps
 from visioncal.model.effects.effect import SIGNIFICANT as SIGNIFICANT

@@ -11,9 +11,10 @@ from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
+from visioncal.estimation.moves import still_to_come
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect, Named, Stood
-from visioncal.model.effects.lens_grows import TIME_CONSTANTS, still_to_come
+from visioncal.model.effects.lens_grows import TIME_CONSTANTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ class _Creep(_Moves, Named):
 
     def left(self, moments: Moments) -> FloatArray:
         """See `_Moves`."""
-        return still_to_come(moments, self.rate)[:, None, None]
+        return still_to_come(moments.progress, self.rate)[:, None, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +96,14 @@ class MountCreeps(_Creep, _OfMount):
 
     kind, what = "mount creeps", "The load on the flange"
     do = "Fasten what the flange carries, let the cell warm up, and record again."
+
+
+@dataclass(frozen=True, eq=False)
+class FrameCreeps(_Creep, _OfMount):
+    """Creep of one of several cameras or targets that share a base or a flange."""
+
+    kind, what = "frame creeps", "A camera or target"
+    do = "Fasten it, let the cell warm up, and record again."
 
 
 @dataclass(frozen=True, eq=False)

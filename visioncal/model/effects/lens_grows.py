@@ -7,20 +7,12 @@ import numpy as np
 
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray
+from visioncal.estimation.moves import still_to_come
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect, LensEffect, Named
 
 # Time constants of a camera's warming in one session.
 TIME_CONSTANTS = 3.0
-
-
-def still_to_come(moments: Moments, rate: float) -> FloatArray:
-    """(k,) share of what goes on over the session, and fades by a rate, after each moment."""
-    over = moments.progress + 1.0
-    if rate == 0.0:
-        return np.asarray(1.0 - over)
-    end = np.exp(-rate)
-    return np.asarray((np.exp(-rate * over) - end) / (1.0 - end))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +47,7 @@ class LensGrows(LensEffect, Named):
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
-        left = still_to_come(moments, self.rate)
+        left = still_to_come(moments.progress, self.rate)
         found, focal = self.none(moments), self.lens.matrix[:2]
         found[:, :2, 0] = -np.outer(left, focal)
         found[:, 2, 1] = found[:, 3, 2] = -left * np.mean(focal)
