@@ -34,6 +34,7 @@ from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.estimation.solve import Solution
 from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports import document
+from visioncal.model.arm import sides_of_motion
 from visioncal.planning.information import stop_factors
 from visioncal.planning.purposes import PURPOSES
 from visioncal.results import to_document
@@ -449,6 +450,22 @@ def test_an_arm_that_is_right_but_for_its_play(way):
     assert result.standing(q) == pytest.approx(stated, abs=1e-9)
     one_side = reporting(cell, approach=np.ones(len(cell.robot.approach)))
     assert arm_found(calibrated(one_side)).sections.arm.backlash == ()
+
+
+def test_play_is_told_by_the_last_motion_where_no_side_is_stated():
+    cell = simulate(replace(GOOD, views=40, seed=3))
+    worn, play = cell.robot.joints.copy(), 4e-3
+    worn[:, 1] -= 0.5 * play * sides_of_motion(worn)[:, 1]
+    poses = forward(cell.robot.arm, worn)
+    known = calibrated(reporting(cell, joints=worn, base_from_flange=poses, approach=None))
+    told = arm_found(known).sections.arm.backlash[1]
+    assert abs(told.deadband_rad - play) < 3.5 * told.sigma_rad
+    assert known.verdict.causes[0].kind == "joint_play"
+    # Nothing tells where the joints of the first stop came from.
+    assert [view.view for view in result_of(known).views if not view.used] in ([], [0])
+    edge = result_of(known).edges["flange_from_cam"]
+    # Chi-square of six exceeds this in one case of a thousand.
+    assert misfit(edge, cell.transforms["flange_from_cam"]) < 22.5
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -255,17 +255,24 @@ class _Blocks:
         return None
 
 
-def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> ArmSizes:
-    """The sizes without blocks that have no evidence, and without negative compliances."""
-    while (lesser := arm.without_least_likely(best)) is not None:
-        arm, best = lesser
-    # Residuals have the opposite sign of the errors.
-    while COMPLIANCE in arm.bases and (
-        (negative := best.values[arm.slice_of(COMPLIANCE)] > 0.0).any()
-    ):
+def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> ArmSizes | None:
+    """The sizes without blocks that have no evidence, and without negative compliances.
+
+    None where none are left that explain more than chance.
+    """
+    while True:
+        while (lesser := arm.without_least_likely(best)) is not None:
+            arm, best = lesser
+        # Residuals have the opposite sign of the errors.
+        negative = best.values[arm.slice_of(COMPLIANCE)] > 0.0 if COMPLIANCE in arm.bases else None
+        if negative is None or not negative.any():
+            break
+        # Without joints that would bend upwards, the rest may have no evidence.
         arm = replace(arm, bases={**arm.bases, COMPLIANCE: arm.bases[COMPLIANCE] * ~negative})
         best = arm.most_likely(best.logs)
     count, gain = arm.nominal.before.size, arm.gain(best)
+    if gain <= SIGNIFICANT:
+        return None
     levels = np.exp(best.logs[:count]).reshape(-1, 2)
     sizes = np.sqrt(arm.shares @ np.exp(2.0 * best.logs[count:]))
     errors = {

@@ -202,7 +202,7 @@ class ArmModel:
                 weight bends it, in the middle of its play.
         """
         if loads is not None and self.backlash.any():
-            q = q + 0.5 * loads.side[:, None] * self.backlash
+            q = q + 0.5 * loads.sides * self.backlash
         return deflected_joints(self.robot, q, self.compliance, loads, self.moments)
 
     def base_from_flange(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
@@ -228,8 +228,8 @@ class ArmModel:
         """
         bent = self.bent(q, loads)
         if name == BACKLASH:
-            sides = np.zeros(len(q)) if loads is None else loads.side
-            return np.asarray(0.5 * sides[:, None, None] * self.robot.axis_jacobian(bent))
+            sides = np.zeros((len(q), 1)) if loads is None else loads.sides
+            return np.asarray(0.5 * sides[:, None] * self.robot.axis_jacobian(bent))
         if name == WEIGHT and self.functions is not None:
             shares = self.functions.values(self.robot, bent)
             return np.asarray(self.robot.axis_jacobian(bent) @ shares)

@@ -38,15 +38,23 @@ class Arm:
         if self.joints is None:
             return None
         if self.loads is not None and self.loads.side.any():
-            return np.repeat(self.loads.side[:, None], self.joints.shape[1], axis=1)
+            return self.loads.sides + np.zeros_like(self.joints)
         stood = np.flatnonzero(np.isfinite(self.poses[:, 0, 0]))
-        moved = np.diff(self.joints[stood], axis=0, prepend=self.joints[stood[:1]])
-        # Encoders of a joint that stands still are noisy: it came from where it did before.
-        signs = -np.sign(np.where(np.abs(moved) > 1e-4, moved, 0.0))
-        last = np.maximum.accumulate(np.where(signs, np.arange(len(signs))[:, None], 0), axis=0)
         sides = np.zeros_like(self.joints)
-        sides[stood] = np.take_along_axis(signs, last, axis=0)
+        sides[stood] = sides_of_motion(self.joints[stood])
         return sides
+
+
+def sides_of_motion(joints: FloatArray) -> FloatArray:
+    """(m, n) sides from which joints came to (m, n) angles [rad], one stop after the other.
+
+    1 from above, -1 from below; 0 before the first motion.
+    """
+    moved = np.diff(joints, axis=0, prepend=joints[:1])
+    # Encoders of a joint that stands still are noisy: it came from where it did before.
+    signs = -np.sign(np.where(np.abs(moved) > 1e-4, moved, 0.0))
+    last = np.maximum.accumulate(np.where(signs, np.arange(len(signs))[:, None], 0), axis=0)
+    return np.take_along_axis(signs, last, axis=0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,8 +41,8 @@ class Loads:
     payload_kg: FloatArray  # (m,) mass of the payload [kg].
     payload_m: FloatArray  # (m, 3) its centre, in the flange's frame [m].
     force_n: FloatArray  # (m, 3) external force on the flange's origin, in the base's frame [N].
-    # (m,) the side from which the joints approached the stop, +1 from above, -1 from below; 0 where
-    # unknown: the middle of their backlash.
+    # (m,) the side from which the joints approached the stop, or (m, n) from which each did: +1
+    # from above, -1 from below; 0 where unknown: the middle of their backlash.
     side: FloatArray
 
     @classmethod
@@ -96,14 +96,20 @@ class Loads:
 
     @property
     def rows(self) -> FloatArray:
-        """(m, 8) all values of each stop, for comparison."""
-        parts = [self.payload_kg[:, None], self.payload_m, self.force_n, self.side[:, None]]
+        """(m, 8) all values of each stop, for comparison; (m, 7 + n) with sides of each joint."""
+        parts = [self.payload_kg[:, None], self.payload_m, self.force_n, self.sides]
         return np.concatenate(parts, axis=1)
+
+    @property
+    def sides(self) -> FloatArray:
+        """(m, 1) of all joints, or (m, n) of each: the sides of approach."""
+        return self.side if self.side.ndim == 2 else self.side[:, None]
 
     @property
     def from_both_sides(self) -> bool:
         """Whether stops were approached from both sides, which separates backlash from offset."""
-        return bool((self.side > 0.0).any() and (self.side < 0.0).any())
+        above, below = (self.sides > 0.0).any(axis=0), (self.sides < 0.0).any(axis=0)
+        return bool((above & below).any())
 
 
 def masses_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) -> Masses | None:

@@ -88,6 +88,7 @@ def solve(
     if solver != "joint":
         cell, level = replace(cell, priors=()), "hand-eye"
     start = find_start(cell, observed, is_solved=not observed.misread)
+    arms = {name: arm.with_sides if start.has_play(name) else arm for name, arm in arms.items()}
     measured = measured_errors(None if observed.scenes else start.solved)
     start = _with_shapes(start, measured)
     try:

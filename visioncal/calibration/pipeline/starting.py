@@ -23,6 +23,7 @@ from visioncal.estimation.problem_parts import Observations, State
 from visioncal.fit.consensus import Candidates
 from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start as Begun
+from visioncal.model.effects import Play
 from visioncal.session import frame_name
 
 # Covariance, up to a level, of a pose that was given without one [rad^2, m^2].
@@ -56,6 +57,18 @@ class Start:
         views = {self.solved.fit.cell.sightings[at].view for at in used}
         agreeing = np.array([row.view in views for row in self.cell.rows], dtype=bool)
         return agreeing if np.mean(agreeing) >= _MOST_AGREE else None
+
+    def has_play(self, robot: str) -> bool:
+        """Whether joints of a robot have play, by the one likelihood."""
+        if self.solved is None:
+            return False
+        unknowns, flange = self.solved.fit.unknowns, self.cell.tree.flanges.get(robot, "")
+        return any(
+            isinstance(effect, Play)
+            and effect.frame == flange
+            and effect.name not in unknowns.closed
+            for effect in unknowns.effects
+        )
 
 
 def find_start(cell: Cell, observed: Observed, *, is_solved: bool) -> Start:

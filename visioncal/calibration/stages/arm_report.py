@@ -69,10 +69,10 @@ def report_of(arm: ArmData, levels: SelectedArmLevel, convention: Convention | N
         result = replace(result, left_out=levels.left_out())
         notes += [advice] if advice else []
     springs = elastic.elastic_of(arm, levels.fit.errors)
-    notes += elastic.play_remarks(result.backlash)
     notes += () if springs is None else elastic.remarks(springs)
-    doubts = () if springs is None else tuple(elastic.doubts(springs))
-    return ArmReport(ArmSections(arm=result, elastic=springs), tuple(notes), doubts)
+    doubts = [*elastic.play_findings(result.backlash)]
+    doubts += () if springs is None else elastic.doubts(springs)
+    return ArmReport(ArmSections(arm=result, elastic=springs), tuple(notes), tuple(doubts))
 
 
 def add_parameters(

@@ -37,6 +37,7 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.robot_likelihood import RobotLikelihood, robot_likelihood
 from visioncal.estimation.unknowns import ARM, EDGE
+from visioncal.model.arm import sides_of_motion
 from visioncal.results.arm import ArmErrorsResult, ArmSections
 from visioncal.robot import Loads, Robot
 from visioncal.session import Session, View
@@ -95,6 +96,13 @@ class RobotArm:
         loads = loads_of([view.numbers for view in views], sides)
         has_pose = np.isfinite(reported[:, 0, 0])
         return cls(robot, reported, has_pose, q, loads, matched, heat)
+
+    @property
+    def with_sides(self) -> Self:
+        """The arm with the side of each joint's last motion, where none of approach is stated."""
+        if self.joints_rad is None or self.loads.side.any():
+            return self
+        return replace(self, loads=replace(self.loads, side=sides_of_motion(self.joints_rad)))
 
     @property
     def is_modelled(self) -> bool:

@@ -259,8 +259,8 @@ def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ..
     return tuple(JointBacklash(*row) for row in zip(*columns, strict=True))
 
 
-def play_remarks(plays: Sequence[JointBacklash]) -> Iterator[str]:
-    """Remark on joints with significant backlash, for the verdict."""
+def play_findings(plays: Sequence[JointBacklash]) -> Iterator[Finding]:
+    """Finding of joints with significant backlash."""
     words = ", ".join(
         f"{play.joint} {figure(1e3 * abs(play.deadband_rad))} +- "
         f"{figure(1e3 * play.sigma_rad)} mrad"
@@ -268,7 +268,12 @@ def play_remarks(plays: Sequence[JointBacklash]) -> Iterator[str]:
         if play.is_sure
     )
     if words:
-        yield (
-            f"Joints have play: {words}. The calibrated arm stands in the middle of it: approach "
-            "every stop from the same side where half of that matters."
+        yield Finding(
+            "joint_play",
+            f"Joints have play: {words}. The calibrated arm stands in the middle of it; of the "
+            "first stop, no motion tells the side.",
+            Remedy(
+                "Approach every stop and every pick from the same side where half of that matters, "
+                "or have the gear adjusted."
+            ),
         )

@@ -114,6 +114,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     # Conventions, clocks, joints.
     misread_poses.MISREAD_POSES,
     Suspect("misread_joints", None, 1e-3, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
+    Suspect("joint_play", None, 1e-6, hides=("wrong_views",)),
     # The frames are by the poses, which a wrong model does not change.
     Suspect("other_arm", None, REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
     *map(Suspect, ("contradicting_joints", "base_link", "tool_frame", "level", "load", "clock")),
