@@ -289,6 +289,19 @@ def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> No
     assert "late_poses" not in {found.kind for found in sound.findings}
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_images_that_are_shifted_from_some_view_on_are_told_from_a_camera_that_moved(mount) -> None:
+    cell = simulate(CellOptions(views=24, mount=mount, pixel_sigma_px=0.1, seed=2))
+    shifts = np.where(np.arange(24)[:, None] < 10, 0.0, [24.0, -16.0])
+    corners = [replace(at, px=at.px + by) for at, by in zip(cell.corners, shifts, strict=True)]
+    first = calibrated(showing(cell, corners)).verdict.causes[0]
+    assert first.kind == "image_shifted"
+    assert "From view 10 on, the images are shifted by (24, -16) px" in str(first.words)
+    moved = simulate(replace(cell.options, camera_moved_m=5e-3))
+    bumped = showing(cell, [*cell.corners[:10], *moved.corners[10:]])
+    assert calibrated(bumped).verdict.causes[0].kind != "image_shifted"
+
+
 @pytest.mark.parametrize(("off_mm", "named"), [(2.0, []), (30.0, [(7,)])])
 def test_doctor_calls_no_view_wrong_for_what_an_arm_may_err_by(off_mm, named) -> None:
     cell = simulate(CellOptions(views=20))

@@ -46,10 +46,11 @@ class FoundEffect:
 
 @dataclass(frozen=True)
 class Zoom:
-    """A lens whose focal length changed, by more than one that warms up."""
+    """A lens that changed, by more than one that warms up."""
 
     station: int | None  # The first after it changed at once; None where it crept.
     share: float  # Of the focal length by which it is longer from there on, or at the end.
+    shift_px: tuple[float, float] = (0.0, 0.0)  # By which its centre is elsewhere from there on.
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,10 +267,12 @@ def _changed(fit: Fit) -> Iterator[tuple[Effect, Zoom, float]]:
     for effect in fit.unknowns.effects:
         size = _size(fit, effect.name)
         if isinstance(effect, LensSteps) and size:
-            share = -float(fit.state.values["effect", effect.name][0])
+            values = -fit.state.values["effect", effect.name]
+            share, focal_px = float(values[0]), float(np.mean(effect.lens.matrix[:2]))
+            shift_px = float(focal_px * values[1]), float(focal_px * values[2])
             stops = np.array([one.stop for one in fit.cell.sightings if one.seer == effect.frame])
             before = float(np.mean(stops < effect.stop))
-            zoom = Zoom(fit.cell.stations[effect.stop], share)
+            zoom = Zoom(fit.cell.stations[effect.stop], share, shift_px)
             yield effect, zoom, abs(share) * float(np.sqrt(before * (1.0 - before)))
         elif isinstance(effect, LensGrows) and size > effect.most:
             share = float(fit.state.values["effect", effect.name][0])

@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.error_sizes import Zoom
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
 from visioncal.core.errors import VisioncalError
@@ -26,6 +27,8 @@ from visioncal.vision.camera import intrinsics, normalise, project, with_intrins
 
 # Changes of intrinsics or corners below this show in no image, and in no pick [px].
 _LEAST_MOVE_PX = 0.1
+# A step of the centre by more is that of the image: a lens that is hit moves it by less [px].
+_SHIFTED_PX = 3.0
 # A part of a picture begins farther from its corner than any centre is wrong [px]; what is left of
 # the move where stated intrinsics were misread.
 _CROPPED_PX, _EXPLAINED = 10.0, 0.1
@@ -230,6 +233,9 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             if zoom.station is not None:
                 first = cell.start_words(zoom.station)
                 do = cell.or_separately("Fix zoom and focus", zoom.station)
+                if np.hypot(*zoom.shift_px) > _SHIFTED_PX and not sizes.rivals.get("lens steps"):
+                    yield _shifted(of, zoom, f"{first}, ", do, changes[1])
+                    continue
                 words = f"{of} changed at once, as where it was zoomed, refocused or hit: {first}, "
                 words += f"its focal length is {share}."
             words += " The result counts it as scatter."
@@ -243,6 +249,18 @@ def _beyond(run: RunState) -> Iterator[Finding]:
                 mahalanobis_sq=max(changes),
                 up_to_mm=10.0 * max(percents) * distance_m,
             )
+
+
+def _shifted(of: str, zoom: Zoom, first: str, do: Remedy, gain: float) -> Finding:
+    """The finding that images are shifted from some view on."""
+    x_px, y_px = map(figure, zoom.shift_px)
+    return Finding(
+        "image_shifted",
+        f"{first[0].upper()}{first[1:]}the images are shifted by ({x_px}, {y_px}) px, as where another part of the "
+        f"sensor is read (a region of interest), or {of[0].lower()}{of[1:]} was hit.",
+        replace(do, words=do.words.replace("Fix zoom and focus", "Keep one region of interest")),
+        mahalanobis_sq=gain,
+    )
 
 
 def _of_fisheye(run: RunState, name: str, of: str) -> Finding | None:
@@ -277,4 +295,7 @@ def _of_fisheye(run: RunState, name: str, of: str) -> Finding | None:
 LENS = Suspect("lens", _stated, 1e-4, True, ("board_size", "board_shape", ARM_ERRORS))
 FIELD = Suspect("lens_field", _beyond, 1e-4, True)
 FOCUS = Suspect("focus", None, 1e-4, True)
+SHIFTED = Suspect(
+    "image_shifted", None, 1e-4, True, ("moved_at_once", "something_moved", "place", ARM_ERRORS)
+)
 MODEL = Suspect("lens_model", None, 1e-4, True, hides=("lens_field", "focus"))

@@ -83,6 +83,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     steps.MOVED_SLOWLY,
     lens.FIELD,
     lens.FOCUS,
+    lens.SHIFTED,
     lens.MODEL,
     Suspect("prior", _contradicted, 2.7e-3),
     lens.LENS,
