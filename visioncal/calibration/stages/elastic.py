@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.core.limits import CONTRADICTION, DETERMINED
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Finding, Remedy
+from visioncal.core.verdict import NOTE, Finding, Remedy
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
 from visioncal.estimation.armpair import ArmData
@@ -83,6 +83,10 @@ def load_ranges(loads: Loads) -> dict[str, Any]:
     return {"payload_kg": kg, **stated}
 
 
+# Play of which half turns the flange by thrice an industrial arm's repeatability [rad].
+_PLAY_RAD = 1e-3
+# Play of which half turns the flange by thrice an industrial arm's repeatability [rad].
+_PLAY_RAD = 1e-3
 # Loads from which on gears are tried for two slopes [N], torques among which their knees are, as
 # quantiles, and the least square of a second slope's change over its variance: chance leaves 10 in
 # one of a hundred arms, whose six joints each have seven knees.
@@ -260,20 +264,22 @@ def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ..
 
 
 def play_findings(plays: Sequence[JointBacklash]) -> Iterator[Finding]:
-    """Finding of joints with significant backlash."""
+    """Finding of joints with significant backlash: a note where that is little."""
+    sure = [play for play in plays if play.is_sure]
+    if not sure:
+        return
     words = ", ".join(
         f"{play.joint} {figure(1e3 * abs(play.deadband_rad))} +- "
         f"{figure(1e3 * play.sigma_rad)} mrad"
-        for play in plays
-        if play.is_sure
+        for play in sure
     )
-    if words:
-        yield Finding(
-            "joint_play",
-            f"Joints have play: {words}. The calibrated arm stands in the middle of it; of the "
-            "first stop, no motion tells the side.",
-            Remedy(
-                "Approach every stop and every pick from the same side where half of that matters, "
-                "or have the gear adjusted."
-            ),
-        )
+    largest_rad = max(abs(play.deadband_rad) for play in sure)
+    yield Finding(
+        "joint_play" if largest_rad > _PLAY_RAD else NOTE,
+        f"Joints have play: {words}. The calibrated arm stands in the middle of it; of the first "
+        "stop, no motion tells the side.",
+        Remedy(
+            "Approach every stop and every pick from the same side where half of that matters, or "
+            "have the gear adjusted."
+        ),
+    )

@@ -256,8 +256,9 @@ def _shifted(of: str, zoom: Zoom, first: str, do: Remedy, gain: float) -> Findin
     x_px, y_px = map(figure, zoom.shift_px)
     return Finding(
         "image_shifted",
-        f"{first[0].upper()}{first[1:]}the images are shifted by ({x_px}, {y_px}) px, as where another part of the "
-        f"sensor is read (a region of interest), or {of[0].lower()}{of[1:]} was hit.",
+        f"{first[0].upper()}{first[1:]}the images are shifted by ({x_px}, {y_px}) px, as where "
+        "another part of the sensor is read (a region of interest), or "
+        f"{of[0].lower()}{of[1:]} was hit.",
         replace(do, words=do.words.replace("Fix zoom and focus", "Keep one region of interest")),
         mahalanobis_sq=gain,
     )
