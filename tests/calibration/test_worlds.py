@@ -257,8 +257,8 @@ WORLDS: dict[str, World] = {
     "lens hit midway": World(
         OPEN,
         hit_midway,
-        causes=("moved_at_once",),
-        words=("The camera moved at once: from view 7 on",),
+        causes=("image_shifted",),
+        words=("^From view 7 on, the images are shifted by .*, or the lens was hit",),
         of=NONE,
     ),
     "autofocus": World(
