@@ -372,6 +372,20 @@ def test_corners_that_are_numbered_a_column_on_get_their_own_numbers(tmp_path, m
     assert not {"turned_board", "lost_views"} & {one.kind for one in mended.verdict.causes}
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_pictures_that_are_turned_from_a_view_on_are_no_other_camera(mount):
+    robot, boards = poses_of(mount)
+    boards[14:] = compose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ boards[14:]
+    cause = visioncal.calibrate(pairs_session(mount, robot, boards)).verdict.causes[0]
+    assert cause.views == (*range(14, 24),)
+    assert "from view 14 on, the pictures are turned by 180 deg" in cause.words
+    # Half a turn elsewhere is another camera's or tool's.
+    boards[14:, 0, 3] += 0.05
+    cause = visioncal.calibrate(pairs_session(mount, robot, boards)).verdict.causes[0]
+    assert cause.views == (*range(14, 24),)
+    assert "pictures" not in cause.words
+
+
 def test_views_that_a_symmetric_board_lets_read_turned_are_said_and_turned_back(
     tmp_path, monkeypatch
 ):
