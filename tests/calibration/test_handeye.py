@@ -16,13 +16,13 @@ import visioncal
 from visioncal.calibration.pipeline.starting import find_start
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cell import read_cell
-from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.pnp import estimate_poses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.closed_form import SOLVERS
+from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import fit_problem, solve_problem
 from visioncal.session import Session

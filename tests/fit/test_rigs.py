@@ -1,16 +1,12 @@
 """Cells of several arms, cameras and boards by the one likelihood."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
 from support.small_cells import PX, ROBOT_RAD, made
 from support.whole_cells import FLOOR, OPTIONS, PLATE, recorded
-from support.without_poses import without_poses
 
 from visioncal.core.transforms import invert, log
-from visioncal.fit.assemble import mixed_model
 from visioncal.fit.solve import solve
 from visioncal.model import read_cell
 from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, RobotAt, simulate
@@ -49,36 +45,6 @@ def test_arms_that_no_sighting_connects_are_eliminated_apart():
     fit = solve(apart).fit
     assert [body.width for body in fit.mixed.bodies] == [6, 6]
     assert fit.used.mean() > 0.9
-
-
-def refitted(fit, used):
-    """The fit of other sightings, at the same linearisation and sizes."""
-    mixed = mixed_model(fit.cell, fit.unknowns, fit.linearised, fit.grams, used)
-    return replace(fit, mixed=mixed, used=used, estimate=mixed.at(fit.estimate.logs))
-
-
-def test_a_stop_left_out_is_predicted_as_by_a_refit_without_it():
-    session = recorded(simulate(replace(OPTIONS, stops=14, seed=2)))
-    fit = solve(read_cell(session, session.corners)).fit
-    stops = np.array([sighting.stop for sighting in fit.cell.sightings])
-    seen_by_all = [stop for stop in range(14) if (stops == stop).sum() >= 3]
-    # One sighting is not used from the beginning: it is predicted without its stop, too.
-    used = fit.used.copy()
-    used[np.flatnonzero(stops == seen_by_all[0])[0]] = False
-    fit = refitted(fit, used)
-    left_out, one_by_one = fit.stops_left_out(), fit.left_out()
-    for stop in (seen_by_all[0], seen_by_all[-1]):
-        refit = without_poses(fit, stops == stop).left_out()
-        for row in np.flatnonzero(stops == stop):
-            sigma = np.sqrt(np.diagonal(left_out.own[row] + left_out.predicted[row]))
-            assert np.abs((left_out.away[row] - refit.away[row]) / sigma).max() < 1e-4
-            assert left_out.squares[row] == pytest.approx(refit.squares[row], rel=1e-3)
-    # Beside another sighting of its hand, a stop tells where the hand is; without its stop nothing
-    # does.
-    moved = [fit.cell.sightings[row].seen != "target_floor" for row in range(len(stops))]
-    wider = np.trace(left_out.predicted - one_by_one.predicted, axis1=1, axis2=2)
-    assert (wider > -1e-12).all()
-    assert wider[moved].max() > 1e-8
 
 
 @pytest.mark.parametrize("in_hand", [True, False])

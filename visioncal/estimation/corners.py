@@ -312,20 +312,6 @@ class WithoutPoses:
         products[count:] -= lens_part.T @ products[:lens]
         return answer, products
 
-    def by_view(self, column: int, modes: FieldModes, lens_part: FloatArray) -> FloatArray:
-        """(v, c + 2 e) products of one column with all, by view; for stacks without `zooms`."""
-        stack, own = self.stack, self.left[:, :, column : column + 1]
-        by_columns = stack.products_by_view(own, self.left)
-        own = self.roots[stack.view_of, None, None] * own
-        by_modes = np.concatenate(
-            [
-                stack.products_with_modes(own, modes.at(corners), views)
-                for corners, views in stack.blocks()
-            ]
-        )
-        by_modes -= by_columns[:, :, : len(lens_part)] @ lens_part
-        return np.concatenate([by_columns, by_modes], axis=2)[:, 0]
-
 
 @dataclass(frozen=True, eq=False)
 class Reprojection:

@@ -40,8 +40,6 @@ class Scene:
     # Prior sigma of given fx, fy, cx, cy; None where not stated.
     matrix_sigma_px: float | None = None
     names: tuple[str, ...] = ("",)  # Names of several targets.
-    # Whether the focal length varies neither with the distance nor at random.
-    is_focus_fixed: bool = False
 
     @property
     def printed(self) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
-"""A fit: estimates with covariance, sightings left out, the budget, predictions."""
+"""A fit: estimates with covariance, sightings left out, predictions."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self, TypeAlias
@@ -150,17 +150,6 @@ class Fit:
         units = self.unknowns.units[at]
         return np.asarray(self.whole[at[:, None], at] * np.outer(units, units))
 
-    def budget(self, key: Key) -> Mapping[str, FloatArray]:
-        """Covariance of an unknown by what it is due to: each size's rows, and `stated` values."""
-        at = self.unknowns.slices[key]
-        units, found = self.unknowns.units[at], dict[str, FloatArray]()
-        for size, share in self.mixed.shares(self.estimate):
-            cause = self.unknowns.sizes[size].name if size >= 0 else "stated"
-            found[cause] = share[at, at] * np.outer(units, units)
-        if self.considered is not None:
-            found["considered"] = self.considered[at, at] * np.outer(units, units)
-        return found
-
     def left_out(self, grams: Sequence[Gram] | None = None) -> LeftOut:
         """Leaves the pose of each used sighting out in turn; others are predicted as they are.
 
@@ -197,74 +186,6 @@ class Fit:
         rest, known = np.eye(6) - share, values[:, :, None]
         away = own_pose - np.linalg.solve(rest, known - share @ own_pose)
         return away[:, :, 0], np.asarray(np.linalg.solve(rest, covariance), dtype=float), alone
-
-    def stops_left_out(self) -> LeftOut:
-        """Leaves each stop out in turn: no sighting at a stop predicts the others there.
-
-        As `left_out`, but that all poses at a stop are removed at once from the information about
-        common unknowns, and its flanges err by the noise that all others determine.
-        """
-        return LeftOut.of(self.cell, self._by_stop())
-
-    def _by_stop(self) -> Iterator[tuple[IntArray, _Deviation]]:
-        seen = dict[int, list[tuple[int, int]]]()
-        heads = [gram.heads(self.estimate.logs) for gram in self.grams]
-        for index, gram in enumerate(self.grams):
-            for row, stop in enumerate(gram.stops.tolist()):
-                seen.setdefault(stop, []).append((index, row))
-        for stop, sightings in seen.items():
-            columns = np.unique(np.concatenate([self.grams[at].columns for at, _ in sightings]))
-            added = np.zeros((len(columns) + 1, len(columns) + 1))
-            for at, row in sightings:
-                gram = self.grams[at].take(np.arange(len(self.grams[at].rows)) == row)
-                if self.used[gram.rows[0]]:
-                    _, mapped = _alone(own_heads := heads[at][row : row + 1])
-                    own = np.append(np.searchsorted(columns, gram.columns), len(columns))
-                    by_pose, f = gram.by_unknowns(mapped)[0], 6 * len(gram.flanges)
-                    of_pose = gram.by_unknowns(own_heads[:, :6, :-1])[0, :, f:]
-                    rows = np.column_stack([of_pose, own_heads[0, :6, -1]])
-                    added[own[:-1, None], own] += by_pose[:, f:].T @ rows
-            values, covariance = self._without_stop(stop, columns, added)
-            for at, row in sightings:
-                gram = self.grams[at].take(np.arange(len(self.grams[at].rows)) == row)
-                own = np.searchsorted(columns, gram.columns)
-                none = np.zeros(0)
-                sigmas = np.concatenate([none, *map(self.flange_sigmas, gram.flanges)])
-                past = [-self.linearised.errors[name][stop] for name in gram.flanges]
-                alone, mapped = _alone(own_heads := heads[at][row : row + 1])
-                both, f = gram.by_unknowns(mapped), 6 * len(gram.flanges)
-                by_errors, by_columns = both[:, :, :f], both[:, :, f:]
-                predicted = by_columns @ values[own] + by_errors @ np.concatenate([none, *past])
-                by_all = by_columns @ covariance[own[:, None], own] @ by_columns.swapaxes(1, 2)
-                within = (by_errors * sigmas**2) @ by_errors.swapaxes(1, 2) + by_all
-                away = (alone @ own_heads[:, :6, -1, None])[:, :, 0] - predicted
-                yield gram.rows, (away, within, alone)
-
-    def _without_stop(
-        self, stop: int, columns: IntArray, added: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Estimate (c,) and covariance (c, c) of columns without the rows at a stop.
-
-        Args:
-            stop: The stop.
-            columns: (c,) all on which its sightings depend.
-            added: (c + 1, c + 1) Gram matrix of its used sightings by these, and the residual.
-        """
-        for body, solved in zip(self.mixed.bodies, self.estimate.bodies, strict=True):
-            unit = int(np.searchsorted(body.stops, stop))
-            if unit == len(body.stops) or body.stops[unit] != stop:
-                continue
-            at = np.isin(body.columns, columns)
-            own = np.append(np.searchsorted(columns, body.columns[at]), len(columns))
-            # By errors at zero of the unknowns.
-            response = solved.response[unit]
-            none = solved.errors[unit] - response @ self.estimate.values[body.columns]
-            by = np.column_stack([-response[:, at], none])
-            added[own[:, None], own] -= by.T @ np.linalg.solve(solved.own[unit], by)
-        covariance = self.estimate.covariance[columns[:, None], columns]
-        values = self.estimate.values[columns] - covariance @ added[:-1, -1]
-        without = np.linalg.inv(np.eye(len(columns)) - covariance @ added[:-1, :-1])
-        return without @ values, without @ covariance
 
     def predict(self, seer: str, seen: str, moments: Moments) -> Prediction:
         """Predicts where a frame will be in another, with covariance.

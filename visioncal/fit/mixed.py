@@ -212,28 +212,6 @@ class Mixed:
             curvature[both[:, None], both] += 2.0 / width**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
         return replace(found, value=value, gradient=gradient, curvature=curvature)
 
-    def shares(self, found: Estimate) -> list[tuple[int, FloatArray]]:
-        """Covariance (p, p) of the common unknowns by each term; all of them sum to the whole.
-
-        As far as the term's rows are noise: `C M C` with M the term's information about the common
-        unknowns, errors replaced by their response.
-        """
-        weights, found_shares = weights_at(found.logs), []
-        for term in self.terms:
-            reduced = np.zeros((self.count, self.count))
-            t = term.columns
-            reduced[t[:, None], t] += term.common[:-1, :-1]
-            for part in term.parts:
-                c, response = self.bodies[part.body].columns, found.bodies[part.body].response
-                own = np.einsum("umc,umn,und->cd", response, part.errors, response, optimize=True)
-                reduced[c[:, None], c] += own
-                mixed = np.einsum("umc,umt->ct", response, part.cross[:, :, :-1], optimize=True)
-                reduced[c[:, None], part.columns] += mixed
-                reduced[part.columns[:, None], c] += mixed.T
-            by = found.covariance @ reduced @ found.covariance
-            found_shares.append((term.size, weights[term.size] * by))
-        return found_shares
-
 
 def weights_at(logs: FloatArray) -> FloatArray:
     """(t + 1,) inverse variances of rows by their size; of size -1, one: these are whitened."""

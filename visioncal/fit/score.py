@@ -16,7 +16,6 @@ from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field, fields_of_lengths, orders_of_waves, waves
 from visioncal.fit.linearise import Gram, Pair, corner_rows, images_of, of_pose_alone
 from visioncal.fit.mixed import body_with, weights_at
-from visioncal.fit.unknowns import Key
 from visioncal.model.effects import Effect
 
 # Sizes that are tried, over one that the data would just show.
@@ -161,21 +160,6 @@ def added_by(fit: Fit, effect: Effect) -> list[Added]:
         own = np.tensordot(local[:, :, rows], moves, ((0, 2), (0, 1)))
         added.append(Added(gram, local, own))
     return added
-
-
-def of_unknown(fit: Fit, key: Key, maps: FloatArray) -> Score:
-    """The score of columns (d) of an edge or a lens that differ by (s, d, c) from stop to stop."""
-    added, own = list[Added](), fit.unknowns.columns(*key)
-    for gram in _used(fit):
-        if not np.isin(own, gram.columns).all():
-            continue
-        places = 6 * len(gram.flanges) + np.array([np.argmax(gram.columns == c) for c in own])
-        head = gram.head
-        local = np.eye(head, gram.fixed.shape[0])[None].repeat(len(gram.rows), axis=0)
-        moves = gram.by_unknowns(local)[:, :, places] @ maps[gram.stops]
-        local = np.swapaxes(moves, 1, 2) @ gram.heads(fit.estimate.logs)
-        added.append(Added(gram, local, (local[:, :, :head] @ moves).sum(axis=0)))
-    return score(fit, added, maps.shape[2], fit.freedom)
 
 
 def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:

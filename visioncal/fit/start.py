@@ -1,4 +1,4 @@
-"""Start of a fit: lenses and boards' poses by OpenCV, edges by closed forms.
+"""Start of a fit: lenses by corners alone, poses and edges by closed forms.
 
 A flat board has two poses, and a symmetric one has the same image after a turn: all stay candidates
 until edges decide between them.
@@ -8,17 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from visioncal.core.errors import ConvergenceError, DataError
-from visioncal.core.limits import FEWEST_VIEWS
-from visioncal.core.number_format import counted
+from visioncal.core.errors import ConvergenceError, DegenerateError
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import (
     Camera,
-    CameraKind,
     Corners,
     FloatArray,
     IntArray,
@@ -26,14 +21,16 @@ from visioncal.core.types import (
     Target,
     evenly,
 )
+from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.estimation.poses import closed_form_poses, determines_pose
 from visioncal.fit.consensus import Candidates, distances_m
 from visioncal.fit.joining import Network, Relation
-from visioncal.fit.weights import by_homography, first_weighed, on_planes
-from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
+from visioncal.fit.weights import first_weighed, on_planes
+from visioncal.model import Cell, MeasuredPlace, MeasuredPose
 from visioncal.model.sightings import Evidence
+from visioncal.session.document import CameraTable
 from visioncal.vision.camera import project
-from visioncal.vision.targets import corner_positions, rotation_transforms, rotations
+from visioncal.vision.targets import corner_positions, first_corners, rotation_transforms, rotations
 
 # Most images of which a lens is estimated.
 _IMAGES = 40
@@ -42,8 +39,6 @@ _FOCAL, _FOCALS, _SQUARE = (0.25, 10.0), 12, 0.05
 # The second pose of a flat board stays where it fits within this factor and addition [px].
 _ALIKE, _ALIKE_PX = 2.0, 0.3
 _NO_POSE = "corners that determine no pose: all, or all but one, lie in one row of the target"
-# Distortion moves corners off a homography by this and more [px].
-_LEAST_PX = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,73 +171,40 @@ def start_lenses(cell: Cell, known: Mapping[str, Camera]) -> dict[str, Camera]:
     for frame in dict.fromkeys(s.seer for s in cell.sightings if s.corners is not None):
         table = cell.cameras[frame]
         lens = known.get(frame, table.stated)
-        if lens is not None:
-            found[frame] = lens
-            continue
-        seen = [s for s in cell.sightings if s.seer == frame and s.corners is not None]
-        # Corners on a line, or a few beside many, mislead the closed form of focal lengths.
-        typical = np.median([len(at.corners.ids) for at in seen if at.corners]) if seen else 0
-        seen = [at for at in seen if at.corners and _shows_lens(cell, at, float(typical))]
-        if len(seen) < FEWEST_VIEWS:
-            raise DataError(
-                f"intrinsics: {counted(len(seen), 'view', ('shows', 'show'))} the target, and at "
-                f"least {FEWEST_VIEWS} are needed.",
-                culprits=["views"],
-                next_step="Add views, or give matrix and distortion in [camera].",
-            )
-        seen = [seen[at] for at in evenly(len(seen), _IMAGES)]
-        px, points = [], []
-        for sighting in seen:
-            if (corners := sighting.corners) is not None:
-                board = corner_positions(cell.boards[sighting.seen])[corners.ids]
-                agrees = by_homography(board, corners.px, least_px=_LEAST_PX).agreeing
-                px.append(corners.px[agrees].astype(np.float32)[:, None])
-                points.append(board[agrees].astype(np.float32)[:, None])
-        most = np.max([at.max(axis=(0, 1)) for at in px], axis=0)
-        size = table.size or (int(most[0]) + 1, int(most[1]) + 1)
-        try:
-            found[frame] = _by_corners(table.model, size, points, px)
-        except cv2.error:  # No closed form starts it.
-            none = np.zeros(4 if table.model == "fisheye" else 5)
-            found[frame] = Camera(table.model, size, np.array([1.0, 1.0, *size]), none)
-        if not _is_made(found[frame]):
-            found[frame] = _lens_by_motion(cell, frame, found[frame])
+        if lens is None:
+            lens = _by_corners(cell, frame, table)
+            fx, fy = lens.matrix[:2] / lens.resolution[0]
+            # Lenses are made with square pixels and such focal lengths.
+            if not (_FOCAL[0] < fx < _FOCAL[1] and abs(np.log(fx / fy)) < _SQUARE):
+                lens = _lens_by_motion(cell, frame, lens)
+        found[frame] = lens
     return found
 
 
-def _by_corners(
-    model: CameraKind,
-    size: tuple[int, int],
-    points: Sequence[NDArray[np.float32]],
-    px: Sequence[NDArray[np.float32]],
-) -> Camera:
-    """A lens by corners (n, 1, 3) of boards and their pixels (n, 1, 2), view by view."""
-    if model == "fisheye":
-        focal = 0.4 * size[0]
-        guess = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1.0]])
-        flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
-        flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
-        _, matrix, lens, *_ = cv2.fisheye.calibrate(
-            points, px, size, guess, np.zeros(4), flags=flags
-        )
-    else:
-        _, matrix, lens, *_ = cv2.calibrateCamera(points, px, size, np.eye(3), np.zeros(5))
-    four = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], float)
-    return Camera(model, size, four, np.asarray(lens, float).ravel()[:5])
-
-
-def _shows_lens(cell: Cell, sighting: Sighting, typical: float) -> bool:
-    """Whether an image has half of the typical number of corners, and not on a line."""
-    corners = sighting.corners
-    if corners is None or 2 * len(corners.ids) < typical:
-        return False
-    return determines_pose(corner_positions(cell.boards[sighting.seen])[corners.ids])
-
-
-def _is_made(lens: Camera) -> bool:
-    """Whether a lens has square pixels and a focal length that are made."""
-    fx, fy = lens.matrix[:2] / lens.resolution[0]
-    return bool(_FOCAL[0] < fx < _FOCAL[1] and abs(np.log(fx / fy)) < _SQUARE)
+def _by_corners(cell: Cell, frame: str, table: CameraTable) -> Camera:
+    """A lens by the corners of some images; one of no focal length where these tell nothing."""
+    seen = {at: s for at, s in enumerate(cell.sightings) if s.seer == frame and s.corners}
+    # Corners on a line, or a few beside many, mislead the closed form of focal lengths.
+    typical = np.median([len(s.corners.ids) for s in seen.values() if s.corners])
+    names = tuple(dict.fromkeys(s.seen for s in seen.values()))
+    boards = [cell.boards[name] for name in names]
+    firsts = dict(zip(names, first_corners(boards).tolist(), strict=True))
+    corners = {
+        at: replace(s.corners, ids=s.corners.ids + firsts[s.seen])
+        for at, s in seen.items()
+        if s.corners is not None
+        and 2 * len(s.corners.ids) >= typical
+        and determines_pose(corner_positions(cell.boards[s.seen])[s.corners.ids])
+    }
+    rows = [*corners]
+    corners = {rows[at]: corners[rows[at]] for at in evenly(len(rows), _IMAGES)}
+    most = np.max([np.ones(2), *(at.px.max(axis=0) for at in corners.values())], axis=0)
+    size = table.size or (int(most[0]) + 1, int(most[1]) + 1)
+    try:
+        return estimate_intrinsics(corners, boards, size, table.model).camera
+    except (ConvergenceError, DegenerateError):
+        none = np.zeros(4 if table.model == "fisheye" else 5)
+        return Camera(table.model, size, np.array([1.0, 1.0, *size]), none)
 
 
 def _lens_by_motion(cell: Cell, frame: str, lens: Camera) -> Camera:

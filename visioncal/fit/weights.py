@@ -77,19 +77,13 @@ def on_planes(cell: Cell, lenses: Mapping[str, Camera]) -> dict[int, FloatArray]
     return found
 
 
-def by_homography(
-    points: FloatArray,
-    px: FloatArray,
-    weights: FloatArray | None = None,
-    least_px: float = _CORNER_PX,
-) -> _Judged:
+def by_homography(points: FloatArray, px: FloatArray, weights: FloatArray | None = None) -> _Judged:
     """Judges the corners of a flat board by a homography (least median of squares, if need be).
 
     Args:
         points: (n, 3) the corners on the board.
         px: (n, 2) their pixels without distortion; NaN where it cannot be inverted: these agree.
         weights: (n,) of the corners.
-        least_px: Residuals that are none [px].
     """
     known = np.isfinite(px).all(axis=1)
     agreeing, flat, px = np.ones(len(px), bool), points[known, :2], px[known]
@@ -104,9 +98,9 @@ def by_homography(
             return _Judged(agreeing, 0.0, 0)
         off = cv2.perspectiveTransform(flat[:, None], found)[:, 0] - px
         lengths = each * np.linalg.norm(off, axis=1)
-        if inside.all() and method == 0 and _within(lengths, least_px, _SUSPECT).all():
+        if inside.all() and method == 0 and _within(lengths, _CORNER_PX, _SUSPECT).all():
             break
-        inside = _within(lengths, least_px)
+        inside = _within(lengths, _CORNER_PX)
     agreeing[known] = inside
     return _Judged(agreeing, float(np.sum(lengths[inside] ** 2)), 2 * int(inside.sum()) - 8)
 

@@ -15,7 +15,6 @@ from visioncal.calibration.stages.detect import (
     unshown_rows,
 )
 from visioncal.calibration.stages.error_sizes import solve_session
-from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
 from visioncal.calibration.stages.repeats import with_stop_means, without_repeats
@@ -24,6 +23,7 @@ from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
+from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.document import CameraTable

@@ -114,7 +114,6 @@ class Observed:
                 tables[frame].intrinsics,
                 tables[frame].matrix_sigma_px,
                 tuple(boards),
-                is_focus_fixed=tables[frame].focus == "fixed",
             )
             for frame, lens in self.lenses.items()
             if boards and self.cameras[frame].pixel_px is not None

@@ -9,7 +9,6 @@ from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.error_sizes import Zoom
-from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CONTRADICTION
@@ -19,6 +18,7 @@ from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation import unknowns
 from visioncal.estimation.fit import Fit
+from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.estimation.joint import moved_mahalanobis_sq
 from visioncal.estimation.scene import ONLY_CAMERA
 from visioncal.model.effects.effect import SIGNIFICANT
