@@ -235,9 +235,11 @@ def creeps_of_frames(fit: Fit) -> Iterator[Effect]:
     """Creep of cameras and targets beside others on the same base or flange."""
     cell = fit.cell
     parents = {name: cell.tree.branches[name].parent for name in cell.unknown}
-    counts = Counter(parents.values())
+    counts, seen = (
+        Counter(parents.values()),
+        [cell.sightings[at] for at in np.flatnonzero(fit.used)],
+    )
     for name in (name for name in (*cell.cameras, *cell.boards) if name in parents):
-        seen = [cell.sightings[at] for at in np.flatnonzero(fit.used)]
         stops = {one.stop for one in seen if name in one.pair}
         if counts[parents[name]] > 1 and len(stops) >= processes.ENOUGH_STOPS:
             yield FrameCreeps(name)
