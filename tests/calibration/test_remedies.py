@@ -78,6 +78,10 @@ def moved_lens(document: dict) -> None:
     camera["matrix"] = np.add(camera["matrix"], [6.0, 6.0, -5.0, 4.0]).tolist()
 
 
+def without_distortion(document: dict) -> None:
+    document["camera"]["distortion"] = [0.0] * 5
+
+
 def turned_off(document: dict) -> None:
     document["mount"] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}[
         document["mount"]
@@ -132,6 +136,9 @@ FAULTS = {
         "board_size", options=replace(SOUND, board_scale=1.03), command="target make"
     ),
     "a lens of another camera": Fault("lens", document_of(moved_lens), command="calibrate"),
+    "a lens without its distortion": Fault(
+        "lens", document_of(without_distortion), command="--intrinsics estimate"
+    ),
     "a camera that was pushed for the last views": Fault(
         "something_moved", seen=pushed, options=replace(SOUND, views=32), command="--views 20-31"
     ),

@@ -9,13 +9,13 @@ from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.error_sizes import Zoom
-from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray
-from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
+from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy, mending
 from visioncal.estimation import unknowns
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.intrinsics import estimate_intrinsics
@@ -36,10 +36,10 @@ _CROPPED_PX, _EXPLAINED = 10.0, 0.1
 _LONE = ("gridboard", "marker")
 # Another model of a lens leaves so much less: more than an even field does.
 _BETTER = 1.1
-_NEW_LENS = Remedy(
-    "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
-    "the camera anew.",
-    CALIBRATE,
+_NEW_LENS = mending(
+    "the lens is estimated from these views (or calibrate the camera anew, and state its matrix "
+    "and distortion)",
+    "--intrinsics estimate",
 )
 
 
@@ -297,6 +297,11 @@ LENS = Suspect("lens", _stated, 1e-4, True, ("board_size", "board_shape", ARM_ER
 FIELD = Suspect("lens_field", _beyond, 1e-4, True)
 FOCUS = Suspect("focus", None, 1e-4, True)
 SHIFTED = Suspect(
-    "image_shifted", None, 1e-4, True, ("moved_at_once", "something_moved", "place", ARM_ERRORS)
+    "image_shifted",
+    None,
+    1e-4,
+    True,
+    ("moved_at_once", "something_moved", "place", ARM_ERRORS),
+    INFLATED,
 )
 MODEL = Suspect("lens_model", None, 1e-4, True, hides=("lens_field", "focus"))

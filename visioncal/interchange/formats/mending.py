@@ -24,6 +24,8 @@ from visioncal.vision.targets import corner_positions
 
 # Columns of what a view shows; the rest of its row is the robot's pose.
 _OBSERVED = ("image", *MEASURED_CAM_POSE, *INSTRUMENT_POSITION, *INSTRUMENT_QUATERNION)
+# Keys by which a session states a lens.
+_OF_LENS = ("matrix", "distortion", "intrinsics", "matrix_sigma_px")
 # Columns that must agree between the two views.
 _MUST_AGREE = ("camera", "target", "instrument", "point")
 
@@ -211,3 +213,25 @@ def without_reported_poses(session: Session) -> Session:
     views = ranges([view.number for view in rows])
     note = f"the poses of views {views} are those of the joint angles, not the reported ones"
     return _with_cells(session, cells.values(), note)
+
+
+def without_stated_lenses(session: Session) -> Session:
+    """Drops matrix and distortion of all cameras, so that they are estimated.
+
+    Raises:
+        DataError: No lens is stated.
+    """
+    document, freed = {**session.document}, list[str]()
+    tables = {"camera": document.get("camera")}
+    tables |= {f"cameras.{name}": own for name, own in document.get("cameras", {}).items()}
+    for name, table in tables.items():
+        if table is not None and "matrix" in table:
+            rest = {key: value for key, value in table.items() if key not in _OF_LENS}
+            group, _, camera = name.partition(".")
+            document[group] = {**document[group], camera: rest} if camera else rest
+            freed.append(camera or name)
+    if not freed:
+        words = f"Session {session.name!r} states no lens."
+        raise DataError(words, culprits=["--intrinsics"], next_step="It is estimated already.")
+    note = f"matrix and distortion of {' and '.join(freed)} were dropped: they are estimated"
+    return session.with_content(document=noting(session, document, [note]))

@@ -25,6 +25,7 @@ from visioncal.interchange.formats.mending import (
     shift_views,
     turn_boards,
     without_reported_poses,
+    without_stated_lenses,
     write_positions,
 )
 from visioncal.interchange.formats.metrology import METROLOGY
@@ -57,6 +58,7 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
 )
 
 _DEFAULTS = ImportOptions()
+_FREE_LENSES = replace(_DEFAULTS, intrinsics="estimate")
 
 # Tries other readings of the poses, and selects one.
 Choose: TypeAlias = Callable[[DoubtfulSession], Candidate]
@@ -86,7 +88,7 @@ def convert(
     Args:
         source: The session, as a folder or an .rrd, or a recording in any of `FOREIGN_FORMATS`.
         dest: Destination; its suffix selects the format, and any other suffix means a folder.
-        requested: Options for a foreign recording.
+        requested: Options for a foreign recording; of a session lenses alone may be estimated.
         form: The name of its format; None to recognise it.
         force: Whether an existing file may be replaced; a folder never is.
         choose: Called with what was read, unless the only reading that agrees with the images or
@@ -130,7 +132,7 @@ def convert(
             choose, session = None, assemble(tested)
         else:
             doubtful = DoubtfulSession.of(replace(foreign, title=dest.resolve().stem))
-    elif requested != _DEFAULTS:
+    elif requested not in (_DEFAULTS, _FREE_LENSES):
         raise DataError(
             f"{source} is a session already; what describes poses and cameras is for somebody "
             "else's recording.",
@@ -152,8 +154,11 @@ def convert(
     )
     for mend, asked in mends:
         session = session if asked is None else mend(session, *asked)
-    if by_joints:
-        session = without_reported_poses(session)
+    for mend_whole, is_asked in (
+        (without_stated_lenses, is_session and requested == _FREE_LENSES),
+        (without_reported_poses, by_joints),
+    ):
+        session = mend_whole(session) if is_asked else session
     if mends_images:
         session = mend_images(session, requested.progress)
     write_session(session, dest)
