@@ -106,6 +106,9 @@ def test_two_cameras_of_one_arm_agree_within_a_bounded_search(real_data, monkeyp
     assert {125, 126, 325, 326} == {int(view) for view in re.findall(r"\d{3}", found[0].words)}
     # By another reference the board is 0.15 to 0.24 % smaller than stated, within its 0.5 %.
     assert not any(item.kind == "board_size" for item in found)
-    # A camera alone takes some 500 steps. Where cameras were reconciled by noise of the robot, two
-    # took more than 20,000.
-    assert len(steps) < 2000
+    # By the board alone, without the robot, camera 3 turns against camera 1 evenly all the time.
+    (crept,) = (item.words for item in found if item.kind == "frame_creeps")
+    assert "cam_cam3 by" in crept
+    # A camera alone takes some 500 steps, and two whose arm is calibrated beside some 2,000. Where
+    # cameras were reconciled by noise of the robot, two took more than 20,000.
+    assert len(steps) < 5000

@@ -125,6 +125,12 @@ def creeping(problem: Problem) -> tuple[str, ...]:
     return tuple(at.name.partition(" of ")[2] for at in creep_effects(problem))
 
 
+def may_have_crept(problem: Problem, frame: str) -> bool:
+    """Whether a frame is neither one that creeps, nor one of two places of one that moved."""
+    is_moved = "@" in frame or f"{frame}@2" in problem.tree.branches
+    return not is_moved and frame not in creeping(problem)
+
+
 def with_creep(
     problem: Problem, state: State, frame: str, change: FloatArray
 ) -> tuple[Problem, State]:
@@ -191,7 +197,7 @@ def find_move(
             rows = np.isfinite(problem.change_of(frame, fit.state)[:, 0, 0])
         if np.sum(~agrees[rows]) >= FEWEST_VIEWS:
             found += [(*step, frame) for step in _best_move(problem, fit, agrees, frame, rows)]
-            may_creep = frame not in (*bases, *creeping(problem)) and "@" not in frame
+            may_creep = frame not in bases and may_have_crept(problem, frame)
             crept = find_creep(problem, fit, agrees, frame) if may_creep else None
             if crept is not None and crept[0] >= FEWEST_VIEWS:
                 found.append((crept[0], -1, crept[1], frame))

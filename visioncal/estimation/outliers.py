@@ -27,6 +27,7 @@ from visioncal.estimation.moves import (
     creeping,
     explained_by_noise,
     find_move,
+    may_have_crept,
     moved,
     with_creep,
 )
@@ -185,7 +186,7 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
         creeps = [
             creep_effect(problem, fit.state, name).take(np.flatnonzero(used))
             for name in still
-            if "@" not in name
+            if may_have_crept(problem, name)
         ]
         if not (slight := find_steps(part, fit, candidates_of(part, still, creeps))):
             break
