@@ -26,6 +26,7 @@ from visioncal.vision.targets import corner_positions, first_corners
 _INSTEAD = {
     "base creeps": "the base, or what stands in it, crept",
     "mount creeps": "what the flange carries crept",
+    "frame creeps": "a camera or target crept",
     "base steps": "the base, or what stands in it, moved at once",
     "mount steps": "what the flange carries moved at once",
     "lens grows": "the lens crept",
