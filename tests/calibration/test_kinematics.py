@@ -452,16 +452,16 @@ def test_an_arm_that_is_right_but_for_its_play(way):
     assert arm_found(calibrated(one_side)).sections.arm.backlash == ()
 
 
-def test_play_is_told_by_the_last_motion_where_no_side_is_stated():
+def test_play_follows_from_the_last_motion_where_no_side_is_stated():
     cell = simulate(replace(GOOD, views=40, seed=3))
     worn, play = cell.robot.joints.copy(), 4e-3
     worn[:, 1] -= 0.5 * play * sides_of_motion(worn)[:, 1]
     poses = forward(cell.robot.arm, worn)
     known = calibrated(reporting(cell, joints=worn, base_from_flange=poses, approach=None))
-    told = arm_found(known).sections.arm.backlash[1]
-    assert abs(told.deadband_rad - play) < 3.5 * told.sigma_rad
+    row = arm_found(known).sections.arm.backlash[1]
+    assert abs(row.deadband_rad - play) < 3.5 * row.sigma_rad
     assert known.verdict.causes[0].kind == "joint_play"
-    # Nothing tells where the joints of the first stop came from.
+    # Nothing shows where the joints of the first stop came from.
     assert [view.view for view in result_of(known).views if not view.used] in ([], [0])
     edge = result_of(known).edges["flange_from_cam"]
     # Chi-square of six exceeds this in one case of a thousand.

@@ -5,7 +5,7 @@ time. Such motion is found by the number of observations that only it explains. 
 is within the noise of single observations.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +25,7 @@ _LEAST_SHARE = 0.25
 _CANDIDATES = 24
 # Name of the effect of a frame that creeps, before its owner's.
 CREEP = "creep"
-# Share of the session that two observations lie apart at least, whose difference tells a speed.
+# Share of the session that two observations lie apart at least, whose difference shows a speed.
 _APART = 0.25
 
 
@@ -104,31 +104,38 @@ def _progress(stops: IntArray, problem: Problem) -> FloatArray:
     return np.asarray(stops / max(last, 1) - 1.0)
 
 
-def creep_effect(problem: Problem, state: State, frame: str, rate: float = 0.0) -> Effect:
-    """Motion of a frame up to its pose at the last stop, a twist in its own axes there.
+@dataclass(frozen=True, eq=False)
+class Creep(Effect):
+    """Motion of a frame up to its pose at the last stop, a twist in its own axes there."""
 
-    It fades by a rate over the session; by zero it is even.
-    """
-    jacobian = problem.linear(state, ideal=True).jacobian[:, :, problem.edge_columns(frame)]
-    left = still_to_come(_progress(problem.observations.stops, problem), rate)
-    flat = PriorInformation.flat(6)
-    return Effect.free(f"{CREEP} of {frame}", flat, jacobian * left[:, None, None])
+    frame: str = ""
+    rate: float = 0.0  # By which it fades, over the session; zero of an even one.
+
+    @classmethod
+    def at(cls, problem: Problem, state: State, frame: str, rate: float = 0.0) -> "Creep":
+        """The motion of a frame of a problem, linearised at a state."""
+        jacobian = problem.linear(state, ideal=True).jacobian[:, :, problem.edge_columns(frame)]
+        left = still_to_come(_progress(problem.observations.stops, problem), rate)
+        flat = PriorInformation.flat(6)
+        free = cls.free(f"{CREEP} of {frame}", flat, jacobian * left[:, None, None])
+        return replace(free, frame=frame, rate=rate)
 
 
-def creep_effects(problem: Problem) -> tuple[Effect, ...]:
+def creep_effects(problem: Problem) -> tuple[Creep, ...]:
     """The effects of a problem's frames that creep, in the order in which they were found."""
-    return tuple(at for at in problem.effects if at.name.partition(" of ")[0] == CREEP)
+    return tuple(effect for effect in problem.effects if isinstance(effect, Creep))
 
 
-def creeping(problem: Problem) -> tuple[str, ...]:
-    """Frames of a problem that creep."""
-    return tuple(at.name.partition(" of ")[2] for at in creep_effects(problem))
+def still_frames(problem: Problem, frames: Iterable[str]) -> list[str]:
+    """Those of some frames that do not creep: nothing creeps evenly, and the rest is no move."""
+    crept = {effect.frame for effect in creep_effects(problem)}
+    return [name for name in frames if name.partition("@")[0] not in crept]
 
 
 def may_have_crept(problem: Problem, frame: str) -> bool:
     """Whether a frame is neither one that creeps, nor one of two places of one that moved."""
     is_moved = "@" in frame or f"{frame}@2" in problem.tree.branches
-    return not is_moved and frame not in creeping(problem)
+    return not is_moved and frame in still_frames(problem, [frame])
 
 
 def with_creep(
@@ -137,7 +144,7 @@ def with_creep(
     """The problem in which a frame creeps by a (6,) twist, and its state: it was in the middle."""
     edges = state.edges.copy()
     edges[problem.unknown[frame]] = edges[problem.unknown[frame]] @ exp(-0.5 * change)
-    wide = problem.with_effects([*problem.effects, creep_effect(problem, state, frame)])
+    wide = problem.with_effects([*problem.effects, Creep.at(problem, state, frame)])
     return wide, State(edges, np.append(state.values, change))
 
 

@@ -22,13 +22,13 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.moves import (
     CREEP,
+    Creep,
     Move,
-    creep_effect,
-    creeping,
     explained_by_noise,
     find_move,
     may_have_crept,
     moved,
+    still_frames,
     with_creep,
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
@@ -180,11 +180,9 @@ def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
         return find_inliers(problem, agreed.fit.state, agreed.used, agreed.fit.noise)
     used, fit = _refined(problem, *_widened(problem, agreed.used, agreed.fit))
     while len(moves) < _MOST_MOVES:
-        part, crept = problem.subset(used), creeping(problem)
-        # Nothing creeps evenly: the rest of it is no move at once.
-        still = [name for name in movable if name.partition("@")[0] not in crept]
+        part, still = problem.subset(used), still_frames(problem, movable)
         creeps = [
-            creep_effect(problem, fit.state, name).take(np.flatnonzero(used))
+            Creep.at(problem, fit.state, name).take(np.flatnonzero(used))
             for name in still
             if may_have_crept(problem, name)
         ]

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
+from typing import Self
 
 import numpy as np
 
@@ -100,7 +101,7 @@ class Effect:
         known: PriorInformation,
         by_sensor: FloatArray | None = None,
         flange_jacobian: Mapping[str, FloatArray] = MappingProxyType({}),
-    ) -> "Effect":
+    ) -> Self:
         """An effect of free values, linearised at zero."""
         size = len(known.gradient)
         return cls(
@@ -110,7 +111,7 @@ class Effect:
     def __len__(self) -> int:
         return len(self.values)
 
-    def take(self, rows: IntArray) -> "Effect":
+    def take(self, rows: IntArray) -> Self:
         """Returns the effect for (m,) rows of the observations."""
         return replace(
             self,

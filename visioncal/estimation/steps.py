@@ -19,7 +19,7 @@ from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import ROUNDING, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
-from visioncal.estimation.moves import CREEP, fitted_change, moved
+from visioncal.estimation.moves import CREEP, Creep, fitted_change, moved
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State, by_size
 from visioncal.estimation.robot_likelihood import robot_likelihood
@@ -90,11 +90,11 @@ def frames_of(problem: Problem, frames: Sequence[str]) -> list[Candidate]:
 
 
 def candidates_of(
-    problem: Problem, frames: Sequence[str], creeps: Sequence[Effect]
+    problem: Problem, frames: Sequence[str], creeps: Sequence[Creep]
 ) -> list[Candidate]:
     """Frames that may have moved at once, and effects of those that may have crept."""
     first = np.array([int(problem.observations.stops.min())])
-    crept = [Candidate(CREEP, at.name.partition(" of ")[2], first, at) for at in creeps]
+    crept = [Candidate(CREEP, at.frame, first, at) for at in creeps]
     return [*frames_of(problem, frames), *crept]
 
 

@@ -140,6 +140,11 @@ class Unknowns:
         return {m.key: slice(a, b) for m, a, b in zip(self.members, ends, ends[1:], strict=False)}
 
     @property
+    def opened(self) -> tuple[Effect, ...]:
+        """Effects whose sizes are not held at their lower bounds."""
+        return tuple(effect for effect in self.effects if effect.name not in self.closed)
+
+    @property
     def count(self) -> int:
         """The number p of columns."""
         return sum(member.count for member in self.members)

@@ -37,7 +37,7 @@ from visioncal.estimation.chain import scatter
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import noise_intervals
-from visioncal.estimation.moves import creep_effect, creeping
+from visioncal.estimation.moves import Creep, creep_effects
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
@@ -312,7 +312,7 @@ def _problem(cell_fit: CellFit, observed: Observed, views: Sequence[ViewPoses]) 
         observations = observations.renamed(move.frame, move.twin, later)
     problem = replace(problem, observations=observations, points=fitted.points)
     edges = State(cell_fit.fit.state.edges, np.zeros(0))
-    creeps = [creep_effect(problem, edges, frame) for frame in creeping(fitted)]
+    creeps = [Creep.at(problem, edges, at.frame, at.rate) for at in creep_effects(fitted)]
     own = {
         effect.name: effect for effect in (*clock_effects(cell_fit.cell, observed.clocks), *creeps)
     }

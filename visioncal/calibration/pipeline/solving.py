@@ -37,7 +37,7 @@ from visioncal.core.types import Mask
 from visioncal.estimation.arm import LEVER_M, rows_of
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import fit_jointly, target_sizes
-from visioncal.estimation.moves import creep_effect, creep_effects
+from visioncal.estimation.moves import Creep, creep_effects
 from visioncal.estimation.observability import chain_words, check_determined
 from visioncal.estimation.outliers import (
     InlierFit,
@@ -438,7 +438,7 @@ def initial_inliers(start: Start) -> InlierFit:
     # Sizes are estimated from the corners, with the lenses.
     problem, state = inliers.problem, inliers.fit.state
     moved = {move.frame for move in inliers.moves}
-    creeps = [at for at in creep_effects(problem) if at.name.partition(" of ")[2] not in moved]
+    creeps = [effect for effect in creep_effects(problem) if effect.frame not in moved]
     values = [np.zeros(0), *(problem.values_of(effect.name, state) for effect in creeps)]
     fit = replace(inliers.fit, state=State(state.edges, np.concatenate(values)))
     return replace(inliers, problem=problem.with_effects(creeps), fit=fit)
@@ -450,14 +450,12 @@ def _with_creeps(start: Start, problem: Problem) -> tuple[Problem, State]:
     if start.solved is None or start.cell.mount is not None:
         return problem, state
     fit = start.solved.fit
-    for effect in fit.unknowns.effects:
-        if effect.name in fit.unknowns.closed or effect.frame not in problem.unknown:
-            continue
-        if isinstance(effect, FrameCreeps):
+    for effect in fit.unknowns.opened:
+        if isinstance(effect, FrameCreeps) and effect.frame in problem.unknown:
             edges, frame = state.edges.copy(), effect.frame
             edges[problem.unknown[frame]] = fit.edge(frame)
             state = State(edges, state.values)
-            creep = creep_effect(problem, state, frame, effect.rate)
+            creep = Creep.at(problem, state, frame, effect.rate)
             values = fit.state.values["effect", effect.name] / np.repeat([LEVER_M, 1.0], 3)
             problem = problem.with_effects([*problem.effects, creep])
             state = State(edges, np.append(state.values, values))

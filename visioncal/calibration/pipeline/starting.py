@@ -62,13 +62,8 @@ class Start:
         """Whether joints of a robot have play, by the one likelihood."""
         if self.solved is None:
             return False
-        unknowns, flange = self.solved.fit.unknowns, self.cell.tree.flanges.get(robot, "")
-        return any(
-            isinstance(effect, Play)
-            and effect.frame == flange
-            and effect.name not in unknowns.closed
-            for effect in unknowns.effects
-        )
+        opened, flange = self.solved.fit.unknowns.opened, self.cell.tree.flanges.get(robot, "")
+        return any(isinstance(effect, Play) and effect.frame == flange for effect in opened)
 
 
 def find_start(cell: Cell, observed: Observed, *, is_solved: bool) -> Start:

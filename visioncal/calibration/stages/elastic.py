@@ -277,7 +277,7 @@ def play_findings(plays: Sequence[JointBacklash]) -> Iterator[Finding]:
     yield Finding(
         "joint_play" if largest_rad > _PLAY_RAD else NOTE,
         f"Joints have play: {words}. The calibrated arm stands in the middle of it; of the first "
-        "stop, no motion tells the side.",
+        "stop, no motion shows the side.",
         Remedy(
             "Approach every stop and every pick from the same side where half of that matters, or "
             "have the gear adjusted."

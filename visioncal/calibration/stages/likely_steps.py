@@ -12,7 +12,7 @@ from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.arm import ArmErrors, stops_of
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import target_sizes
-from visioncal.estimation.moves import creeping
+from visioncal.estimation.moves import still_frames
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.solve import Solution, fit_problem
@@ -98,9 +98,7 @@ def likely_steps(
     robots = [robot for robot in problem.robots if len(stops_of(problem, robot)) >= FEWEST_STOPS]
     if not robots:
         return ()
-    # Nothing creeps evenly: the rest of it is no move at once.
-    crept = creeping(problem)
-    still = [name for name in problem.unknown if name.partition("@")[0] not in crept]
+    still = still_frames(problem, problem.unknown)
     candidates = frames_of(problem, still) + sizes_of(problem, fit)
     candidates += joints_of(problem, {name: offsets[name] for name in robots if name in offsets})
     candidates += [drift_of(problem, robot) for robot in robots]

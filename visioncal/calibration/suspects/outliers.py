@@ -24,7 +24,7 @@ from visioncal.core.transforms import (
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import TWIST_UNITS
-from visioncal.estimation.moves import creep_effects, creeping
+from visioncal.estimation.moves import creep_effects
 from visioncal.estimation.outliers import InlierFit
 from visioncal.results import Moved
 from visioncal.robot import Robot
@@ -107,10 +107,13 @@ def moved_finding(moved: Moved) -> Finding:
 def crept_findings(cell_fit: CellFit) -> Iterator[Finding]:
     """Finding that frames of a whole cell crept."""
     problem, state = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.fit.state
-    effects = creep_effects(problem)
-    ends = (exp(problem.values_of(effect.name, state)) for effect in effects)
-    away = [pose_difference(np.eye(4), end) for end in ends]
-    crept = sorted(zip(away, creeping(problem), strict=True), reverse=True)
+    crept = sorted(
+        (
+            (pose_difference(np.eye(4), exp(problem.values_of(at.name, state))), at.frame)
+            for at in creep_effects(problem)
+        ),
+        reverse=True,
+    )
     if crept:
         words = ", ".join(f"{frame} by {mm_and_deg(*by)}" for by, frame in crept)
         yield Finding(

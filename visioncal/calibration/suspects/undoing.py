@@ -43,7 +43,7 @@ _WRONG = float(np.log(0.05)) - 6.0 * float(np.log(2.0))
 _MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
 # A turn of a board differs by less from a quarter or half one [rad]; copies of poses by less.
 _NEAR_RAD, _SAME = 0.1, 1e-9
-# Of so few views, one that is wrong leaves a fit none to be told by.
+# Of so few views, one that is wrong bends the fit of all.
 _FEW = 7
 # Views are alike within so many medians.
 _UNEVEN = 7.0
