@@ -33,11 +33,10 @@ from visioncal.estimation.gating import gate
 from visioncal.estimation.lens_field import LensLevels, displacements, distances
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.mixed import (
-    CommonRows,
     MixedModel,
+    PriorInformation,
     SizePrior,
     Units,
-    level_weight,
     profile_interval,
 )
 from visioncal.estimation.poses import determines_pose
@@ -49,9 +48,9 @@ from visioncal.simulation import CAMERAS, CellOptions, cell_session, simulate
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions
 
-# Sizes: the noise of the first units and of common rows, two errors of units, and of two groups of
-# common unknowns, of which one has a share of the other, too.
-SIZES, UNKNOWNS, COMMON_ROWS = 5, 9, 15
+# Sizes: the noise of units, two of their errors, and of two groups of common unknowns, of which one
+# has a share of the other, too.
+SIZES, UNKNOWNS = 5, 9
 
 
 def positive(rng, *shape):
@@ -60,37 +59,22 @@ def positive(rng, *shape):
 
 
 class _Example:
-    """A model of two batches of units, common rows and a prior, beside its rows one by one."""
+    """A model of units and of a prior, beside its rows one by one."""
 
     def __init__(self, scale=1.0):
         rng = np.random.default_rng(0)
 
-        def unit(shape, sizes, *, is_known):
-            away, slopes = scale * rng.normal(size=shape), rng.normal(size=(*shape, UNKNOWNS))
-            known = positive(rng, *shape) if is_known else np.zeros((*shape, shape[1]))
-            return Units(away, slopes, known, positive(rng, len(sizes), *shape), sizes)
-
-        self.units = (
-            unit((7, 5), np.arange(3), is_known=False),
-            unit((4, 2), np.array([2]), is_known=True),
-        )
-        self.rows = rng.normal(size=(COMMON_ROWS, UNKNOWNS))
-        self.away = scale * rng.normal(size=COMMON_ROWS)
+        shape, sizes = (9, 5), np.arange(3)
+        away, slopes = scale * rng.normal(size=shape), rng.normal(size=(*shape, UNKNOWNS))
+        known = 0.1 * positive(rng, *shape)
+        self.units = Units(away, slopes, known, positive(rng, len(sizes), *shape), sizes)
         self.known = np.pad(rng.normal(size=(2, 5)), ((0, 0), (0, UNKNOWNS - 5)))
         self.shares = np.zeros((UNKNOWNS, SIZES))
         self.shares[5:7, 3], self.shares[7:, 4], self.shares[8, 3] = 1.0, [1.0, 2.0], 0.5
         self.prior = SizePrior.of_ratios([(1, 2)], SIZES, 0.6, 1.5)
         self.model = MixedModel(
             self.units,
-            (
-                CommonRows(
-                    *(self.rows.T @ each for each in (self.rows, self.away)),
-                    self.away @ self.away,
-                    COMMON_ROWS,
-                    noise=0,
-                ),
-                CommonRows(self.known.T @ self.known, np.zeros(UNKNOWNS)),
-            ),
+            PriorInformation(self.known.T @ self.known, np.zeros(UNKNOWNS)),
             self.shares,
             self.prior,
         )
@@ -98,23 +82,19 @@ class _Example:
     def covariance(self, logs):
         squares = np.exp(2.0 * logs)
         blocks = [
-            unit.known[at] + np.tensordot(squares[unit.sizes], unit.parts[:, at], axes=1)
-            for unit in self.units
-            for at in range(len(unit.residuals))
+            self.units.known[at] + np.tensordot(squares[:3], self.units.parts[:, at], axes=1)
+            for at in range(len(self.units.residuals))
         ]
-        noise = block_diag(*blocks, squares[0] * np.eye(COMMON_ROWS), np.eye(2))
+        noise = block_diag(*blocks, np.eye(2))
         return noise + (self.jacobian * (self.shares @ squares)) @ self.jacobian.T
 
     @property
     def jacobian(self):
-        units = [unit.jacobian.reshape(-1, UNKNOWNS) for unit in self.units]
-        return np.concatenate([*units, self.rows, self.known])
+        return np.concatenate([self.units.jacobian.reshape(-1, UNKNOWNS), self.known])
 
     @property
     def residuals(self):
-        return np.concatenate(
-            [*(unit.residuals.ravel() for unit in self.units), self.away, np.zeros(2)]
-        )
+        return np.append(self.units.residuals.ravel(), np.zeros(2))
 
     def projection(self, logs):
         """P of the restricted likelihood, and the information on the flat unknowns."""
@@ -171,7 +151,7 @@ def test_the_most_likely_sizes_have_no_slope_between_their_bounds():
 def test_the_likeliest_size_of_more_unknowns_is_that_of_the_likelihood(true_size):
     """In steps of a fifth, with all other sizes held, of errors that the first units share."""
     example, rng = _Example(), np.random.default_rng(1)
-    units = example.units[0]
+    units = example.units
     moved = rng.normal(size=(*units.residuals.shape, 8))
     units.residuals[:] += moved @ (true_size * rng.normal(size=8))
     everywhere = np.ones(len(moved), dtype=bool)
@@ -179,9 +159,9 @@ def test_the_likeliest_size_of_more_unknowns_is_that_of_the_likelihood(true_size
     without = example.value(LOGS)
 
     def beside(value):
-        added = value**2 * np.einsum("uik,vjk->uivj", moved, moved).reshape(35, 35)
+        added = value**2 * np.einsum("uik,vjk->uivj", moved, moved).reshape(45, 45)
         original = example.covariance
-        example.covariance = lambda logs: original(logs) + np.pad(added, (0, 8 + COMMON_ROWS + 2))
+        example.covariance = lambda logs: original(logs) + np.pad(added, (0, 2))
         try:
             return example.value(LOGS)
         finally:
@@ -209,19 +189,12 @@ def test_a_size_of_nothing_is_found_beside_a_large_one():
         parts,
         np.arange(2),
     )
-    model = MixedModel((units,), (), np.zeros((1, 2)))
+    model = MixedModel(units, PriorInformation.flat(1), np.zeros((1, 2)))
     found = model.maximised(np.log([3.0, 3.0]), np.log(1e-10), np.log(1e2))
     assert np.isfinite(found.value)
     # Forty of them tell a size to a ninth.
     assert np.exp(found.logs[0]) == pytest.approx(1.0, rel=0.4)
     assert np.exp(found.logs[1]) < 1e-5
-
-
-def test_a_size_counts_by_its_evidence_and_its_prior():
-    # Akaike: a parameter costs one in log-likelihood.
-    assert level_weight(2.0) == pytest.approx(0.5)
-    assert level_weight(2.0 + 2.0 * np.log(9.0), prior=0.1) == pytest.approx(0.5)
-    assert (level_weight(1e5, prior=1e-3), level_weight(-1e5)) == pytest.approx((1.0, 0.0))
 
 
 LEVELS = LensLevels(field=1.5, length=0.35, breathing=0.05, jitter=0.01)

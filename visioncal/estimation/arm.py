@@ -10,12 +10,13 @@ price of an uncalibrated arm.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit
 
 from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.mixed import LEAST_SIGMA, PriorInformation, level_weight
+from visioncal.estimation.mixed import LEAST_SIGMA, PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.robot_likelihood import RobotLikelihood
@@ -161,12 +162,11 @@ def find_arm_errors(likelihood: RobotLikelihood, robot: int, basis: FloatArray) 
         start,
         np.append(seen, True),
         np.append(np.full(len(start) - 1, LEAST_SIGMA), _NOTHING),
-        # The search stops early where the likelihood seems not to reach that without them.
-        enough=likelihood.white[1],
     )
     gain = 2.0 * (likelihood.white[1] - value)
     if gain > SIGNIFICANT:
-        sigma = np.sqrt(level_weight(gain)) * sigmas[-1]
+        # Each parameter costs one in log-likelihood (Akaike 1974).
+        sigma = np.sqrt(expit(0.5 * gain - 1.0)) * sigmas[-1]
     else:
         levels = [np.append(likelihood.white[0], at) for at in _SIZES]
         gains = [

@@ -126,7 +126,7 @@ def estimate_arm_sizes(
         _, gain = plain.likelihood.model.likely_size(found, blocks.columns(HARMONICS), plain.mine)
         if 2.0 * gain > _LEAST_GAIN:
             logs = np.append(best.logs[: len(found.logs)], np.log(_TYPICAL[HARMONICS]))
-            tried = blocks.most_likely(logs, found.value - 0.5 * SIGNIFICANT)
+            tried = blocks.most_likely(logs)
         if tried is not None and tried.value < best.value:
             arm, best, waves, worse = blocks, tried, candidate, 0
         else:
@@ -219,13 +219,10 @@ class _Blocks:
         """Twice the gain in log-likelihood over the nominal arm."""
         return 2.0 * (self.nominal.white[1] - estimate.value)
 
-    def most_likely(self, start: FloatArray, enough: float = np.inf) -> MixedEstimate:
-        """Maximum-likelihood levels and sizes, from (2 r + g,) logarithms.
-
-        `enough` is a value that matters: the search ends once it is unlikely to be reached.
-        """
+    def most_likely(self, start: FloatArray) -> MixedEstimate:
+        """Maximum-likelihood levels and sizes, from (2 r + g,) logarithms."""
         low, high = np.log(LEAST_SIGMA), np.log(MOST_SIGMA)
-        return self.likelihood.model.maximised(start, low, high, enough, _LITTLE)
+        return self.likelihood.model.maximised(start, low, high, _LITTLE)
 
     def without(self, name: str, logs: FloatArray) -> tuple[Self, FloatArray]:
         """The same without a block, and the logarithms of the other sizes."""
@@ -249,7 +246,7 @@ class _Blocks:
         enough = best.value + 0.5 * SIGNIFICANT
         for _, lesser, logs in sorted(trials, key=lambda trial: trial[0]):
             with suppress(LinAlgError):
-                found = lesser.most_likely(logs, enough)
+                found = lesser.most_likely(logs)
                 if found.value < enough:
                     return lesser, found
         return None
@@ -284,8 +281,7 @@ def _sized(arm: _Blocks, best: MixedEstimate, waves: _Waves | None = None) -> Ar
     # Combinations that the observations do not determine keep their prior.
     block, second = errors[HARMONICS], errors.pop(_SECOND)
     share = second.sigma / block.sigma
-    (units,) = arm.likelihood.model.units
-    weights = np.linalg.inv(units.total(best.logs)[arm.mine])
+    weights = np.linalg.inv(arm.likelihood.model.units.total(best.logs)[arm.mine])
     jacobian = np.concatenate([share * arm.columns(_SECOND), arm.columns(HARMONICS)], axis=2)
     scaled = jacobian * block.sigma
     values, vectors = np.linalg.eigh(gram(scaled, weights @ scaled))

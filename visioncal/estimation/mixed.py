@@ -12,10 +12,10 @@ of units are eliminated unit by unit, so that an evaluation is linear in the num
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.special import expit, logit
 
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -23,16 +23,11 @@ from visioncal.estimation.linalg import NULL_SHARE, covariance_root, gram, inver
 
 # Bounds of the standard deviations, in units of the residuals [rad and m].
 LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
-# A step changes a sigma by a factor of e at most, unless it vanishes.
-_LONGEST_STEP = 1.0
+# Most change of a size's logarithm in one step, most steps, and least curvature, over that of each
+# size alone.
+_LONGEST_STEP, _STEPS, _FLAT = 1.5, 60, 0.1
 # A smaller gain of log-likelihood corresponds to a hundredth of the levels' uncertainty.
 LITTLE = 2e-5
-# Sizes near zero have a gradient below this, and at most this ratio of curvature to gradient (that
-# of a variance is 2): they become zero at once.
-_HARDLY, _VARIANCES = 0.1, 3.0
-# The actual gain is rarely more than this multiple of the second-order prediction, for steps up to
-# this length: at three times the initial level it is three times the prediction.
-_SURELY, _SHORT_STEP = 3.0, 0.5
 # Square root of the likelihood-ratio limit of a 95 % interval of one unknown.
 SURPRISE_95 = float(np.sqrt(chi2_limit(0.05, 1)))
 # First and largest half width and tolerance of its search, in logarithms of the sigma.
@@ -60,6 +55,22 @@ class LikelihoodValue:
     value: float
     gradient: FloatArray
     curvature: FloatArray
+
+
+class _Likelihood(Protocol):
+    """A likelihood with slopes by the (k,) logarithms of sizes."""
+
+    @property
+    def logs(self) -> FloatArray: ...
+    @property
+    def value(self) -> float: ...
+    @property
+    def gradient(self) -> FloatArray: ...
+    @property
+    def curvature(self) -> FloatArray: ...
+
+
+_Estimate = TypeVar("_Estimate", bound=_Likelihood)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,30 +128,6 @@ class Units:
 
 
 @dataclass(frozen=True, eq=False)
-class CommonRows:
-    """Rows that depend on the common unknowns alone, by their products; a prior is one, too."""
-
-    information: FloatArray  # (q, q) at a noise size of one.
-    gradient: FloatArray  # (q,) product of their Jacobian and their residuals.
-    cost: float = 0.0  # Squared residuals.
-    rows: float = 0.0  # Number of rows.
-    noise: int = -1  # Index of the size of their noise; -1 where their covariance is absolute.
-
-    def beside(self, count: int) -> "CommonRows":
-        """The same with `count` more unknowns, on which they do not depend."""
-        return replace(
-            self,
-            information=np.pad(self.information, (0, count)),
-            gradient=np.pad(self.gradient, (0, count)),
-        )
-
-    def left(self, values: FloatArray) -> tuple[FloatArray, float]:
-        """(q,) gradient and squared residuals at (q,) values."""
-        gradient = self.gradient - self.information @ values
-        return gradient, self.cost - float(values @ (self.gradient + gradient))
-
-
-@dataclass(frozen=True, eq=False)
 class WhiteUnits:
     """Units at some sizes, in units of their noise."""
 
@@ -160,10 +147,11 @@ class MixedEstimate(LikelihoodValue):
 
 @dataclass(frozen=True, eq=False)
 class MixedModel:
-    """Units and common rows, with q common unknowns and k sizes."""
+    """Units with q common unknowns, and k sizes."""
 
-    units: tuple[Units, ...]
-    common: tuple[CommonRows, ...]
+    units: Units
+    # Of the common unknowns, by all else; its gradient is the pull (q,) of its residuals.
+    common: PriorInformation
     # (q, k) variance of each common unknown by the square of each size; zeros where it is flat.
     shares: FloatArray
     # Prior of the sizes: it decides where the residuals cannot, because the common unknowns can
@@ -175,31 +163,16 @@ class MixedModel:
         sizes = np.exp(logs)
         is_random = self.shares.any(axis=1)
         variances = (self.shares @ sizes**2)[is_random]
-        gradient = np.zeros(len(self.shares))
-        information = np.diag(gradient)
-        information[is_random, is_random] = 1.0 / variances
-        value, white = float(np.log(variances).sum()), []
-        for unit in self.units:
-            at = unit.white(logs)
-            information += gram(at.jacobian, at.jacobian)
-            gradient += gram(at.jacobian, at.residuals)
-            value -= 2.0 * float(np.linalg.slogdet(at.whitening)[1].sum())
-            white.append(at)
-        for rows in self.common:
-            weight = 1.0 if rows.noise < 0 else sizes[rows.noise] ** -2.0
-            information += weight * rows.information
-            gradient += weight * rows.gradient
-            if rows.noise >= 0:
-                value += 2.0 * rows.rows * float(logs[rows.noise])
+        at, known = self.units.white(logs), self.common
+        information = known.information + gram(at.jacobian, at.jacobian)
+        information[is_random, is_random] += 1.0 / variances
         root = covariance_root(information)
-        values = root @ (root.T @ gradient)
-        value += float(np.sum(values[is_random] ** 2 / variances))
-        value -= 2.0 * float(np.linalg.slogdet(root)[1])
-        left = [replace(at, residuals=at.residuals - at.jacobian @ values) for at in white]
-        value += sum(float(np.sum(at.residuals**2)) for at in left)
-        for rows in self.common:
-            weight = 1.0 if rows.noise < 0 else sizes[rows.noise] ** -2.0
-            value += weight * rows.left(values)[1]
+        values = root @ (root.T @ (known.gradient + gram(at.jacobian, at.residuals)))
+        left = replace(at, residuals=at.residuals - at.jacobian @ values)
+        value = float(np.log(variances).sum() + np.sum(values[is_random] ** 2 / variances))
+        value -= 2.0 * float(np.linalg.slogdet(at.whitening)[1].sum() + np.linalg.slogdet(root)[1])
+        value += float(np.sum(left.residuals**2))
+        value -= float(values @ (2.0 * known.gradient - known.information @ values))
         flat = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
         here = MixedEstimate(0.5 * value, *flat, logs, values, root)
         gradient, curvature = self._slopes(here, left) if is_sloped else flat
@@ -209,12 +182,10 @@ class MixedModel:
             value += 2.0 * prior.value
         return replace(here, value=0.5 * value, gradient=gradient, curvature=curvature)
 
-    def _slopes(
-        self, here: MixedEstimate, white: Sequence[WhiteUnits]
-    ) -> tuple[FloatArray, FloatArray]:
+    def _slopes(self, here: MixedEstimate, at: WhiteUnits) -> tuple[FloatArray, FloatArray]:
         """Gradient (k,) and average information (k, k) by the logarithms of the sizes."""
         variances, values, root = np.exp(2.0 * here.logs), here.values, here.root
-        by_size = np.zeros(len(variances))
+        by_size, unit = np.zeros(len(variances)), self.units
         is_random = self.shares.any(axis=1)
         own = self.shares[is_random] @ variances
         # Variance of each random unknown by each size.
@@ -225,38 +196,22 @@ class MixedModel:
         # weighted residuals. Their products, less what the unknowns absorb, are the information.
         along = np.zeros((len(values), len(variances)))
         along[is_random] = 2.0 * parts * (values[is_random] / own)[:, None]
-        average, absorbed = np.zeros((len(variances),) * 2), np.zeros_like(along)
-        for unit, at in zip(self.units, white, strict=True):
-            back = np.swapaxes(at.whitening, 1, 2)
-            fitted = times_root(at.jacobian, root)
-            remaining = np.eye(fitted.shape[1]) - fitted @ np.swapaxes(fitted, 1, 2)
-            remaining = back @ remaining @ at.whitening
-            pulled = back @ at.residuals[:, :, None]
-            pulls = (unit.parts @ pulled)[..., 0]
-            traces = np.tensordot(unit.parts, remaining, axes=([1, 2, 3], [0, 1, 2]))
-            squares = variances[unit.sizes]
-            by_size[unit.sizes] += squares * (traces - np.sum(pulls * pulled[..., 0], axis=(1, 2)))
-            working = at.jacobian @ along
-            moved = at.whitening @ np.moveaxis(2.0 * squares[:, None, None] * pulls, 0, 2)
-            working[:, :, unit.sizes] += moved
-            average += gram(working, working)
-            absorbed += gram(at.jacobian, working)
-        for rows in self.common:
-            weight = 1.0 if rows.noise < 0 else 1.0 / variances[rows.noise]
-            rest, cost = rows.left(values)
-            products = rows.information @ along
-            average += weight * along.T @ products
-            absorbed += weight * products
-            if rows.noise < 0:
-                continue
-            trace = float(np.sum(root * (rows.information @ root)))
-            by_size[rows.noise] += rows.rows - weight * (cost + trace)
-            crossed = 2.0 * weight * rest @ along
-            average[rows.noise] += crossed
-            average[:, rows.noise] += crossed
-            average[rows.noise, rows.noise] += 4.0 * weight * cost
-            absorbed[:, rows.noise] += 2.0 * weight * rest
-        projected = root.T @ absorbed
+        back = np.swapaxes(at.whitening, 1, 2)
+        fitted = times_root(at.jacobian, root)
+        remaining = np.eye(fitted.shape[1]) - fitted @ np.swapaxes(fitted, 1, 2)
+        remaining = back @ remaining @ at.whitening
+        pulled = back @ at.residuals[:, :, None]
+        pulls = (unit.parts @ pulled)[..., 0]
+        traces = np.tensordot(unit.parts, remaining, axes=([1, 2, 3], [0, 1, 2]))
+        squares = variances[unit.sizes]
+        by_size[unit.sizes] += squares * (traces - np.sum(pulls * pulled[..., 0], axis=(1, 2)))
+        working = at.jacobian @ along
+        working[:, :, unit.sizes] += at.whitening @ np.moveaxis(
+            2.0 * squares[:, None, None] * pulls, 0, 2
+        )
+        products = self.common.information @ along
+        average = gram(working, working) + along.T @ products
+        projected = root.T @ (gram(at.jacobian, working) + products)
         return by_size, 0.5 * (average - projected.T @ projected)
 
     def likely_size(
@@ -265,10 +220,10 @@ class MixedModel:
         """Maximum-likelihood size of more random unknowns of equal variance, beside an estimate.
 
         With the other sizes held, the likelihood of a size is a sum over the eigenvalues of the
-        unknowns' information. `moved` is the (n, d, j) Jacobian of the n first units in the (u,)
+        unknowns' information. `moved` is the (n, d, j) Jacobian of the n units in the (u,)
         mask `among`. Returns the size within a tenth, and its gain of log-likelihood, or zeros.
         """
-        own = self.units[0].white(here.logs)
+        own = self.units.white(here.logs)
         residuals = own.residuals - own.jacobian @ here.values
         moved = own.whitening[among] @ moved
         absorbed = here.root.T @ gram(own.jacobian[among], moved)
@@ -289,104 +244,77 @@ class MixedModel:
         logs: FloatArray,
         low: FloatArray | float,
         high: FloatArray | float,
-        enough: float = np.inf,
         little: float = LITTLE,
     ) -> MixedEstimate:
-        """Finds the most likely sizes by damped Newton steps of their (k,) logarithms.
-
-        The curvature is the average information, corrected by the changes of the gradient along
-        the last steps (Dennis, Gay and Welsch 1981).
-
-        Args:
-            logs: (k,) initial logarithms.
-            low: Lower bounds; equal to `high` for fixed sizes.
-            high: Upper bounds.
-            enough: The search ends once it is unlikely to reach a value below this.
-            little: Predicted gain of log-likelihood below which the search has converged.
-        """
+        """Finds the most likely sizes from (k,) initial logarithms; see `maximised`."""
         low, high = np.broadcast_to(low, logs.shape), np.broadcast_to(high, logs.shape)
-        logs = np.clip(logs, low, high)
-        # A prior of its ratio to another keeps a size from becoming zero at once.
-        is_untied = np.ones(len(logs), dtype=bool)
-        if self.prior is not None:
-            is_untied &= ~self.prior.jacobian.any(axis=0)
-        now, damping, correction = self.at(logs), 1e-3, np.zeros((len(logs),) * 2)
-        for _ in range(60):
-            # Levels at a bound that they would cross are held there.
-            free = np.where(now.gradient > 0.0, logs > low, logs < high) & (low < high)
-            second = now.curvature + correction
-            curvature = second + damping * np.diag(np.maximum(np.diag(second), 1.0))
-            near_zero = (now.gradient > 0.0) & (now.gradient < _HARDLY) & (damping < 1.0)
-            vanishing = (
-                free & is_untied & near_zero & (np.diag(now.curvature) < _VARIANCES * now.gradient)
-            )
-            moving, least = free & ~vanishing, low - logs
-            # A vanishing variance affects the other levels like half a step of its logarithm.
-            fall = np.where(vanishing, 0.5 * np.expm1(2.0 * least), 0.0)
-            newton = _bounded_step(
-                now.gradient + curvature @ fall, curvature,
-                np.where(moving, np.maximum(least, -_LONGEST_STEP), 0.0),
-                np.where(moving, np.minimum(high - logs, _LONGEST_STEP), 0.0),
-            )  # fmt: skip
-            step = np.where(vanishing, least, newton)
-            predicted = -float(newton @ (now.gradient + second @ (fall + 0.5 * newton)))
-            predicted += 0.5 * float(now.gradient[vanishing].sum())
-            is_short = damping < 1.0 and np.abs(newton).max(initial=0.0) < _SHORT_STEP
-            if predicted < little or (is_short and now.value - _SURELY * predicted > enough):
-                break
-            trial = None
-            # Levels of very different size can make matrices numerically singular.
-            with suppress(np.linalg.LinAlgError):
-                trial = self.at(logs + step)
-            if trial is not None and trial.value <= now.value:
-                change = trial.gradient - now.gradient - now.curvature @ fall
-                correction = _corrected(trial.curvature, correction, newton, change)
-                logs, now, damping = logs + step, trial, max(damping / 10, 1e-6)
-            else:  # The next step is at most half as long.
-                damping = max(10.0 * damping, 1.0)
-        return now
+        return maximised(self.at, logs, low, high, little)[0]
 
 
-def _corrected(
-    curvature: FloatArray, correction: FloatArray, step: FloatArray, change: FloatArray
-) -> FloatArray:
-    """A correction of the curvature by the gradient's change along a short step; or zero."""
-    moved = step != 0.0
-    if np.abs(step).max(initial=0.0) > _SHORT_STEP or not moved.any():
-        return np.zeros_like(correction)
-    inner = np.ix_(moved, moved)
-    step, change, second = step[moved], change[moved], (curvature + correction)[inner]
-    along = second @ step
-    corrected = correction.copy()
-    # The gradient has to change by a share of what is predicted at least; of exact data nothing is.
-    if step @ change > 0.05 * (step @ along) > 0.0:
-        corrected[inner] += np.outer(change, change) / (step @ change)
-        corrected[inner] -= np.outer(along, along) / (step @ along)
-    return corrected
+def maximised(
+    at: Callable[[FloatArray], _Estimate],
+    start: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    little: float,
+) -> tuple[_Estimate, int]:
+    """Finds the most likely sizes by damped Newton steps of their (k,) logarithms.
 
+    The curvature is the average information, no direction's below a share of that of each size
+    alone (Levenberg 1944).
 
-def _bounded_step(
-    gradient: FloatArray, curvature: FloatArray, least: FloatArray, most: FloatArray
-) -> FloatArray:
-    """Newton step (k,) within bounds: clipped components are fixed and the others solved anew."""
-    step, bound = np.zeros(len(gradient)), least == most
-    for _ in range(len(gradient)):
-        rest = ~bound
-        target = -(gradient + curvature @ np.where(bound, step, 0.0))[rest]
-        step[rest] = np.linalg.solve(curvature[np.ix_(rest, rest)], target)
-        violated = rest & ((step < least) | (step > most))
-        if not violated.any():
-            break
-        step, bound = np.clip(step, least, most), bound | violated
-    return step
+    Args:
+        at: The negative log-likelihood with its slopes, at (k,) logarithms.
+        start: (k,) where the search begins.
+        low: (k,) lower bounds; equal to `high` for sizes that are held.
+        high: (k,) upper bounds.
+        little: Gain that is negligible.
 
-
-def level_weight(gain: float, prior: float = 0.5) -> float:
-    """Akaike weight of a non-zero level (Akaike 1974: each parameter costs 1 in log-likelihood).
-
-    `gain` is the decrease of twice the log-likelihood without it, `prior` its prior probability.
+    Returns:
+        The estimate, and how many likelihoods it took.
     """
-    return float(expit(0.5 * gain - 1.0 + logit(prior)))
+    found, count, damping = at(np.clip(start, low, high)), 1, 0.0
+    for _ in range(_STEPS):
+        # Sizes at a bound that they would cross are held there.
+        inside = (high > low) & ~((found.logs <= low) & (found.gradient > 0.0))
+        inside &= ~((found.logs >= high) & (found.gradient < 0.0))
+        step, promised = _step(found, np.flatnonzero(inside), damping)
+        if promised < little:
+            break
+        trial, count = None, count + 1
+        # Sizes of very different magnitude can make matrices numerically singular.
+        with suppress(np.linalg.LinAlgError):
+            trial = at(np.clip(found.logs + step, low, high))
+        if trial is not None and trial.value < found.value:
+            found, damping = trial, damping / 10.0 if damping > 1e-2 else 0.0
+        else:
+            damping = max(10.0 * damping, 1.0)
+    return found, count
+
+
+def _step(found: _Likelihood, inside: IntArray, damping: float) -> tuple[FloatArray, float]:
+    """A damped Newton step (k,) of some sizes, none longer than the longest, and what it promises.
+
+    What is clipped is fixed, and the others are solved anew: a size that vanishes goes far. The
+    average information may be indefinite: all solve the one matrix that is not.
+    """
+    step, slope = np.zeros(len(found.logs)), found.gradient[inside]
+    curvature = found.curvature[inside[:, None], inside]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 1e-8))
+    values, vectors = np.linalg.eigh(curvature * np.outer(scale, scale))
+    curvature = (vectors * (np.maximum(values, _FLAT) + damping)) @ vectors.T
+    slope = scale * slope
+    promised = 0.5 * float(slope @ np.linalg.solve(curvature, slope))
+    moved, rest = np.zeros(len(inside)), np.ones(len(inside), bool)
+    while rest.any():
+        pull = (slope + curvature @ np.where(rest, 0.0, moved))[rest]
+        moved[rest] = -np.linalg.solve(curvature[rest][:, rest], pull)
+        beyond = rest & (np.abs(scale * moved) > _LONGEST_STEP)
+        if not beyond.any():
+            break
+        moved, rest = np.clip(moved, -_LONGEST_STEP / scale, _LONGEST_STEP / scale), rest & ~beyond
+    step[inside] = scale * moved
+    return step, promised
 
 
 def profile_interval(

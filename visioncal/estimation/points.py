@@ -29,7 +29,7 @@ from visioncal.estimation.linalg import (
     eigenvalue_shares,
     gram,
 )
-from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedModel, Units
+from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedModel, PriorInformation, Units
 from visioncal.estimation.robot_likelihood import START_SIGMA
 from visioncal.estimation.robust import ROUNDS
 
@@ -80,7 +80,8 @@ class Groups:
 
     def level(self, start: float) -> float:
         """Noise by restricted maximum likelihood [m], searched from a start."""
-        model = MixedModel((self._units(),), (), np.zeros((self.jacobian.shape[2], 1)))
+        count = self.jacobian.shape[2]
+        model = MixedModel(self._units(), PriorInformation.flat(count), np.zeros((count, 1)))
         low, high = np.log([LEAST_SIGMA]), np.log([MOST_SIGMA])
         found = model.maximised(np.log([max(start, LEAST_SIGMA)]), low, high)
         return float(np.exp(found.logs[0]))

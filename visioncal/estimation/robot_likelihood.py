@@ -13,8 +13,8 @@ from visioncal.estimation.mixed import (
     LEAST_SIGMA,
     LITTLE,
     MOST_SIGMA,
-    CommonRows,
     MixedModel,
+    PriorInformation,
     SizePrior,
     Units,
 )
@@ -59,12 +59,12 @@ class RobotLikelihood:
     @property
     def jacobian(self) -> FloatArray:
         """(u, 6 w, q) Jacobian of the flange errors by the free unknowns."""
-        return self.model.units[0].jacobian
+        return self.model.units.jacobian
 
     @property
     def rms(self) -> FloatArray:
         """(2,) RMS of the flange errors' rotation [rad] and translation [m]."""
-        squares = self.model.units[0].residuals.reshape(-1, 2, 3) ** 2
+        squares = self.model.units.residuals.reshape(-1, 2, 3) ** 2
         return np.asarray(np.sqrt(np.mean(squares, axis=(0, 2))))
 
     def most_likely(
@@ -72,7 +72,6 @@ class RobotLikelihood:
         start: FloatArray,
         free: Mask,
         least: FloatArray | float = LEAST_SIGMA,
-        enough: float = np.inf,
         little: float = LITTLE,
     ) -> tuple[FloatArray, float]:
         """Finds the maximum-likelihood levels, and the negative log-likelihood there.
@@ -81,12 +80,11 @@ class RobotLikelihood:
             start: (r, 2) initial levels; or (2 r + k,) with k more sizes.
             free: (2 r + k,) mask of the sizes to estimate, robot by robot.
             least: Lower bound of the sizes.
-            enough: See `MixedModel.maximised`.
-            little: See `MixedModel.maximised`.
+            little: See `mixed.maximised`.
         """
         logs = np.log(np.maximum(start.ravel(), LEAST_SIGMA))
         low, high = (np.where(free, np.log(bound), logs) for bound in (least, MOST_SIGMA))
-        found = self.model.maximised(logs, low, high, enough, little)
+        found = self.model.maximised(logs, low, high, little)
         return np.exp(found.logs).reshape(start.shape), found.value
 
     def levels(self, *, from_above: bool) -> FloatArray:
@@ -145,7 +143,7 @@ class RobotLikelihood:
             typical: (g,) logarithms of typical sizes, which are their prior within a factor of e;
                 no prior if None.
         """
-        (units,), count = self.model.units, moves.shape[2]
+        units, known, count = self.model.units, self.model.common, moves.shape[2]
         jacobian = np.zeros((*units.residuals.shape, count))
         jacobian[(self.members == robot).any(axis=1)] = self.moved(robot, moves)
         units = replace(units, jacobian=np.concatenate([units.jacobian, jacobian], axis=2))
@@ -159,8 +157,10 @@ class RobotLikelihood:
         model = replace(
             self.model,
             prior=prior,
-            units=(units,),
-            common=tuple(rows.beside(count) for rows in self.model.common),
+            units=units,
+            common=PriorInformation(
+                np.pad(known.information, (0, count)), np.pad(known.gradient, (0, count))
+            ),
             shares=np.asarray(block_diag(self.model.shares, own)),
         )
         return replace(self, model=model)
@@ -203,8 +203,8 @@ def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLi
     levels = np.arange(2 * count)
     seen = np.intersect1d(np.arange(count), members)
     model = MixedModel(
-        (Units(reduced.errors, jacobian, reduced.covariance, parts, levels),),
-        (CommonRows(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),),
+        Units(reduced.errors, jacobian, reduced.covariance, parts, levels),
+        PriorInformation(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
         np.zeros((jacobian.shape[2], len(levels))),
         ratio_prior(seen.tolist(), len(levels)),
     )

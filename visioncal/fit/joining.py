@@ -210,7 +210,12 @@ class Network:
         Returns:
             The frames; those that depend on the unknown orientation of a board; what joined them.
         """
-        known = [*self._known(), *self._mounted_points()]
+        known = [
+            Relation(branch.parent, name, branch.known[None], 0.0)
+            for name, branch in self.tree.branches.items()
+            if branch.known is not None
+        ]
+        known += [*self.stated, *self._mounted_points()]
         apart = _Joined.apart(self.tree)
         for pair in self.oriented:
             if len(pair.segments) <= 2:
@@ -288,13 +293,6 @@ class Network:
                 return found
         return [*self._partly_solved(joined)]
 
-    def _known(self) -> Iterator[Relation]:
-        """The stated transforms."""
-        for name, branch in self.tree.branches.items():
-            if branch.known is not None:
-                yield Relation(branch.parent, name, branch.known[None], 0.0)
-        yield from self.stated
-
     def _parts(
         self, joined: _Joined, pair: _Pair, rows: IntArray, shift: int = 0
     ) -> tuple[list[tuple[str, str]], list[FloatArray]]:
@@ -358,7 +356,8 @@ class Network:
         if not _is_doubtful(least):
             return best, None
         for shift in _SHIFTS:
-            there = np.flatnonzero((stops + shift >= 0) & (stops + shift < self._stop_count))
+            last = len(next(iter(self.poses.values())))
+            there = np.flatnonzero((stops + shift >= 0) & (stops + shift < last))
             robots = [self.poses[step.robot][stops[there] + shift] for step in pair.robots]
             there = there[np.isfinite(robots).all(axis=(0, 2, 3))]
             if len(there) < max(half, FEWEST_VIEWS):
@@ -382,10 +381,6 @@ class Network:
                 wrong = np.isin(self.stops, gone)
                 wrong[rows[is_wrong]] = True
         return best, wrong
-
-    @property
-    def _stop_count(self) -> int:
-        return len(next(iter(self.poses.values())))
 
     def _partly_solved(self, joined: _Joined) -> Iterator[Relation]:
         """Relations where the motion determines them in part, and a prior may the rest.

@@ -289,7 +289,8 @@ def predicted(
         for effect in unknowns.effects:
             if effect.place == "edge" and effect.frame == name:
                 twist = twist + effect.twists(moments, state.values["effect", effect.name])
-        edge = moments.poses[name] if step.robot else _edge(cell, state, name)
+        known = moments.poses[name] if step.robot else cell.tree.branches[name].known
+        edge = state.values["edge", name] if known is None else known
         moved = exp(twist)
         edge = edge @ moved
         before, back = back, back @ (edge if step.is_up else invert(edge))
@@ -304,12 +305,6 @@ def predicted_sightings(cell: Cell, unknowns: Unknowns, state: State, pair: Pair
     """Predicts the k sightings of a pair, with the errors of the flanges at their stops."""
     errors = {name: errors[pair.stops] for name, errors in state.errors.items()}
     return predicted(cell, unknowns, state, pair.path, pair.moments, errors)
-
-
-def _edge(cell: Cell, state: State, name: str) -> FloatArray:
-    """(4, 4) `parent_from_frame`, unknown or known."""
-    known = cell.tree.branches[name].known
-    return state.values["edge", name] if known is None else known
 
 
 def linearised(

@@ -5,17 +5,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray
+from visioncal.estimation.mixed import maximised
 from visioncal.fit.mixed import Estimate, Mixed
 from visioncal.model.effects.effect import SIGNIFICANT, Size
 
 # Most change of a size's logarithm in one search: in the elimination, far sizes cancel to nothing.
 _FAR = 3.0
-# Most change in one step; gain of -2 log L that is negligible.
-_STEP, _LITTLE = 1.5, 1e-3
-_STEPS = 40
-# Least curvature, over that of each size alone.
-_FLAT = 0.1
+# Gain of -2 log L that is negligible.
+_LITTLE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +25,7 @@ class Found:
 
 
 def most_likely(mixed: Mixed, start: FloatArray, low: FloatArray, high: FloatArray) -> Found:
-    """Maximises the restricted likelihood by Fisher steps, within bounds.
+    """Maximises the restricted likelihood within bounds; see `estimation.mixed.maximised`.
 
     Args:
         mixed: The model.
@@ -37,40 +35,7 @@ def most_likely(mixed: Mixed, start: FloatArray, low: FloatArray, high: FloatArr
     """
     first = np.clip(start, low, high)
     least, most = np.maximum(low, first - _FAR), np.minimum(high, first + _FAR)
-    found, count, damping = mixed.at(first), 1, 0.0
-    for _ in range(_STEPS):
-        slope = found.gradient
-        inside = (most > least) & ~((found.logs <= least) & (slope > 0.0))
-        inside &= ~((found.logs >= most) & (slope < 0.0))
-        if not inside.any():
-            break
-        step = _step(found, inside, damping)
-        trial_logs = np.clip(found.logs + step, least, most)
-        moved = trial_logs - found.logs
-        gain = -float(moved @ slope + 0.5 * moved @ found.curvature @ moved)
-        if max(gain, -float(moved @ slope) / 2) < _LITTLE:
-            break
-        trial, count = mixed.at(trial_logs), count + 1
-        if trial.value < found.value:
-            found, damping = trial, damping / 10.0 if damping > 1e-2 else 0.0
-        else:
-            damping = max(10.0 * damping, 1.0)
-            if damping > 1e6:
-                break
-    return Found(found, count)
-
-
-def _step(found: Estimate, inside: Mask, damping: float) -> FloatArray:
-    """A damped Fisher step (t,) of the sizes in a mask, at most `_STEP` long in each."""
-    at = np.flatnonzero(inside)
-    curvature = found.curvature[at[:, None], at]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 1e-8))
-    values, vectors = np.linalg.eigh(curvature * np.outer(scale, scale))
-    values = np.maximum(values, _FLAT) + damping
-    step = np.zeros(len(inside))
-    pull = vectors.T @ (scale * found.gradient[at])
-    step[at] = -scale * (vectors @ (pull / values))
-    return step * min(1.0, _STEP / max(float(np.abs(step).max()), 1e-12))
+    return Found(*maximised(mixed.at, first, least, most, _LITTLE))
 
 
 def significant(

@@ -209,7 +209,8 @@ def unknowns_of(start: Start, effects: Sequence[Effect]) -> Unknowns:
             shaped = has_shape and name in pictured
             members.append(printed_board(name, board, has_shape=shaped, is_sized=is_sized))
     members += [random_effect(effect) for effect in effects]
-    erring = _erring(cell)
+    passed = {step.robot for pair in cell.pairs for step in cell.tree.path(*pair)}
+    erring = tuple(name for name in cell.arms if name in passed)
     noise, ratios = list(flange_noise(erring)), [(f"rad {name}", f"m {name}") for name in erring]
     compared = _compared(cell)
     for name in start.lenses:
@@ -258,12 +259,6 @@ def _measuring(cell: Cell) -> dict[str, bool]:
         elif isinstance(evidence, MeasuredPlace) and evidence.sigma_m is None:
             found[sighting.seer] = False
     return found
-
-
-def _erring(cell: Cell) -> tuple[str, ...]:
-    """Flanges whose errors some sighting shows."""
-    passed = {step.robot for pair in cell.pairs for step in cell.tree.path(*pair)}
-    return tuple(name for name in cell.arms if name in passed)
 
 
 def _compared(cell: Cell) -> set[str]:

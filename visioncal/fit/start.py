@@ -275,17 +275,13 @@ def _of_corners(
 ) -> _Options | None:
     px, points = corners.px, corner_positions(board)[corners.ids]
     poses = closed_form_poses(points, plane)
-    off = np.array([_off_px(lens, pose, points, px) for pose in poses])
+    away = [project(lens, apply(pose, points)) - px for pose in poses]
+    off = np.array([np.sqrt(np.nanmean(each**2)) for each in away])
     if not np.isfinite(off).any():
         return None
     alike = poses[off < _ALIKE * np.nanmin(off) + _ALIKE_PX]
     numbers = np.tile(np.arange(len(symmetries)), len(alike))
     return _Options((alike[:, None] @ symmetries).reshape(-1, 4, 4), numbers)
-
-
-def _off_px(lens: Camera, pose: FloatArray, points: FloatArray, px: FloatArray) -> float:
-    found = project(lens, apply(pose, points))
-    return float(np.sqrt(np.nanmean((found - px) ** 2)))
 
 
 def _network(cell: Cell, options: Sequence[_Options], early: float = 1.0) -> Network:

@@ -256,7 +256,7 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     values = run.assessment.fit.values((ARM, arm.robot))
     values = values if errors.is_estimated else np.zeros(errors.basis.shape[2])
     if model is None:
-        return FittedArm(of="links", values=values, hidden=True if not errors.gain else None)
+        return FittedArm(of="links", values=values, hidden=None if errors.is_likely else True)
     # Errors that are not part of its geometry, as functions of the joints are, depend on the loads
     # of a stop.
     loaded, kept = bool(model.values_by_stop.any()), model.is_kept

@@ -5,6 +5,7 @@ alike in one image; the robots' motion separates them.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +23,6 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Observations, State
 from visioncal.fit.consensus import Candidates
 from visioncal.fit.solve import CellFit, solve_from
-from visioncal.fit.start import Start as Begun
 from visioncal.model.effects import Play
 from visioncal.session import frame_name
 
@@ -89,7 +89,10 @@ def find_start(cell: Cell, observed: Observed, *, is_solved: bool) -> Start:
     if cell.mount is not None:
         refuse_too_few(problem, cell.mount)
     begun = session_start(observed, cell.reference, has_priors=bool(cell.priors))
-    solved = _solved(begun) if is_solved else None
+    solved = None
+    # Where it does not come to rest, the fit of poses says why.
+    with suppress(VisioncalError):
+        solved = solve_from(begun) if is_solved else None
     edges = dict(begun.edges)
     if solved is not None and cell.mount is not None and np.mean(solved.used) >= _MOST_AGREE:
         # In a whole cell, frames may have moved since.
@@ -166,15 +169,6 @@ def _ambiguous(
         # Nothing else decides between the poses of a frame's only view.
         ambiguous |= rows & (rows.sum() == 1) & (poses > 1)
     return ambiguous
-
-
-def _solved(begun: Begun) -> CellFit | None:
-    """The one likelihood of a session; None where it does not come to rest."""
-    try:
-        return solve_from(begun)
-    except VisioncalError:
-        # The fit of poses says why.
-        return None
 
 
 def targets_of(cell: Cell) -> dict[str, Target]:

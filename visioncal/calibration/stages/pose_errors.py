@@ -96,7 +96,7 @@ def _stop_errors(
     """Residuals of each stop alone, and their (s, d, 6) derivatives by a robot's flange."""
     index, count = problem.robots.index(robot), len(problem.poses[robot])
     likelihood = robot_likelihood(problem, state, noise)
-    (units,), (common,) = likelihood.model.units, likelihood.model.common
+    units, common = likelihood.model.units, likelihood.model.common
     with_robot = (likelihood.members == index).any(axis=1)
     levels = noise.robots.copy()
     levels[index] = 0.0

@@ -20,7 +20,6 @@ from visioncal.estimation.mixed import (
     MOST_SIGMA,
     MixedEstimate,
     PriorInformation,
-    level_weight,
 )
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
@@ -179,7 +178,8 @@ def _with_sizes(
             is_possible = (sizes[left] <= most[left]).all()
             others = [without([*closed, index], found.logs).value for index in left]
             weakest = int(np.argmin(others))
-            is_clear = level_weight(2.0 * (others[weakest] - found.value), _RARE) > 0.5
+            # Each size costs one in log-likelihood (Akaike 1974).
+            is_clear = others[weakest] - found.value > 1.0 - np.log(_RARE / (1.0 - _RARE))
             if is_clear and is_possible:
                 for index, other in zip(left, others, strict=True):
                     effect, size = effects[index], float(np.exp(found.logs[first + index]))
