@@ -64,7 +64,7 @@ def test_sizes_of_a_field_are_found_and_of_a_sound_cell_none():
     cell = simulate(CellOptions(views=30, seed=4))
     found = sizes_of(estimate_lenses(known_of(cell, joints=False)))
     (sound,) = found.levels.values()
-    assert (sound.field, sound.jitter, sound.gains) == (0.0, 0.0, (0.0, 0.0, 0.0))
+    assert (sound.field, sound.jitter, sound.gains) == (0.0, 0.0, (0.0,) * 4)
     assert not found.lenses
     moved = field_of(cell, 0.3, np.random.default_rng(2))
     found = sizes_of(estimate_lenses(known_of(moved, joints=False)))

@@ -17,7 +17,8 @@ from support.misfits import misfit
 
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.random_effects import KINDS
-from visioncal.core.transforms import exp, invert, log
+from visioncal.core.transforms import apply_each, exp, invert, log
+from visioncal.core.types import Corners
 from visioncal.results import Calibration
 from visioncal.simulation import BOARDS, CAMERAS, CellOptions, SimulatedCell, cell_session, simulate
 from visioncal.vision.camera import project
@@ -118,6 +119,19 @@ def breathing(cell):
 def zoomed_once(share):
     """A lens that is longer by a share from the tenth view on."""
     return lambda cell: zoomed(cell, share * (np.arange(len(cell.corners)) >= 9))
+
+
+def creeping(cell):
+    """Images that are read row by row in 25 ms by an arm that creeps by 30 mm/s and 1 deg/s."""
+    drawn = np.random.default_rng(4).standard_normal((len(cell.corners), 6))
+    moves, camera = 0.025 * drawn * np.repeat([0.0175, 0.03], 3), cell.options.camera
+    points, looks = corner_positions(cell.options.target), list[Corners]()
+    for seen, pose, move in zip(cell.corners, cell.cam_from_target, moves, strict=True):
+        share = seen.px[:, 1] / (camera.resolution[1] - 1) - 0.5
+        at = apply_each(exp(share[:, None] * move) @ pose, points[seen.ids])
+        still = project(camera, apply_each(np.tile(pose, (len(at), 1, 1)), points[seen.ids]))
+        looks.append(replace(seen, px=seen.px + project(camera, at) - still))
+    return showing(cell, looks)
 
 
 def wavy(cell):
@@ -343,6 +357,15 @@ WORLDS: dict[str, World] = {
         lambda cell: zoomed(cell, 0.012 * (time_of(cell) + 0.5)),
         causes=("focus",),
         words=(r"The lens crept.*its focal length became 1.2 % longer",),
+    ),
+    "images read while the arm creeps": World(
+        replace(FINE, views=24, state_intrinsics=False),
+        creeping,
+        status="check",
+        causes=("row_motion",),
+        words=(r"first row and its last, by (\S+) px",),
+        figure=(4.6, 0.7),
+        never=frozenset({"wrong_views", "lens_field", "focus", "image_shifted"}),
     ),
     # Boards that are not as drawn, or not as large as stated.
     "bent board": World(

@@ -197,7 +197,7 @@ def test_a_size_of_nothing_is_found_beside_a_large_one():
     assert np.exp(found.logs[1]) < 1e-5
 
 
-LEVELS = LensLevels(field=1.5, length=0.35, breathing=0.05, jitter=0.01)
+LEVELS = LensLevels(field=1.5, length=0.35, breathing=0.05, jitter=0.01, motion=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -236,8 +236,8 @@ def test_what_is_eliminated_is_noise_that_corners_share(corners):
     for view in range(views):
         rows = stack.view_of == view
         by_poses[rows, :, 6 * view : 6 * view + 6] = now.by_pose[rows]
-        zoom = np.where(rows[:, None], stack.zooms, 0.0).ravel()
-        covariance += np.outer(zoom, zoom)
+        own = np.where(rows[:, None, None], stack.zooms, 0.0).reshape(len(covariance), -1)
+        covariance += own @ own.T
     slopes = np.concatenate([by_poses, shared], axis=2).reshape(len(covariance), -1)
     normal = slopes.T @ np.linalg.solve(covariance, slopes)
     inner, size = normal[: 6 * views, : 6 * views], 6 * views

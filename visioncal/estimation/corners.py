@@ -48,8 +48,8 @@ class CornerStack:
     weights: FloatArray | None = None
     # Stated standard deviation of a corner of weight one [px]; None if not stated.
     stated_px: float | None = None
-    # (n, 2) displacement of the corners by one sigma of their view's focus jitter, in units of the
-    # corner noise, unweighted; None for no jitter.
+    # (n, 2, m) displacements of the corners by one sigma each of what differs from view to view
+    # (focus jitter, motion of rows), in units of the corner noise, unweighted; None for none.
     zooms: FloatArray | None = None
 
     @classmethod
@@ -102,7 +102,7 @@ class CornerStack:
     def weigh(self, *rows: FloatArray) -> None:
         """Whitens (n, 2, ...) rows by the corner noise, in place.
 
-        The noise is each corner's own, by its weight, and the focus jitter of its view.
+        The noise is each corner's own, by its weight, and what differs from view to view.
         """
         kept = [row for row in rows if row.size]
         if self.weights is not None:
@@ -118,21 +118,22 @@ class CornerStack:
 
     @cached_property
     def weighed_zooms(self) -> tuple[FloatArray, FloatArray]:
-        """(n, 2) weighted `zooms`, and (v,) the sums of their squares."""
+        """(n, 2, m) weighted `zooms`, orthogonal in each view, and (v, m) sums of their squares."""
         if self.zooms is None:
-            return np.zeros((len(self.px), 2)), np.zeros(len(self.starts))
-        weighted = self.given_weights[:, None] * self.zooms
-        return weighted, self.sum_by_view(np.sum(weighted**2, axis=1))
+            return np.zeros((len(self.px), 2, 0)), np.zeros((len(self.starts), 0))
+        weighted = self.given_weights[:, None, None] * self.zooms
+        squares, turned = np.linalg.eigh(self.products_by_view(weighted, weighted))
+        return self.products_with_views(weighted, turned), np.maximum(squares, 0.0)
 
     def refocus(self, array: FloatArray) -> None:
-        """Multiplies (n, 2, ...) rows by each view's (1 + z z^T)^(-1/2), z of `zooms`, in place."""
+        """Multiplies (n, 2, ...) rows by each view's (1 + Z Z^T)^(-1/2), Z of `zooms`, in place."""
         if self.zooms is None:
             return
         zooms, squares = self.weighed_zooms
         share = (1.0 - 1.0 / np.sqrt(1.0 + squares)) / np.maximum(squares, np.finfo(float).tiny)
         flat = array.reshape(len(array), 2, -1)
-        along = share[:, None] * self.products_by_view(zooms[:, :, None], flat)[:, 0]
-        removed = zooms[:, :, None] * along[self.view_of][:, None]
+        along = share[:, :, None] * self.products_by_view(zooms, flat)
+        removed = self.products_with_views(zooms, along)
         np.subtract(array, removed.reshape(array.shape), out=array)
 
     @property
@@ -281,12 +282,12 @@ class WithoutPoses:
             return self.answer, self.products
         stack, count = self.stack, self.left.shape[2]
         zooms, squares = stack.weighed_zooms
-        rows = np.concatenate([self.by_pose, zooms[:, :, None]], axis=2)
+        rows = np.concatenate([self.by_pose, zooms], axis=2)
         left = self.left * self.roots[stack.view_of, None, None]
         stack.refocus(rows[:, :, :6])
         stack.refocus(left)
         size, lens = count + 2 * modes.count, len(lens_part)
-        by_view = np.empty((len(self.roots), 7, 2 * modes.count))
+        by_view = np.empty((len(self.roots), rows.shape[2], 2 * modes.count))
         crossed = np.zeros((2 * count, modes.count))
         inner = np.zeros((modes.count, modes.count))
         for corners, views in stack.blocks():
@@ -300,7 +301,8 @@ class WithoutPoses:
         answer[:, :, :count], following = self.answer, answer[:, :, count:]
         np.matmul(-self.inverse, by_view[:, :6], out=following)
         by_view *= self.roots[:, None, None] ** 2
-        along = by_view[:, 6] / (self.roots * np.sqrt(1.0 + squares))[:, None]
+        along = by_view[:, 6:] / (self.roots[:, None] * np.sqrt(1.0 + squares))[:, :, None]
+        along = along.reshape(-1, along.shape[2])
         products = np.empty((size, size))
         products[:count, :count] = self.products
         products[:count, count:] = np.concatenate([crossed[:count], crossed[count:]], axis=1)

@@ -31,8 +31,9 @@ class LensLevels:
     length: float = 0.2  # The field's length, as a share of the image's width.
     breathing: float = 0.0  # Relative change of the focal length as the distance doubles [1/px].
     jitter: float = 0.0  # Relative change of the focal length from view to view [1/px].
-    # Fall of twice the log-likelihood without each of the three.
-    gains: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    motion: float = 0.0  # See `row_motions` [rad/px].
+    # Fall of twice the log-likelihood without each of the four.
+    gains: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
 def lens_part(camera: Camera, length: float) -> FloatArray:
@@ -62,8 +63,22 @@ def _over_image(camera: Camera) -> tuple[FloatArray, FloatArray]:
 
 
 def zooms(px: FloatArray, camera: Camera) -> FloatArray:
-    """(n, 2) derivative of corners at (n, 2) pixels by the relative focal length [px]."""
-    return np.asarray(px - camera.matrix[2:])
+    """(n, 2, 1) derivative of corners at (n, 2) pixels by the relative focal length [px]."""
+    return np.asarray(px - camera.matrix[2:])[:, :, None]
+
+
+def row_motions(px: FloatArray, camera: Camera) -> FloatArray:
+    """(n, 2, 4) displacements of corners at (n, 2) pixels by motion while rows are read [px].
+
+    By shifts along both axes, growth and turn of the image from its first row to its last [rad], of
+    which the middle row has none: what a plane does that faces the camera. A board that is tilted
+    moves otherwise by the share of its depth that its own depth is.
+    """
+    share = px[:, 1] / (camera.resolution[1] - 1) - 0.5
+    x, y = (px - camera.matrix[2:]).T
+    focal, none = np.full(len(px), float(np.mean(camera.matrix[:2]))), np.zeros(len(px))
+    moved = np.stack([np.array([focal, none, x, -y]), np.array([none, focal, y, x])])
+    return np.asarray(np.moveaxis(share * moved, (0, 2), (1, 0)))
 
 
 def depths_m(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
@@ -90,7 +105,7 @@ def breathing_columns(
     if size == 0.0:
         return np.zeros((len(px), 2, 0))
     far = distances(stack, cam_from_target)[stack.view_of]
-    return (size * far[:, None] * zooms(px, camera))[:, :, None]
+    return np.asarray(size * far[:, None, None] * zooms(px, camera))
 
 
 def displacements(

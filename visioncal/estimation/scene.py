@@ -15,7 +15,7 @@ from visioncal.estimation.appearance import (
     stated_board_sigma,
 )
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.lens_field import LensLevels, zooms
+from visioncal.estimation.lens_field import LensLevels, row_motions, zooms
 from visioncal.estimation.linalg import covariance_from
 from visioncal.vision.targets import numbered_positions
 
@@ -107,9 +107,13 @@ class CornerProblem:
 
     def with_levels(self, levels: LensLevels) -> "CornerProblem":
         """Returns the problem with lens errors beyond the model."""
-        zoomed = levels.jitter * zooms(self.stack.px, self.scene.camera)
-        stack = replace(self.stack, zooms=zoomed if levels.jitter > 0.0 else None)
-        return replace(self, stack=stack, levels=levels)
+        px, camera, of_views = self.stack.px, self.scene.camera, list[FloatArray]()
+        if levels.jitter > 0.0:
+            of_views.append(levels.jitter * zooms(px, camera))
+        if levels.motion > 0.0:
+            of_views.append(levels.motion * row_motions(px, camera))
+        zoomed = np.concatenate(of_views, axis=2) if of_views else None
+        return replace(self, stack=replace(self.stack, zooms=zoomed), levels=levels)
 
     @cached_property
     def covariance(self) -> FloatArray:

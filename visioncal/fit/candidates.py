@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.limits import CheckLimits
-from visioncal.core.types import evenly
+from visioncal.core.types import IntArray, evenly
 from visioncal.fit import processes
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
 from visioncal.fit.linearise import Pair, images_of
-from visioncal.fit.score import best_field, of_effect
+from visioncal.fit.score import best_field, of_effect, of_rows
 from visioncal.fit.trials import gain_of
 from visioncal.fit.unknowns import (
     State,
@@ -36,6 +36,7 @@ from visioncal.model.effects import (
     MountCreeps,
     MountSteps,
     Play,
+    RowMotion,
     Springs,
     Stood,
     Weight,
@@ -45,6 +46,8 @@ from visioncal.model.effects import (
 _RULED_OUT = float(np.log(CheckLimits.ruled_out))
 # Most stops after which a frame may have been moved, and a lens.
 _STEPS, _ZOOMS = 12, 60
+# Most stops at which images may move while they are read: four unknowns each.
+_MOVING = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +125,7 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """All that are not open yet, with their scores."""
     yield from beside_zooms(fit, scored(fit, effects_of_lenses(fit), sole_flange(fit)))
     yield from of_arms(fit, pairs)
+    yield from of_images(fit, pairs)
     yield from scored(fit, creeps_of_frames(fit))
     for flange in fit.unknowns.erring:
         yield from scored(fit, effects_of_frames(fit, flange), flange)
@@ -138,6 +142,24 @@ def of_stops(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     yield from of_arms(fit, pairs)
     jitters = [one for one in effects_of_lenses(fit) if isinstance(one, FocusJitter)]
     yield from beside_zooms(fit, scored(fit, jitters))
+
+
+def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
+    """Motion of rows while they are read, of cameras whose motion is not known."""
+    swept = {sweep.camera for sweep in fit.cell.sweeps}
+    for camera in fit.unknowns.lenses.keys() - swept:
+        effect = RowMotion(camera, fit.unknowns.lenses[camera], stops_of(fit, camera))
+        is_open = effect.name in {known.name for known in fit.unknowns.effects}
+        if not is_open and 0 < len(effect.stops) <= _MOVING:
+            score, bounds = of_rows(fit, pairs, effect.typical), effect.size
+            size, gain = score.best(np.ones(len(score.pull)), bounds.low, bounds.high)
+            yield Candidate(gain, starting_at(random_effect(effect), size), effect)
+
+
+def stops_of(fit: Fit, camera: str) -> IntArray:
+    """(s,) stops of the views of one camera."""
+    stops = [gram.stops for gram in fit.grams if gram.pair[0] == camera]
+    return np.unique(np.concatenate([np.zeros(0, int), *stops]))
 
 
 def of_arms(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
@@ -204,8 +226,7 @@ def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
             is_stated = fit.cell.cameras[camera].stated is not None
             yield Breathing(camera, lens, reference_m, is_stated)
             is_breathing = f"breathing {camera}" in fit.sizes.keys() - fit.unknowns.closed
-            stops = [gram.stops for gram in fit.grams if gram.pair[0] == camera]
-            yield FocusJitter(camera, lens, np.unique(np.concatenate(stops)), is_breathing)
+            yield FocusJitter(camera, lens, stops_of(fit, camera), is_breathing)
 
 
 def effects_of_arms(fit: Fit) -> Iterator[Effect]:

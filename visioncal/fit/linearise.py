@@ -30,7 +30,7 @@ from visioncal.fit.mixed import weights_at
 from visioncal.fit.unknowns import Key, State, Unknowns
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Moments, Sighting
 from visioncal.model.boards import shape_basis
-from visioncal.model.effects import Rolling
+from visioncal.model.effects import Rolling, RowMotion
 from visioncal.vision.camera import project_with_jacobian
 from visioncal.vision.targets import corner_positions
 
@@ -329,7 +329,7 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
     edges = [name for name in frames if ("edge", name) in unknowns]
     by_pose = [at.slopes[name] for name in (*flanges, *edges)]
     columns = [unknowns.columns("edge", name) for name in edges]
-    by_lens, of_lens = list[FloatArray](), list[IntArray]()
+    inner, of_inner = list[tuple[int, FloatArray]](), dict[Key, IntArray]()
     for effect in unknowns.effects:
         known = unknowns.columns("effect", effect.name)
         if effect.place == "edge" and effect.frame in frames:
@@ -337,16 +337,16 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
             slopes = effect.slopes(pair.moments, values)
             by_pose.append(at.by_effects[effect.frame] @ slopes)
             columns.append(known)
-        elif effect.place == "lens" and effect.frame == seer and pair.corners:
-            by_lens.append(effect.columns(pair.moments, distances))
-            of_lens.append(known)
-    columns += of_lens
+        elif effect.frame == seer and pair.corners and not isinstance(effect, Rolling):
+            key: Key = ("effect", effect.name)
+            first = int(own[("lens", seer) if effect.place == "lens" else key][0])
+            inner.append((first, effect.columns(pair.moments, distances)))
+            of_inner[key] = known
+    columns += of_inner.values()
     moves = np.concatenate([np.zeros((len(pair.rows), 6, 0)), *by_pose], axis=2)
-    if by_lens:
-        lens, old = np.concatenate(by_lens, axis=2), moves
-        moves = np.zeros((len(lens), 6 + lens.shape[1], old.shape[2] + lens.shape[2]))
-        moves[:, :6, : old.shape[2]], moves[:, 6:, old.shape[2] :] = old, lens
-    free = {key: places for key, places in own.items() if key in unknowns}
+    for first, by_local in inner:
+        moves = _beside(moves, first, by_local)
+    free = {key: at for key, at in own.items() if key in unknowns and key not in of_inner}
     kept = {key: places[: unknowns[key].count] for key, places in free.items()}
     columns += [unknowns.columns(*key)[: len(places)] for key, places in kept.items()]
     places = np.concatenate([np.zeros(0, int), *kept.values()]).astype(np.int64)
@@ -361,6 +361,14 @@ def _linearised(cell: Cell, unknowns: Unknowns, state: State, pair: Pair) -> Gra
         pair.names, pair.rows, pair.stops, pair.moments, distances, parts, flanges, moves, fixed,
         np.concatenate([np.zeros(0, int), *columns]), at.poses, at.by_effects,
     )  # fmt: skip
+
+
+def _beside(moves: FloatArray, first: int, others: FloatArray) -> FloatArray:
+    """Derivatives (k, m, c) of local columns beside (k, n, d) ones of those from `first` on."""
+    (rows, old), (more, new) = moves.shape[1:], others.shape[1:]
+    found = np.zeros((len(moves), max(rows, first + more), old + new))
+    found[:, :rows, :old], found[:, first : first + more, old:] = moves, others
+    return found
 
 
 def _corner_parts(unknowns: Unknowns, pair: Pair, rows: "CornerRows") -> tuple[Products, ...]:
@@ -418,7 +426,7 @@ MEASURED_NOISES = (
 class CornerRows:
     """Rows of n corners, by local columns."""
 
-    head: FloatArray  # (n, 2, h) by pose, lens, board, and a delay of the image's rows.
+    head: FloatArray  # (n, 2, h) by pose, lens, board, delay and motion of the image's rows.
     functions: FloatArray  # (n, r) by a field, along either axis.
     residual: FloatArray  # (n, 2).
     own: dict[Key, IntArray]  # Local columns of what is a sighting's own.
@@ -457,10 +465,14 @@ def corner_rows(
     columns |= {key: by_pose @ moved[:, :, None] for key, moved in delays.items()}
     residual = pair.px - found.px
     for effect in unknowns.effects:
-        if effect.place == "lens" and effect.frame == seer:
-            columns_of = effect.columns(pair.moments, pair.distances(poses))
-            moved = columns_of @ state.values["effect", effect.name]
-            residual = residual - (found.jacobian_intrinsics @ moved[pair.owner, :, None])[:, :, 0]
+        if effect.frame != seer or effect.place == "edge" or isinstance(effect, Rolling):
+            continue
+        by_own = found.jacobian_intrinsics
+        if isinstance(effect, RowMotion):
+            by_own = columns["effect", effect.name] = effect.shifts(pair.px)
+        columns_of = effect.columns(pair.moments, pair.distances(poses))
+        moved = columns_of @ state.values["effect", effect.name]
+        residual = residual - (by_own @ moved[pair.owner, :, None])[:, :, 0]
     functions = np.zeros((len(residual), 0))
     if seer in unknowns.fields:
         # Where corners are predicted: at those seen, a field could explain their noise.

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from visioncal.core.types import FloatArray
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field, fields_of_lengths, orders_of_waves, waves
 from visioncal.fit.linearise import Gram, Pair, corner_rows, images_of, of_pose_alone
 from visioncal.fit.mixed import body_with, weights_at
-from visioncal.model.effects import Effect
+from visioncal.model.effects import Effect, RowMotion
 
 # Sizes that are tried, over one that the data would just show.
 _TRIED = np.exp(np.linspace(-3.0, 5.0, 17))
@@ -160,6 +161,34 @@ def added_by(fit: Fit, effect: Effect) -> list[Added]:
         own = np.tensordot(local[:, :, rows], moves, ((0, 2), (0, 1)))
         added.append(Added(gram, local, own))
     return added
+
+
+def of_rows(fit: Fit, pairs: Sequence[Pair], motion: RowMotion) -> Score:
+    """The score of a motion of rows, by what each image shows beside a pose of its own.
+
+    What lens and board may absorb of it counts as if they did.
+    """
+    count, own = len(motion.stops), images_of(pairs, motion.frame)
+    pull, information = np.zeros((count, 4)), np.zeros((count, 4, 4))
+    for gram in fit.grams:
+        pair = next((one for one in own if np.array_equal(one.rows, gram.rows)), None)
+        kept = np.flatnonzero(fit.used[gram.rows] & np.isin(gram.stops, motion.stops))
+        if pair is None or not len(kept):
+            continue
+        twists = pair.twists(gram.by_effects)
+        rows = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, twists)
+        moved = motion.shifts(pair.px) * pair.weights[:, None, None]
+        by_pose, moved, residual = (
+            pair.padded(part)[kept].reshape(len(kept), -1, part.shape[2])
+            for part in (rows.head[:, :, :6], moved, rows.residual[:, :, None])
+        )
+        turned = np.swapaxes(by_pose, 1, 2)
+        moved = moved - by_pose @ (of_pose_alone(turned @ by_pose) @ (turned @ moved))
+        weighted = _weight(fit, gram) * np.swapaxes(moved, 1, 2)
+        at = np.searchsorted(motion.stops, gram.stops[kept])
+        np.add.at(pull, at, (weighted @ residual)[:, :, 0])
+        np.add.at(information, at, weighted @ moved)
+    return Score(pull.ravel(), np.asarray(block_diag(*information)), fit.of_corners)
 
 
 def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:

@@ -115,7 +115,7 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
     for effect, zoom, rms in _changed(fit):
         name, others = effect.frame, levels[effect.frame]
         jitter = float(np.hypot(others.jitter, rms / _noise_px(fit, name)))
-        gains = (*others.gains[:2], max(others.gains[2], _gain(fit, effect.name)))
+        gains = (*others.gains[:2], max(others.gains[2], _gain(fit, effect.name)), others.gains[3])
         levels[name] = replace(others, jitter=jitter, gains=gains)
         # A step beside a larger growth is what its course differs by.
         if abs(zoom.share) > grew.get(name, 0.0):
@@ -240,12 +240,12 @@ def _noise_px(fit: Fit, camera: str) -> float:
 
 def _levels(fit: Fit, camera: str) -> LensLevels:
     """Sizes of a lens's errors beyond its model, in units of the noise of its corners."""
-    names = [f"{of} {camera}" for of in ("field", "breathing", "focus jitter")]
+    names = [f"{of} {camera}" for of in ("field", "breathing", "focus jitter", "row motion")]
     px, at = _noise_px(fit, camera), fit.unknowns.fields.get(camera)
-    field_px, breathing, jitter = (_size(fit, name) / px for name in names)
-    of_field, of_breathing, of_jitter = (_gain(fit, name) for name in names)
-    gains = (of_field, of_breathing, of_jitter)
-    return LensLevels(field_px, at.length if at else 0.2, breathing, jitter, gains)
+    field_px, breathing, jitter, motion = (_size(fit, name) / px for name in names)
+    of_field, of_breathing, of_jitter, of_motion = (_gain(fit, name) for name in names)
+    gains = (of_field, of_breathing, of_jitter, of_motion)
+    return LensLevels(field_px, at.length if at else 0.2, breathing, jitter, motion, gains)
 
 
 def _grown(fit: Fit) -> Iterator[FoundEffect]:

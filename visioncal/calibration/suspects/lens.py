@@ -190,7 +190,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
     fit = run.assessment.fit
     for name, noise_px in fit.sigmas_px.items():
         levels, distance_m = fit.lens_levels(name), mean_distance_m(fit, name)
-        field, *changes = levels.gains
+        field, *changes = levels.gains[:3]
         of = "The lens" if len(fit.sigmas_px) == 1 else f"The lens of {name}"
         if field > SIGNIFICANT:
             if (model := _of_fisheye(run, name, of)) is not None:
@@ -251,6 +251,26 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             )
 
 
+def _moving(run: RunState) -> Iterator[Finding]:
+    """Images that move while their rows are read."""
+    fit = run.assessment.fit
+    for name, noise_px in fit.sigmas_px.items():
+        levels, optics = fit.lens_levels(name), fit.linearised.camera_parameters
+        if levels.gains[3] > SIGNIFICANT:
+            moved_px = levels.motion * noise_px * float(np.mean(optics.camera(name).matrix[:2]))
+            yield Finding(
+                "row_motion",
+                "The arm, or what it looks at, moved while pictures were read, as by a rolling "
+                f"shutter: between a picture's first row and its last, by {figure(moved_px)} px "
+                "(rms, along each axis). The result counts it, with poses of the middle rows.",
+                Remedy(
+                    "Wait until the arm stands still before each image; or sweep, with the times "
+                    "of images and robot (stamp_s, streams): then the motion is known."
+                ),
+                mahalanobis_sq=levels.gains[3],
+            ).of("" if name == ONLY_CAMERA else name)
+
+
 def _shifted(of: str, zoom: Zoom, first: str, do: Remedy, gain: float) -> Finding:
     """The finding that images are shifted from some view on."""
     x_px, y_px = map(figure, zoom.shift_px)
@@ -304,4 +324,5 @@ SHIFTED = Suspect(
     ("moved_at_once", "something_moved", "place", ARM_ERRORS),
     INFLATED,
 )
+MOTION = Suspect("row_motion", _moving, 1e-4, True)
 MODEL = Suspect("lens_model", None, 1e-4, True, hides=("lens_field", "focus"))

@@ -84,6 +84,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     lens.FIELD,
     lens.FOCUS,
     lens.SHIFTED,
+    lens.MOTION,
     lens.MODEL,
     Suspect("prior", _contradicted, 2.7e-3),
     lens.LENS,

@@ -24,6 +24,7 @@ from visioncal.model.effects.play import Play as Play
 from visioncal.model.effects.posture import BaseTilts as BaseTilts
 from visioncal.model.effects.posture import BracketBends as BracketBends
 from visioncal.model.effects.rolling import Rolling as Rolling
+from visioncal.model.effects.rolling import RowMotion as RowMotion
 from visioncal.model.effects.springs import Springs as Springs
 from visioncal.model.effects.springs import Weight as Weight
 from visioncal.model.effects.stops_short import MovesOn as MovesOn

@@ -1,10 +1,11 @@
 """A rolling shutter: the rows of an image are exposed one after the other."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.core.types import FloatArray
+from visioncal.core.types import Camera, FloatArray, IntArray, evenly
+from visioncal.estimation.lens_field import row_motions
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect
 
@@ -25,3 +26,37 @@ class Rolling(Effect):
         """See `Effect`: it moves no pose, since the middle row has the stamp."""
         del distances
         return np.zeros((len(moments), 6, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class RowMotion(Effect):
+    """Motion of the image while its rows are read, another one at each of some stops [rad].
+
+    Four values each: see `row_motions`. An arm that creeps meanwhile, at a speed that no stamp
+    tells, moves the image so; its pose is that of the middle row, or off by noise.
+    """
+
+    # Half a metre away, at 0.2 m/s, rows of 25 ms move by a hundredth.
+    place, kind, bounds = "corners", "row motion", (3e-3, 1e-7, 0.01)
+    lens: Camera
+    stops: IntArray  # (s,) in order.
+
+    @property
+    def count(self) -> int:
+        """See `Effect`."""
+        return 4 * len(self.stops)
+
+    @property
+    def typical(self) -> "RowMotion":
+        """See `Effect`."""
+        return replace(self, stops=self.stops[evenly(len(self.stops), 40)])
+
+    def shifts(self, px: FloatArray) -> FloatArray:
+        """(n, 2, 4) displacements of (n, 2) corners by a stop's own values."""
+        return row_motions(px, self.lens)
+
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """(k, 4, c) of the values at the moments' stops."""
+        del distances
+        is_own = moments.stops[:, None] == self.stops
+        return np.asarray(np.kron(is_own, np.eye(4)).reshape(len(is_own), 4, -1))
