@@ -71,7 +71,7 @@ class _Example:
         self.known = np.pad(rng.normal(size=(2, 5)), ((0, 0), (0, UNKNOWNS - 5)))
         self.shares = np.zeros((UNKNOWNS, SIZES))
         self.shares[5:7, 3], self.shares[7:, 4], self.shares[8, 3] = 1.0, [1.0, 2.0], 0.5
-        self.prior = SizePrior.of_ratios([(1, 2)], SIZES, 0.6, 1.5)
+        self.prior = SizePrior.of_ratios([(1, 2)], SIZES)
         self.model = MixedModel(
             self.units,
             PriorInformation(self.known.T @ self.known, np.zeros(UNKNOWNS)),

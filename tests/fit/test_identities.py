@@ -194,7 +194,7 @@ def test_the_curvature_is_the_mean_of_observed_and_expected_information():
         ahead, behind = (mixed.at(logs + sign * move).gradient for sign in (1, -1))
         observed[size] = (ahead - behind) / (2 * step)
     expected = dense.expected_information(logs)
-    expected += mixed.at(logs).curvature - replace(mixed, ratios=()).at(logs).curvature
+    expected += mixed.at(logs).curvature - replace(mixed, prior=None).at(logs).curvature
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     assert np.abs((observed + expected) / 2 - found.curvature).max() < 1e-3 * scale.max()
 
@@ -234,8 +234,7 @@ class Dense:
         solved = np.linalg.solve(inner, right)
         counts = sum(2 * t.count * logs[t.size] for t in self.mixed.terms if t.size >= 0)
         value = counts + full[-1, -1] - right @ solved + np.linalg.slogdet(inner)[1]
-        mean, width = self.mixed.ratio
-        return value + sum(((logs[b] - logs[a] - mean) / width) ** 2 for a, b in self.mixed.ratios)
+        return value + 2.0 * self.mixed.prior.at(logs).value
 
     def expected_information(self, logs):
         """2 tr(P V_t P V_s) of the log sizes: 4 (n - 2 c) on the diagonal, and 4 T."""

@@ -172,11 +172,6 @@ class Compressed:
         return covariance_from(self.information)
 
     @property
-    def field_freedom(self) -> float:
-        """Effective number of coefficients of lens errors that the corners determine."""
-        return 0.0 if self.coefficients is None else self.coefficients.freedom
-
-    @property
     def shared_gradient(self) -> FloatArray:
         """(k,) half the gradient by the appearance, of all views."""
         return np.asarray(self.shared_pulls.sum(axis=0))

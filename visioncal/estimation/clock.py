@@ -150,7 +150,8 @@ def fit_offset(
         not close, or too few frames are covered.
     """
     # Sparse frames taken at rest match over as long as the rests last.
-    near_s = NEAR_S if frames.are_dense else WIDEST_OFFSET_S
+    is_dense = len(frames) > 2 and float(np.median(np.diff(frames.stamps_s))) <= WINDOW_S
+    near_s = NEAR_S if is_dense else WIDEST_OFFSET_S
     recorded = _Recorded(robot, frames.only(evenly(len(frames), MOST_FRAMES)))
     with one_blas_thread():
         fits = [

@@ -38,11 +38,6 @@ class ImageTimes:
     def __len__(self) -> int:
         return len(self.stamps_s)
 
-    @property
-    def are_dense(self) -> bool:
-        """Whether they sample the motion itself, and not only the rests between motions."""
-        return len(self) > 2 and float(np.median(np.diff(self.stamps_s))) <= WINDOW_S
-
     def only(self, chosen: Mask | IntArray) -> "ImageTimes":
         """Returns some of the views, in ascending order."""
         stack, rows = self.stack, np.arange(len(self))[chosen]

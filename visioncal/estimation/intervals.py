@@ -6,10 +6,16 @@ from functools import partial
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.mixed import LEAST_SIGMA, SURPRISE_95, profile_interval
+from visioncal.estimation.mixed import (
+    LEAST_SIGMA,
+    RATIO_LOG_SIGMA,
+    SURPRISE_95,
+    TYPICAL_RATIO,
+    profile_interval,
+)
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.robot_likelihood import RATIO_LOG_SIGMA, TYPICAL_RATIO, robot_likelihood
+from visioncal.estimation.robot_likelihood import robot_likelihood
 
 # Logarithms of the integration's ends, from a hundredth, below which levels add nothing to a
 # variance, to nine; and the number of steps between, short ones near the most likely level.

@@ -42,24 +42,18 @@ def lens_part(camera: Camera, length: float) -> FloatArray:
     The modes along x come first, then those along y. A random field must be orthogonal to the fixed
     columns beside it (Hodges and Reich 2010).
     """
-    px, columns = _over_image(camera)
-    flat = columns.reshape(-1, columns.shape[2])
+    axes = (np.linspace(0.0, size - 1.0, _IMAGE_GRID) for size in camera.resolution)
+    px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    rays = normalise(camera, px)
+    seen = np.isfinite(rays).all(axis=1)
+    px, points = px[seen], np.column_stack([rays[seen], np.ones(int(seen.sum()))])
+    flat = np.concatenate(project_with_jacobian(camera, points).jacobian_intrinsics)
     scale = np.linalg.norm(flat, axis=0)
     scale[scale == 0.0] = 1.0
     inverse = np.linalg.pinv(flat / scale, rcond=_DETERMINED) / scale[:, None]
     by_axis = inverse.reshape(len(scale), -1, 2)
     modes = field_modes(px, camera.resolution, length).at(slice(None))
     return np.concatenate([by_axis[:, :, 0] @ modes, by_axis[:, :, 1] @ modes], axis=1)
-
-
-def _over_image(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """(n, 2) pixels all over the image, and (n, 2, k) their derivatives by the intrinsics."""
-    axes = (np.linspace(0.0, size - 1.0, _IMAGE_GRID) for size in camera.resolution)
-    px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    rays = normalise(camera, px)
-    seen = np.isfinite(rays).all(axis=1)
-    points = np.column_stack([rays[seen], np.ones(int(seen.sum()))])
-    return px[seen], project_with_jacobian(camera, points).jacobian_intrinsics
 
 
 def zooms(px: FloatArray, camera: Camera) -> FloatArray:

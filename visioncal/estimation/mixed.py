@@ -21,6 +21,9 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import NULL_SHARE, covariance_root, gram, inverse_roots, times_root
 
+# Typical translation to rotation noise of arms and cameras [m/rad]: median, and standard deviation
+# of its logarithm, a factor of five.
+TYPICAL_RATIO, RATIO_LOG_SIGMA = 0.6, 1.5
 # Bounds of the standard deviations, in units of the residuals [rad and m].
 LEAST_SIGMA, MOST_SIGMA = 1e-10, 1e2
 # Most change of a size's logarithm in one step, most steps, and least curvature, over that of each
@@ -81,14 +84,12 @@ class SizePrior:
     mean: FloatArray  # (m,).
 
     @classmethod
-    def of_ratios(
-        cls, pairs: Sequence[tuple[int, int]], count: int, ratio: float, log_sigma: float
-    ) -> "SizePrior":
+    def of_ratios(cls, pairs: Sequence[tuple[int, int]], count: int) -> "SizePrior":
         """Prior of the second size over the first, of some pairs among k sizes."""
         jacobian = np.zeros((len(pairs), count))
         for row, (first, second) in zip(jacobian, pairs, strict=True):
-            row[first], row[second] = -1.0 / log_sigma, 1.0 / log_sigma
-        return cls(jacobian, np.full(len(pairs), np.log(ratio) / log_sigma))
+            row[first], row[second] = -1.0 / RATIO_LOG_SIGMA, 1.0 / RATIO_LOG_SIGMA
+        return cls(jacobian, np.full(len(pairs), np.log(TYPICAL_RATIO) / RATIO_LOG_SIGMA))
 
     def beside(self, typical: FloatArray, log_sigma: float) -> "SizePrior":
         """The same with g more sizes, of (g,) typical logarithms within `log_sigma`."""

@@ -18,6 +18,7 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution, by_noise_alone
+from visioncal.estimation.tree import Branch
 
 # Least share of the following observations explained; others may have moved, too, or be wrong.
 _LEAST_SHARE = 0.25
@@ -49,9 +50,10 @@ def moved(
     count = int(number or 1) + 1
     while (twin := f"{first}@{count}") in problem.tree.branches:
         count += 1
+    edge = Branch(problem.tree.branches[frame].parent)
     split = replace(
         problem,
-        tree=problem.tree.with_twin(frame, twin),
+        tree=replace(problem.tree, branches={**problem.tree.branches, twin: edge}),
         observations=problem.observations.renamed(frame, twin, problem.observations.stops >= stop),
     )
     frames = problem.frames(fit.state)

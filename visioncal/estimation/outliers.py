@@ -227,10 +227,18 @@ def find_inliers(
 
 
 def _core(problem: Problem, state: State, among: Mask) -> tuple[Mask, Solution]:
-    """The nearest half of some observations at a start, extended by all it predicts."""
+    """The nearest half of some observations at a start, extended by all it predicts.
+
+    To it belongs the nearest half of each pair of frames, if near.
+    """
     rows, part = np.flatnonzero(among), problem.subset(among)
     mask = nearest(_lever_distances(part, state), half_of(len(rows)))
-    search, mask = _ObservationSearch(part), _of_pairs(part, mask, state)
+    # The nearest half of all may be of few pairs of frames, such as the still boards of still
+    # cameras: other frames would be undetermined.
+    distance, near = _lever_distances(part, state), _near(part, state, mask)
+    for group in part.groups if len(part.groups) > 1 else ():
+        mask[group.rows[np.argsort(distance[group.rows])][: (len(group.rows) + 1) // 2]] = True
+    search, mask = _ObservationSearch(part), mask & near
     every = np.ones(len(rows), dtype=bool)
     # The noise is held at first: gross outliers would pass for noise of a robot.
     state = solve_problem(part.subset(mask), state, starting_noise(problem))[0]
@@ -238,16 +246,6 @@ def _core(problem: Problem, state: State, among: Mask) -> tuple[Mask, Solution]:
     used = among.copy()
     used[rows] = mask
     return used, fit
-
-
-def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
-    """The observations of a mask, and the nearest half of each pair of frames, if near."""
-    # The nearest half of all may be of few pairs of frames, such as the still boards of still
-    # cameras: other frames would be undetermined.
-    distance, nearest = _lever_distances(problem, state), mask.copy()
-    for group in problem.groups if len(problem.groups) > 1 else ():
-        nearest[group.rows[np.argsort(distance[group.rows])][: (len(group.rows) + 1) // 2]] = True
-    return nearest & _near(problem, state, mask)
 
 
 def _lever_distances(problem: Problem, state: State) -> FloatArray:

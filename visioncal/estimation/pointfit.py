@@ -74,11 +74,6 @@ class PointPairs:
             self.covariances + self.nominal_sigma_m[:, None, None] ** 2 * np.eye(3), dtype=float
         )
 
-    @property
-    def known_noise_m(self) -> float:
-        """The stated noise of a coordinate, root mean square over all [m]."""
-        return float(np.sqrt(np.trace(self.known, axis1=1, axis2=2).mean() / 3.0))
-
 
 @dataclass(frozen=True)
 class Scale:
@@ -215,7 +210,9 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
     agreement, scale = _fit_inliers(pairs, expected_noise_m)
     fit, agrees = agreement.fit, agreement.mask
     extents = spreads(pairs.nominal[agrees])[0]
-    level_m = float(np.hypot(fit.sigma, pairs.known_noise_m))
+    # Beside the stated noise of a coordinate, root mean square over all.
+    stated_m = np.sqrt(np.trace(pairs.known, axis1=1, axis2=2).mean() / 3.0)
+    level_m = float(np.hypot(fit.sigma, stated_m))
     _refuse_poor(
         pairs,
         fit,

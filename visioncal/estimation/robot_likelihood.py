@@ -1,6 +1,6 @@
 """Restricted likelihood (REML) of the robots' noise levels at a fit."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -21,17 +21,6 @@ from visioncal.estimation.mixed import (
 from visioncal.estimation.normal_equations import reduce
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-
-# Typical translation to rotation noise of arms and cameras [m/rad]: median, and standard deviation
-# of its logarithm, a factor of five.
-TYPICAL_RATIO, RATIO_LOG_SIGMA = 0.6, 1.5
-
-
-def ratio_prior(robots: Iterable[int], count: int, first: int = 0) -> SizePrior:
-    """Prior of the ratio of both levels of robots, which begin at index `first` of k sizes."""
-    pairs = [(first + 2 * robot, first + 2 * robot + 1) for robot in robots]
-    return SizePrior.of_ratios(pairs, count, TYPICAL_RATIO, RATIO_LOG_SIGMA)
-
 
 # Lower bound of the initial noise levels of robots [rad and m]: the search starts from above.
 START_SIGMA = 5e-4
@@ -201,12 +190,12 @@ def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLi
     moving = problem.moving
     jacobian = np.ascontiguousarray(reduced.jacobian[:, :, moving])
     levels = np.arange(2 * count)
-    seen = np.intersect1d(np.arange(count), members)
+    seen = np.intersect1d(np.arange(count), members).tolist()
     model = MixedModel(
         Units(reduced.errors, jacobian, reduced.covariance, parts, levels),
         PriorInformation(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
         np.zeros((jacobian.shape[2], len(levels))),
-        ratio_prior(seen.tolist(), len(levels)),
+        SizePrior.of_ratios([(2 * robot, 2 * robot + 1) for robot in seen], len(levels)),
     )
     return RobotLikelihood(
         reduced.by_flanges, reduced.cost, model, moving, members, stops, noise.robots

@@ -101,8 +101,10 @@ class CornerProblem:
             np.array([shares.get(view, 1.0) for view in corners]),
         )
         problem = replace(problem, board_sizes=(BoardSizes(),) * len(problem.printed))
-        # Corners too few to judge by leave a lens as it is.
-        lens = _lens_sigma(scene, is_refined=scene.mode == "refine" and problem.has_spare_corners)
+        # Corners too few to judge by, with under ten residuals per unknown, leave a lens as it is.
+        sought = len(problem.lens) + len(BOARD_NAMES) * len(problem.printed)
+        is_spare = 2 * len(stack.px) - 6 * len(stack.views) >= 10 * sought
+        lens = _lens_sigma(scene, is_refined=scene.mode == "refine" and is_spare)
         return replace(problem, stated_sigma=np.concatenate([lens, *boards]))
 
     def with_levels(self, levels: LensLevels) -> "CornerProblem":
@@ -123,7 +125,7 @@ class CornerProblem:
         if self.lens_covariance is not None:
             covariance[:count, :count] += self.lens_covariance
         for board, sizes in zip(self.printed, self.board_sizes, strict=True):
-            scale, (aspect, *bends, shear) = self.scale_of(board), self.shape_of(board)
+            scale, aspect, *bends, shear = self.points_of(board)
             covariance[scale, scale] += sizes.scale**2
             covariance[[aspect, shear], [aspect, shear]] += sizes.plane**2
             covariance[bends, bends] += sizes.bend**2
@@ -174,20 +176,10 @@ class CornerProblem:
         """Column (1,) of one printed board's scale."""
         return self.points_of(board)[:1]
 
-    def shape_of(self, board: int) -> IntArray:
-        """Columns (9,) of one printed board's aspect, shear and bend."""
-        return self.points_of(board)[1:]
-
     def points_of(self, target: int) -> IntArray:
         """Columns of all unknowns of one target's corner positions."""
         columns = shape_slices(self.scene.targets, len(self.lens))[target]
         return np.arange(columns.start, columns.stop)
-
-    @property
-    def has_spare_corners(self) -> bool:
-        """Whether there are ten residuals per unknown, enough to estimate lens and board."""
-        residuals = 2 * len(self.stack.px) - 6 * len(self.stack.views)
-        return residuals >= 10 * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
 
     def unknowns(self, compressed: Compressed) -> int:
         """Number of unknowns, poses among them, that the corners have determined, not a prior."""
@@ -195,10 +187,12 @@ class CornerProblem:
         kept = self.is_uncertain & ~self.is_held
         information = compressed.shared_information[np.ix_(kept, kept)]
         prior = floored_sigma_px(sigma_px) ** 2 * self.prior_information[np.ix_(kept, kept)]
+        found = compressed.coefficients
+        freedom = 0.0 if found is None else found.freedom
         # Values that nothing determines are none.
         ridge = _RIDGE * np.diag(np.diag(information) + 1.0)
         own = float(np.trace(np.linalg.solve(information + prior + ridge, information)))
-        return 6 * len(compressed.information) + round(own + compressed.field_freedom)
+        return 6 * len(compressed.information) + round(own + freedom)
 
     def sigma_px(self, compressed: Compressed) -> float:
         """Noise of a corner's coordinate [px]; see `CornerStack.sigma_px`."""

@@ -179,7 +179,11 @@ def find_steps(
     ends = np.cumsum([0, *map(len, columns)])
     equations = [*equations_from(widened, start, every)]
     stops = np.array([stop for stop, *_ in equations])
-    freedom, tried = _residual_freedom(problem, fit), Counter[str]()
+    # Unknowns with a prior take less than one degree of freedom each.
+    determined = float(np.sum(problem.moving))
+    determined -= float(np.sum(fitted * problem.prior_information(fit.state).information))
+    freedom = max(float(problem.observations.directions.sum()) - determined, 6.0)
+    tried = Counter[str]()
     for candidate in candidates:
         tried[candidate.kind] += len(candidate.stops)
     steps = []
@@ -220,14 +224,6 @@ def find_steps(
             gain = -freedom * float(np.log1p(-share))
             steps.append(Step(candidate, stop, value, covariances[best], gain, spread))
     return sorted(steps, key=lambda step: -step.gain)
-
-
-def _residual_freedom(problem: Problem, fit: Solution) -> float:
-    """Degrees of freedom of the residuals; unknowns with a prior take less than one each."""
-    prior = problem.prior_information(fit.state).information
-    prior_share = float(np.sum(fitted_covariance(problem, fit.state, fit.noise) * prior))
-    determined = float(np.sum(problem.moving)) - prior_share
-    return max(float(problem.observations.directions.sum()) - determined, 6.0)
 
 
 def with_step(problem: Problem, fit: Solution, step: Step) -> tuple[Problem, Solution]:

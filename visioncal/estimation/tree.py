@@ -76,11 +76,6 @@ class Tree:
         }
         return replace(self, branches=kept)
 
-    def with_twin(self, frame: str, twin: str) -> "Tree":
-        """Returns the tree with one more frame on the parent of another, by an unknown edge."""
-        edge = Branch(self.branches[frame].parent)
-        return replace(self, branches={**self.branches, twin: edge})
-
     def above(self, frame: str) -> Iterator[str]:
         """A frame and its ancestors, up to the root."""
         while frame != self.root:

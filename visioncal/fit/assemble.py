@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.robot_likelihood import RATIO_LOG_SIGMA, TYPICAL_RATIO
+from visioncal.estimation.mixed import SizePrior
 from visioncal.fit.linearise import Gram
 from visioncal.fit.mixed import Body, Mixed, Part, Term, body_with, prior_term, summed
 from visioncal.fit.unknowns import State, Unknowns
@@ -46,14 +46,13 @@ def mixed_model(
     offsets = unknowns.offsets(state)
     for size, columns, sigma in unknowns.priors():
         terms.setdefault(size, []).append(prior_term(size, columns, offsets[columns], sigma))
-    ratios = tuple((unknowns.size_of(a), unknowns.size_of(b)) for a, b in unknowns.ratios)
+    ratios = [(unknowns.size_of(a), unknowns.size_of(b)) for a, b in unknowns.ratios]
     return Mixed(
         tuple(summed(group, bodies) for group in terms.values()),
         bodies,
         unknowns.count,
         len(unknowns.sizes),
-        ratios,
-        (float(np.log(TYPICAL_RATIO)), RATIO_LOG_SIGMA),
+        SizePrior.of_ratios(ratios, len(unknowns.sizes)),
     )
 
 

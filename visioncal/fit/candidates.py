@@ -9,11 +9,12 @@ import numpy as np
 from visioncal.core.limits import CheckLimits
 from visioncal.core.types import IntArray, evenly
 from visioncal.fit import processes
+from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
-from visioncal.fit.linearise import Pair, images_of
+from visioncal.fit.linearise import Pair, images_of, linearised
 from visioncal.fit.score import best_field, of_effect, of_rows
-from visioncal.fit.trials import gain_of
+from visioncal.fit.sizes import most_likely
 from visioncal.fit.unknowns import (
     State,
     Unknowns,
@@ -300,3 +301,22 @@ def tried_effects(fit: Fit) -> Iterator[Effect]:
             heat = Heat(name, arm.model, arm.heat)
             if heat.is_shown(fit.cell.moments):
                 yield heat
+
+
+def gain_of(fit: Fit, pairs: Sequence[Pair], effect: Effect) -> float:
+    """Log-likelihood of an effect against none, each at its most likely sizes of all else.
+
+    It is linearised once, at the point where the fit was.
+    """
+    member = random_effect(effect)
+    unknowns = fit.unknowns.with_members(member)
+    unknowns = replace(unknowns, effects=(*unknowns.effects, effect))
+    values = {**fit.linearised.values, member.key: np.zeros(member.count)}
+    state = State(values, fit.linearised.errors)
+    grams = linearised(fit.cell, unknowns, state, tuple(pairs))
+    mixed = mixed_model(fit.cell, unknowns, state, grams, fit.used)
+    starts, (low, high) = unknowns.starts(), unknowns.bounds()
+    for name, value in fit.sizes.items():
+        starts[unknowns.size_of(name)] = np.log(value)
+    found = most_likely(mixed, np.clip(starts, low, high), low, high)
+    return (fit.estimate.value - found.estimate.value) / 2.0

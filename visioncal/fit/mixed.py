@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.mixed import SizePrior
 
 # Shares of a unit diagonal that are added where a factor does not exist.
 _RIDGES = (1e-12, 1e-9, 1e-6, 1e-3, 1.0)
@@ -92,9 +93,7 @@ class Mixed:
     bodies: tuple[Body, ...]
     count: int  # p.
     sizes: int  # t.
-    # Pairs of sizes with a prior of the second over the first; its mean and width as logarithms.
-    ratios: tuple[tuple[int, int], ...] = ()
-    ratio: tuple[float, float] = (0.0, 1.0)
+    prior: SizePrior | None = None  # Of the sizes.
 
     @cached_property
     def places(self) -> dict[int, IntArray]:
@@ -151,7 +150,16 @@ class Mixed:
         found = Estimate(
             logs, float(value), values, covariance, tuple(eliminated), none, np.diag(none)
         )
-        return self._with_prior(self._sloped(found) if is_sloped else found)
+        found = self._sloped(found) if is_sloped else found
+        if self.prior is None:
+            return found
+        prior = self.prior.at(logs)
+        return replace(
+            found,
+            value=found.value + 2.0 * prior.value,
+            gradient=found.gradient + 2.0 * prior.gradient,
+            curvature=found.curvature + 2.0 * prior.curvature,
+        )
 
     def _sloped(self, found: Estimate) -> Estimate:
         """An estimate with its gradient and curvature."""
@@ -198,19 +206,6 @@ class Mixed:
         scale = weights[:-1]
         curvature = np.diag(diagonal) - 4.0 * inner * np.outer(scale, scale)
         return replace(found, gradient=gradient, curvature=curvature)
-
-    def _with_prior(self, found: Estimate) -> Estimate:
-        """An estimate with the prior of the ratios."""
-        value, gradient, curvature = found.value, found.gradient.copy(), found.curvature.copy()
-        mean, width = self.ratio
-        for first, second in self.ratios:
-            away = (found.logs[second] - found.logs[first] - mean) / width
-            value += away**2
-            slope = 2.0 * away / width
-            gradient[[first, second]] += [-slope, slope]
-            both = np.array([first, second])
-            curvature[both[:, None], both] += 2.0 / width**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        return replace(found, value=value, gradient=gradient, curvature=curvature)
 
 
 def weights_at(logs: FloatArray) -> FloatArray:

@@ -357,7 +357,8 @@ def _choose_levels(
             return found
         # They also explain much of a slipped joint: where the slip explains more, they are left
         # out.
-        if not (gain := found.function_gain):
+        by_joint = None if found.kinematics is None else found.kinematics.fit.functions
+        if by_joint is None or not (gain := by_joint.gain):
             return arm
         joints = joints_of(fit.problem, joint_offsets({arm.robot: arm}))
         slips = any(step.gain > gain for step in find_steps(fit.problem, fit.solution, joints))

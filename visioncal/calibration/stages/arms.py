@@ -109,12 +109,6 @@ class RobotArm:
         """Whether its joints at all stops belong to a known model."""
         return self.matched is not None and self.joints_rad is not None
 
-    @property
-    def function_gain(self) -> float:
-        """Twice the gain in log-likelihood by joint error functions; zero without any."""
-        functions = None if self.kinematics is None else self.kinematics.fit.functions
-        return 0.0 if functions is None else functions.gain
-
     def at(self, stops: IntArray) -> Self:
         """The arm at a subset (k,) of its stops."""
         stood = self.has_pose[stops]
