@@ -62,6 +62,15 @@ def short(cell):
     return reporting(cell, base_from_flange=cell.robot.base_from_flange @ exp(left))
 
 
+def short_of_lines(cell):
+    """As `short`, by a hundredth, of an arm that moves on straight lines and turns evenly."""
+    sent = cell.robot.base_from_flange
+    back = np.zeros((len(sent), 6))
+    back[1:] = log(invert(sent[1:]) @ sent[:-1])
+    back[1:, 3:] = np.einsum("nji,nj->ni", sent[1:, :3, :3], sent[:-1, :3, 3] - sent[1:, :3, 3])
+    return reporting(cell, base_from_flange=sent @ exp(-0.01 * back))
+
+
 def onwards(cell):
     """Poses that are read when the arm is a two-hundredth of the way to its next stop."""
     there = cell.robot.base_from_flange
@@ -76,7 +85,8 @@ def tilted(cell):
 
 
 def crept(cell):
-    return moved_base(cell, -np.pad(time_of(cell) * CREEP_M, ((0, 0), (3, 0))))
+    """To where it is at the end."""
+    return moved_base(cell, -np.pad((time_of(cell) - 0.5) * CREEP_M, ((0, 0), (3, 0))))
 
 
 def bent_bracket(cell):
@@ -477,6 +487,7 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
         (bent_bracket, "bracket_bends", None),
         (warmed, "lens_grows", np.array([1.5e-3 * (1.0 - np.exp(-3.0)), 0.0, 0.0])),
         (short, "stops_short", None),
+        (short_of_lines, "stops_short", np.array([-0.01, 0.0, 0.0, 0.0])),
         (onwards, "moves_on", None),
     ],
 )
@@ -495,6 +506,24 @@ def test_what_grows_is_named_recovered_and_in_the_budget(change, kind, true):
     # The mean of what a base tilts by is a base that stands otherwise.
     if kind != "base_tilts":
         assert np.all(np.abs(error_of(cell, known)) < 4.5 * np.sqrt(np.diag(fit.whole))[:12])
+
+
+def test_a_bracket_that_bends_alone_is_within_its_sigmas():
+    """Across its length, which looks much as if the base were lower and the camera farther."""
+    squares = []
+    for seed in range(4):
+        cell = simulate(replace(FINE, views=26, seed=seed))
+        down = -cell.robot.base_from_flange[:, 2, :3]
+        across, turned = down * [1.0, 1.0, 0.0], np.cross(down, [0.0, 0.0, 1.0])
+        bends = np.append(6e-3 * turned, 8e-4 * across, axis=1)
+        poses = cell.robot.base_from_flange @ exp(-bends)
+        known = calibrated(reporting(cell, base_from_flange=poses), joints=False)
+        assert known.verdict.causes[0].kind == "bracket_bends"
+        mean = exp(bends.mean(axis=0)) @ cell.transforms["flange_from_cam"]
+        away = log(invert(mean) @ known.assessment.edges["cam"].matrix)
+        covariance = known.assessment.edges["cam"].covariance
+        squares.append(float(away @ np.linalg.solve(covariance, away)) / 6.0)
+    assert 0.05 < np.mean(squares) < 2.5
 
 
 def test_a_bump_is_in_the_covariance():

@@ -59,6 +59,9 @@ class ArmErrors:
     # (2,) noise of the fit: white noise and errors together as single stops show them, without what
     # is the same at all stops. None of links.
     fit_sigmas: FloatArray | None = None
+    # (2,) what the fit knows of this session and a pick does not: errors that grow with time, reach
+    # or gravity, or follow motions; None for none.
+    of_session: FloatArray | None = None
     # Number of errors, the last ones, that are correlated in time; the others are correlated over
     # the posture. At another time they have other values.
     time_correlated_count: int = 0

@@ -174,7 +174,7 @@ def with_pose_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotA
 
     def found(name: str) -> ArmErrors | None:
         errors = find_pose_errors(fit.problem, fit.state, fit.noise, name)
-        if errors is None or (white := errors.white) is None:
+        if errors is None or errors.white is None:
             return errors
         # Residuals of a board whose size is held follow the posture, too: beside its size, such
         # errors are to be significant.
@@ -183,9 +183,7 @@ def with_pose_errors(arms: Mapping[str, RobotArm], fit: Fit) -> dict[str, RobotA
             beside = find_pose_errors(sized.problem, sized.state, sized.noise, name)
             gain = errors.gain if beside is None else min(errors.gain, beside.gain)
             errors = replace(errors, gain=gain)
-        # Errors that grow with time, reach or gravity are others at a pick, and in another session.
-        varies = random_effect_rms(fit.problem, fit.state, name)
-        return replace(errors, white=np.hypot(white, varies))
+        return replace(errors, of_session=random_effect_rms(fit.problem, fit.state, name))
 
     return {
         name: arm if arm.is_modelled else replace(arm, errors=found(name))

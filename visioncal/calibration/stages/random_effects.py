@@ -125,9 +125,11 @@ def _of_flange(
         tried += [(next(own, effect), kind.most) for effect in kind.of_flange(robot, stood)][:1]
     found = dict[Effect, float]()
     for effect, most in tried:
-        columns, name = effect.columns(moments, np.ones(count)), effect.kind.replace(" ", "_")
+        name, unseen = effect.kind.replace(" ", "_"), effect.unseen(moments)
+        columns = np.append(effect.columns(moments, np.ones(count)), unseen, axis=2)
         flat = PriorInformation.flat(columns.shape[2])
-        found[Effect.free(f"{name} of {robot}", flat, None, {robot: columns})] = most
+        free = Effect.free(f"{name} of {robot}", flat, None, {robot: columns})
+        found[replace(free, held=np.arange(len(free)) >= effect.count)] = most
     return found
 
 

@@ -7,9 +7,10 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.random_effects import KINDS
-from visioncal.calibration.suspects.suspect import Suspect
+from visioncal.calibration.suspects.suspect import UNEXPLAINED, Suspect
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.verdict import Finding, Remedy
+from visioncal.model.effects import BracketBends
 from visioncal.model.effects.effect import LensEffect
 
 
@@ -19,7 +20,9 @@ def _found(kind: str, run: RunState) -> Iterator[Finding]:
     # what chance explains.
     is_alone = not any(arm.errors is not None and arm.errors.is_significant for arm in arms)
     for owner in fit.unknowns.of(kind):
-        values, covariance = fit.values((kind, owner)), fit.covariance((kind, owner))
+        shown = fit.unknowns.moved[fit.unknowns.columns((kind, owner))]
+        values = fit.values((kind, owner))[shown]
+        covariance = fit.covariance((kind, owner))[np.ix_(shown, shown)]
         squared = float(values @ np.linalg.solve(covariance, values))
         if is_alone or issubclass(effect, LensEffect):
             squared = max(squared, run.cell_fit.gains.get(f"{kind} of {owner}", 0.0))
@@ -28,4 +31,12 @@ def _found(kind: str, run: RunState) -> Iterator[Finding]:
             yield found.of(owner if len(fit.noise.robots) > 1 else "")
 
 
-GROWING = tuple(Suspect(kind, partial(_found, kind), 1e-4, True) for kind in KINDS)
+def _suspect(kind: str) -> Suspect:
+    """The suspect of a kind: a pick errs by it as views do, and what no view tells is no motion."""
+    effect, own = KINDS[kind], ("robot_noise", "robot_noise_of_pick", UNEXPLAINED)
+    inflated: tuple[str, ...] = () if issubclass(effect, LensEffect) else own
+    inflated += ("calibration",) if issubclass(effect, BracketBends) else ()
+    return Suspect(kind, partial(_found, kind), 1e-4, True, inflates=inflated)
+
+
+GROWING = tuple(map(_suspect, KINDS))

@@ -75,6 +75,10 @@ class Effect(ABC):
                 where a frame moves.
         """
 
+    def unseen(self, moments: Moments) -> FloatArray:
+        """Columns (k, 6, u) of what no moment shows, of the same size: it counts, at zero."""
+        return np.zeros((len(moments), 6, 0))
+
     @property
     def typical(self) -> "Effect":
         """One by whose score this one is judged, where it has very many unknowns."""

@@ -107,7 +107,9 @@ class BaseTilts(PostureEffect, Named):
 class BracketBends(PostureEffect, Named):
     """Bends of what the flange carries [m], linear in gravity's direction along its axes.
 
-    Turns are times a length of 0.1 m.
+    Turns are times a length of 0.1 m. What of a bend is a twist of base and flange no view tells:
+    where the tool bends along, the base is as if it were elsewhere; where the camera's bracket does
+    alone, it is not, and the mean bend is all the flange's.
     """
 
     kind, bounds, count, most = "bracket bends", (1e-2, 1e-7, 0.1), 18, 3e-3
@@ -120,8 +122,17 @@ class BracketBends(PostureEffect, Named):
         by = mm_and_deg(1e3 * float(shift), float(np.rad2deg(turn / 0.1)))
         return (
             f"The load on the flange bends with its weight, by up to {by}. The result is that of "
-            "the views' mean attitude."
+            "the views' mean attitude; whether a tool bends along, no view tells."
         )
+
+    def unseen(self, moments: Moments) -> FloatArray:
+        """See `Effect`: by twists of base and flange, less those of the flange alone."""
+        away = self.frames.copy()
+        away[6:] -= self.raw(self.stops).mean(axis=0)
+        shown, sizes, _ = np.linalg.svd(away, full_matrices=False)
+        # Of a bracket that bends alike in all directions, they are three times as large as of one
+        # that bends at random.
+        return np.asarray(twists_of_frames(moments.poses[self.frame]) @ (2.0 * shown * sizes))
 
     def raw(self, poses: FloatArray) -> FloatArray:
         """See `PostureEffect`."""
