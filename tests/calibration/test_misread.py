@@ -214,6 +214,7 @@ PLANTED = [
         (partial(plant, "rows in another order", seed=seed), MOUNTS[0], 14)
         for seed in (0, 1, 2, 11, 12)
     ),
+    *((partial(plant, "numbers of rotations", seed=seed), MOUNTS[0], 14) for seed in range(6)),
     (misread("euler-ZYX-deg", "mm", Reading("euler-xyz-rad")), MOUNTS[0], 14),
     # KUKA's angles taken for FANUC's turn as the right ones do.
     *((stored("euler-ZYX-deg", "euler-xyz-deg"), mount, 14) for mount in MOUNTS),
@@ -356,6 +357,19 @@ def test_what_is_advised_runs_as_it_is_printed_and_mends_it(tmp_path, monkeypatc
         " && visioncal calibrate 'my cell-fixed' -o out"
     )
     assert Calibration.load(Path("out/calibration.json")).verdict.status == "good"
+
+
+def test_positions_and_rotations_that_two_signs_may_belong_to_are_both_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    poses = cell_poses()
+    wrong = poses.true_robot * np.array([[1, 1, 1, -1], [1, 1, 1, -1], [1, 1, 1, 1], [0, 0, 0, 1]])
+    pairs_session(poses.mount, wrong, poses.camera.poses()).save(Path("cell"))
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert [run.status for run in followed.runs] == [3, 0]
+    assert "--positions 0-13:-x,-y,z" in followed.runs[0].said
+    assert "another sign of x and y in the robot's rotations" in followed.runs[0].said
+    done = typed("convert", "cell", "other", "--guess", "--yes")
+    assert "--positions" in done.refused("close as first read").err
 
 
 @pytest.mark.parametrize("lost", ["rotations", "poses", "positions"])

@@ -102,7 +102,8 @@ def _chosen(recorded: DoubtfulSession, *, yes: bool) -> Candidate:
         raise DataError(
             "Nothing was written: the chain does not close as first read, and no other reading "
             "stands out.",
-            next_step=f"Look how the program wrote the poses, and state that: {POSE_OPTIONS}."
+            next_step="Look how the program wrote the poses, and where the camera is, and state "
+            f"that: {POSE_OPTIONS}{', or --positions' if guess.positions else ''}."
             if guess.is_open
             else "Check that the poses and what the camera saw are of the same views and the "
             "same robot, and that positions stand before rotations (where not, name the columns in "

@@ -132,13 +132,28 @@ def _left_handed(poses: Poses, rng: np.random.Generator) -> Poses:
 
 
 def _axes(poses: Poses, rng: np.random.Generator) -> Poses:
-    """Positions by other axes or with another sign of one, beside rotations that are right."""
+    """Positions of two exchanged axes or with another sign of one, beside right rotations.
+
+    In circular order, or with two other signs, they close the chain as such rotations do.
+    """
     told = numbers(poses.true_robot)
-    order = ((0, 2, 1), (1, 0, 2), (2, 1, 0), (1, 2, 0), (0, 1, 2))[rng.integers(5)]
+    order = ((0, 2, 1), (1, 0, 2), (2, 1, 0), (0, 1, 2))[rng.integers(4)]
     signs = np.ones(3)
     if order == (0, 1, 2):
         signs[rng.integers(3)] = -1.0
     return replace(poses, robot=replace(told, positions=told.positions[:, order] * signs))
+
+
+def _components(poses: Poses, rng: np.random.Generator) -> Poses:
+    """Two numbers of a rotation vector exchanged, or one of it or of Euler angles of other sign."""
+    form = ("rotation-vector", "euler-ZYX-deg", "euler-XYZ-deg")[rng.integers(3)]
+    told, terms = numbers(poses.true_robot, form), np.eye(3)
+    if form == "rotation-vector" and rng.integers(2):
+        terms = terms[:, ((0, 2, 1), (1, 0, 2), (2, 1, 0))[rng.integers(3)]]
+    else:
+        terms[(at := rng.integers(3)), at] = -1.0
+    told = replace(told, rotations=told.rotations @ terms)
+    return replace(poses, robot=told if rng.integers(2) else numbers(told.poses()))
 
 
 def _board_mm(poses: Poses, _: np.random.Generator) -> Poses:
@@ -161,4 +176,5 @@ MISTAKES: Mapping[str, Plant] = {
     "one axis left-handed": _left_handed,
     "board's size in mm": _board_mm,
     "axes of positions": _axes,
+    "numbers of rotations": _components,
 }

@@ -26,7 +26,7 @@ from visioncal.calibration.guess.search import (
 )
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.number_format import counted
+from visioncal.core.number_format import counted, figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, Mount
@@ -65,6 +65,19 @@ class Guess:
     def is_open(self) -> bool:
         """Whether several readings close the chain alike, and the declared one does not."""
         return not self.stands_out and bool(_alike(self.declared, self.candidates))
+
+    @property
+    def positions(self) -> str:
+        """Sums for `convert --positions` by the reading of those alike that changes these alone."""
+        declared = self.declared.hypothesis
+        for item in _alike(self.declared, self.candidates):
+            axes, signs = item.hypothesis.robot.axes, item.hypothesis.robot.signs
+            if item.hypothesis == replace(
+                declared, robot=replace(declared.robot, axes=axes, signs=signs)
+            ):
+                each = zip(axes, signs, strict=True)
+                return ",".join(f"{'-' if sign < 0 else ''}{'xyz'[at]}" for at, sign in each)
+        return ""
 
 
 def guess_reading(
@@ -248,7 +261,9 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
         return f"{ONE_AXIS} at most, which cannot distinguish readings. As first read, {closes}."
     if alike := _alike(declared, ranked):
         words = (
-            f"{', '.join(item.hypothesis.changes)} (to {_figures(item)})" for item in alike[:3]
+            f"{', '.join(item.hypothesis.changes)} (to {_figures(item)}; the camera is then at "
+            f"({', '.join(figure(1e3 * part) for part in item.fit.x[:3, 3].tolist())}) mm)"
+            for item in alike[:3]
         )
         listed = "; or with ".join(words)
         return (
@@ -270,7 +285,12 @@ def _alike(declared: Candidate, ranked: Sequence[Candidate]) -> list[Candidate]:
         return []
     rivals = [item for item in ranked if item is not declared and item.fit.closes]
     most = max((item.log_posterior for item in rivals), default=np.inf)
-    return [item for item in rivals if item.log_posterior > most - CLEAR]
+    alike = list[Candidate]()
+    for item in rivals:
+        near = item.log_posterior > most - CLEAR
+        if near and not any(_are_same(other, item) for other in alike):
+            alike.append(item)
+    return alike
 
 
 def _figures(candidate: Candidate) -> str:

@@ -1,6 +1,6 @@
 """The table of readings: what people mistake about recorded poses, and how it is undone."""
 
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import permutations, product
@@ -27,6 +27,8 @@ class SideReading(Reading):
     # Where the recorded rotations came from misreading others: the form in which those were
     # misread. Writing the rotations in it gets them back, and they are read as `rotation`.
     written: str = ""
+    # Signed places, from 1, of the numbers of a rotation; empty for as they are written.
+    terms: tuple[int, ...] = ()
     # Rotations of rows, by their places, that no formula gives back.
     by_place: tuple[tuple[str, tuple[float, ...]], ...] = ()
     # Whether rotations are transposed while positions are not those of an inverse.
@@ -61,6 +63,8 @@ class SideReading(Reading):
             valid = np.isfinite(rotations).all(axis=(1, 2))
             recorded = np.full((len(rotations), ROTATION_FORMS[self.written].size), np.nan)
             recorded[valid] = ROTATION_FORMS[self.written].write(rotations[valid])
+        if self.terms:
+            recorded = recorded[:, np.abs(self.terms) - 1] * np.sign(self.terms)
         return ROTATION_FORMS[self.rotation].read(recorded)
 
     def poses(self, numbers: PoseNumbers) -> FloatArray:
@@ -174,6 +178,7 @@ def changes(declared: Hypothesis, is_measured: bool, count: int) -> Iterator[Cha
     words = "the images mirrored, or the robot's poses in a left-handed frame (one axis mirrored)"
     yield Change(words, "robot", {"mirrored": True})
     yield from _axes()
+    yield from _components(declared.robot.rotation)
     if is_measured:
         yield from _units("camera", declared.camera, "the board's size in")
     else:
@@ -186,18 +191,57 @@ def changes(declared: Hypothesis, is_measured: bool, count: int) -> Iterator[Cha
             yield Change(order, "chain", {"order": order})
 
 
-def _axes() -> Iterator[Change]:
-    """Positions whose axes are exchanged, or have another sign, beside rotations that are right."""
-    for axes in (*permutations(range(3)),):
+def _orders() -> Iterator[tuple[tuple[int, ...], str, int]]:
+    """Other orders of three axes, their names, and the number of mistakes that they imply."""
+    for axes in permutations((0, 1, 2)):
         if axes != (0, 1, 2):
-            named = ", ".join("xyz"[axis] for axis in axes)
-            words = f"the numbers of the robot's positions taken as {named}"
-            yield Change(words, "robot", {"axes": axes}, 1 + (axes in ((1, 2, 0), (2, 0, 1))))
+            cost = 1 + (axes in ((1, 2, 0), (2, 0, 1)))
+            yield axes, ", ".join("xyz"[axis] for axis in axes), cost
+
+
+def _signs(names: Sequence[str]) -> Iterator[tuple[tuple[int, ...], str, int]]:
+    """Other signs of three numbers, the names of those that change, and how many change."""
     for signs in product((1, -1), repeat=3):
         if min(signs) < 0:
-            named = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
-            words = f"another sign of {named} in the robot's positions"
-            yield Change(words, "robot", {"signs": signs}, signs.count(-1))
+            named = [name for name, sign in zip(names, signs, strict=True) if sign < 0]
+            yield signs, " and ".join(named), len(named)
+
+
+def _axes() -> Iterator[Change]:
+    """Positions whose axes are exchanged, or have another sign, beside rotations that are right."""
+    for axes, named, cost in _orders():
+        words = f"the numbers of the robot's positions taken as {named}"
+        yield Change(words, "robot", {"axes": axes}, cost)
+    for signs, named, cost in _signs("xyz"):
+        words = f"another sign of {named} in the robot's positions"
+        yield Change(words, "robot", {"signs": signs}, cost)
+
+
+def _components(form: str) -> Iterator[Change]:
+    """Rotations of which numbers are exchanged or have another sign, beside right positions.
+
+    With one other sign, a rotation vector's rotation R is H R^T H, with a half turn H about its
+    axis: transposed, and with the other two signs in the positions, it closes the chain alike.
+    """
+    size, whose = ROTATION_FORMS[form].size, "the robot's rotations"
+    fields, names = dict[str, Any](), ("number 1", "number 2", "number 3")
+    if size != 3:
+        # The vector of a quaternion is along that of the rotation.
+        fields, names = {"rotation": "rotation-vector", "written": "rotation-vector"}, (*"xyz",)
+        whose += " (of qx, qy, qz, or of rx, ry, rz)"
+    is_vector = not form.startswith("euler-")
+    if is_vector:
+        # Transposed, it has the other three signs.
+        fields["transposed"] = False
+    for signs, named, cost in _signs(names):
+        if not (is_vector and cost == 3):
+            terms = tuple((np.arange(1, 4) * signs).tolist())
+            words = f"another sign of {named} in {whose}"
+            yield Change(words, "robot", {**fields, "terms": terms}, cost)
+    for axes, named, cost in _orders() if is_vector else ():
+        terms = tuple(1 + axis for axis in axes)
+        words = f"the numbers of {whose} taken as {named}"
+        yield Change(words, "robot", {**fields, "terms": terms}, cost)
 
 
 def _units(part: Literal["robot", "camera"], side: SideReading, words: str) -> Iterator[Change]:
@@ -239,6 +283,7 @@ def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change
         radians = [name.replace("-deg", "-rad") for name in degrees]
         pairs += [*product(radians, degrees), ("rotation-vector", "rotation-vector-deg")]
     known = [rotations]
+    yield from _signed_angles(robot, known, [f"euler-{order}-deg" for order in used])
     for name, written in pairs:
         tried = SideReading(name, written=written).rotations(robot)
         # Other names of the same numbers in another order are the same mistake.
@@ -251,3 +296,17 @@ def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change
             if {name, written} == {"euler-ZYX-deg", "euler-xyz-deg"}:
                 words += ", or the reverse (A, B, C of KUKA and W, P, R of FANUC)"
             yield Change(words, "robot", {"rotation": name, "written": written}, 2)
+
+
+def _signed_angles(
+    robot: PoseNumbers, known: list[FloatArray], forms: Sequence[str]
+) -> Iterator[Change]:
+    """Rotations made of Euler angles of which one has another sign; they are added to the known."""
+    for form, (signs, named, cost) in product(forms, _signs(("first", "second", "third"))):
+        terms = tuple((np.arange(1, 4) * signs).tolist())
+        tried = SideReading(form, written=form, terms=terms).rotations(robot)
+        if cost > 1 or any(np.allclose(tried, other, atol=1e-9, equal_nan=True) for other in known):
+            continue
+        known.append(tried)
+        words = f"another sign of the {named} of the robot's {ROTATION_FORMS[form].words}"
+        yield Change(words, "robot", {"rotation": form, "written": form, "terms": terms}, 2)

@@ -18,8 +18,9 @@ from visioncal.calibration.suspects.missing_axis import missing_axes
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
+from visioncal.core.number_format import ranges
 from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy
+from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy, mending
 from visioncal.estimation.chain import robot_part
 
 # A robot that moves by less stood still [m].
@@ -43,9 +44,9 @@ _LOST_TURNS = Remedy(
     "or degrees=True of SciPy), and write the poses anew; or convert the robot's own log. The "
     "session cannot be mended: whole turns about the last axis of the tool are lost."
 )
-_WHICH = Remedy(
-    "Look how the program wrote the poses, and convert the recording anew with that stated: "
-    f"{POSE_OPTIONS}."
+_WHICH = (
+    "Look how the program wrote the poses, and where the camera is; then convert the recording "
+    f"anew with that stated: {POSE_OPTIONS}."
 )
 _UNRECORDED = Remedy(
     "Convert the recording itself again with --guess, if the session was made of one: angles that "
@@ -141,7 +142,12 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
         step = _MIRRORED if robot.mirrored else step
         yield Finding("misread_poses", guess.sentence, step)
     elif guess.is_open:
-        yield Finding("misread_poses", guess.sentence, _WHICH)
+        step = Remedy(_WHICH)
+        if guess.positions:
+            every = ranges([view.number for view in run.session.views])
+            step = mending("positions are read otherwise", f"--positions {every}:{guess.positions}")
+            step = replace(step, words=f"{_WHICH} Where the positions are wrong: {step.words}")
+        yield Finding("misread_poses", guess.sentence, step)
     yield from unknown
 
 

@@ -383,6 +383,11 @@ def _untested(
             by_names = [name for name in foreign.makers if POSE_FORMS[name].likely]
             if whose == "robot" and len(by_names) == 1:
                 forms = f"{by_names[0]}, as the columns' names suggest, or {forms}"
+            if why.startswith("With "):
+                joints += (
+                    " What else this reading changes is done to the session that is then written: "
+                    "visioncal convert SESSION NEW --guess --yes."
+                )
             raise DataError(
                 f"{foreign.name}: the form of the {whose}'s rotations is not said, and nothing "
                 f"determines it: {why}.",
