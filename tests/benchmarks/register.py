@@ -115,6 +115,8 @@ def made(row: Row, seed: int) -> tuple[Image, Target, Print]:
         told = {
             "kind": "picture",
             "width_m": row.width_m,
+            # As sure as the ChArUco board's, which it stands beside.
+            "square_sigma_m": 1e-6 * 9,
             "image": base64.b64encode(cv2.imencode(".png", picture)[1].tobytes()).decode(),
         }
         flat = Print(

@@ -233,17 +233,20 @@ def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float
     alone, boards = _alone(fit, flange, each), _boards(fit)
     if alone is None:
         return []
-    sizes, logs = np.geomspace(1e-6, 0.1, 31), list[float]()
-    gains = list[list[FloatArray]]()
+    sizes, logs, lefts = np.geomspace(1e-6, 0.1, 31), list[float](), list[FloatArray]()
     for tried in _tried_of(fit, flange, alone, creeps=False):
         for is_free in (False, True) if boards else (False,):
             value, left, _ = judged(tried, boards, is_free=is_free)
             # One board of twenty is of another size.
             logs.append(tried.prior + value + np.log(0.05 if is_free else 0.95))
-            of_each = (Score(left[a:b, -1], left[a:b, a:b], np.inf) for a, b in pairwise(counts))
-            gains.append([score.gains(sizes) for score in of_each])
+            lefts.append(left)
+    under = np.array(lefts)
+    gains = [
+        Score(under[:, a:b, -1], under[:, a:b, a:b], np.inf).gains(sizes)
+        for a, b in pairwise(counts)
+    ]
     found, known = [], np.array(logs)
-    averaged = np.logaddexp.reduce(known[:, None, None] + np.array(gains), axis=0)
+    averaged = np.logaddexp.reduce(known[:, None] + np.array(gains), axis=1)
     for effect, gain in zip(effects, averaged - np.logaddexp.reduce(known), strict=True):
         best = int(
             np.where(

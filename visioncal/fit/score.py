@@ -36,7 +36,7 @@ class Added:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Score and information of c further columns."""
+    """Score and information of c further columns; `gains` takes many, (..., c) and (..., c, c)."""
 
     pull: FloatArray  # (c,) A'P y.
     information: FloatArray  # (c, c) A'P A.
@@ -72,14 +72,14 @@ class Score:
         return sizes, self.gains(sizes)
 
     def gains(self, sizes: FloatArray) -> FloatArray:
-        """(k,) gains of columns with equal sigmas, of k sizes."""
+        """(..., k) gains of columns with equal sigmas, of k sizes; of many scores at once, too."""
         values, vectors = np.linalg.eigh(self.information)
-        return self._gains(values, vectors.T @ self.pull, sizes)
+        return self._gains(values, (self.pull[..., None, :] @ vectors)[..., 0, :], sizes)
 
     def _gains(self, values: FloatArray, pull: FloatArray, sizes: FloatArray) -> FloatArray:
-        within = 1.0 + sizes[:, None] ** 2 * np.maximum(values, 0.0)
-        squares = np.sum(sizes[:, None] ** 2 * pull**2 / within, axis=1)
-        return np.asarray(self._student(squares) - 0.5 * np.log(within).sum(axis=1))
+        within = 1.0 + sizes[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
+        squares = np.sum(sizes[:, None] ** 2 * pull[..., None, :] ** 2 / within, axis=-1)
+        return np.asarray(self._student(squares) - 0.5 * np.log(within).sum(axis=-1))
 
     def _student(self, squares: npt.ArrayLike) -> FloatArray:
         """Log-likelihood that some squares gain, with the level of the noise integrated out."""
