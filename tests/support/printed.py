@@ -135,9 +135,13 @@ def photographed(print_, width_m, camera, pose, look=Look(), seed=0, corner_m=(0
     matrix[:2, 2] = camera.matrix[2:]
     texel = width_m / print_.shape[1]
     size = np.array(print_.shape[::-1]) * texel
-    # Of texels finer than sub-pixels some would be left out, and edges along rows be 0.04 px off.
-    depth = pose[2] @ [*(size / 2 + corner_m), 0, 1]
-    s = max(SAMPLES, round(float(depth / camera.matrix[0] / texel / 1.5)))
+    # Of texels finer than sub-pixels some would be left out, and edges along rows be 0.04 px off: a
+    # pixel sees most texels where the print is slanted most.
+    corners = np.pad(np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size + corner_m, ((0, 0), (0, 1)))
+    corners = corners @ pose[:3, :3].T + pose[:3, 3]
+    slants = np.abs(corners @ pose[:3, 2]) / np.linalg.norm(corners, axis=1)
+    seen_m = (corners[:, 2] / np.maximum(slants, 0.2)).max() / camera.matrix[0]
+    s = max(SAMPLES, round(float(seen_m / texel / 1.5)))
     ends = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size + np.array(corner_m)
     bounds = cv2.projectPoints(
         np.pad(ends, ((0, 0), (0, 1))),

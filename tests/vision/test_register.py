@@ -186,6 +186,21 @@ def test_the_blur_of_a_small_covered_board_is_found_from_sharper_and_wider_ones(
             assert squared(found, pose) < 2.0
 
 
+def test_a_slanted_label_is_drawn_as_it_is_seen():
+    # A Gaussian on the print, as wide along as across, and kernels that blur what is finest too
+    # little leave 0.008 of the grey levels' range at this tilt.
+    picture = PICTURES["label"](0)
+    flat = Print.of_picture(picture, 0.3)
+    half = replace(WIDE, resolution=(640, 400), matrix=CAMERAS["wide"].matrix / 2)
+    pose = pose_at(0.5, 50.0, np.array([0.15, 0.1, 0.0]), np.random.default_rng(1), off=0.0)
+    image = photographed(picture, 0.3, half, pose, Look(noise=0.3, light=0.0))
+    found = register(image, flat, half, Seen(pose), factors=(1,))
+    # Of rounding and noise, 0.0016; and by the pixels' boxes.
+    rest = found.look.residuals[found.look.weights > 0.5]
+    assert np.sqrt(np.mean(rest**2)) < 0.005
+    assert found.seen.gauss_px == pytest.approx(np.hypot(0.5, 12**-0.5), abs=0.015)
+
+
 def test_too_little_of_a_print_gives_nothing():
     flat, image, pose, _ = view(0, Look())
     outside = pose.copy()

@@ -54,10 +54,11 @@ class Look:
         seen, camera = self.seen, self.level.camera
         blur_px = 3 * seen.gauss_px + seen.disc_px + 0.8 * self.level.factor
         blur_px += moved_px(camera, self.flat, seen) / 2
-        pixel_m = self.flat.middle_at(seen.cam_from_target)[2] / camera.matrix[:2].mean()
-        rim = min(blur_px * pixel_m, 0.12 * self.flat.size_m.min())
         at = self.drawn.places_m - self.flat.corner_m[:, None, None]
-        inside = ((at > rim) & (at < (self.flat.size_m - rim)[:, None, None])).all(axis=0)
+        # A slanted pixel sees more of the print.
+        rim = blur_px / self.level.factor * np.hypot(*np.gradient(at, axis=(1, 2)))
+        rim = np.minimum(rim, 0.12 * self.flat.size_m.min())
+        inside = ((at > rim) & (self.flat.size_m[:, None, None] - at > rim)).all(axis=0)
         return np.asarray(inside & self.level.is_sound, np.float32)
 
     @cached_property

@@ -21,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
-from scipy.special import ive
 
 from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Image
@@ -36,6 +35,10 @@ BLOCK_PX = 8
 # sampling at each pixel aliases by less than noise does; and the narrowest of an image, as its
 # pixels alone are boxes of 0.29.
 _SAMPLED_PX, _SHARPEST_PX = 0.5, 0.32
+# Cosine of a print's tilt below which a Gaussian on it, as wide along as across, is too rough.
+_SLANTED = 0.85
+# Frequencies of a kernel.
+_FREQUENCIES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +242,9 @@ class Level:
         pixel_m = self.factor * float(middle[2] / self.camera.matrix[:2].mean())
         # A slanted pixel sees more of the print along one direction.
         slant = abs(float(pose[:3, 2] @ middle)) / float(np.linalg.norm(middle))
-        first, second, by, sigma_m = flat.blurred(_SAMPLED_PX * pixel_m / max(slant, 0.2) ** 0.5)
+        # Four places within a pixel leave less to a Gaussian on the print.
+        within, sampled_px = (0.0, _SAMPLED_PX) if moving or slant > _SLANTED else (0.25, 0.35)
+        first, second, by, sigma_m = flat.blurred(sampled_px * pixel_m / max(slant, 0.2) ** 0.5)
         count = 1 + 2 * moving * int(
             np.clip(moved_px(self.camera, flat, seen) / self.factor / 3, 2, 6)
         )
@@ -260,13 +265,14 @@ class Level:
         )
         # The print at each pixel beside one Gaussian for all, by the heat equation, and
         # how that is shifted, as slopes of perspective change within a pixel.
-        side = np.float32(_SAMPLED_PX * pixel_m / middle[2])
+        side = np.float32(sampled_px * pixel_m / middle[2])
         (xx, xy), (yx, yy) = side * depth * q[:, :2]
         fields = [xx**2 + xy**2 - sigma_m**2, yx**2 + yy**2 - sigma_m**2, xx * yx + xy * yy]
         fields += [-side * across * (n[0] * px + n[1] * py) for px, py in ((xx, xy), (yx, yy))]
         finer = [_pixels(cv2.resize(_pixels(one), x.shape[::-1])) for one in fields]
         layers = np.zeros((5 if moving else 3, *x.shape), np.float32)
         place = np.zeros((2, *x.shape), np.float32)
+        corner = _pixels(flat.corner_m)[:, None, None]
         for k in range(count):
             at = (k + 0.5) / count - 0.5
             own = _exp(at * seen.twist) @ pose
@@ -274,34 +280,34 @@ class Level:
             rows = _pixels(np.linalg.inv(np.c_[own[:3, :2], own[:3, 3]]))
             gx, gy, scale = (row[0] * x + row[1] * y + row[2] for row in rows)
             on = np.stack([gx / scale, gy / scale])
-            corner = _pixels(flat.corner_m)[:, None, None]
             texels = _pixels(((on - corner) / np.float32(flat.texel_m) - 0.5 - by // 2) / by)
-            drawn, bent = (
-                cv2.remap(table, texels[0], texels[1], cv2.INTER_LINEAR, None, _EDGE)
-                for table in (first, second)
-            )
-            parts, more = cv2.split(drawn), cv2.split(bent)
-            for share, part in zip(finer, (*more, *parts[1:]), strict=True):
-                layers[0] += share * part
-            layers[:3] += parts
-            if moving:
-                layers[3:] += np.float32(at) * np.stack(parts[1:])
+            beside = [np.float32(within) * np.gradient(texels, axis=axis) for axis in (2, 1)]
+            for right, down in ((0, 0),) if not within else ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                at_px = texels + right * beside[0] + down * beside[1]
+                drawn, bent = (
+                    cv2.remap(table, at_px[0], at_px[1], cv2.INTER_LINEAR, None, _EDGE)
+                    for table in (first, second)
+                )
+                parts, more = cv2.split(drawn), cv2.split(bent)
+                for share, part in zip(finer, (*more, *parts[1:]), strict=True):
+                    layers[0] += share * part
+                layers[:3] += parts
+                if moving:
+                    layers[3:] += np.float32(at) * np.stack(parts[1:])
             place = on if 2 * k + 1 == count else place
-        # The print's own Gaussian is a part of the blur where the image was not reduced by one.
-        own_px = _SAMPLED_PX * (self.factor == 1)
-        layers, variance = (
-            layers / np.float32(count),
-            (seen.gauss_px / self.factor) ** 2 - own_px**2,
-        )
+        # The print's own blur is a part of what is seen, which a reduced image's own is not.
+        reduced_px = _SAMPLED_PX * (self.factor > 1)
+        variance = (seen.gauss_px / self.factor) ** 2 + reduced_px**2 - sampled_px**2 - within**2
+        layers /= np.float32(count * (4 if within else 1))
         by_disc = []
         if seen.disc_px > 0.0:
             radius, sharp = seen.disc_px / self.factor, layers[0]
             layers = np.stack([_through(layer, _disc(radius)) for layer in layers])
             wider = _through(sharp, _disc(1.02 * radius)) - layers[0]
             by_disc = [_gauss(wider, variance) / np.float32(0.02 * seen.disc_px)]
+        by_sigma = _gauss_by_variance(layers[0], variance)
+        by_sigma *= 2 * seen.gauss_px / self.factor**2
         layers = np.stack([_gauss(layer, variance) for layer in layers])
-        by_sigma = cv2.Laplacian(layers[0], cv2.CV_32F, borderType=_EDGE)
-        by_sigma *= seen.gauss_px / self.factor**2
         slopes = [*layers[1:3], by_sigma, *by_disc, *layers[3:]]
         blurs = 1 + len(by_disc)
         shares = np.zeros((len(slopes), 6 + blurs + 6 * moving + len(lens), *depth.shape))
@@ -350,16 +356,34 @@ def _bends(camera: Camera, px: FloatArray, columns: int) -> tuple[FloatArray, Fl
     return rays, -np.swapaxes(np.linalg.solve(by_ray, by_lens[:, :, :columns]), 1, 2)
 
 
-def _gauss(layer: Pixels, variance: float) -> Pixels:
-    """A (h, w) layer through a Gaussian [px^2], by the kernel of Lindeberg (1990).
+def _kernels(variance: float) -> tuple[FloatArray, FloatArray]:
+    """Kernel (2 r + 1,) of a Gaussian [px^2] on pixels, and its derivative by the variance.
 
-    Its variance is exact however small, even below 0, and its derivative by it half a Laplacian of
-    pixels. A sampled Gaussian hardly changes below a sigma of 0.3 px: no step would leave there.
+    Its frequencies up to those of pixels are a Gaussian's, however small the variance, even below
+    0. A sampled Gaussian hardly changes below a sigma of 0.3 px, and that of Lindeberg (1990) has
+    the variance, but blurs what is finest too little: both make blurs too wide.
     """
-    reach = int(3.5 * abs(variance) ** 0.5 + 1.5)
-    kernel = ive(np.arange(-reach, reach + 1), variance)
-    kernel /= kernel.sum()
+    reach = int(3.5 * abs(variance) ** 0.5 + 4.5)
+    frequencies = (np.arange(_FREQUENCIES) + 0.5) * np.pi / _FREQUENCIES
+    waves = np.cos(np.arange(-reach, reach + 1)[:, None] * frequencies) / _FREQUENCIES
+    passed = np.exp(-0.5 * variance * frequencies**2)
+    kernel, by_variance = waves @ passed, waves @ (-0.5 * frequencies**2 * passed)
+    return kernel / kernel.sum(), by_variance - by_variance.mean()
+
+
+def _gauss(layer: Pixels, variance: float) -> Pixels:
+    """A (h, w) layer through a Gaussian [px^2]."""
+    kernel, _ = _kernels(variance)
     return _pixels(cv2.sepFilter2D(layer, -1, kernel, kernel, borderType=_EDGE))
+
+
+def _gauss_by_variance(layer: Pixels, variance: float) -> Pixels:
+    """The derivative of the same by the variance."""
+    both = _kernels(variance)
+    parts = (
+        cv2.sepFilter2D(layer, -1, one, two, borderType=_EDGE) for one, two in (both, both[::-1])
+    )
+    return _pixels(sum(parts))
 
 
 def _through(layer: Pixels, kernel: Pixels) -> Pixels:
