@@ -386,6 +386,40 @@ def test_pictures_that_are_turned_from_a_view_on_are_no_other_camera(mount):
     assert "pictures" not in cause.words
 
 
+@pytest.mark.parametrize("degrees", [90.0, 180.0])
+@pytest.mark.parametrize(
+    ("some", "when"), [(slice(12, None), "from view 12 on"), (slice(1, None, 2), "in all of these")]
+)
+def test_a_base_that_turned_is_no_board_that_was_read_turned(some, when, degrees):
+    robot, boards = poses_of("eye-in-hand")
+    turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    robot[some] = compose(turn, np.array([1.4, 0.2, 0.0])) @ robot[some]
+    cause = visioncal.calibrate(pairs_session("eye-in-hand", robot, boards)).verdict.causes[0]
+    assert cause.kind == "something_moved", cause.words
+    assert when in cause.words
+    assert "or the controller's base frame was another one" in cause.words
+    assert f"mm and {degrees:.0f} deg" in cause.words
+
+
+def test_rows_in_reverse_order_are_mended_by_one_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robot, boards = poses_of("eye-in-hand")
+    robot[14:] = robot[14:][::-1].copy()
+    pairs_session("eye-in-hand", robot, boards).save(Path("cell"))
+    followed = follow("calibrate", "cell", "-o", "out")
+    assert followed.last.status == 0
+    mended = visioncal.calibrate("cell-fixed")
+    used, sound = (
+        [view.used for view in result.views] for result in (mended, calibrated("eye-in-hand"))
+    )
+    assert sum(used) == sum(sound)
+    assert "exchanged_views" not in {finding.kind for finding in mended.verdict.findings}
+    assert "rows 14 to 23 are in reverse order" in followed.runs[0].said
+    assert "--exchange 14,23,15,22,16,21,17,20,18,19 " in followed.runs[0].said
+    again = typed("convert", "cell", "other", "--exchange", "14,23,14,22")
+    assert "Views 14 and 22" in again.refused("--exchange").err
+
+
 def test_views_that_a_symmetric_board_lets_read_turned_are_said_and_turned_back(
     tmp_path, monkeypatch
 ):

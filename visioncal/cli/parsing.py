@@ -38,12 +38,12 @@ def numbers_in(words: str, option: str, form: str = "", scale: float = 1.0) -> t
     return tuple(scale * value for value in values)
 
 
-def pair_in(words: str, option: str) -> tuple[int, int]:
-    """Parses the numbers of two views, written as 8,17."""
+def pairs_in(words: str, option: str) -> tuple[int, ...]:
+    """Parses the numbers of pairs of views, written as 8,17 or 8,17,9,16."""
     numbers = _whole_numbers(words)
-    needed = "the numbers of two views, as 8,17"
-    _check(len(numbers) == 2, words, option, needed)
-    return numbers[0], numbers[1]
+    needed = "the numbers of two views, as 8,17, or of several pairs, as 8,17,9,16"
+    _check(len(numbers) > 0 and len(numbers) % 2 == 0, words, option, needed)
+    return tuple(numbers)
 
 
 def views_in(words: str, option: str) -> tuple[int, ...]:

@@ -21,7 +21,7 @@ from visioncal.cli.options import (
     session_argument,
     yes_flag,
 )
-from visioncal.cli.parsing import names_in, pair_in, places_in, shift_in, turn_in
+from visioncal.cli.parsing import names_in, pairs_in, places_in, shift_in, turn_in
 from visioncal.core.choices import (
     PLAN_SPEED,
     POSE_FORMS,
@@ -396,8 +396,8 @@ class ConvertOptions(RobotPoseOptions):
     mirror_poses: bool = _doubt(
         "Mirror left-handed poses.", "--mirror-poses", default=False, needs="guess"
     )
-    exchange: tuple[int, int] | None = _doubt(
-        "Two views whose images are exchanged: 8,17.", parse=pair_in
+    exchange: tuple[int, ...] | None = _doubt(
+        "Pairs of views whose images are exchanged: 8,17, or 8,17,9,16.", parse=pairs_in
     )
     shift: tuple[tuple[int, ...], int] | None = _doubt(
         "Views whose poses stand so many rows later: 12-24:2.", parse=shift_in

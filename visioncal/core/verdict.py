@@ -232,12 +232,19 @@ class Verdict:
         again: Sequence[str] = (),
         need: Sequence[str] = (),
     ) -> Self:
-        """Fills session, output, command line and need, as typed, into the remedies' commands."""
+        """Fills session, output, command line and need, as typed, into the remedies' commands.
+
+        Each command that writes a corrected copy of the session has a folder of its own.
+        """
+        every = [finding.do.command for finding in self.findings if finding.do is not None]
+        copies = [*dict.fromkeys(command for command in every if "FIXED" in command)]
 
         def filled(finding: Finding) -> Finding:
             if finding.do is None:
                 return finding
-            command = with_paths(finding.do.command, session, out, again, need)
+            command = finding.do.command
+            copy = copies.index(command) if command in copies else 0
+            command = with_paths(command, session, out, again, need, copy=copy)
             return replace(finding, do=replace(finding.do, command=command))
 
         return replace(self, findings=tuple(map(filled, self.findings)))
@@ -258,12 +265,18 @@ def with_paths(
     out: Path | str = "",
     again: Sequence[str] = (),
     need: Sequence[str] = (),
+    *,
+    copy: int = 0,
 ) -> str:
-    """Fills the paths of a run into a command; see `Verdict.with_paths`."""
+    """Fills the paths of a run into a command; see `Verdict.with_paths`.
+
+    A corrected copy of the session has the first free name after so many as `copy`.
+    """
     folder, result = Path(session), Path(out or "out")
     name = f"{folder.with_suffix('') if folder.is_file() else folder}-fixed"
     names = (name, *(f"{name}-{index}" for index in range(2, 100)))
-    fixed = next((word for word in names if not Path(word).exists()), name)
+    free = [word for word in names if not Path(word).exists()]
+    fixed = free[copy] if copy < len(free) else name
     is_file = result.suffix in (".json", ".rrd")
     new = f"{result.parent if is_file else result}-new"
     paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}

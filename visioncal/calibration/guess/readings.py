@@ -239,9 +239,11 @@ def _components(form: str) -> Iterator[Change]:
             words = f"another sign of {named} in {whose}"
             yield Change(words, "robot", {**fields, "terms": terms}, cost)
     for axes, named, cost in _orders() if is_vector else ():
-        terms = tuple(1 + axis for axis in axes)
-        words = f"the numbers of {whose} taken as {named}"
-        yield Change(words, "robot", {**fields, "terms": terms}, cost)
+        # The first and last are exchanged as where Euler angles ZYX are taken for xyz: `rewritten`.
+        if size == 3 or axes != (2, 1, 0):
+            terms = tuple(1 + axis for axis in axes)
+            words = f"the numbers of {whose} taken as {named}"
+            yield Change(words, "robot", {**fields, "terms": terms}, cost)
 
 
 def _units(part: Literal["robot", "camera"], side: SideReading, words: str) -> Iterator[Change]:

@@ -163,10 +163,13 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
     used = np.flatnonzero(inliers.used[order])
     before, after = order[: used[0]], order[used[-1] + 1 :]
     run = max(before, after, key=len)
+    when = f"from view {rows[int(run[0])].view} on" if len(run) else ""
     if len(run) < FEWEST_VIEWS or (change := _common_change(inliers, run)) is None:
-        return
+        # Views here and there, as of every second row.
+        run, when = order[~inliers.used[order]], "in all of these"
+        if len(run) < FEWEST_VIEWS or (change := _common_change(inliers, run)) is None:
+            return
     what, how = _changed_words(cell_fit, *change)
-    when = f"from view {rows[int(run[0])].view} on"
     if run is before:
         last = rows[int(run[-1])].station
         following = min((row for row in rows if row.station > last), key=lambda row: row.station)
@@ -279,14 +282,27 @@ def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFau
             words = f"{short}: {{views}} were left out. Each pose is right at the other's stop."
             yield _fault(cell_fit, EXCHANGED, at_both, words, _EXCHANGE, short)
             pairs = [pair for pair in pairs if pair[0] not in at_both]
-    for pair in pairs:
-        first, second = (rows[row].view for row in pair)
-        words = (
-            f"Views {first} and {second} are exchanged: the image of each fits the pose in "
-            "the other's row. They were left out."
-        )
-        do = mending("their images are exchanged", f"--exchange {first},{second}")
-        yield _fault(cell_fit, EXCHANGED, pair, words, do)
+    if not pairs:
+        return
+    if len(pairs) > 2 and len({sum(pair) for pair in pairs}) == 1:
+        # Of rows in reverse order, some fit the pose of another one, too.
+        first, last = min(pairs)
+        within = ((at, first + last - at) for at in range(first, (first + last + 1) // 2))
+        pairs = [pair for pair in within if not used[[*pair]].any()]
+    views = [(rows[first].view, rows[second].view) for first, second in pairs]
+    each = f"{views[0][0]} and {views[0][1]}"
+    order = ""
+    if len(pairs) > 1:
+        each = f"{', '.join(f'{first} with {second}' for first, second in views)}"
+        if len({sum(pair) for pair in views}) == 1:
+            order = f", as where rows {min(views)[0]} to {min(views)[1]} are in reverse order"
+    words = (
+        f"views {each} are exchanged: the image of each fits the pose in "
+        f"the other's row{order}. They were left out."
+    )
+    typed = ",".join(f"{first},{second}" for first, second in views)
+    do = mending("their images are exchanged", f"--exchange {typed}")
+    yield _fault(cell_fit, EXCHANGED, [row for pair in pairs for row in pair], words, do)
 
 
 def farthest_by_arms(robots: Iterable[Robot]) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
 from visioncal.core.number_format import counted, ranges, some_of, view_words
-from visioncal.core.transforms import compose, exp, invert, rotation_angle
+from visioncal.core.transforms import apply, compose, exp, invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Rejection
 from visioncal.core.verdict import Finding, mending, or_alone
 from visioncal.estimation.chain import robot_part
@@ -62,6 +62,7 @@ class _Record:
     rows: IntArray  # (m,) the rows that show the board.
     camera: FloatArray  # (m, c, 4, 4) `cam_from_target` with all rivals.
     marks: FloatArray  # (k, 3) corners of the board [m]; empty of several and of unknown ones.
+    is_numbered: bool  # Whether the camera's poses are of corners, which have numbers.
 
     @classmethod
     def of(cls, run: RunState) -> Self:
@@ -83,7 +84,8 @@ class _Record:
         mount: Mount = run.mount or "eye-in-hand"
         known, shown = robot_part(robot, mount), np.array(rows, dtype=int)
         marks = corner_positions(*session.boards.values()) if len(turns) == 1 else np.zeros((0, 3))
-        return cls(np.array(views), known, mount, shown, np.array(padded), marks)
+        is_numbered = bool(run.corners) and len(marks) > 0
+        return cls(np.array(views), known, mount, shown, np.array(padded), marks, is_numbered)
 
     def paired(self, order: IntArray) -> IntArray:
         """(m,) the robot's row of each view that shows the board; -1 where it has no pose."""
@@ -399,9 +401,9 @@ def _turned(
         if not degrees:
             by_squares, middle = _squares_on(record.marks, turned[near, :2, 3])
             near = near[by_squares]
-        if len(near) < 2:
-            continue
         whole = compose(turn, np.array([*middle, 0.0]))
+        if len(near) < 2 or (degrees and not _is_reading(record, whole, edges.lever)):
+            continue
         squares = apart.copy()
         squares[near] = edges.squares(invert(whole) @ turned[near])
         (there,), (agrees,) = _evidence(squares[None])
@@ -430,6 +432,20 @@ def _turned(
             ),
             short,
         )
+
+
+def _is_reading(record: _Record, turn: FloatArray, lever: float) -> bool:
+    """Whether a board may be read so: where its corners were numbered, they are others of its own.
+
+    Else its own middle is in the picture. What turns about another place is another frame.
+    """
+    if not record.is_numbered:
+        centre = np.linalg.solve(np.eye(2) - turn[:2, :2], turn[:2, 3])
+        return float(np.linalg.norm(centre)) < lever
+    between = np.linalg.norm(record.marks[:, None] - record.marks, axis=2)
+    away = np.linalg.norm(apply(turn, record.marks)[:, None] - record.marks, axis=2)
+    near = 0.2 * float(between[between > 0.0].min(initial=np.inf))
+    return float(away.min(axis=1).max()) < near
 
 
 def _squares_on(marks: FloatArray, shifts: FloatArray) -> tuple[Mask, FloatArray]:

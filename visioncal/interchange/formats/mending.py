@@ -38,33 +38,43 @@ def noting(
     return {**document, "corrected": corrected} if changes else document
 
 
-def exchange_views(session: Session, first: int, second: int) -> Session:
-    """Exchanges the images, corners and readings of two views; the session notes it in `corrected`.
+def exchange_views(session: Session, *views: int) -> Session:
+    """Exchanges the images, corners and readings of pairs of views; notes it in `corrected`.
+
+    Args:
+        session: A session.
+        views: Numbers of views: the first with the second, the third with the fourth, and so on.
 
     Raises:
-        DataError: There are no two such views.
+        DataError: There are no such views, or one is in two pairs.
     """
     cells = {
         view.number: {name: view.cell(name) for name in session.columns} for view in session.views
     }
-    first_cells, second_cells = cells.get(first, {}), cells.get(second, {})
-    differing = [
-        name for name in _MUST_AGREE if first_cells.get(name, "") != second_cells.get(name, "")
-    ]
-    if first == second or differing or not (first_cells and second_cells):
-        raise DataError(
-            f"Views {first} and {second} of session {session.name!r} are not two views that see "
-            f"the same{': another ' * bool(differing)}{' and '.join(differing)}.",
-            culprits=["--exchange"],
-        )
-    for name in {*_OBSERVED} & {*session.columns}:
-        first_cells[name], second_cells[name] = second_cells[name], first_cells[name]
+    partners = dict[int, int]()
+    for first, second in zip(views[::2], views[1::2], strict=True):
+        first_cells, second_cells = cells.get(first, {}), cells.get(second, {})
+        differing = [
+            name for name in _MUST_AGREE if first_cells.get(name, "") != second_cells.get(name, "")
+        ]
+        is_twice = first == second or bool({first, second} & partners.keys())
+        if is_twice or differing or not (first_cells and second_cells):
+            raise DataError(
+                f"Views {first} and {second} of session {session.name!r} are not two views that "
+                f"see the same{': another ' * bool(differing)}{' and '.join(differing)}.",
+                culprits=["--exchange"],
+            )
+        partners |= {first: second, second: first}
+        for name in {*_OBSERVED} & {*session.columns}:
+            first_cells[name], second_cells[name] = second_cells[name], first_cells[name]
     corners = session.corner_table
     if corners is not None:
-        is_first, is_second = corners.views == first, corners.views == second
-        views = np.where(is_first, second, np.where(is_second, first, corners.views))
-        corners = replace(corners, views=views)
-    note = f"the images of views {first} and {second} were exchanged"
+        owners = [partners.get(view, view) for view in corners.views.tolist()]
+        corners = replace(corners, views=np.array(owners, dtype=corners.views.dtype))
+    named = ", ".join(
+        f"{first} and {second}" for first, second in zip(views[::2], views[1::2], strict=True)
+    )
+    note = f"the images of views {named} were exchanged"
     return _with_cells(session, cells.values(), note, corners=corners)
 
 

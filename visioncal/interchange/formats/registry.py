@@ -74,7 +74,7 @@ def convert(
     force: bool = False,
     choose: Choose | None = None,
     mirrors_poses: bool = False,
-    exchange: tuple[int, int] | None = None,
+    exchange: tuple[int, ...] | None = None,
     shift: tuple[tuple[int, ...], int] | None = None,
     turned: tuple[tuple[int, ...], tuple[float, ...]] | None = None,
     positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = None,
@@ -94,7 +94,7 @@ def convert(
         choose: Called with what was read, unless the only reading that agrees with the images or
             the target's poses contradicts nothing stated; returns the reading to apply.
         mirrors_poses: Whether that reading may mirror the robot's poses.
-        exchange: Two views whose images, corners and readings are exchanged.
+        exchange: Pairs of views whose images, corners and readings are exchanged.
         shift: Views whose poses of the robot stand so many rows later (earlier where negative).
         turned: Views in which the board was read turned in its plane; by which angle [deg], and
             about which point of the board [mm] (x, y).
