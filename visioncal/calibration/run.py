@@ -17,6 +17,7 @@ from visioncal.calibration.pipeline.reading import (
 from visioncal.calibration.pipeline.result import result_of, view_evidence
 from visioncal.calibration.pipeline.run_state import CalibrationOptions, RunState, initial_state
 from visioncal.calibration.pipeline.solving import solve
+from visioncal.calibration.stages.board_points import with_board_points
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.suspects.misread_poses import with_open_chains
@@ -185,6 +186,7 @@ STAGES: tuple[Stage, ...] = (
     Stage("readings", read_readings),
     Stage("intrinsics", estimate_lenses),
     Stage("pnp", locate_targets),
+    Stage("board", with_board_points),
     Stage("clock", put_on_one_clock),
     Stage("joints", check_joint_angles),
     Stage("solve", _fit),

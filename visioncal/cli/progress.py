@@ -16,6 +16,7 @@ WORDS = {
     "dense": "fit boards to blurred images",
     "intrinsics": "estimate the lens",
     "pnp": "locate the board in each view",
+    "board": "look for corners that are elsewhere on the board",
     "clock": "compare the clocks",
     "joints": "check poses and joint angles",
     "solve": "solve for all frames",

@@ -108,7 +108,8 @@ class Target:
     # Positions of a rig's points [m]; empty elsewhere.
     points_m: tuple[tuple[float, float, float], ...] = ()
     point_numbers: tuple[int, ...] = ()  # Their numbers in the rig's table.
-    # Standard deviation of each position per axis [m]; empty if exact.
+    # Standard deviation of each position per axis [m], of a printed board in its plane; empty if
+    # exact.
     point_sigmas_m: tuple[float, ...] = ()
     # For points that are corners of tags, the tag's id and the corner, from 0 to 3 clockwise from
     # the upper left; else empty.

@@ -5,7 +5,8 @@ lies at `(1 + scale) p + aspect (-x, y, 0) / 2 + shear (y, x, 0) / 2 + z(x, y)`,
 of second and third order without offset and tilt, which belong to the board's pose: the target's
 frame is that of the plane that fits the corners best.
 
-The points of a rig deviate from its table by their stated standard deviations.
+The points of a rig deviate from its table by their stated standard deviations; corners of a printed
+board whose images show that they are elsewhere deviate in its plane, beside its shape.
 """
 
 from collections.abc import Sequence
@@ -65,22 +66,35 @@ def board_basis(positions: FloatArray) -> FloatArray:
     return basis
 
 
+def loose_basis(positions: FloatArray, *, is_loose: bool) -> FloatArray:
+    """`board_basis` of (c, 3) corners, and derivatives by x and y of each where these are loose."""
+    basis, count = board_basis(positions), len(positions)
+    if not is_loose:
+        return basis
+    moved = np.zeros((count, 3, count, 2))
+    moved[np.arange(count), :2, np.arange(count)] = np.eye(2)
+    return np.concatenate([basis, moved.reshape(count, 3, -1)], axis=2)
+
+
 def shape_basis(target: Target) -> FloatArray:
     """Derivatives (c, 3, s) of a target's corners with respect to its shape.
 
-    The shape of a printed board is that of `board_basis`; that of a rig are the positions of its
-    points, or nothing if the rig is exact.
+    The shape of a printed board is that of `board_basis`, and x and y of its corners where these
+    have a size; that of a rig are the positions of its points, or nothing if the rig is exact.
     """
     positions = corner_positions(target)
     if not target.is_rig:
-        return board_basis(positions)
+        return loose_basis(positions, is_loose=bool(target.point_sigmas_m))
     size = len(stated_board_sigma(target))
     return np.eye(3 * len(positions), size).reshape(len(positions), 3, size)
 
 
 def shaped_corners(target: Target, shape: FloatArray) -> FloatArray:
-    """(c, 3) corners of a target of a (s,) shape, in its frame, whose z points into it [m]."""
-    return np.asarray(corner_positions(target) + shape_basis(target) @ shape)
+    """(c, 3) corners of a target of a (s,) shape, in its frame, whose z points into it [m].
+
+    The shape may be that of `BOARD_NAMES` alone, where its corners are loose.
+    """
+    return np.asarray(corner_positions(target) + shape_basis(target)[:, :, : len(shape)] @ shape)
 
 
 def boards_basis(targets: Sequence[Target]) -> FloatArray:
@@ -104,7 +118,7 @@ def stated_board_sigma(target: Target) -> FloatArray:
         return np.repeat(sigmas, 3).astype(float)
     shape = np.zeros(len(BOARD_NAMES))
     shape[SCALE] = target.square_sigma_m / target.square_m
-    return shape
+    return np.append(shape, np.repeat(target.point_sigmas_m, 2))
 
 
 @dataclass(frozen=True, eq=False)

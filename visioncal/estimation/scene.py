@@ -125,7 +125,7 @@ class CornerProblem:
         if self.lens_covariance is not None:
             covariance[:count, :count] += self.lens_covariance
         for board, sizes in zip(self.printed, self.board_sizes, strict=True):
-            scale, aspect, *bends, shear = self.points_of(board)
+            scale, aspect, *bends, shear = self.points_of(board)[: len(BOARD_NAMES)]
             covariance[scale, scale] += sizes.scale**2
             covariance[[aspect, shear], [aspect, shear]] += sizes.plane**2
             covariance[bends, bends] += sizes.bend**2

@@ -29,7 +29,7 @@ from visioncal.estimation.tree import PathStep
 from visioncal.fit.mixed import weights_at
 from visioncal.fit.unknowns import Key, State, Unknowns
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Moments, Sighting
-from visioncal.model.boards import shape_basis
+from visioncal.model.boards import SHAPES, shape_basis, shape_count
 from visioncal.model.effects import Rolling, RowMotion
 from visioncal.vision.camera import project_with_jacobian
 from visioncal.vision.targets import corner_positions
@@ -158,6 +158,7 @@ class Pair:
     path: tuple[PathStep, ...]
     moments: Moments  # (k) theirs.
     points: FloatArray  # (c, 3) corners of the board [m].
+    is_loose: bool  # Whether each may be elsewhere.
 
     @property
     def names(self) -> tuple[str, str]:
@@ -226,8 +227,8 @@ class Pair:
 
     @cached_property
     def basis(self) -> FloatArray:
-        """(c, 3, 10) derivatives of the board's corners by its shape [m]."""
-        return shape_basis(self.points)
+        """(c, 3, s) derivatives of the board's corners by its shape [m]."""
+        return shape_basis(self.points, is_loose=self.is_loose)
 
 
 def pairs_of(cell: Cell, most: int = 50) -> tuple[Pair, ...]:
@@ -249,6 +250,7 @@ def pairs_of(cell: Cell, most: int = 50) -> tuple[Pair, ...]:
             pair = Pair(
                 np.array(rows), stops, tuple(cell.sightings[row] for row in rows),
                 cell.tree.path(*names), cell.moments.take(stops), points,
+                shape_count(board) > SHAPES,
             )  # fmt: skip
             found.append(pair)
     return tuple(found)

@@ -28,7 +28,7 @@ from visioncal.fit.unknowns import (
     random_effect,
 )
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Sighting
-from visioncal.model.boards import SHAPES
+from visioncal.model.boards import SHAPES, shape_count
 from visioncal.model.effects import Clock, Effect, Links, Rolling, Size, Zeros
 from visioncal.vision.camera import intrinsics
 
@@ -173,7 +173,9 @@ def state_of(start: Start, effects: Sequence[Effect]) -> State:
     values: dict[Key, FloatArray] = {("edge", name): matrix for name, matrix in start.edges.items()}
     values |= {("lens", name): intrinsics(lens) for name, lens in start.lenses.items()}
     boards = {*start.cell.boards, *(s.seen for s in start.cell.sightings if _is_of_board(s))}
-    values |= {("shape", name): np.zeros(SHAPES) for name in boards}
+    values |= {
+        ("shape", name): np.zeros(shape_count(start.cell.boards.get(name))) for name in boards
+    }
     values |= {("effect", effect.name): np.zeros(effect.count) for effect in effects}
     stops = len(start.cell.moments)
     return State(values, {name: np.zeros((stops, 6)) for name in start.cell.arms})

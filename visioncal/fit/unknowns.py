@@ -11,7 +11,7 @@ import numpy as np
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Target
 from visioncal.fit.lens_field import Field, by_lens
-from visioncal.model.boards import BEND, PLANE, SHAPES, SIZE
+from visioncal.model.boards import BEND, PLANE, SHAPES, SIZE, shape_count
 from visioncal.model.effects import Effect, Size
 from visioncal.session.document import CameraTable
 from visioncal.vision.boards.kind import DEFAULT_RELATIVE_SIGMA
@@ -292,7 +292,9 @@ def printed_board(frame: str, board: Target | None, *, has_shape: bool, is_sized
         ):
             size = Size(f"{part} {frame}", *bounds, _ONE_IN_TEN, f"shape of {frame}")
             priors.append(Prior(np.arange(SHAPES)[columns], size))
-    count = SHAPES if has_shape else 1
+        if (whole := shape_count(board)) > SHAPES and board is not None:
+            priors.append(Prior(np.arange(SHAPES, whole), sigma=board.point_sigmas_m[0]))
+    count = shape_count(board) if has_shape else 1
     return Vector(("shape", frame), tuple(priors), np.zeros(count), np.ones(count))
 
 

@@ -25,7 +25,6 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import BOARD_NAMES, shaped_corners
 from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.fit import Fit
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.unknowns import ARM, BOARD, EDGE, LENS, SIZE
 from visioncal.results import (
@@ -273,9 +272,13 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     )
 
 
-def _fitted_columns(fit: Fit, arms: Iterable[RobotArm]) -> IntArray:
+def _fitted_columns(run: RunState, arms: Iterable[RobotArm]) -> IntArray:
     """Columns of a fit's edges, of free values of lenses and boards, and of arms' errors."""
-    columns = [fit.unknowns.of_kinds(EDGE, LENS, BOARD)]
+    fit = run.assessment.fit
+    columns = [fit.unknowns.of_kinds(EDGE, LENS)]
+    for name in fit.unknowns.of(BOARD):
+        kept = np.isin(fit.unknowns.values_of((BOARD, name)), _written(run, name))
+        columns.append(fit.unknowns.columns((BOARD, name))[kept])
     for arm in arms:
         errors = fit.unknowns.columns((ARM, arm.robot))
         columns.append(errors if arm.model is None else errors[arm.model.is_kept])
@@ -288,7 +291,7 @@ def _fit_covariance(run: RunState) -> tuple[FloatArray, FloatArray]:
     The second is the part by noise, and by errors that change with time.
     """
     fit, arm, errors = run.assessment.fit, run.robot_arm, run.robot_arm.errors
-    columns = _fitted_columns(fit, [arm])
+    columns = _fitted_columns(run, [arm])
     parts = [part[np.ix_(columns, columns)] for part in (fit.whole, fit.by_noise)]
     if errors is None or errors.is_estimated:
         return parts[0], parts[1]
@@ -387,19 +390,26 @@ def _joint_fit_of_cell(run: RunState) -> CellJointFit:
         for fitted in [_fitted_arm(run, arm)]
         if fitted is not None
     }
-    columns = _fitted_columns(fit, [arm for arm, _ in arms.values()])
+    columns = _fitted_columns(run, [arm for arm, _ in arms.values()])
     return CellJointFit(
         cameras={
             object_name(name, "camera"): tuple(fit.unknowns.values_of((LENS, name)).tolist())
             for name in fit.unknowns.of(LENS)
         },
         targets={
-            plate: tuple(fit.unknowns.values_of((BOARD, name)).tolist())
+            plate: tuple(_written(run, name).tolist())
             for plate, name in zip(plates, fit.unknowns.of(BOARD), strict=False)
         },
         arms={robot: fitted for robot, (_, fitted) in arms.items()},
         covariance=fit.whole[np.ix_(columns, columns)],
     )
+
+
+def _written(run: RunState, board: str) -> IntArray:
+    """(c,) which of a target's uncertain values a result has: places of a rig's points alone."""
+    values = run.assessment.fit.unknowns.values_of((BOARD, board))
+    is_rig = run.session.boards[board].is_rig
+    return values if is_rig else values[values < len(BOARD_NAMES)]
 
 
 def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
@@ -414,12 +424,13 @@ def _shapes(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]
         if frame_name("target", plate) not in fit.problem.tree.branches:
             continue
         if not target.is_rig:
+            # Where single corners are elsewhere, that board is not to be used again.
+            values, moved = values[: len(BOARD_NAMES)], fit.unknowns.values_of(board, moved=True)
+            written = _written(run, plate)
             boards[name] = BoardResult(
                 shape=dict(zip(BOARD_NAMES, values.tolist(), strict=True)),
-                sigma={BOARD_NAMES[at]: float(sigmas[at]) for at in free},
-                estimated=tuple(
-                    BOARD_NAMES[at] for at in fit.unknowns.values_of(board, moved=True)
-                ),
+                sigma={BOARD_NAMES[at]: float(sigmas[at]) for at in written},
+                estimated=tuple(BOARD_NAMES[at] for at in np.intersect1d(written, moved)),
                 bend_mm=1e3 * float(np.ptp(shaped_corners(target, values)[:, 2])),
             )
         elif len(free):

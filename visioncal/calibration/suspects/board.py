@@ -11,12 +11,12 @@ from visioncal.calibration.stages.other_board import board_correction
 from visioncal.calibration.suspects.lens import has_changed
 from visioncal.calibration.suspects.suspect import Suspect
 from visioncal.core.limits import CONTRADICTION
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import counted, figure, ranges
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import invert
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
-from visioncal.estimation.appearance import ASPECT, SCALE, SHEAR, shaped_corners
+from visioncal.estimation.appearance import ASPECT, BOARD_NAMES, SCALE, SHEAR, shaped_corners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import (
     MeasuredScale,
@@ -184,11 +184,18 @@ def _shape_findings(fitted: Fit, name: str, target: Target, called: str) -> Iter
     def has_moved(*chosen: int) -> bool:
         return has_changed(fitted, columns[np.isin(values, chosen)])
 
-    drawn = np.where(np.arange(len(shape)) == SCALE, shape, 0.0)
+    drawn, named = np.where(np.arange(len(shape)) == SCALE, shape, 0.0), len(BOARD_NAMES)
     corners, even = (shaped_corners(target, at) for at in (shape, drawn))
     off_m = np.linalg.norm(corners - even, axis=1).max()
-    bends = np.setdiff1d(np.arange(len(shape)), [SCALE, ASPECT, SHEAR])
-    if not has_moved(ASPECT, *bends, SHEAR) or off_m < _LEAST_BEND_M:
+    bends = np.setdiff1d(np.arange(named), [SCALE, ASPECT, SHEAR])
+    points = np.arange(named, len(shape))
+    if not has_moved(ASPECT, *bends, SHEAR, *points) or off_m < _LEAST_BEND_M:
+        return
+    flat = "Put the board on a stiff, flat plate, or print it on another printer, and record again."
+    if len(points) and has_moved(*points):
+        words = f"The {called} has {_elsewhere(corner_positions(target), corners)}."
+        do = f"Measure it there. {flat}"
+        yield Finding("board_shape", f"{words} The result counts it.", Remedy(do))
         return
     parts = []
     if has_moved(ASPECT):
@@ -204,8 +211,34 @@ def _shape_findings(fitted: Fit, name: str, target: Target, called: str) -> Iter
         depth = figure(1e3 * float(np.ptp(corners[:, 2])))
         parts.insert(0, f"not flat: its corners lie within {depth} mm of depth")
     words = f"The {called} is {', and '.join(parts)}. Its shape was estimated with the rest."
-    flat = "Put the board on a stiff, flat plate, or print it on another printer, and record again."
     yield Finding("board_shape", words, Remedy(flat))
+
+
+def _elsewhere(positions: FloatArray, corners: FloatArray) -> str:
+    """How far (c, 3) corners in a board's plane are from their stated positions, in words.
+
+    Both are compared by the affine map that fits most of them (least absolute deviations).
+    """
+    plane = np.column_stack([positions[:, :2], np.ones(len(positions))])
+    off = corners[:, :2] - positions[:, :2]
+    lengths = np.ones(len(off))
+    for _ in range(50):
+        root = 1.0 / np.sqrt(np.maximum(lengths, 1e-3 * lengths.max()))[:, None]
+        left = off - plane @ np.linalg.lstsq(plane * root, off * root, rcond=None)[0]
+        lengths = np.linalg.norm(left, axis=1) + 1e-12
+    far = lengths > lengths.max() / 2
+    if far.sum() > len(far) / 3:
+        rms = figure(1e3 * float(np.sqrt(np.mean(lengths**2))))
+        return f"its corners {rms} mm (rms) from where its file has them, in all views alike"
+    shift = figure(1e3 * float(np.median(lengths[far])))
+    which = f"its {counted(int(far.sum()), 'corner')} {ranges(np.flatnonzero(far).tolist())}"
+    for axis, line in ((1, "row"), (0, "column")):
+        lines = np.unique(positions[:, axis].round(6), return_inverse=True)[1]
+        whole = [at for at in np.unique(lines) if np.mean(far[lines == at]) > 0.6]
+        if np.isin(lines[far], whole).mean() > 0.8:
+            which = f"{line} {ranges([at + 1 for at in whole])} of its corners"
+            break
+    return f"{which} {shift} mm from where the others have them, in all views alike"
 
 
 def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:

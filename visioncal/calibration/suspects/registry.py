@@ -101,6 +101,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("unseen_target"),
     # Images and readings.
     Suspect("missing_images", is_doubt=False),
+    Suspect("unsteady_corners", is_doubt=False),
     Suspect("repeated_readings", is_doubt=False),
     Suspect("repeated_views", chance=FACT),
     Suspect("corner_numbers", chance=FACT),
