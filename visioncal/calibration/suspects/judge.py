@@ -131,11 +131,14 @@ def _good_for_mm(worst: Picks | None, doubts: Sequence[Finding]) -> float | None
 
 def _good_for(worst: Picks, good_for_mm: float, status: VerdictStatus) -> Finding:
     verb = "would be" if status == "bad" else "is"
-    sensor = "instrument" if worst.camera.startswith("instrument") else "camera"
+    is_read = worst.camera.startswith("instrument")
+    # Where no corners were, a lens that the views determine says little.
+    where = "at" if is_read else "where the views looked, at"
+    sensor = "instrument" if is_read else "camera"
     corrected = "" if worst.uncorrected is None else ", with corrected targets"
     return Finding(
         "good_for",
-        f"It {verb} good for tasks of {figure(rounded_up(good_for_mm))} mm and more at "
+        f"It {verb} good for tasks of {figure(rounded_up(good_for_mm))} mm and more {where} "
         f"{figure(worst.distance_m)} m from the {sensor}{corrected}.",
     )
 
