@@ -106,9 +106,9 @@ def unsigned(robot, boards):
     return robot, boards
 
 
-def in_two_units(robot, boards, some, factor):
+def in_two_units(robot, boards, some, factor, axes=slice(3)):
     robot = robot.copy()
-    robot[[*some], :3, 3] *= factor
+    robot[[*some], axes, 3] *= factor
     return robot, boards
 
 
@@ -126,6 +126,11 @@ PLANTED = {
         partial(in_two_units, some=range(8, 24), factor=1e3),
         [*range(8, 24)],
         "a thousand times as large",
+    ),
+    "mixed_units of one axis": (
+        partial(in_two_units, some=range(12, 24), factor=1e3, axes=2),
+        [*range(12, 24)],
+        "z of the robot's position is a thousand times as large",
     ),
     "mixed_units here and there": (
         partial(in_two_units, some=(2, 3, 11, 17), factor=1e-3),
@@ -384,6 +389,35 @@ def test_pictures_that_are_turned_from_a_view_on_are_no_other_camera(mount):
     cause = visioncal.calibrate(pairs_session(mount, robot, boards)).verdict.causes[0]
     assert cause.views == (*range(14, 24),)
     assert "pictures" not in cause.words
+
+
+@pytest.mark.parametrize(
+    ("part", "columns", "mount"),
+    [
+        (np.s_[:, 0, 3], "x_m", MOUNTS[0]),
+        (np.s_[:, :2, 3], "x_m and y_m", MOUNTS[1]),
+        (np.s_[:, :3, :3], "qx to qw", MOUNTS[0]),
+    ],
+)
+def test_columns_that_stand_in_other_rows_are_no_rail(part, columns, mount):
+    robot, boards = poses_of(mount)
+    mixed = robot.copy()
+    mixed[part] = np.roll(robot, 1, axis=0)[part]
+    cause = visioncal.calibrate(pairs_session(mount, mixed, boards)).verdict.causes[0]
+    assert f"the numbers of {columns} stand 1 row later than the others" in cause.words
+    assert f"move the cells of {columns} up by 1 row" in cause.do.words
+    # Once moved, the last row has none.
+    mixed[:-1][part] = mixed[1:][part]
+    mended = visioncal.calibrate(pairs_session(mount, mixed[:-1], boards[:-1]))
+    assert sum(view.used for view in mended.views) == len(boards) - 1
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_a_column_that_was_sorted_by_itself_is_no_rail(mount):
+    robot, boards = poses_of(mount)
+    robot[:, 2, 3] = np.sort(robot[:, 2, 3])
+    cause = visioncal.calibrate(pairs_session(mount, robot, boards)).verdict.causes[0]
+    assert "The robot's z has the numbers of other rows" in cause.words
 
 
 @pytest.mark.parametrize("degrees", [90.0, 180.0])

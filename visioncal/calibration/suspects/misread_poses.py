@@ -15,6 +15,7 @@ from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.missing_axis import missing_axes
+from visioncal.calibration.suspects.other_rows import of_other_rows
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
@@ -153,6 +154,9 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
 
 def _unrecorded(run: RunState) -> Iterator[Finding]:
     """The finding that the robot's poses are not those of the images, whatever the frames are."""
+    if apart := [*of_other_rows(run)]:
+        yield from apart
+        return
     views, both = _both_sides(run.base_from_flange, run.poses_of_one_board, run.session.mount)
     kept = thinned(np.arange(len(both)))
     views, both = views[kept], both[kept]

@@ -10,7 +10,7 @@ from visioncal.core.conventions import UNITS_M
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.core.verdict import Finding, Remedy, mending
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.observability import too_little_motion
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
@@ -65,6 +65,16 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
         if is_axis
         else "Write poses that contain this axis, or calibrate views at one place of it."
     )
+    if is_axis and _is_in_other_order(both[:, 0, axis, 3], motion, away_m):
+        words = (
+            f"The robot's {name} has the numbers of other rows, as where its column was sorted by "
+            f"itself: in the order that the images show, robot and camera agree to "
+            f"{figure(1e3 * away_m)} mm, and in that of the rows they differ by up to "
+            f"{figure(1e3 * moved_m)} mm."
+        )
+        step = f"In views.csv, write column {name}_m anew, each number in the row of its own pose."
+        yield Finding("misread_poses", words, Remedy(f"{step} Calibrate again.", CALIBRATE))
+        return
     by_view = dict(zip(views.tolist(), motion.tolist(), strict=True))
     every = ranges([view.number for view in run.session.views])
     for _, factor in _columns(run, by_view, away_m, [POSE[axis]] if is_axis else []):
@@ -96,6 +106,13 @@ def missing_axes(run: RunState, views: IntArray, both: FloatArray) -> Iterator[F
         do = mending("it is added to the positions", f"--positions {every}:{terms}")
         break
     yield Finding("misread_poses", words, do)
+
+
+def _is_in_other_order(values: FloatArray, motion: FloatArray, away_m: float) -> bool:
+    """Whether values (m,) with the motion (m,) that they lack are the same ones in other rows."""
+    apart = np.sort(values + motion) - np.sort(values)
+    apart -= np.median(apart)
+    return float(np.quantile(np.abs(apart), 0.9)) < max(CLEAR_RATIO * away_m, 1e-4)
 
 
 def _left_by_step(motion: FloatArray) -> float:

@@ -350,20 +350,21 @@ def _signed(
 def _mixed_units(record: _Record, own: IntArray, base: float) -> Iterator[Undoing]:
     """Views whose position is in millimetres where the others' are in metres, or the reverse.
 
-    The sizes of the positions tell the rows of either unit, however many they are.
+    The sizes of the positions, or of one axis, tell the rows of either unit, however many they are.
     """
     flanges = robot_part(record.robot, record.mount)
-    sizes_m = np.linalg.norm(flanges[:, :3, 3], axis=1)
-    for factor, wrong, unit in (
-        (1e-3, sizes_m > _FARTHEST_M, "a thousand times as large"),
-        (1e3, sizes_m < _NEAREST_M, "a thousandth as large"),
+    sizes_m, large = np.linalg.norm(flanges[:, :3, 3], axis=1), "a thousand times as large"
+    single = ((1e-3, np.abs(flanges[:, at, 3]) > _FARTHEST_M, large, "xyz"[at]) for at in range(3))
+    for factor, wrong, unit, part in (
+        (1e-3, sizes_m > _FARTHEST_M, large, "xyz"),
+        (1e3, sizes_m < _NEAREST_M, "a thousandth as large", "xyz"),
+        *single,
     ):
         rows = wrong[own] & (own >= 0)
         if np.sum(rows) < 1 or np.sum(~rows & (own >= 0)) < 1:
             continue
-        scaled = compose(
-            flanges[:, :3, :3], flanges[:, :3, 3] * np.where(wrong, factor, 1.0)[:, None]
-        )
+        is_scaled = wrong[:, None] & np.array([name in part for name in "xyz"])
+        scaled = compose(flanges[:, :3, :3], flanges[:, :3, 3] * np.where(is_scaled, factor, 1.0))
         edges = _Edges.by(replace(record, robot=robot_part(scaled, record.mount)), own, own >= 0)
         if edges is None:
             continue
@@ -372,8 +373,9 @@ def _mixed_units(record: _Record, own: IntArray, base: float) -> Iterator[Undoin
         if squares[agrees].mean() > CLOSING_SCORE**2 or np.sum(agrees & rows) < 0.6 * np.sum(rows):
             continue
         views = tuple(record.views[record.rows[rows]].tolist())
-        short = f"the robot's position is {unit} as in the others, as where it is in another unit"
-        axes = ",".join(f"{factor:g}*{name}_m" for name in "xyz")
+        whose = "the robot's position" if part == "xyz" else f"{part} of the robot's position"
+        short = f"{whose} is {unit} as in the others, as where it is in another unit"
+        axes = ",".join(f"{factor:g}*{at}_m" if at in part else at for at in "xyz")
         yield Undoing(
             EVIDENCE * float(log - base) + _MISTAKE,
             Finding(
