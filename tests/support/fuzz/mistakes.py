@@ -145,10 +145,12 @@ def _axes(poses: Poses, rng: np.random.Generator) -> Poses:
 
 
 def _components(poses: Poses, rng: np.random.Generator) -> Poses:
-    """Two numbers of a rotation vector exchanged, or one of it or of Euler angles of other sign."""
+    """Two numbers of a rotation vector exchanged, one of other sign, or Euler angles in gon."""
     form = ("rotation-vector", "euler-ZYX-deg", "euler-XYZ-deg")[rng.integers(3)]
     told, terms = numbers(poses.true_robot, form), np.eye(3)
-    if form == "rotation-vector" and rng.integers(2):
+    if form == "euler-ZYX-deg" and rng.integers(2):
+        terms /= 0.9
+    elif form == "rotation-vector" and rng.integers(2):
         terms = terms[:, ((0, 2, 1), (1, 0, 2), (2, 1, 0))[rng.integers(3)]]
     else:
         terms[(at := rng.integers(3)), at] = -1.0

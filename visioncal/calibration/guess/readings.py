@@ -18,6 +18,7 @@ _MIRROR = np.array([1.0, -1.0, 1.0])
 _UNITS = ("m", "mm", "cm", "inch")
 # Radians that were read as degrees leave all rotations within 2 pi degrees of identity, per angle.
 _RADIANS_AS_DEGREES_RAD = np.deg2rad(12.0)
+_GON = 0.9  # Degrees of a gon, of which 400 are a turn.
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class SideReading(Reading):
     written: str = ""
     # Signed places, from 1, of the numbers of a rotation; empty for as they are written.
     terms: tuple[int, ...] = ()
+    angle_unit: float = 1.0  # Factor of the angles, beside the unit of their form.
     # Rotations of rows, by their places, that no formula gives back.
     by_place: tuple[tuple[str, tuple[float, ...]], ...] = ()
     # Whether rotations are transposed while positions are not those of an inverse.
@@ -65,7 +67,7 @@ class SideReading(Reading):
             recorded[valid] = ROTATION_FORMS[self.written].write(rotations[valid])
         if self.terms:
             recorded = recorded[:, np.abs(self.terms) - 1] * np.sign(self.terms)
-        return ROTATION_FORMS[self.rotation].read(recorded)
+        return ROTATION_FORMS[self.rotation].read(self.angle_unit * recorded)
 
     def poses(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 4, 4) transforms [m]; NaN in rows without a pose."""
@@ -230,6 +232,8 @@ def _components(form: str) -> Iterator[Change]:
         fields, names = {"rotation": "rotation-vector", "written": "rotation-vector"}, (*"xyz",)
         whose += " (of qx, qy, qz, or of rx, ry, rz)"
     is_vector = not form.startswith("euler-")
+    if form.endswith("-deg"):
+        yield Change(f"{whose} in gon (400 to a turn)", "robot", {"angle_unit": _GON})
     if is_vector:
         # Transposed, it has the other three signs.
         fields["transposed"] = False
@@ -303,7 +307,11 @@ def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change
 def _signed_angles(
     robot: PoseNumbers, known: list[FloatArray], forms: Sequence[str]
 ) -> Iterator[Change]:
-    """Rotations made of Euler angles of which one has another sign; they are added to the known."""
+    """Rotations made of Euler angles in gon, or with one of another sign, which is then known."""
+    for form in forms:
+        words = f"the robot's {ROTATION_FORMS[form].words}, but in gon (400 to a turn)"
+        fields = {"rotation": form, "written": form, "angle_unit": _GON}
+        yield Change(words, "robot", fields, 2)
     for form, (signs, named, cost) in product(forms, _signs(("first", "second", "third"))):
         terms = tuple((np.arange(1, 4) * signs).tolist())
         tried = SideReading(form, written=form, terms=terms).rotations(robot)

@@ -370,10 +370,9 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
 
     # Transposed or mirrored rotations turn by the same angles.
     @cache
-    def by_robot(rotation: str, written: str, terms: tuple[int, ...], order: str) -> FloatArray:
+    def by_robot(numbers: SideReading, order: str) -> FloatArray:
         at = ROW_ORDERS[order](len(recording.robot))[rows]
-        of_robot = recording.robot.rows(np.maximum(at, 0))
-        rotations = SideReading(rotation, written=written, terms=terms).rotations(of_robot)
+        rotations = numbers.rotations(recording.robot.rows(np.maximum(at, 0)))
         rotations[at < 0] = np.nan
         return relative_angles(rotations)
 
@@ -382,15 +381,17 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
         return relative_angles(SideReading(rotation).rotations(of_camera))
 
     @cache
-    def away(of_robot: tuple[str, str, tuple[int, ...], str], of_camera: str) -> float:
-        difference = np.abs(by_robot(*of_robot) - by_camera(of_camera))
+    def away(numbers: SideReading, order: str, of_camera: str) -> float:
+        difference = np.abs(by_robot(numbers, order) - by_camera(of_camera))
         rank = int(PAIRS_SHARE * len(difference))
         return float(np.partition(np.nan_to_num(difference, nan=np.inf), rank)[rank])
 
     def mismatch(reading: Hypothesis) -> float:
         robot = reading.robot
-        key = (robot.rotation, robot.written, robot.terms, reading.order)
-        return away(key, reading.camera.rotation)
+        numbers = SideReading(
+            robot.rotation, written=robot.written, terms=robot.terms, angle_unit=robot.angle_unit
+        )
+        return away(numbers, reading.order, reading.camera.rotation)
 
     return mismatch
 

@@ -110,21 +110,28 @@ def misreadings(run: RunState) -> Iterator[Finding]:
         yield from _misread_poses(run)
         return
     for robot in run.session.robots:
-        for pair in pairs_of(run, robot):
-            if closes(run.robots[robot].base_from_flange, pair.poses, pair.mount):
-                continue
+        poses, every = run.robots[robot].base_from_flange, pairs_of(run, robot)
+        every = [pair for pair in every if len(pair.poses) >= FEWEST_ROWS]
+        wrong = [pair for pair in every if not closes(poses, pair.poses, pair.mount)]
+        whose = f"robot {robot}" if robot else "the robot"
+        for pair in wrong:
             hint = next(_misread_poses(_of_pair(run, robot, pair)), None)
             if hint is None:
                 continue
+            within, of_these = "", ""
+            if len(wrong) < len(every):
+                # Through other cameras or targets its poses are right.
+                seen = " and ".join(filter(None, [pair.camera, pair.target]))
+                within, of_these = f", in its rows of {seen}", f" that are of {seen}"
             if hint.do is not None and hint.do.command:
                 # The command that writes a copy takes one camera and one robot only.
                 step = (
-                    f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
-                    "quaternion x, y, z, w), and calibrate again."
+                    f"Correct the rows of {whose} in views.csv{of_these} (base_from_flange in "
+                    "metres, quaternion x, y, z, w), and calibrate again."
                 )
                 hint = replace(hint, do=Remedy(step))
-            yield replace(hint, words=f"Robot {robot}: {hint.words}")
-            # All cameras would show the same.
+            yield replace(hint, words=f"{whose[0].upper()}{whose[1:]}{within}: {hint.words}")
+            # All of these would show the same.
             break
 
 
