@@ -119,6 +119,13 @@ def two_folders(folder):
     shoot(folder / "rgb", "frame_{:03d}_corners.png")
 
 
+def calls_of_numpy(folder):
+    """A matrix a view, as NumPy's call in Python that gives it."""
+    shoot(folder, "{}_view.png")
+    for at, pose in enumerate(world()[0]):
+        write(folder / f"{at}_view.txt", f"{'T = ' * (at % 2)}np.array({pose.tolist()})\n")
+
+
 def array(folder):
     shoot(folder, "img{:02d}.png")
     np.save(folder / "robot_poses.npy", world()[0])
@@ -962,6 +969,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         two_sessions, several_bodies, sentence_above,
         sorted_as_text, called_by_words, a_folder_a_view, columns_as_lists,
         blocks_of_text, mappings_of_any_names, rounds, pictures_to_numbers, lines_with_brackets,
+        calls_of_numpy,
         krl_with_a_retract, krl_from_one, krl_with_a_home_of_another_name, rapid_with_a_home,
         as_many_of_other_names, below_units, below_headings, points_of_a_table,
         below_a_preamble, below_tabs, halcon,

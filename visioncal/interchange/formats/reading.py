@@ -279,7 +279,9 @@ def read_record(path: Path, document: object = None) -> dict[str, object]:
     """Content of the file of one view, by name; numbers without a name are its `matrix`."""
     if path.suffix.lower() in DOCUMENTS:
         document = document or read_document(path)
-    elif not (document := _keyed(text := read_plain_text(path)) or _halcon(text, path)):
+    elif called := _CALLED.fullmatch(text := read_plain_text(path)):
+        document = {"matrix": parse_yaml(called[1], str(path))}
+    elif not (document := _keyed(text) or _halcon(text, path)):
         try:
             table = read_table(path, text)
         except DataError:
@@ -293,6 +295,10 @@ def read_record(path: Path, document: object = None) -> dict[str, object]:
     return flattened(document if isinstance(document, Mapping) else {"matrix": document})
 
 
+# An array as Python prints or assigns it.
+_CALLED = re.compile(
+    r"\s*+(?:\w++\s*+=\s*+)?(?:\w++\.)?(?:array|matrix)\(\s*+(\[[-+0-9.eE,\s\[\]]++),?[^\[\]()]*+\)\s*+"
+)
 _HALCON = re.compile(r"^[ \t]*([frt])[ \t]+(\S.*)$", re.MULTILINE)
 
 
