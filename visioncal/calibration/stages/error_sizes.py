@@ -31,6 +31,7 @@ _INSTEAD = {
     "mount steps": "what the flange carries moved at once",
     "lens grows": "the lens crept",
     "lens steps": "the lens changed at once",
+    "row motion": "the camera moved while rows of its images were read",
 }
 
 
