@@ -130,9 +130,9 @@ class BracketBends(PostureEffect, Named):
         away = self.frames.copy()
         away[6:] -= self.raw(self.stops).mean(axis=0)
         shown, sizes, _ = np.linalg.svd(away, full_matrices=False)
-        # Of a bracket that bends alike in all directions, they are three times as large as of one
-        # that bends at random.
-        return np.asarray(twists_of_frames(moments.poses[self.frame]) @ (2.0 * shown * sizes))
+        # Of a bracket that bends at random; of one that bends alike in all directions, up to three
+        # times as large, which would be said of an arm's errors that look like bends, too.
+        return np.asarray(twists_of_frames(moments.poses[self.frame]) @ (shown * sizes))
 
     def raw(self, poses: FloatArray) -> FloatArray:
         """See `PostureEffect`."""
