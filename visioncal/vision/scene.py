@@ -10,12 +10,12 @@ neighbouring patches share errors of lens and light.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import spline_filter
 
 from visioncal.core.transforms import apply, exp, invert, log
 from visioncal.core.types import Camera, FloatArray, Image, Mask
@@ -32,6 +32,8 @@ _TEXTURE = 44.0
 _ALIKE, _MOST_VARIANCE = 0.5, 4.0
 # Error of a shift that interpolation, lens and light leave with any contrast [px].
 _FLOOR_PX = 0.02
+# Step after which a patch is at rest [px]; the next would be a small part of it.
+_SETTLED_PX = 1e-3
 # Residual of a patch that follows the camera: in pixels of its scale, and in sigmas.
 _GATE_PX, _GATE_SIGMA = 1.0, 4.0
 # Fewest patches that follow the camera, and their share of all in the reference: where parts cover
@@ -202,6 +204,34 @@ def _textured(image: FloatArray, mask: Mask, scale: int) -> FloatArray:
     return np.asarray(found[0].reshape(-1, 2)[found[1].ravel() * (box / 2) ** 2 > _TEXTURE], float)
 
 
+@dataclass(frozen=True, eq=False)
+class _Spline:
+    """An image between its pixels, by cubic B-splines."""
+
+    coefficients: FloatArray  # (h + 4, w + 4) of the image, mirrored beyond two pixels of its edge.
+
+    @classmethod
+    def of(cls, image: FloatArray) -> Self:
+        return cls(np.pad(spline_filter(image), 2, mode="reflect"))
+
+    def patches(self, places: FloatArray, box: int) -> FloatArray:
+        """(n, box^2) values by rows of squares whose first pixels are at (n, 2) places (u, v).
+
+        All pixels of a patch lie alike between those of the image: two products with the four
+        weights of each axis. A place beyond the image gives the nearest patch in it.
+        """
+        most = np.array(self.coefficients.shape[::-1]) - 4 - box
+        first = np.clip(np.floor(places), 0, most).astype(int)
+        t = np.clip(places - first, 0.0, 1.0)
+        parts = [(1 - t) ** 3, (3 * t - 6) * t**2 + 4, 1 + 3 * t * (1 + t - t**2), t**3]
+        weights = np.stack(parts)[..., None, None] / 6
+        windows = sliding_window_view(self.coefficients, (box + 3, box + 3))
+        window = windows[first[:, 1] + 1, first[:, 0] + 1]
+        rows = sum(weights[at, :, 1] * window[:, at : at + box] for at in range(4))
+        found = sum(weights[at, :, 0] * rows[:, :, at : at + box] for at in range(4))
+        return np.reshape(found, (len(places), box**2))
+
+
 def _tracked(
     before: FloatArray, now: FloatArray, at: FloatArray, guess: FloatArray
 ) -> tuple[FloatArray, FloatArray, Mask]:
@@ -216,22 +246,23 @@ def _tracked(
     columns = np.stack([patch, np.ones_like(patch), by_u, by_v], axis=2)
     inverse = np.linalg.pinv(columns.transpose(0, 2, 1) @ columns, hermitian=True)
     solve = inverse @ columns.transpose(0, 2, 1)
-    reach = np.indices((box, box)).reshape(2, 1, -1) - _HALF
-    spline, shifts = spline_filter(now), guess.copy()
+    spline, shifts, moving = _Spline.of(now), guess.copy(), np.arange(len(at))
+    values, solved = np.zeros((len(at), box**2)), np.zeros((len(at), 4))
+    gain, length = np.full(len(at), np.inf), np.full(len(at), np.inf)
     for _ in range(12):
-        places = (at + shifts).T[::-1, :, None] + reach
-        values = map_coordinates(spline, places, mode="nearest", prefilter=False)
-        solved = (solve @ values[:, :, None])[:, :, 0]
-        gain = np.where(solved[:, 0] > 0.1, solved[:, 0], np.inf)
-        rest = solved[:, 2:] / gain[:, None]
+        values[moving] = spline.patches(at[moving] + shifts[moving] - _HALF, box)
+        solved[moving] = (solve[moving] @ values[moving, :, None])[:, :, 0]
+        gain[moving] = np.where(solved[moving, 0] > 0.1, solved[moving, 0], np.inf)
+        rest = solved[moving, 2:] / gain[moving, None]
+        length[moving] = away = np.linalg.norm(rest, axis=1)
         # Beyond a pixel and a half the slopes say only where it goes.
-        length = np.linalg.norm(rest, axis=1, keepdims=True)
-        shifts -= rest * np.minimum(1.0, 1.5 / np.maximum(length, 1e-9))
+        shifts[moving] -= rest * np.minimum(1.0, 1.5 / np.maximum(away, 1e-9))[:, None]
+        moving = moving[away > _SETTLED_PX]
     variance = np.mean((values - (columns @ solved[:, :, None])[:, :, 0]) ** 2, axis=1)
     covariances = variance[:, None, None] * inverse[:, 2:, 2:] / gain[:, None, None] ** 2
     limit = np.array(before.shape[::-1]) - _HALF - 1
     found = np.all((at + shifts > _HALF) & (at + shifts < limit), axis=1) & np.isfinite(gain)
-    found &= (length[:, 0] < 0.1) & (variance < (1 - _ALIKE) * values.var(axis=1))
+    found &= (length < 0.1) & (variance < (1 - _ALIKE) * values.var(axis=1))
     # More is left where something else is in a part of the patch.
     found &= variance < _MOST_VARIANCE * np.median(variance[found]) if found.any() else found
     return shifts, covariances + _FLOOR_PX**2 * np.eye(2), found
