@@ -15,6 +15,7 @@ from support.commands import visioncal as command
 from support.edited import rewritten
 from support.following import follow
 from support.fuzz.broken_sessions import BROKEN, Mistake, broken_session, edit, sound_session
+from support.marks import slow
 from support.refusals import raised
 from support.rendered import Shot, photograph
 
@@ -26,7 +27,7 @@ from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import NOTE
 from visioncal.interchange.formats import load_for_rereading
 from visioncal.results import Calibration, to_document
-from visioncal.session import Session
+from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (
     BOARDS,
@@ -235,13 +236,17 @@ def test_missing_cut_and_empty_images_are_named_and_left_out(session_copy, resul
     assert away_mm(calibration, result) < 3 * calibration.edges["flange_from_cam"].sigma_mm
 
 
-def test_two_views_and_no_board_are_refused(session_copy):
-    for path in sorted((session_copy / "images").iterdir())[2:]:
-        cv2.imwrite(str(path), np.full((800, 1280), 90, np.uint8))
-    raised(DataError, "intrinsics: 2 views show the target", visioncal.calibrate, session_copy)
-    for path in sorted((session_copy / "images").iterdir()):
-        path.write_bytes(cv2.imencode(".png", np.full((800, 1280), 90, np.uint8))[1].tobytes())
-    caught = raised(DataError, "no view shows the target", visioncal.calibrate, session_copy)
+def test_two_views_and_no_board_are_refused(rendered):
+    few = Session.load(rendered).only(range(3))
+    files = {view.image: few.images.read(view.image) for view in few.views}
+    files[few.views[2].image] = cv2.imencode(".png", np.full((800, 1280), 90, np.uint8))[
+        1
+    ].tobytes()
+    two = few.with_content(images=MemoryImages(files))
+    raised(DataError, "intrinsics: 2 views show the target", visioncal.calibrate, two)
+    blank = [np.full((200, 320), 90, np.uint8)] * 3
+    none = Session.from_arrays(blank, np.tile(np.eye(4), (3, 1, 1)), charuco(9, 6))
+    caught = raised(DataError, "no view shows the target", visioncal.calibrate, none)
     assert "almost uniform" in caught.culprits[0]
 
 
@@ -272,13 +277,11 @@ def sound(tmp_path_factory):
 
 
 def test_nothing_is_wrong_with_a_sound_session(sound):
-    found = visioncal.doctor(sound)
-    assert found.is_sound
-    assert "15 of 15 images" in str(found)
     done = command("doctor", sound)
     assert (done.status, done.err) == (0, "")
     assert f"visioncal calibrate {sound} -o out" in done.out
-    assert re.search(r"in 15 images, over [5-9]\d % of their width and [5-9]\d % of", str(found))
+    assert "15 of 15 images" in done.out
+    assert re.search(r"in 15 images, over [5-9]\d % of their width and [5-9]\d % of", done.out)
 
 
 def test_views_that_leave_lens_and_mount_open_are_told_of_both():
@@ -311,14 +314,14 @@ def test_stops_that_are_too_few_to_check_a_result_are_said_as_the_verdict_says_t
 
 
 def first_of_blurred(shown, sigma_px):
-    """What is said of a declared ChArUco board of 9 x 6 where images show another or are blurred.
+    """What is said of a declared ChArUco board of 9 x 6 where an image shows another or is blurred.
 
     A module of its markers is 2.9 px wide.
     """
     image, _ = photograph(shown, Shot(square_px=28))
     image = np.pad(image, 20, mode="edge")
     image = cv2.GaussianBlur(image, (0, 0), sigma_px) if sigma_px else image
-    session = Session.from_arrays([image] * 3, np.tile(np.eye(4), (3, 1, 1)), charuco(9, 6))
+    session = Session.from_arrays([image], np.eye(4)[None], charuco(9, 6))
     return visioncal.doctor(session).findings[0]
 
 
@@ -357,7 +360,7 @@ SLIGHT = {"tilt_rad": (0.0, 0.015), "roll_rad": 0.015}
     ("mount", "motion"),
     [
         ("eye-in-hand", {"motion": "one_axis"}),
-        ("eye-to-hand", {"motion": "one_axis"}),
+        slow("eye-to-hand", {"motion": "one_axis"}),
         ("eye-to-hand", {"motion": "translation"}),
         ("eye-in-hand", SLIGHT),
     ],

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 from support.drawn import column
+from support.marks import slow
 from support.misfits import misfit
 from support.problems import observed, pose, world
 from support.refusals import raised
@@ -103,7 +104,7 @@ def three():
     """The session of a cell of three cameras: two or more see by way of a robot at most stops."""
     right = CameraAt("right", place_m=(0.3, -1.0, 1.2), camera=CAMERAS["fine"])
     cameras = (*OPTIONS.cameras, right)
-    return recorded(simulate(replace(OPTIONS, cameras=cameras, stops=16)))
+    return recorded(simulate(replace(OPTIONS, cameras=cameras, stops=12)))
 
 
 def test_any_frame_is_placed_in_any_other_with_the_covariance_of_the_chain(clean):
@@ -149,7 +150,7 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert away_m < 2.5e-4
 
 
-@pytest.mark.parametrize("frame", ["cam_right", "target_floor"])
+@pytest.mark.parametrize("frame", ["cam_right", slow("target_floor")])
 def test_a_frame_that_creeps_was_not_bumped_again_and_again(frame):
     cell = simulate(replace(PLAIN, moved=(Moved(frame, creeps=True, shift_m=0.012),), seed=3))
     found = solved(cell)
@@ -486,8 +487,9 @@ def test_an_arm_of_a_cell_drifts_with_its_own_temperatures(warm, tmp_path):
     assert not any(reason.startswith("Robot b: the arm drift") for reason in found.verdict.reasons)
     budget = found.cell.uncertainty.budget_mm["flange_a_from_target_plate_a"]
     assert 0.0 < budget["temperature of a"] < budget["total"]
+    few = session_of(cell).only([sight.view for sight in cell.sights if sight.stop < 8])
     with pytest.raises(DataError, match=r"robot a: level 'thermal' needs .* temp1_c"):
-        solved(cell, replace(session_of(cell), streams={}), "thermal")
+        solved(cell, replace(few, streams={}), "thermal")
     raised(DataError, "warms up needs pace_s", replace, cell.options, pace_s=0.0)
 
 
@@ -568,7 +570,7 @@ def test_pictures_of_several_cameras_are_one_cell(tmp_path):
 
 def test_two_images_that_are_exchanged_have_a_command_that_mends_them(three):
     # The images of one camera at two stops.
-    views = [view for view in three.views if view.text["target"] == "plate_b"]
+    views = [view for view in three.views if view.text.get("target") == "plate_b"]
     of_one = [view.number for view in views if view.text["camera"] == views[0].text["camera"]]
     first, second = of_one[1], of_one[3]
     swapped = exchange_views(three, first, second)
@@ -580,5 +582,5 @@ def test_two_images_that_are_exchanged_have_a_command_that_mends_them(three):
     assert len(mended.declaration.corrected) == 2
     now, was = ({view.number: view.numbers for view in it.views} for it in (mended, three))
     assert now == was
-    other = next(view.number for view in three.views if view.text["target"] != "plate_b")
+    other = next(view.number for view in three.views if view.text.get("target") == "floor")
     raised(DataError, r"another .*target", exchange_views, three, first, other)

@@ -182,10 +182,10 @@ def moving(kind, mount, count=16):
 @pytest.mark.parametrize(
     ("kind", "mount", "name", "keys"),
     [
-        ("gantry", MOUNTS[0], "base_from_target", "xyz"),
+        slow("gantry", MOUNTS[0], "base_from_target", "xyz"),
         ("gantry", MOUNTS[1], "flange_from_target", "xyz"),
         ("scara", MOUNTS[0], "flange_from_cam", "z"),
-        ("scara", MOUNTS[1], "base_from_cam", "z"),
+        slow("scara", MOUNTS[1], "base_from_cam", "z"),
     ],
 )
 def test_a_machine_that_cannot_tilt_hears_what_to_measure(kind, mount, name, keys):
@@ -205,7 +205,7 @@ def test_a_machine_that_cannot_tilt_hears_what_to_measure(kind, mount, name, key
     assert not any("tilted" in str(step) for step in found.verdict.next_steps)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_a_rail_leaves_a_turn_open_too(mount):
     error = raised(
         DegenerateError, "in position only", visioncal.calibrate, moving("rail", mount)[0]
@@ -219,8 +219,12 @@ def test_a_lens_that_far_views_leave_open_hears_what_to_state():
     )
     cell = simulate(far)
     known = calibrated(cell)
-    assert known.assessment.edges["cam"].sigma_mm > 1.0
-    assert misfit(known.assessment.edges["cam"], cell.transforms["flange_from_cam"]) < 22.5
+    found = known.assessment.edges["cam"]
+    lens = known.lenses["cam"].camera
+    assert np.allclose(lens.matrix[:2], CAMERAS["wide"].matrix[:2], atol=14.0)
+    assert found.sigma_mm > 1.0
+    assert np.sqrt(np.diag(found.covariance)[3:].max()) < 5e-3
+    assert misfit(found, cell.transforms["flange_from_cam"]) < 22.5
     (words,) = (note for note in known.notes if "robot's motion determined the lens" in note)
     assert "over 5 % of the image's width" in words
     assert "role = intrinsics" in words

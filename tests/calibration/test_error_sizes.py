@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 from support.cells import calibrated, known_of, reporting, session_of, showing
 
@@ -23,6 +24,7 @@ def square_of(path, edge):
     return float(error @ np.linalg.solve(edge.covariance, error))
 
 
+@pytest.mark.slow
 def test_a_far_board_and_an_unknown_lens_are_told_apart_by_the_robots_motion(real_data):
     # At 3 m the board is flat in its images, which tell no focal length.
     path = real_data / "field/worlds/far3m-h-4000"

@@ -11,7 +11,8 @@ from support.refusals import raised
 from support.tracked import errors_of, known_of
 
 import visioncal
-from visioncal.calibration.run import calibrate
+from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.run import STAGES, calibrate, run_stages
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert
@@ -208,6 +209,11 @@ def test_what_cannot_be_calibrated_is_refused_by_name(options, change, words):
     raised(DataError, words, known_of, change(session_of(tracked(options))))
 
 
+def read(session: Session) -> RunState:
+    """What is known of a session before anything is fitted."""
+    return run_stages(RunState(session), STAGES[: [stage.name for stage in STAGES].index("solve")])
+
+
 def test_a_misspelt_point_is_named_and_measured_poses_come_before_readings():
     named = edited(session_of(tracked(POINTS)), "point", lambda _, cell: f"nest_{cell}")
     for name, words in (
@@ -217,7 +223,7 @@ def test_a_misspelt_point_is_named_and_measured_poses_come_before_readings():
         ("tooling ball", "was read once"),
     ):
         wrong = edited(named, "point", lambda at, cell, name=name: name if at == 6 else cell)
-        assert words in known_of(wrong).reasons[6]
+        assert words in read(wrong).reasons[6]
     session = session_of(tracked(PROBE))
     views = []
     for view in session.views:
@@ -229,7 +235,7 @@ def test_a_misspelt_point_is_named_and_measured_poses_come_before_readings():
         views=tuple(views),
         document={**session.document, "mount": "eye-to-hand"},
     )
-    known = known_of(both)
+    known = read(both)
     assert both.mount == "eye-to-hand"
     assert known.readings is None
     words = "30 rows have an instrument's readings"

@@ -166,6 +166,7 @@ def test_two_streams_with_clocks_of_their_own(real_data, calibrated):
     assert np.median([value.residual_deg for value in used]) < 0.5
 
 
+@pytest.mark.slow
 def test_a_positioner_from_its_joints(real_data, calibrated, tmp_path):
     (tmp_path / "positioner.toml").write_text(POSITIONER)
     result, _ = calibrated(

@@ -17,6 +17,7 @@ from support.samples import made_up
 
 from visioncal.calibration.stages import detect
 from visioncal.core.documents import tables
+from visioncal.core.errors import DataError
 from visioncal.interchange.formats import file_search, reading, rereading
 from visioncal.interchange.formats.columns import foreign_from
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
@@ -1372,10 +1373,7 @@ def test_a_board_of_other_counts_is_named_before_the_form_is_asked_for(tmp_path)
 def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypatch):
     session = world()[2]
     shoot(tmp_path / "in", "img{:02d}.png")
-    # Quaternions, which have fewer readings than angles, none of which agrees.
-    poses = np.random.default_rng(0).normal(0.0, 0.5, (9, 7))
-    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    np.save(tmp_path / "in/poses.npy", poses)
+    np.save(tmp_path / "in/poses.npy", angles_of("xyz"))
     write(tmp_path / "board.toml", tomli_w.dumps(target_document(session.target)))
     find, searched = detect.find_corners, list[int]()
 
@@ -1383,7 +1381,12 @@ def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypat
         searched.append(view)
         return find(image, target, view, **options)
 
+    def undecided(*_, **__):
+        raise DataError("No reading agrees.")
+
     monkeypatch.setattr(detect, "find_corners", counted)
+    # However many readings are tried, and whatever each of them takes.
+    monkeypatch.setattr(rereading, "guess_from_camera_poses", undecided)
     monkeypatch.setattr(rereading, "_TESTED", (6, 9))
     options = ("--target", tmp_path / "board.toml", "--mount", "eye-in-hand")
     assert visioncal("convert", tmp_path / "in", tmp_path / "out", *options).status == 2

@@ -211,14 +211,24 @@ def test_poses_frames_and_lenses_may_be_named(source, rendered, tmp_path):
     assert "tool0" in caught.next_step
 
 
-@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
-def test_a_data_set_of_lerobot_calibrates(version, source, rendered, tmp_path):
-    path = write_dataset(tmp_path / "set", source, rendered, version, "ur10e_follower")
-    session = convert(path, tmp_path / "out", requested=BOARD)
+def test_data_sets_of_lerobot_are_one_session_that_calibrates(source, rendered, tmp_path):
+    """Of both versions."""
+    first, session = (
+        convert(
+            write_dataset(tmp_path / version, source, rendered, version, "ur10e_follower"),
+            tmp_path / f"{version}-out",
+            requested=BOARD,
+        )
+        for version in ("v2.1", "v3.0")
+    )
     assert session.declaration.robot.model == "ur10e"
     assert len(session.views) == len(source.views)
     q = np.array([view.joints_rad for view in session.views])
     assert np.abs(q - [view.joints_rad for view in source.views]).max() < 1e-4
+    assert first.document == session.document | {"name": first.document["name"]}
+    for view, other in zip(session.views, first.views, strict=True):
+        assert view.numbers == other.numbers
+        assert np.array_equal(pixels(session.images, view.image), pixels(first.images, other.image))
     transform = calibrate(session, level="hand-eye").transforms["flange_from_cam"]
     meant = calibrate(source, level="hand-eye").transforms["flange_from_cam"]
     # A video's compression moves corners by some hundredths of a pixel.

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.later import FITTED, Change, again, knock, usual
+from support.marks import slow
 from support.refusals import raised
 from support.scenes import CAMERA, Scene, disturbed, turned
 from support.wrong_arms import target_in_camera
@@ -183,7 +184,7 @@ def posed(place, rng, count, change=None, start=0):
         )
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_changes_of_any_size_are_answered_and_beyond_the_model_something_else(mount):
     place, rng = usual(mount), np.random.default_rng(5)
     guard, kept = Guard(place.calibration), None
