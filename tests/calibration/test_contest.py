@@ -219,11 +219,11 @@ def test_a_lens_that_far_views_leave_open_hears_what_to_state():
     )
     cell = simulate(far)
     known = calibrated(cell)
-    found = known.assessment.edges["cam"]
-    lens = known.lenses["cam"].camera
-    assert np.allclose(lens.matrix[:2], CAMERAS["wide"].matrix[:2], atol=14.0)
+    found, lens, true = known.assessment.edges["cam"], known.lenses["cam"], CAMERAS["wide"].matrix
+    assert np.allclose(lens.camera.matrix[:2], true[:2], atol=14.0)
+    # The motion tells the focal length to a per cent, and the views alone not to five.
+    assert np.sqrt(np.diag(lens.covariance)[:2].max()) < 0.01 * true[0]
     assert found.sigma_mm > 1.0
-    assert np.sqrt(np.diag(found.covariance)[3:].max()) < 5e-3
     assert misfit(found, cell.transforms["flange_from_cam"]) < 22.5
     (words,) = (note for note in known.notes if "robot's motion determined the lens" in note)
     assert "over 5 % of the image's width" in words

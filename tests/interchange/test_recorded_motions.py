@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.bags import FORMS, BagOptions, write_bag
 from support.lerobot import KEY, write_dataset
+from support.marks import crossed, slow
 from support.refusals import raised
 
 from visioncal import calibrate, simulation
@@ -119,8 +120,9 @@ def with_depth(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("kind", ["16UC1", "32FC1", "compressed", "cloud"])
-@pytest.mark.parametrize("form", ["ros1", "mcap"])
+@pytest.mark.parametrize(
+    ("kind", "form"), crossed(["16UC1", "32FC1", "compressed", "cloud"], ["ros1", "mcap"])
+)
 def test_depth_of_a_bag_is_that_of_its_views(kind, form, with_depth, tmp_path):
     source = Session.load(with_depth)
     path = tmp_path / ("b.bag" if form == "ros1" else "b")
@@ -246,7 +248,7 @@ HOSTILE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("version", [slow("v2.1"), "v3.0"])
 def test_a_hostile_description_of_a_data_set_is_refused(version, source, rendered, tmp_path):
     path = write_dataset(tmp_path / "set", source, rendered, version, "ur10e")
     file = path / "meta" / "info.json"

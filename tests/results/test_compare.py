@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.cells import reporting
 from support.commands import visioncal
+from support.marks import slow
 from support.picks import calibration_of
 from support.samples import made_up
 
@@ -50,7 +51,7 @@ def pair(mount):
     return calibration_of(first), calibration_of(second)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_a_moved_board_is_no_moved_camera(mount):
     second = calibration_of(moved(cells(mount)[1], board=2e-3 * SHIFT))
     comparison = compare(pair(mount)[0], second)

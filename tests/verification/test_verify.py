@@ -11,6 +11,7 @@ from support.beyond import with_field
 from support.cells import board_numbers, calibrated, known_of, pairs_session, reporting, session_of
 from support.commands import visioncal
 from support.later import ANYHOW, Change, again, knock, known_again, usual
+from support.marks import crossed
 from support.misfits import misfit
 from support.pages import Page
 from support.refusals import raised
@@ -363,7 +364,11 @@ def recovered(either, change, rng, causes=None):
     return causes, changed(found, causes, either.calibration.rms)[0]
 
 
-@pytest.mark.parametrize("kind", ["camera", "board", "camera and board", "joint 3"])
+@pytest.mark.parametrize(
+    ("kind", "either"),
+    crossed(["camera", "board", "camera and board", "joint 3"], MOUNTS),
+    indirect=["either"],
+)
 def test_what_changed_is_estimated_with_its_covariance_and_the_rest_is_kept(either, kind):
     rng, old, squares = np.random.default_rng(7), either.calibration, []
     (x, z), q = either.cell.transforms.values(), either.cell.robot.joints
