@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from support.cells import calibrated, error_of, reporting, showing
 from support.commands import visioncal
@@ -142,6 +143,36 @@ def creeping(cell):
         still = project(camera, apply_each(np.tile(pose, (len(at), 1, 1)), points[seen.ids]))
         looks.append(replace(seen, px=seen.px + project(camera, at) - still))
     return showing(cell, looks)
+
+
+def on_the_way(cell):
+    """Poses that are read when the arm is a twelfth of the way to its next stop."""
+    there = cell.robot.base_from_flange
+    away = np.append(log(invert(there[:-1]) @ there[1:]), np.zeros((1, 6)), axis=0)
+    return reporting(cell, base_from_flange=there @ exp(0.08 * away))
+
+
+def logged_once(axis):
+    """One coordinate, or the angle about x of angles about z, y, x, that is one number."""
+
+    def change(cell):
+        poses = cell.robot.base_from_flange.copy()
+        if axis < 3:
+            poses[:, axis, 3] = poses[0, axis, 3]
+            return reporting(cell, base_from_flange=poses)
+        angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX")
+        angles[:, 2] = angles[0, 2]
+        poses[:, :3, :3] = Rotation.from_euler("ZYX", angles).as_matrix()
+        return reporting(cell, base_from_flange=poses)
+
+    return change
+
+
+def with_another_tool(cell):
+    """From the tenth view on, poses of a tool that is 60 mm longer and 20 mm to the side."""
+    poses = cell.robot.base_from_flange.copy()
+    poses[9:] = poses[9:] @ exp(np.array([0.0, 0.0, 0.3, 0.02, 0.0, 0.06]))
+    return reporting(cell, base_from_flange=poses)
 
 
 def wavy(cell):
@@ -377,7 +408,46 @@ WORLDS: dict[str, World] = {
         figure=(4.6, 0.7),
         never=frozenset({"wrong_views", "lens_field", "focus", "image_shifted"}),
     ),
+    # Poses that are not those of the images.
+    "poses read on the way": World(
+        FINE,
+        on_the_way,
+        status="bad",
+        causes=("misread_poses",),
+        words=(r"away from the next stop by (\S+) % of the way.*the pose was read later",),
+        figure=(8.0, 1.0),
+        of=NONE,
+    ),
+    "a height that was logged once": World(
+        FINE,
+        logged_once(2),
+        causes=("misread_poses",),
+        words=("^The robot's z is .* mm in all 20 rows, to the last digit",),
+        of=NONE,
+    ),
+    "an angle that was logged once": World(
+        FINE,
+        logged_once(3),
+        causes=("misread_poses",),
+        words=("^The robot's angle about X is .* deg in all 20 rows.*moving axes ZYX",),
+        of=NONE,
+    ),
+    "another tool midway": World(
+        FINE,
+        with_another_tool,
+        words=(r"controller's tool .*by \((\S+), \S+, 60\) mm and 17 deg",),
+        figure=(20.0, 0.5),
+        of=NONE,
+    ),
     # Boards that are not as drawn, or not as large as stated.
+    "printed longer along one axis": World(
+        FINE,
+        printed([0.012, 0.0], [0.0, 0.0]),
+        causes=("board_size",),
+        words=(r"the board is (\S+) % longer along its x",),
+        figure=(1.2, 0.05),
+        of=NONE,
+    ),
     "bent board": World(
         replace(FINE, board_bow_m=3e-4), joints=True, words=("not flat",), of=(0, 6)
     ),

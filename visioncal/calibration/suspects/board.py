@@ -62,7 +62,8 @@ def _found(run: RunState) -> Iterator[Finding]:
         if measured.is_another and SCALE in fitted.unknowns.values_of(board, moved=True):
             scale, sigma = float(fitted.values(board)[SCALE]), float(fitted.sigmas(board)[SCALE])
             written = replace(measured, scale=scale, sigma=sigma)
-            yield scale_finding(called, target, measured, written, (run.session, name))
+            found = scale_finding(called, target, measured, written, (run.session, name))
+            yield _stretched(found, fitted, board, called)
         yield from _shape_findings(fitted, name, target, called)
 
 
@@ -173,6 +174,28 @@ def scale_finding(
     total = measured.sigma**2 + measured.stated_sigma**2
     square = measured.scale**2 / total
     return Finding("board_size", words, Remedy(do, command or CALIBRATE), mahalanobis_sq=square)
+
+
+def _stretched(found: Finding, fitted: Fit, board: tuple[str, str], called: str) -> Finding:
+    """The finding on a board's size, of one that is stretched by as much: of both axes."""
+    columns = fitted.unknowns.columns(board)[fitted.unknowns.values_of(board) == ASPECT]
+    scale, aspect = (float(fitted.values(board)[at]) for at in (SCALE, ASPECT))
+    is_even = abs(aspect) < 0.5 * abs(scale) or not has_changed(fitted, columns)
+    if found.kind != "board_size" or is_even:
+        return found
+    by = (
+        f"{figure(100 * abs(share))} % {'longer' if share > 0 else 'shorter'} along its {axis}"
+        for axis, share in (("x", scale - aspect / 2), ("y", scale + aspect / 2))
+    )
+    return replace(
+        found,
+        words=f"By the robot's motion the {called} is {' and '.join(by)} than stated, as where a "
+        "printer stretches one axis. The result goes by both.",
+        do=Remedy(
+            "Print it on another printer, and measure it along both axes; one square_m is not "
+            "enough for this one, of which the result knows both."
+        ),
+    )
 
 
 def _shape_findings(fitted: Fit, name: str, target: Target, called: str) -> Iterator[Finding]:

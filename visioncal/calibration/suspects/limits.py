@@ -22,10 +22,6 @@ _LISTED = 3
 # From here on places disagree by more than arms, markers and lenses err [mm], where that is so many
 # times as much as turns do on the lever.
 _FAR_MM, _MUCH_FARTHER = 20.0, 10.0
-_LOOK_AT_BOTH = (
-    "More views alike will not help: give images in place of poses of a marker, or a larger "
-    "marker; then record joint angles with the arm's model."
-)
 
 
 def collect_findings(judged: Findings) -> list[Finding]:
@@ -192,6 +188,16 @@ def _tilted(judged: Findings) -> Remedy:
     return _more_views(judged, f"Add {count} views or more, {how}.", count=count)
 
 
+def _against_lasting(judged: Findings) -> Remedy:
+    """Advice against errors that last from view to view."""
+    words = "More views alike will not help: "
+    if all(sensor.pixel_px is None for sensor in judged.sensors):
+        words += "give images in place of poses of a marker, or a larger marker; then "
+    if all(arm.modelled for arm in judged.arms):
+        return Remedy(f"{words}look whether camera, target and base hold still, and record again.")
+    return Remedy(f"{words}record joint angles with the arm's model.")
+
+
 def _sigmas(judged: Findings) -> Iterator[Finding]:
     """Finding on directions of the unknown edges that are known too little."""
     # Those of a calibrated arm are as undetermined as the errors of its first and last links, which
@@ -218,7 +224,7 @@ def _sigmas(judged: Findings) -> Iterator[Finding]:
         step, by = NO_JOINTS, "by the arm's own errors"
     elif any(arm.are_lasting for arm in judged.arms):
         # They are no finding where chance may explain them, or no arm errs by as much.
-        step, by = Remedy(_LOOK_AT_BOTH), "by errors that last from view to view"
+        step, by = _against_lasting(judged), "by errors that last from view to view"
     elif _is_of_board(judged) and is_of_board:
         step, by = MEASURE_BOARD, "by how well the board's size is stated"
     words = (

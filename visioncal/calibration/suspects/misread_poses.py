@@ -1,10 +1,13 @@
 """Findings on misread poses: another reading of them explains what the cameras see."""
 
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess.decide import POSE_OPTIONS
 from visioncal.calibration.guess.fit import robust_fits
@@ -19,7 +22,9 @@ from visioncal.calibration.suspects.other_rows import of_other_rows
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import VisioncalError
-from visioncal.core.number_format import ranges
+from visioncal.core.limits import CLEAR_RATIO
+from visioncal.core.number_format import figure, ranges
+from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy, mending
 from visioncal.estimation.chain import robot_part
@@ -49,6 +54,17 @@ _WHICH = (
     "Look how the program wrote the poses, and where the camera is; then convert the recording "
     f"anew with that stated: {POSE_OPTIONS}."
 )
+_LOG_ANEW = Remedy(
+    "Look how this number comes into the log, and record again; or convert the robot's own log."
+)
+# A number that stands still does so to a digit; others vary by more [mm, deg].
+_DIGIT_MM, _DIGIT_DEG, _VARIES_MM, _VARIES_DEG = 1e-3, 2e-3, 20.0, 5.0
+_IN_MOTION = Remedy(
+    "Wait until the arm stands still before each image, and log the measured pose then; or record "
+    "times of images and of a stream of poses (stamp_s, streams): then the delay is estimated."
+)
+# Shares of the way to another stop that are tried.
+_SHARES = np.linspace(-0.4, 0.4, 81).round(2)
 _UNRECORDED = Remedy(
     "Convert the recording itself again with --guess, if the session was made of one: angles that "
     "were misread cannot all be read anew from here. Or look how the poses were recorded, and how "
@@ -144,7 +160,7 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
         return
     # Units that merely bring both sides nearer do not precede an axis that closes the chain.
     unknown = [] if guess.best.fit.closes else [*_unrecorded(run)]
-    if guess.stands_out and not any(hint.do != _UNRECORDED for hint in unknown):
+    if guess.stands_out and all(hint.do in (_UNRECORDED, _LOG_ANEW) for hint in unknown):
         robot = guess.best.hypothesis.robot
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
         step = _MIRRORED if robot.mirrored else step
@@ -165,16 +181,21 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
         yield from apart
         return
     views, both = _both_sides(run.base_from_flange, run.poses_of_one_board, run.session.mount)
-    kept = thinned(np.arange(len(both)))
+    kept, robot = thinned(np.arange(len(both))), both[:, 0]
     views, both = views[kept], both[kept]
     if len(both) < FEWEST_ROWS:
         return
     # Both turn by the same angle between two views, whatever the unknown frames.
     by_robot, by_camera = (relative_angles(both[:, side, :3, :3]) for side in (0, 1))
     away = np.abs(by_robot - by_camera)
+    if still := _still(robot):
+        yield Finding("misread_poses", still, _LOG_ANEW)
     if np.quantile(away, PAIRS_SHARE) < _ALIKE_RAD:
         yield from missing_axes(run, views, both)
     alike = float(np.mean(away < _ALIKE_RAD))
+    if np.median(away) > _ALIKE_RAD and (late := _on_the_way(robot, by_camera, kept)) is not None:
+        yield late
+        return
     words = "The robot's poses are not those of the images: "
     if np.ptp(both[:, 0, :3, 3], axis=0).max() < _STILL_M:
         words += "all rows have one position of the robot."
@@ -186,6 +207,75 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
     else:
         return
     yield Finding("misread_poses", words, _UNRECORDED)
+
+
+def _still(robot: FloatArray) -> str:
+    """The number of (m, 4, 4) poses that stood still while all others varied; empty for none.
+
+    Of positions, or of angles about moving axes in the orders that makers use.
+    """
+    turns = Rotation.from_matrix(robot[:, :3, :3])
+    numbers: dict[str, tuple[Sequence[str], FloatArray, str, float, float]] = {
+        "": ("xyz", 1e3 * robot[:, :3, 3], "mm", _DIGIT_MM, _VARIES_MM)
+    }
+    for order in ("ZYX", "XYZ", "ZYZ"):
+        with warnings.catch_warnings(), suppress(UserWarning):
+            # Where two axes coincide, one of their angles is zero by convention.
+            warnings.simplefilter("error", UserWarning)
+            angles = np.rad2deg(np.unwrap(turns.as_euler(order), axis=0))
+            of = f", of angles about moving axes {order}"
+            about = [f"angle about {axis}" for axis in order]
+            numbers[of] = (about, angles, "deg", _DIGIT_DEG, _VARIES_DEG)
+    for of, (names, values, unit, digit, varies) in numbers.items():
+        spread = np.ptp(values, axis=0)
+        at = int(spread.argmin())
+        if spread[at] < digit and np.delete(spread, at).min() > varies:
+            return (
+                f"The robot's {names[at]} is {values[0, at]:.6g} {unit} in all {len(robot)} rows, "
+                f"to the last digit{of}, though all else varies: the log repeated one number, or "
+                "this column is not the robot's."
+            )
+    return ""
+
+
+def _on_the_way(robot: FloatArray, camera: FloatArray, kept: IntArray) -> Finding | None:
+    """The finding that poses belong to places on the way to another stop; None where none fit.
+
+    Args:
+        robot: (m, 4, 4) poses, in the order of their stops.
+        camera: (p,) angles by which the camera turned between the pairs of the kept ones [rad].
+        kept: Indices of the poses that are compared.
+    """
+    onwards = log(invert(robot[:-1]) @ robot[1:])
+    back = log(invert(robot[1:]) @ robot[:-1])
+    ways = {
+        "next": np.append(onwards, np.zeros((1, 6)), axis=0),
+        "last": np.append(np.zeros((1, 6)), back, axis=0),
+    }
+    found = list[tuple[float, float, str]]()
+    for which, way in ways.items():
+        for share in _SHARES:
+            turned = (robot @ exp(share * way))[kept, :3, :3]
+            away = float(np.median(np.abs(relative_angles(turned) - camera)))
+            found.append((away, float(share), which))
+    (away, share, which), none = min(found), min(one for one in found if one[1] == 0.0)[0]
+    if CLEAR_RATIO * away > none:
+        return None
+    percent = f"{100.0 * abs(share):.0f} %"
+    words, when = "The arm moved between image and pose: ", "the image was taken later than that"
+    if which == "next" and share < 0.0:
+        when = "the pose was read later than that, with the arm on its way to the next stop"
+    elif which == "last" and share > 0.0:
+        when = "the arm had not arrived there yet, as of poses that were commanded"
+    towards = (
+        f"{'towards' if share > 0.0 else 'away from'} the {which} stop by {percent} of the way"
+    )
+    words += (
+        f"with each pose moved {towards}, robot and camera turn alike to "
+        f"{figure(np.rad2deg(away))} deg (median of all pairs), as read to "
+        f"{figure(np.rad2deg(none))} deg. So {when}."
+    )
+    return Finding("misread_poses", words, _IN_MOTION)
 
 
 def turned_boards(run: RunState) -> Iterator[Finding]:

@@ -223,13 +223,16 @@ def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str
     thing, edge = ("camera" if frame.startswith("cam") else "target"), cell_fit.fit.frames[frame]
     on_flange = (cell_fit.cell.mount == "eye-in-hand") == (thing == "camera")
     of_robot = f"controller's {'tool' if on_flange else 'base frame'}"
-    # Poses of another tool, or in another frame, make the edge another one.
-    other = edge @ invert(step) @ invert(edge)
-    x, y, z = (figure(1e3 * part) for part in other[:3, 3].tolist())
-    turn = f"{figure(pose_difference(np.eye(4), other)[1])} deg"
     moved = mm_and_deg(*pose_difference(np.eye(4), step))
-    how = f": the {thing} by {moved}, or the {of_robot} by ({x}, {y}, {z}) mm and {turn}"
+    how = f": the {thing} by {moved}, or the {of_robot} by {other_frame(edge, edge @ step)}"
     return f"the {thing} or the {of_robot}", how
+
+
+def other_frame(before: FloatArray, after: FloatArray) -> str:
+    """Where poses of another tool, or in another frame, have it: an edge is another one by it."""
+    other = before @ invert(after)
+    x, y, z = (figure(1e3 * part) for part in other[:3, 3].tolist())
+    return f"({x}, {y}, {z}) mm and {figure(pose_difference(np.eye(4), other)[1])} deg"
 
 
 def _common_change(inliers: InlierFit, rows: IntArray) -> tuple[str, FloatArray] | None:
@@ -246,8 +249,7 @@ def _common_change(inliers: InlierFit, rows: IntArray) -> tuple[str, FloatArray]
         poses[:, :3, 3] for poses in (part.measured(state), part.predicted(state))
     )
     sizes = np.sum(measured * (predicted - measured), axis=1) / np.sum(measured**2, axis=1)
-    if CLEAR_RATIO * np.ptp(sizes) < abs(float(np.median(sizes))):
-        return "", np.eye(4)
+    of_size = float(np.ptp(sizes) / max(abs(np.median(sizes)), np.finfo(float).tiny))
     found = list[tuple[float, str, FloatArray]]()
     for frame in filter(lambda name: part.observations.involves(name).all(), part.unknown):
         changes = part.change_of(frame, state)
@@ -258,6 +260,9 @@ def _common_change(inliers: InlierFit, rows: IntArray) -> tuple[str, FloatArray]
         )
         found.append((float(np.median(left) / size), frame, step))
     ratio, frame, step = min(found, default=(np.inf, "", np.eye(4)), key=lambda item: item[0])
+    # A tool that is longer along the line of sight looks like another size, too.
+    if CLEAR_RATIO * of_size < min(1.0, CLEAR_RATIO**2 * ratio):
+        return "", np.eye(4)
     if CLEAR_RATIO * ratio >= 1.0:
         return None
     is_alone = all(CLEAR_RATIO * ratio < rival for rival, other, _ in found if other != frame)

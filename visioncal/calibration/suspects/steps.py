@@ -6,13 +6,14 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell_fit import OTHER_POSTURE
+from visioncal.calibration.suspects.outliers import other_frame
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import exp, pose_difference
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.identifiability import joint_words
-from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step
+from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step, with_step
 
 _LIMITS = CalibrationLimits()
 _THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
@@ -31,8 +32,14 @@ def _found(run: RunState) -> Iterator[Finding]:
     if steps[1:]:
         instead = f" Or else, as these views leave it open: {_words(steps[1], run)}."
     thing = _THINGS.get(step.of, step.of)
+    fasten = f"Fasten {thing[0].lower()}{thing[1:]}"
+    if (
+        step.kind == FRAME
+        and pose_difference(np.eye(4), exp(step.value))[0] > _LIMITS.arm_errors[0]
+    ):
+        fasten += ", keep one tool and base frame in the controller"
     kind, do = {
-        FRAME: ("moved_at_once", f"Fasten {thing[0].lower()}{thing[1:]}"),
+        FRAME: ("moved_at_once", fasten),
         JOINT: ("joint_slipped", "Look whether the joint keeps its zero"),
         SIZE: ("board_changed", "Measure both prints, take one of them for all views"),
         DRIFT: ("moved_slowly", "Fasten base and target, let the arm warm up, and record again."),
@@ -81,7 +88,12 @@ def _words(step: Step, run: RunState) -> str:
     if run.cell_fit.may_be_of_arms(exp(step.value)):
         words += OTHER_POSTURE
     if mount is not None and far_mm > _LIMITS.arm_errors[0]:
+        fit = run.assessment.sized
+        stepped, solved = with_step(fit.problem, fit.solution, step)
+        edges = stepped.frames(solved.state)
+        before, after = (edges[at] for at in stepped.unknown if at.partition("@")[0] == step.of)
         words += f", or the controller's {'tool' if on_flange else 'base frame'} is another one"
+        words += f", by {other_frame(before, after)}"
     return words
 
 
