@@ -21,6 +21,7 @@ from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Target, 
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.appearance import SCALE, board_basis
 from visioncal.estimation.corners import CornerStack, WithoutPoses, mean_square_by_view, reproject
+from visioncal.estimation.lens_field import row_motions, zooms
 from visioncal.estimation.poses import fit_poses
 from visioncal.fit.lens_field import orders_of_waves, waves
 from visioncal.vision.targets import corner_positions, first_corners
@@ -37,6 +38,8 @@ _WRONG = 5.0
 # Chance by which a sound board has a corner that scatters too much, and what does no harm [px].
 _UNSTEADY, _LEAST_PX = 1e-6, 0.1
 _ROUNDS = 12
+# Noise beside what moves in single views, over that without, above which nothing does.
+_MOVES = 0.9
 # Directions that poses, lens and shape do not leave open, by the information they leave.
 _OPEN = 1e-4
 
@@ -50,6 +53,7 @@ class PointErrors:
     # Numbers of corners that scatter by more than the others, as where glare lies on them.
     unsteady: IntArray
     unsteady_px: float  # By how much (rms, along each axis); zero of none.
+    noise_px: float  # Of the other corners.
 
 
 def with_board_points(seen: T) -> T:
@@ -131,6 +135,27 @@ def point_errors(
         corners: Those of each view.
         cam_from_target: (4, 4) pose of each view, near which it is linearised.
     """
+    found = _point_errors(target, camera, corners, cam_from_target, is_moving=False)
+    if found is None:
+        return None
+    rest = {view: at.take(~np.isin(at.ids, found.unsteady)) for view, at in corners.items()}
+    moving = _point_errors(target, camera, rest, cam_from_target, is_moving=True)
+    if moving is None or moving.noise_px > _MOVES * found.noise_px:
+        return found
+    # Focus, a rolling shutter or a wrong lens: these move the outer corners of a board most.
+    moving = _point_errors(target, camera, corners, cam_from_target, is_moving=True)
+    return moving and replace(moving, unsteady=found.unsteady[:0], unsteady_px=0.0)
+
+
+def _point_errors(
+    target: Target,
+    camera: Camera,
+    corners: Mapping[int, Corners],
+    cam_from_target: Mapping[int, FloatArray],
+    *,
+    is_moving: bool,
+) -> PointErrors | None:
+    """`point_errors`; beside zoom and motion of the rows of each view where `is_moving`."""
     positions = corner_positions(target)
     chosen = [view for view in corners if len(corners[view].ids) * 2 > len(positions)]
     chosen = [chosen[at] for at in evenly(len(chosen), _MOST_VIEWS).tolist()]
@@ -146,10 +171,14 @@ def point_errors(
     stack, starts = stack.keep(right[stack.view_of]), poses.cam_from_target[right]
     views, count = len(stack.views), 2 * len(positions)
     basis, weights = board_basis(positions), np.ones(len(positions))
+    # Of a radian, they are as good as free.
+    predicted = reproject(stack, camera, starts, lens=False).px
+    each_view = (zooms(predicted, camera), row_motions(predicted, camera))
+    by_view = np.concatenate(each_view, axis=2)[:, :, : None if is_moving else 0]
     # Wrong corners hide each other, since poses and lens follow them: each counts by what it
     # scatters beside the others.
     for _ in range(_ROUNDS):
-        stack = replace(stack, weights=weights[stack.ids])
+        stack = replace(stack, weights=weights[stack.ids], zooms=by_view)
         own, pulls, unknowns = _reduced(stack, camera, starts, basis, count)
         inner = np.einsum("nai,naj->ij", own, own)
         values, vectors = np.linalg.eigh(inner)
@@ -166,7 +195,7 @@ def point_errors(
     wrong = np.flatnonzero((ratios > limit) & (scatter > _LEAST_PX))
     if len(wrong):
         rest = {view: at.take(~np.isin(at.ids, wrong)) for view, at in corners.items()}
-        others = point_errors(target, camera, rest, cam_from_target)
+        others = _point_errors(target, camera, rest, cam_from_target, is_moving=is_moving)
         if others is None:
             return None
         unsteady = np.union1d(others.unsteady, wrong)
@@ -175,7 +204,7 @@ def point_errors(
             return replace(others, unsteady=unsteady, unsteady_px=most)
     each = stack.sum_by_view(np.einsum("nai,na->ni", rows, left))
     products = each @ each.T
-    freedom = left.size - 6 * views - unknowns - len(values)
+    freedom = left.size - (6 + by_view.shape[2]) * views - unknowns - len(values)
     if freedom < left.size / 3:
         return None
     share = left.size / freedom
@@ -188,7 +217,7 @@ def point_errors(
     square = float(np.mean((found**2 - noise) / values))
     sigma_m = float(np.sqrt(max(square, 0.0)))
     none = np.zeros(0, dtype=np.int64)
-    return PointErrors(sigma_m, p_value if square > 0.0 else 1.0, none, 0.0)
+    return PointErrors(sigma_m, p_value if square > 0.0 else 1.0, none, 0.0, noise**0.5)
 
 
 def _scatter(stack: CornerStack, left: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
