@@ -47,8 +47,9 @@ from visioncal.model.effects import (
 _RULED_OUT = float(np.log(CheckLimits.ruled_out))
 # Most stops after which a frame may have been moved, and a lens.
 _STEPS, _ZOOMS = 12, 60
-# Most stops at which images may move while they are read: four unknowns each.
-_MOVING = 120
+# Most stops at which images may move while they are read, of four unknowns each, and what counts
+# between their first row and their last [px]: below, other errors of images look so.
+_MOVING, _LEAST_PX = 120, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +155,8 @@ def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
         if not is_open and 0 < len(effect.stops) <= _MOVING:
             score, bounds = of_rows(fit, pairs, effect.typical), effect.size
             size, gain = score.best(np.ones(len(score.pull)), bounds.low, bounds.high)
-            yield Candidate(gain, starting_at(random_effect(effect), size), effect)
+            if size * float(np.mean(effect.lens.matrix[:2])) > _LEAST_PX:
+                yield Candidate(gain, starting_at(random_effect(effect), size), effect)
 
 
 def stops_of(fit: Fit, camera: str) -> IntArray:

@@ -257,7 +257,8 @@ def _moving(run: RunState) -> Iterator[Finding]:
     for name, noise_px in fit.sigmas_px.items():
         levels, optics = fit.lens_levels(name), fit.linearised.camera_parameters
         if levels.gains[3] > SIGNIFICANT:
-            moved_px = levels.motion * noise_px * float(np.mean(optics.camera(name).matrix[:2]))
+            moved = levels.motion * noise_px
+            moved_px = moved * float(np.mean(optics.camera(name).matrix[:2]))
             yield Finding(
                 "row_motion",
                 "The arm, or what it looks at, moved while pictures were read, as by a rolling "
@@ -268,6 +269,7 @@ def _moving(run: RunState) -> Iterator[Finding]:
                     "of images and robot (stamp_s, streams): then the motion is known."
                 ),
                 mahalanobis_sq=levels.gains[3],
+                up_to_mm=1e3 * moved * mean_distance_m(fit, name),
             ).of("" if name == ONLY_CAMERA else name)
 
 
