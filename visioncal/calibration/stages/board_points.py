@@ -6,7 +6,7 @@ the scatter from view to view: errors of a view that many of its corners share c
 that scatter by more than the others are left out before.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -58,9 +58,12 @@ class PointErrors:
 
 def with_board_points(seen: T) -> T:
     """Gives corners that are elsewhere on their boards a size, in `Target.point_sigmas_m`."""
-    seen = _without_unsteady(seen)
+    errors = [*_errors(seen)]
+    if any(len(found.unsteady) for *_, found in errors):
+        seen = _without_unsteady(seen, errors)
+        errors = [*_errors(seen)]
     session, loose = seen.session, dict[str, Target]()
-    for name, _, _, found in _errors(seen):
+    for name, _, _, found in errors:
         if found.p_value <= FALSE_ALARM:
             target = loose.get(name, session.boards[name])
             sigma_m = max(found.sigma_m, *target.point_sigmas_m[:1], 0.0)
@@ -94,10 +97,10 @@ def _errors(seen: Observed) -> Iterator[tuple[str, str, int, PointErrors]]:
                     yield name, frame, start, found
 
 
-def _without_unsteady(seen: T) -> T:
+def _without_unsteady(seen: T, errors: Iterable[tuple[str, str, int, PointErrors]]) -> T:
     """Leaves out corners that scatter by more than others in one camera's images, with a note."""
     lost = dict[str, list[IntArray]]()
-    for name, frame, start, found in _errors(seen):
+    for name, frame, start, found in errors:
         if not len(found.unsteady):
             continue
         lost.setdefault(frame, []).append(found.unsteady + start)
@@ -115,7 +118,7 @@ def _without_unsteady(seen: T) -> T:
             view: corners.take(~np.isin(corners.ids, ids)) for view, corners in look.corners.items()
         }
         seen = seen.with_camera(frame, replace(look, corners=kept))
-    return locate_targets(estimate_lenses(seen)) if lost else seen
+    return locate_targets(estimate_lenses(seen))
 
 
 def point_errors(
