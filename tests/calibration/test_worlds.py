@@ -593,8 +593,9 @@ def test_a_bracket_that_bends_alone_is_within_its_sigmas():
         away = log(invert(mean) @ known.assessment.edges["cam"].matrix)
         covariance = known.assessment.edges["cam"].covariance
         squares.append(float(away @ np.linalg.solve(covariance, away)) / 6.0)
-    # What no view tells has the size of what they tell, and of such a bracket is up to three times
-    # as large, in one of six components: (9 + 5) / 6, and of four cells less than 4. Without it, 8.
+    # A bend that no view shows has the size of what they show, and of such a bracket is up to three
+    # times as large, in one of six components: (9 + 5) / 6, and of four cells less than 4. Without
+    # it, 8.
     assert 0.05 < np.mean(squares) < 4.0
 
 

@@ -60,8 +60,8 @@ class ArmErrors:
     # is the same at all stops. None of links.
     fit_sigmas: FloatArray | None = None
     # (2,) what the fit knows of this session and a pick does not: errors that grow with time, reach
-    # or gravity, or follow motions; None for none.
-    of_session: FloatArray | None = None
+    # or gravity, or follow motions; zero for none.
+    of_session: FloatArray | float = 0.0
     # Number of errors, the last ones, that are correlated in time; the others are correlated over
     # the posture. At another time they have other values.
     time_correlated_count: int = 0

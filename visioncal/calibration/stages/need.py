@@ -261,7 +261,7 @@ def _picks(
             by_posture, in_time = (to_base @ array @ to_base.mT for array in (by_posture, in_time))
         parts["arm"] = by_posture + in_time
         if as_noise.white is not None:
-            level = np.hypot(as_noise.white, 0.0 if (own := as_noise.of_session) is None else own)
+            level = np.hypot(as_noise.white, as_noise.of_session)
             noise = noise.with_robot(index, level)
         pick_level = np.hypot(level, _lasting_sigma(as_noise))
     elif errors is not None:

@@ -32,7 +32,7 @@ def _found(kind: str, run: RunState) -> Iterator[Finding]:
 
 
 def _suspect(kind: str) -> Suspect:
-    """The suspect of a kind: a pick errs by it as views do, and what no view tells is no motion."""
+    """The suspect of a kind: a pick errs by it as views do, and what no view shows is no motion."""
     effect, own = KINDS[kind], ("robot_noise", "robot_noise_of_pick", UNEXPLAINED)
     inflated: tuple[str, ...] = () if issubclass(effect, LensEffect) else own
     inflated += ("calibration",) if issubclass(effect, BracketBends) else ()

@@ -107,7 +107,7 @@ class BaseTilts(PostureEffect, Named):
 class BracketBends(PostureEffect, Named):
     """Bends of what the flange carries [m], linear in gravity's direction along its axes.
 
-    Turns are times a length of 0.1 m. What of a bend is a twist of base and flange no view tells:
+    Turns are times a length of 0.1 m. A bend that is a twist of base and flange is in no view:
     where the tool bends along, the base is as if it were elsewhere; where the camera's bracket does
     alone, it is not, and the mean bend is all the flange's.
     """
@@ -122,7 +122,7 @@ class BracketBends(PostureEffect, Named):
         by = mm_and_deg(1e3 * float(shift), float(np.rad2deg(turn / 0.1)))
         return (
             f"The load on the flange bends with its weight, by up to {by}. The result is that of "
-            "the views' mean attitude; whether a tool bends along, no view tells."
+            "the views' mean attitude; whether a tool bends along, no view shows."
         )
 
     def unseen(self, moments: Moments) -> FloatArray:

@@ -33,7 +33,7 @@ class RowMotion(Effect):
     """Motion of the image while its rows are read, another one at each of some stops [rad].
 
     Four values each: see `row_motions`. An arm that creeps meanwhile, at a speed that no stamp
-    tells, moves the image so; its pose is that of the middle row, or off by noise.
+    shows, moves the image so; its pose is that of the middle row, or off by noise.
     """
 
     # Half a metre away, at 0.2 m/s, rows of 25 ms move by a hundredth.
