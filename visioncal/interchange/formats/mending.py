@@ -57,8 +57,10 @@ def exchange_views(session: Session, *views: int) -> Session:
         differing = [
             name for name in _MUST_AGREE if first_cells.get(name, "") != second_cells.get(name, "")
         ]
-        is_twice = first == second or bool({first, second} & partners.keys())
-        if is_twice or differing or not (first_cells and second_cells):
+        if twice := sorted({first, second} & partners.keys()):
+            words = f"view {twice[0]} must be in one pair, and is in two."
+            raise DataError(f"Views {first} and {second}: {words}", culprits=["--exchange"])
+        if first == second or differing or not (first_cells and second_cells):
             raise DataError(
                 f"Views {first} and {second} of session {session.name!r} are not two views that "
                 f"see the same{': another ' * bool(differing)}{' and '.join(differing)}.",
