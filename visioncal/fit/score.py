@@ -15,7 +15,14 @@ from scipy.linalg import block_diag
 from visioncal.core.types import FloatArray
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field, fields_of_lengths, orders_of_waves, waves
-from visioncal.fit.linearise import Gram, Pair, corner_rows, images_of, of_pose_alone
+from visioncal.fit.linearise import (
+    CornerRows,
+    Gram,
+    Pair,
+    corner_rows,
+    images_of,
+    of_pose_alone,
+)
 from visioncal.fit.mixed import body_with, weights_at
 from visioncal.model.effects import Effect, RowMotion
 
@@ -170,13 +177,10 @@ def of_rows(fit: Fit, pairs: Sequence[Pair], motion: RowMotion) -> Score:
     """
     count, own = len(motion.stops), images_of(pairs, motion.frame)
     pull, information = np.zeros((count, 4)), np.zeros((count, 4, 4))
-    for gram in fit.grams:
-        pair = next((one for one in own if np.array_equal(one.rows, gram.rows)), None)
+    for gram, pair, rows in _of_images(fit, own):
         kept = np.flatnonzero(fit.used[gram.rows] & np.isin(gram.stops, motion.stops))
-        if pair is None or not len(kept):
+        if not len(kept):
             continue
-        twists = pair.twists(gram.by_effects)
-        rows = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, twists)
         moved = motion.shifts(pair.px) * pair.weights[:, None, None]
         by_pose, moved, residual = (
             pair.padded(part)[kept].reshape(len(kept), -1, part.shape[2])
@@ -201,13 +205,8 @@ def _by_waves(fit: Fit, own: Sequence[Pair], camera: str) -> Iterator[Added]:
     """The waves' columns, of some images at a time: those of all would fill the memory."""
     orders, width = orders_of_waves(), float(fit.unknowns.lenses[camera].resolution[0])
     count = len(orders)
-    for gram in fit.grams:
-        pair = next((one for one in own if np.array_equal(one.rows, gram.rows)), None)
+    for gram, pair, rows in _of_images(fit, own):
         kept = fit.used[gram.rows]
-        if pair is None or not kept.any():
-            continue
-        twists = pair.twists(gram.by_effects)
-        rows = corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, twists)
         predicted = pair.px - rows.residual / pair.weights[:, None]
         each = waves(predicted, width, orders) * pair.weights[:, None]
         full = np.concatenate([rows.head, rows.residual[:, :, None]], axis=2)
@@ -225,6 +224,15 @@ def _by_waves(fit: Fit, own: Sequence[Pair], camera: str) -> Iterator[Added]:
             product += more * by_pose.reshape(-1, 2 * count).T @ solved.reshape(-1, 2 * count)
             local = local + more / weight * np.swapaxes(solved, 1, 2) @ raw[:, :6]
         yield Added(taken, weight * local, product)
+
+
+def _of_images(fit: Fit, own: Sequence[Pair]) -> Iterator[tuple[Gram, Pair, CornerRows]]:
+    """The rows of the corners of some images, of which the fit uses any."""
+    for gram in fit.grams:
+        pair = next((one for one in own if np.array_equal(one.rows, gram.rows)), None)
+        if pair is not None and fit.used[gram.rows].any():
+            twists = pair.twists(gram.by_effects)
+            yield gram, pair, corner_rows(fit.unknowns, fit.linearised, pair, gram.poses, twists)
 
 
 def best_field(fit: Fit, pairs: Sequence[Pair], camera: str) -> tuple[Field, float, float]:
