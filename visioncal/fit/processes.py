@@ -10,9 +10,9 @@ further off than that of independent errors: they take a camera's transform for 
 What each stop alone says of its flange follows from the factorisation.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Self
 
 import numpy as np
@@ -45,6 +45,8 @@ ENOUGH_STOPS, _MOST = 8, 40
 _LOOSE = 0.01
 # Shares of evidence that do not count: of a size, of a process where estimates are averaged.
 _LITTLE, _SHARE = 1e-4, 0.01
+# Logarithm below the most evidence from which less is not looked for.
+_FAR = 14.0
 # Most stops at which estimates are averaged; of more, the mean over the stops is nearly as good.
 _AVERAGED = 100
 
@@ -163,37 +165,42 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     if alone is None:
         return None
     stops, p = len(alone.stops), fit.unknowns.count
-    boards, logs, free, kinds = _boards(fit), list[float](), list[float](), []
-    off = list[FloatArray]()
-    for tried in _tried_of(fit, flange, alone, creeps=True):
+    boards, logs, free = _boards(fit), list[float](), list[float]()
+    off, levels = list[FloatArray](), list[tuple[Process | None, float, float]]()
+
+    def weighed(tried: Tried) -> FloatArray:
         ways = (False, True) if boards else (False,)
         found = [judged(tried, boards, is_free=is_free) for is_free in ways]
         logs.append(tried.prior + found[0][0])
         free.append(tried.prior + found[-1][0])
         off.append(found[-1][2])
-        if tried.process is not None:
-            kinds.append((tried.process, tried.size, tried.white))
+        levels.append((tried.process, tried.size, tried.white))
+        return np.array([logs[-1], free[-1]])
+
+    grid, beside = _grid_of(fit, flange, alone, creeps=True)
+    _climb(grid, lambda one: weighed(beside(one)))
     odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs))
     mean_squares = np.exp(free - np.logaddexp.reduce(free)) @ np.array(off)
-    shares = np.exp(logs - np.logaddexp.reduce(logs))[len(_WHITE) :]
+    shares = np.exp(logs - np.logaddexp.reduce(logs)).tolist()
+    by_process = dict[Process, list[tuple[float, tuple[Process, float, float]]]]()
+    for share, (process, size, white) in zip(shares, levels, strict=True):
+        if process is not None:
+            by_process.setdefault(process, []).append((share, (process, size, white)))
     # The estimate's response to an error at each stop, which it takes for independent.
     gains = np.linalg.inv(alone.known + alone.independent) @ alone.rows[:, :, :p]
     independent = np.einsum("uia,uij,ujb->ab", gains, alone.independent, gains, optimize=True)
     known, excess, shift = fit.estimate.covariance, np.zeros((p, p)), np.zeros(p)
     added = np.zeros((p, p))
     moved = list[tuple[float, FloatArray]]()
-    count = len(_SIZES) * len(_WHITE)
-    for at in range(0, len(shares), count):
-        own, process = shares[at : at + count], kinds[at][0]
-        share = float(own.sum())
+    for process, own in by_process.items():
+        share = sum(share for share, _ in own)
         if process.is_of_time and share > _SHARE and stops <= _AVERAGED:
             # The likeliest size of a process stands for all of its sizes where it is estimated.
-            values, covariance = _estimated(alone, *kinds[at + int(own.argmax())])
+            values, covariance = _estimated(alone, *max(own, key=lambda one: one[0])[1])
             moved.append((share, values - fit.estimate.values))
             excess += share * (covariance - known)
             continue
-        shown = [one for one in zip(own.tolist(), kinds[at : at + count], strict=True)
-                 if one[0] > _LITTLE]  # fmt: skip
+        shown = [one for one in own if one[0] > _LITTLE]
         squares = sum(share * size**2 for share, (_, size, _) in shown)
         missing = sum(share * (1.0 - white**2) for share, (*_, white) in shown)
         if shown:
@@ -297,24 +304,45 @@ class _Shared:
 
 
 def _tried_of(fit: Fit, flange: str, alone: StopErrors, *, creeps: bool) -> Iterator[Tried]:
+    grid, beside = _grid_of(fit, flange, alone, creeps=creeps)
+    return map(beside, grid)
+
+
+def _grid_of(
+    fit: Fit, flange: str, alone: StopErrors, *, creeps: bool
+) -> tuple[Iterator[Tried], Callable[[Tried], Tried]]:
+    """Processes over the stops, each of all sizes, before these are seen; the same beside them.
+
+    Independent errors of all levels come first.
+    """
     levels, poses = fit.flange_sigmas(flange), fit.cell.arms[flange].poses[alone.stops]
     boards = np.eye(fit.unknowns.count)[:, [board.column for board in _boards(fit)]]
-    return tried(alone, processes(poses, levels, creeps=creeps), boards)
-
-
-def tried(alone: StopErrors, kinds: Iterable[Process], boards: FloatArray) -> Iterator[Tried]:
-    """Processes over the stops, each of all sizes; independent errors of all levels first.
-
-    Args:
-        alone: What the stops say.
-        kinds: The processes.
-        boards: (p, b) the sizes of boards that are held, by the unknowns.
-    """
-    some, kinds = evenly(len(alone.stops), _MOST), tuple(kinds)
+    some = evenly(len(alone.stops), _MOST)
+    kinds = tuple(processes(poses, levels, creeps=creeps))
     shared = _Shared.of(alone, some, kinds)
     rows, rest, by_boards = _combined(alone, some, shared.independent[1.0], boards)
-    for one in _grid(kinds, _SIZES, rest, by_boards):
-        yield one.beside(rows, shared)
+    return _grid(kinds, _SIZES, rest, by_boards), lambda one: one.beside(rows, shared)
+
+
+def _climb(grid: Iterable[Tried], weighed: Callable[[Tried], FloatArray]) -> None:
+    """Weighs what is tried, but for sizes and levels beyond those that are as good as ruled out.
+
+    Along sizes, and along levels, a likelihood has one peak.
+    """
+    most = np.full(2, -np.inf)
+    for _, of_process in groupby(grid, lambda one: one.process):
+        before = np.full(2, -np.inf)
+        for _, of_size in groupby(of_process, lambda one: one.size):
+            last = best = np.full(2, -np.inf)
+            for one in of_size:
+                found = weighed(one)
+                best, most = np.maximum(best, found), np.maximum(most, found)
+                if np.all(found < np.minimum(last, most - _FAR)):
+                    break
+                last = found
+            if np.all(best < np.minimum(before, most - _FAR)):
+                break
+            before = best
 
 
 def _grid(

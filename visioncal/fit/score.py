@@ -5,12 +5,12 @@ values and A'P A their information; the likelihood of values ~ N(0, s^2) at the 
 follows for any s (Rao 1948; for variances Verbeke and Molenberghs 2003).
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, eigvalsh_tridiagonal, lapack
 
 from visioncal.core.types import FloatArray
 from visioncal.fit.fit import Fit
@@ -26,6 +26,8 @@ from visioncal.fit.linearise import (
 from visioncal.fit.mixed import body_with, weights_at
 from visioncal.model.effects import Effect, RowMotion
 
+# Columns from which on no eigenvectors are worked out.
+_MANY = 64
 # Sizes that are tried, over one that the data would just show.
 _TRIED = np.exp(np.linspace(-3.0, 5.0, 17))
 # Least size of a function of the field, over the uncertainty with which all corners show it.
@@ -65,17 +67,17 @@ class Score:
         # Columns of a millionth of the variance of others add nothing to see.
         at = np.flatnonzero(sigmas > 1e-3 * sigmas.max(initial=0.0))
         scaled = self.information[at[:, None], at] * np.outer(sigmas[at], sigmas[at])
+        pull = (sigmas * self.pull)[at]
+        if len(at) > _MANY:
+            return _best_of_many(scaled, pull, low, high, self._student)
         values, vectors = np.linalg.eigh(scaled)
-        # A size of which one direction is as large as its uncertainty.
-        unit = 1.0 / np.sqrt(max(float(values.max(initial=0.0)), 1e-300))
-        sizes = np.unique(np.clip(unit * _TRIED, low, high))
-        gains = self._gains(values, vectors.T @ (sigmas * self.pull)[at], sizes)
+        sizes = _sizes_of(float(values.max(initial=0.0)), low, high)
+        gains = self._gains(values, vectors.T @ pull, sizes)
         return float(sizes[gains.argmax()]), float(gains.max())
 
     def posterior(self, low: float, high: float) -> tuple[FloatArray, FloatArray]:
         """Sizes (k,) that the data would hardly show to clearly show, and their gains (k,)."""
-        unit = 1.0 / np.sqrt(max(float(np.linalg.eigvalsh(self.information)[-1]), 1e-300))
-        sizes = np.unique(np.clip(unit * _TRIED, low, high))
+        sizes = _sizes_of(float(np.linalg.eigvalsh(self.information)[-1]), low, high)
         return sizes, self.gains(sizes)
 
     def gains(self, sizes: FloatArray) -> FloatArray:
@@ -96,6 +98,32 @@ class Score:
         share = np.asarray(squares) / self.freedom
         beyond = np.maximum(share - 0.999, 0.0)
         return np.asarray(0.5 * self.freedom * (beyond - np.log1p(beyond - share)))
+
+
+def _sizes_of(most: float, low: float, high: float) -> FloatArray:
+    """Sizes about the one of which a direction of most information is as large as its sigma."""
+    return np.unique(np.clip(_TRIED / np.sqrt(max(most, 1e-300)), low, high))
+
+
+def _best_of_many(
+    information: FloatArray,
+    pull: FloatArray,
+    low: float,
+    high: float,
+    student: Callable[[float], FloatArray],
+) -> tuple[float, float]:
+    """The same as `Score.best` by a tridiagonal matrix: half the time of eigenvectors."""
+    lower, diagonal, beside, reflectors, _ = lapack.dsytrd(information, lower=1)
+    turned, _, _ = lapack.dormqr("L", "T", lower[1:, :-1], reflectors, pull[1:, None], 64)
+    pull = np.append(pull[:1], turned)
+    (most,) = eigvalsh_tridiagonal(diagonal, beside, "i", (len(pull) - 1, len(pull) - 1))
+    sizes, gains = _sizes_of(float(most), low, high), list[float]()
+    for square in np.square(sizes).tolist():
+        pivots, factors, _ = lapack.dpttrf(1.0 + square * diagonal, square * beside)
+        solved, _ = lapack.dpttrs(pivots, factors, pull)
+        gains.append(float(student(square * float(pull @ solved))) - np.log(pivots).sum() / 2.0)
+    best = int(np.argmax(gains))
+    return float(sizes[best]), gains[best]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ The likelihood is by which readings are compared: a view is gaussian, with the s
 of its own fit, or one of a few outliers, with a broad tail.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -194,11 +194,12 @@ def robust_fits(
         if not falls.any():
             break
         edges[falls], sums[falls], nearest[falls] = trial[falls], lower[falls], rows[falls]
-    found = (
-        distances(robot[at], camera[at], float(lever[at]), tuple(edges[at, start]))
-        for at, start in enumerate(sums.argmin(axis=1))
-    )
-    return [replace(fit, share=share) for fit in found]
+    best = edges[np.arange(len(robot)), sums.argmin(axis=1)]
+    away = zip(*_away(robot, camera, (best[:, 0], best[:, 1])), lever.tolist(), strict=True)
+    return [
+        Fit(x, z, shift, angle, at, share=share)
+        for (x, z), (shift, angle, at) in zip(best, away, strict=True)
+    ]
 
 
 def _away(

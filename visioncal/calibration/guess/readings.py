@@ -69,9 +69,19 @@ class SideReading(Reading):
             recorded = recorded[:, np.abs(self.terms) - 1] * np.sign(self.terms)
         return ROTATION_FORMS[self.rotation].read(self.angle_unit * recorded)
 
-    def poses(self, numbers: PoseNumbers) -> FloatArray:
-        """(n, 4, 4) transforms [m]; NaN in rows without a pose."""
-        rotations = self.rotations(numbers)
+    @property
+    def of_rotations(self) -> tuple[object, ...]:
+        """The same for readings that have the same `rotations` of the same numbers."""
+        return self.rotation, self.written, self.terms, self.angle_unit, self.by_place
+
+    def poses(self, numbers: PoseNumbers, rotations: FloatArray | None = None) -> FloatArray:
+        """(n, 4, 4) transforms [m]; NaN in rows without a pose.
+
+        Args:
+            numbers: The recorded numbers.
+            rotations: Their `rotations`, where these are known.
+        """
+        rotations = self.rotations(numbers) if rotations is None else rotations
         positions = self.scale * UNITS_M[self.unit] * numbers.positions[:, self.axes] * self.signs
         if self.mirrored:
             rotations, positions = rotations * np.outer(_MIRROR, _MIRROR), positions * _MIRROR
@@ -142,7 +152,10 @@ class Hypothesis:
         """
         is_inverse = self.robot.inverse ^ self.camera.inverse ^ (self.mount == MOUNTS[0])
         ratio = round(UNITS_M[self.robot.unit] / UNITS_M[self.camera.unit], 9)
-        sides = (replace(side, unit="", inverse=False) for side in (self.robot, self.camera))
+        sides = (
+            (*side.of_rotations, side.transposed, side.mirrored, side.axes, side.signs, side.scale)
+            for side in (self.robot, self.camera)
+        )
         return *sides, is_inverse, ratio, self.order
 
     def robot_numbers(self, robot: PoseNumbers) -> PoseNumbers:

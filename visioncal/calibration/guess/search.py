@@ -11,6 +11,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import combinations, product
+from typing import TypeAlias
 
 import numpy as np
 
@@ -50,6 +51,8 @@ _BOARD_DISTANCE_M = (0.02, 30.0)
 # Turns of robot and camera agree from here on [rad]. A print differs by less than the first
 # logarithm from its stated size; a fit follows the second. Rounds in which nearest rows are found.
 _TURNS_AGREE_RAD, _PRINTED, _FOLLOWED, _CONCENTRATED = 0.1, 0.03, 0.2, 4
+# Form of rotations, that of which they were written, terms and unit of angles of a reading.
+_Rotations: TypeAlias = tuple[str, str, tuple[int, ...], float]
 # Directions with a smaller singular value, relative to the largest, are not determined.
 _DETERMINED = 1e-3
 # The screening and the first fits hand on at most so many readings, whose scores are near the best
@@ -137,14 +140,24 @@ def chains(
     of_robot = np.array([reading.rows(len(recording.robot))[rows] for reading in tried])
     looked, at = np.unique(of_robot, return_inverse=True)
     robot, camera = recording.robot.rows(np.maximum(looked, 0)), recording.camera.rows(rows)
-    by_robot = {side: side.poses(robot) for side in {reading.robot for reading in tried}}
-    by_camera = {side: side.poses(camera) for side in {reading.camera for reading in tried}}
+    by_robot = _poses_by({reading.robot for reading in tried}, robot)
+    by_camera = _poses_by({reading.camera for reading in tried}, camera)
     both = zip(tried, at.reshape(of_robot.shape), strict=True)
     poses = np.array([by_robot[reading.robot][index] for reading, index in both])
     outside = np.array([reading.mount == "eye-to-hand" for reading in tried])
     poses[outside] = invert(poses[outside])
     poses[of_robot < 0] = np.nan
     return poses, np.array([by_camera[reading.camera] for reading in tried])
+
+
+def _poses_by(sides: Iterable[SideReading], numbers: PoseNumbers) -> dict[SideReading, FloatArray]:
+    """(n, 4, 4) poses by readings of one side; rotations that several share are read once."""
+    rotations, found = dict[object, FloatArray](), dict[SideReading, FloatArray]()
+    for side in sides:
+        if side.of_rotations not in rotations:
+            rotations[side.of_rotations] = side.rotations(numbers)
+        found[side] = side.poses(numbers, rotations[side.of_rotations])
+    return found
 
 
 def fitted(
@@ -344,13 +357,17 @@ def _undone(
     declared: Hypothesis, pairs: Iterable[tuple[Change | None, Change]]
 ) -> list[Hypothesis]:
     """The readings with one mistake, or two that go together, undone."""
-    return [
-        second.of(declared if first is None else first.of(declared))
-        for first, second in pairs
-        if first is None
-        or first.part != second.part
-        or first.fields.keys().isdisjoint(second.fields)
-    ]
+    last, without, found = None, declared, list[Hypothesis]()
+    for first, second in pairs:
+        if first is not last:
+            last, without = first, declared if first is None else first.of(declared)
+        if (
+            first is None
+            or first.part != second.part
+            or first.fields.keys().isdisjoint(second.fields)
+        ):
+            found.append(second.of(without))
+    return found
 
 
 def _near(tried: Sequence[Hypothesis], scores: Sequence[float]) -> list[Hypothesis]:
@@ -370,9 +387,11 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
 
     # Transposed or mirrored rotations turn by the same angles.
     @cache
-    def by_robot(numbers: SideReading, order: str) -> FloatArray:
+    def by_robot(fields: _Rotations, order: str) -> FloatArray:
+        rotation, written, terms, angle_unit = fields
+        reading = SideReading(rotation, written=written, terms=terms, angle_unit=angle_unit)
         at = ROW_ORDERS[order](len(recording.robot))[rows]
-        rotations = numbers.rotations(recording.robot.rows(np.maximum(at, 0)))
+        rotations = reading.rotations(recording.robot.rows(np.maximum(at, 0)))
         rotations[at < 0] = np.nan
         return relative_angles(rotations)
 
@@ -381,17 +400,15 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
         return relative_angles(SideReading(rotation).rotations(of_camera))
 
     @cache
-    def away(numbers: SideReading, order: str, of_camera: str) -> float:
-        difference = np.abs(by_robot(numbers, order) - by_camera(of_camera))
+    def away(fields: _Rotations, order: str, of_camera: str) -> float:
+        difference = np.abs(by_robot(fields, order) - by_camera(of_camera))
         rank = int(PAIRS_SHARE * len(difference))
         return float(np.partition(np.nan_to_num(difference, nan=np.inf), rank)[rank])
 
     def mismatch(reading: Hypothesis) -> float:
         robot = reading.robot
-        numbers = SideReading(
-            robot.rotation, written=robot.written, terms=robot.terms, angle_unit=robot.angle_unit
-        )
-        return away(numbers, reading.order, reading.camera.rotation)
+        fields = robot.rotation, robot.written, robot.terms, robot.angle_unit
+        return away(fields, reading.order, reading.camera.rotation)
 
     return mismatch
 
