@@ -20,7 +20,13 @@ from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Target, evenly
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.appearance import SCALE, board_basis
-from visioncal.estimation.corners import CornerStack, WithoutPoses, mean_square_by_view, reproject
+from visioncal.estimation.corners import (
+    CornerStack,
+    Reprojection,
+    WithoutPoses,
+    mean_square_by_view,
+    reproject,
+)
 from visioncal.estimation.lens_field import row_motions, zooms
 from visioncal.estimation.poses import fit_poses
 from visioncal.fit.lens_field import orders_of_waves, waves
@@ -38,6 +44,8 @@ _WRONG = 5.0
 # Chance by which a sound board has a corner that scatters too much, and what does no harm [px].
 _UNSTEADY, _LEAST_PX = 1e-6, 0.1
 _ROUNDS = 12
+# Combinations of what is smooth that corners show by less than this share of the most are none.
+_SHOWN = 1e-5
 # Noise beside what moves in single views, over that without, above which nothing does.
 _MOVES = 0.9
 # Directions that poses, lens and shape do not leave open, by the information they leave.
@@ -174,16 +182,18 @@ def _point_errors(
     stack, starts = stack.keep(right[stack.view_of]), poses.cam_from_target[right]
     views, count = len(stack.views), 2 * len(positions)
     basis, weights = board_basis(positions), np.ones(len(positions))
+    at = reproject(stack, camera, starts)
     # Of a radian, they are as good as free.
-    predicted = reproject(stack, camera, starts, lens=False).px
-    each_view = (zooms(predicted, camera), row_motions(predicted, camera))
+    each_view = (zooms(at.px, camera), row_motions(at.px, camera))
     by_view = np.concatenate(each_view, axis=2)[:, :, : None if is_moving else 0]
+    columns, smooth = _columns(stack, camera, at, basis, count)
     # Wrong corners hide each other, since poses and lens follow them: each counts by what it
     # scatters beside the others.
     for _ in range(_ROUNDS):
         stack = replace(stack, weights=weights[stack.ids], zooms=by_view)
-        own, pulls, unknowns = _reduced(stack, camera, starts, basis, count)
-        inner = np.einsum("nai,naj->ij", own, own)
+        own, pulls, unknowns = _reduced(stack, columns, smooth)
+        flat = own.reshape(-1, count)
+        inner = flat.T @ flat
         values, vectors = np.linalg.eigh(inner)
         is_open = values > _OPEN * np.median(values)
         values, vectors = values[is_open], vectors[:, is_open]
@@ -241,15 +251,10 @@ def _scatter(stack: CornerStack, left: FloatArray, count: int) -> tuple[FloatArr
     return ratios / np.median(ratios[ratios > 0.0]), rms
 
 
-def _reduced(
-    stack: CornerStack, camera: Camera, poses: FloatArray, basis: FloatArray, count: int
-) -> tuple[FloatArray, FloatArray, int]:
-    """Derivatives (n, 2, count) by corners' places, and residuals, beside all that is smooth.
-
-    Returns:
-        Both, and how many unknowns beside the poses were eliminated.
-    """
-    at = reproject(stack, camera, poses)
+def _columns(
+    stack: CornerStack, camera: Camera, at: Reprojection, basis: FloatArray, count: int
+) -> tuple[FloatArray, int]:
+    """Derivatives (n, 2, 6 + s + count) by poses, what is smooth and places, then residuals; s."""
     orders = orders_of_waves()
     orders = orders[np.sum(orders**2, axis=1) <= _WAVES**2]
     # Where corners are predicted: at those seen, the field could explain their noise.
@@ -261,15 +266,28 @@ def _reduced(
     each = np.arange(len(stack.px))
     for axis in (0, 1):
         by_places[each, :, 2 * stack.ids + axis] = at.by_point[:, :, axis]
-    stack.weigh(by_shape, by_field, by_places)
     smooth = np.concatenate([at.by_intrinsics, by_shape, by_field], axis=2)
-    unknowns = smooth.shape[2]
     # Residuals are predicted less detected ones.
-    columns = np.concatenate([smooth, by_places, -at.residuals[:, :, None]], axis=2)
-    left = WithoutPoses.of(stack, at.by_pose, columns, None).left.reshape(2 * len(stack.px), -1)
-    others, own = left[:, :unknowns], left[:, unknowns:]
+    columns = [at.by_pose, smooth, by_places, -at.residuals[:, :, None]]
+    return np.concatenate(columns, axis=2), smooth.shape[2]
+
+
+def _reduced(
+    stack: CornerStack, columns: FloatArray, smooth: int
+) -> tuple[FloatArray, FloatArray, int]:
+    """Derivatives (n, 2, c) by corners' places, and residuals, beside all that is smooth.
+
+    Returns:
+        Both, and how many unknowns beside the poses were eliminated.
+    """
+    columns = columns.copy()
+    stack.weigh(columns)
+    left = WithoutPoses.of(stack, columns[:, :, :6], columns[:, :, 6:], None).left
+    others, own = np.split(left.reshape(2 * len(stack.px), -1), [smooth], axis=1)
     scale = np.linalg.norm(others, axis=0)
-    root, sizes, _ = np.linalg.svd(others / np.where(scale > 0.0, scale, 1.0), full_matrices=False)
-    root = root[:, sizes > 1e-6 * sizes[0]]
+    others = others / np.where(scale > 0.0, scale, 1.0)
+    squares, vectors = np.linalg.eigh(others.T @ others)
+    is_shown = squares > _SHOWN**2 * squares[-1]
+    root = others @ (vectors[:, is_shown] / np.sqrt(squares[is_shown]))
     own = (own - root @ (root.T @ own)).reshape(len(stack.px), 2, -1)
     return own[:, :, :-1], own[:, :, -1], root.shape[1]
