@@ -221,8 +221,10 @@ def effects_of_lenses(fit: Fit) -> Iterator[Effect]:
     for camera, lens in fit.unknowns.lenses.items():
         if ("lens", camera) not in fit.unknowns:
             continue
+        body = fit.cell.tree.body(camera)
+        flange = body if body in fit.cell.arms else ""
         for kind in NAMED:
-            yield from kind.of_lens(camera, lens)
+            yield from kind.of_lens(camera, lens, flange)
         if fit.cell.cameras[camera].focus == "auto":
             distances = [gram.distances for gram in fit.grams if gram.pair[0] == camera]
             reference_m = float(np.median(np.concatenate(distances)))

@@ -138,9 +138,13 @@ class CellFit:
         They have the `sizes` of errors.
         """
         shares, sizes, problems, poses = self._shares, self.sizes, {}, {}
+        stops = self.inlier_fit.problem.observations.stops.tolist()
+        stop_of = {row.view: at for row, at in zip(self.cell.rows, stops, strict=True)}
         for frame, scene in scenes.items():
             corners: dict[int, Corners] = {
-                view.view: view.corners for view in views[frame] if view.corners is not None
+                view.view: sizes.steadied(frame, stop_of[view.view], view.corners)
+                for view in views[frame]
+                if view.corners is not None
             }
             problem, levels = CornerProblem.of(scene, corners, shares), sizes.levels.get(frame)
             problems[frame] = replace(

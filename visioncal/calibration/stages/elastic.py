@@ -85,8 +85,6 @@ def load_ranges(loads: Loads) -> dict[str, Any]:
 
 # Play of which half turns the flange by thrice an industrial arm's repeatability [rad].
 _PLAY_RAD = 1e-3
-# Play of which half turns the flange by thrice an industrial arm's repeatability [rad].
-_PLAY_RAD = 1e-3
 # Loads from which on gears are tried for two slopes [N], torques among which their knees are, as
 # quantiles, and the least square of a second slope's change over its variance: chance leaves 10 in
 # one of a hundred arms, whose six joints each have seven knees.

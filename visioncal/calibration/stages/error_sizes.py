@@ -17,7 +17,7 @@ from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
-from visioncal.model.effects import Effect, LensGrows, LensSteps
+from visioncal.model.effects import Effect, LensGrows, LensSags, LensSteps
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions, first_corners
@@ -29,7 +29,9 @@ _INSTEAD = {
     "frame creeps": "a camera or target crept",
     "base steps": "the base, or what stands in it, moved at once",
     "mount steps": "what the flange carries moved at once",
+    "bracket bends": "what the flange carries bends with its weight",
     "lens grows": "the lens crept",
+    "lens sags": "the lens gives way with its weight",
     "lens steps": "the lens changed at once",
     "row motion": "the camera moved while rows of its images were read",
 }
@@ -39,7 +41,7 @@ _INSTEAD = {
 class FoundEffect:
     """An effect of a size that chance does not explain."""
 
-    effect: Effect
+    effect: LensGrows | LensSags
     columns: FloatArray  # See `Effect.columns`, at the session's stations.
     values: FloatArray  # (c,) estimates.
     covariance: FloatArray  # (c, c) of these.
@@ -63,7 +65,7 @@ class ErrorSizes:
     # (k, k) covariances of given intrinsics beyond what is stated, by camera.
     lenses: Mapping[str, FloatArray] = field(default_factory=dict)
     boards: Mapping[str, BoardSizes] = field(default_factory=dict)  # By the session's name.
-    grown: tuple[FoundEffect, ...] = ()  # Lenses that grow.
+    grown: tuple[FoundEffect, ...] = ()  # Lenses that grow or sag.
     # Other lenses that changed, by camera: the fit has them as lenses that vary from view to view,
     # since what is linear at one lens is not so at another.
     zoomed: Mapping[str, Zoom] = field(default_factory=dict)
@@ -71,6 +73,21 @@ class ErrorSizes:
     rivals: Mapping[str, frozenset[str]] = field(default_factory=dict)  # See `Unknowns.rivals`.
     # Whether boards keep their stated sizes: errors of arms are confounded with them.
     holds_scales: bool = False
+
+    def steadied(self, camera: str, station: int, corners: Corners) -> Corners:
+        """Corners of an image as a lens shows them that neither grows nor sags."""
+        px = corners.px
+        for found in self.grown:
+            if found.effect.frame == camera:
+                moves, lens = (found.columns[station] @ found.values)[:4], found.effect.lens.matrix
+                px = px - moves[2:] - (px - lens[2:]) * (moves[:2] / lens[:2])
+        return replace(corners, px=px)
+
+    def steadied_by(self, kind: str, camera: str) -> FloatArray:
+        """(c,) values of a kind of a problem's effects that `steadied` takes; (1,) zero of none."""
+        own = (one for one in self.grown if one.effect.frame == camera)
+        values = (one.values for one in own if one.effect.kind == kind.replace("_", " "))
+        return next(values, np.zeros(1))
 
     def instead_of(self, kind: str) -> str:
         """The rivals of a kind of effects, as a sentence behind others; empty without any."""
@@ -107,9 +124,10 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
     lenses = {name: _covariance(fit, name, levels[name]) for name in given}
     lenses = {name: covariance for name, covariance in lenses.items() if covariance.any()}
     for found in grown:
-        # In each view, the lens is another than on average, by a quarter of its growth (rms).
+        # In each view, the lens is another than on average.
         name = found.effect.frame
-        own = abs(float(found.values[0])) / (4.0 * _noise_px(fit, name))
+        focal_px = fit.unknowns.lenses[name].matrix[0]
+        own = float(np.std(found.columns[:, 0] @ found.values)) / focal_px / _noise_px(fit, name)
         jitter = float(np.hypot(levels[name].jitter, own))
         levels[name] = replace(levels[name], jitter=jitter)
     zoomed, grew = dict[str, Zoom](), {at.effect.frame: abs(float(at.values[0])) for at in grown}
@@ -250,11 +268,11 @@ def _levels(fit: Fit, camera: str) -> LensLevels:
 
 
 def _grown(fit: Fit) -> Iterator[FoundEffect]:
-    """Lenses that grow by what they may."""
+    """Lenses that grow or sag by what they may."""
     stations, moments = np.array(fit.cell.stations), fit.cell.moments
     for effect in fit.unknowns.effects:
         size = _size(fit, effect.name)
-        if not isinstance(effect, LensGrows) or not 0.0 < size <= effect.most:
+        if not isinstance(effect, LensGrows | LensSags) or not 0.0 < size <= effect.most:
             continue
         known = effect.columns(moments, np.ones(len(moments)))
         columns = np.zeros((stations.max() + 1, *known.shape[1:]))

@@ -206,8 +206,9 @@ def _of_lens(
             lens = found.columns[problem.observations.stops[own]]
             by_lens = compressed.by_shared[rows[own] - views.start, :, : lens.shape[1]]
             moved[own] = by_lens @ lens
+    # Of what the corners were not steadied by.
     information = np.asarray(np.linalg.inv(found.covariance), dtype=float)
-    prior = PriorInformation(information, -information @ found.values)
+    prior = PriorInformation(information, np.zeros(len(found.values)))
     kind = found.effect.kind.replace(" ", "_")
     return Effect.free(f"{kind} of {found.effect.frame}", prior, moved)
 

@@ -123,8 +123,8 @@ def _of_step(run: RunState, _: str) -> Trial:
     return Trial(own, with_step(*own, run.assessment.steps[0]), is_in_fit=False)
 
 
-def _held(run: RunState, columns: IntArray) -> Trial:
-    """A trial of what is in the fit, without which some values are zero."""
+def _held(run: RunState, columns: IntArray, at: FloatArray | float = 0.0) -> Trial:
+    """A trial of what is in the fit, without which some values are as they are given."""
     fit, first = run.assessment.fit, 6 * len(run.assessment.fit.frames)
     problem, effects = fit.problem, []
     for effect in problem.effects:
@@ -132,14 +132,17 @@ def _held(run: RunState, columns: IntArray) -> Trial:
         held = effect.held | np.isin(np.arange(own.start, own.stop), columns)
         effects.append(replace(effect, held=held))
     values = fit.state.values.copy()
-    values[columns - first] = 0.0
+    values[columns - first] = at
     without = problem.with_effects(effects)
     solved = fit_problem(without, State(fit.state.edges, values), fit.noise)
     return Trial((without, solved), (problem, fit.solution))
 
 
 def _of_growth(run: RunState, kind: str) -> Trial:
-    return _held(run, run.assessment.fit.unknowns.of_kinds(kind))
+    unknowns, sizes = run.assessment.fit.unknowns, run.cell_fit.sizes
+    columns = {owner: unknowns.columns((kind, owner)) for owner in unknowns.of(kind)}
+    taken = [0.0 * own + sizes.steadied_by(kind, owner) for owner, own in columns.items()]
+    return _held(run, np.concatenate([*columns.values()]), -np.concatenate(taken))
 
 
 def _of_board(run: RunState, kind: str) -> Trial:

@@ -21,7 +21,8 @@ def _found(kind: str, run: RunState) -> Iterator[Finding]:
     is_alone = not any(arm.errors is not None and arm.errors.is_significant for arm in arms)
     for owner in fit.unknowns.of(kind):
         shown = fit.unknowns.moved[fit.unknowns.columns((kind, owner))]
-        values = fit.values((kind, owner))[shown]
+        values = fit.values((kind, owner)) + run.cell_fit.sizes.steadied_by(kind, owner)
+        values = values[shown]
         covariance = fit.covariance((kind, owner))[np.ix_(shown, shown)]
         squared = float(values @ np.linalg.solve(covariance, values))
         if is_alone or issubclass(effect, LensEffect):

@@ -118,9 +118,9 @@ class Named(ABC):
         return iter(())
 
     @classmethod
-    def of_lens(cls, camera: str, lens: Camera) -> Iterator[Effect]:
-        """Those that are tried of a lens: none of effects on a flange."""
-        del camera, lens
+    def of_lens(cls, camera: str, lens: Camera, flange: str) -> Iterator[Effect]:
+        """Those that are tried of a lens, on a flange or on none: none of effects on a flange."""
+        del camera, lens, flange
         return iter(())
 
     @classmethod

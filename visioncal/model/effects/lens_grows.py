@@ -27,8 +27,9 @@ class LensGrows(LensEffect, Named):
     rate: float = TIME_CONSTANTS  # By which it fades, over the session; zero of an even one.
 
     @classmethod
-    def of_lens(cls, camera: str, lens: Camera) -> Iterator[Effect]:
+    def of_lens(cls, camera: str, lens: Camera, flange: str) -> Iterator[Effect]:
         """As what warms up; evenly."""
+        del flange
         for rate in (TIME_CONSTANTS, 0.0):
             yield cls(camera, lens, rate)
 
