@@ -363,6 +363,21 @@ def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():
     )
 
 
+def test_a_step_by_a_few_times_the_noise_is_named_though_a_view_agrees_by_chance():
+    """The views after it are calibrated alone, as the camera stands: picks come after them."""
+    cell, rng = simulate(CellOptions(views=20, seed=3)), np.random.default_rng(2)
+    step = np.array([0.02, 0.03, -0.02, 0.006, -0.004, 0.008])
+    twists = step + rng.normal(0.0, [0.008] * 3 + [0.002] * 3, (9, 6))
+    flange = cell.robot.base_from_flange.copy()
+    some = [at for at in range(10, 20) if at != 16]
+    flange[some] = flange[some] @ exp(twists)
+    cause = calibrate(session_of(cell, flange)).verdict.causes[0]
+    assert cause.kind == "something_moved"
+    assert "left out: from view 10 on, the camera" in cause.words
+    assert "or calibrate the 10 views from there on alone" in cause.do.words
+    assert cause.do.command.endswith("--views 10-19")
+
+
 def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:
     cell, rng = simulate(CellOptions(views=20)), np.random.default_rng(1)
     flange = cell.robot.base_from_flange.copy()

@@ -18,7 +18,7 @@ from support.misfits import misfit
 
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.random_effects import KINDS
-from visioncal.core.transforms import apply_each, exp, invert, log
+from visioncal.core.transforms import adjoint, apply_each, exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.results import Calibration
 from visioncal.simulation import BOARDS, CAMERAS, CellOptions, SimulatedCell, cell_session, simulate
@@ -88,6 +88,14 @@ def tilted(cell):
 def crept(cell):
     """To where it is at the end."""
     return moved_base(cell, -np.pad((time_of(cell) - 0.5) * CREEP_M, ((0, 0), (3, 0))))
+
+
+def turned_beside(cell):
+    """A target that turns by 0.7 deg in its place beside the robot, to where it is at the end."""
+    place = np.eye(4)
+    place[:3, 3] = cell.transforms["base_from_target"][:3, 3]
+    turns = (time_of(cell) - 0.5) * (adjoint(place)[:, :3] @ [0.006, 0.008, -0.007])
+    return moved_base(cell, -turns)
 
 
 def bent_bracket(cell):
@@ -562,6 +570,7 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
     [
         (tilted, "base_tilts", TILT_RAD_M),
         (crept, "base_creeps", np.pad(-CREEP_M, (3, 0))),
+        (turned_beside, "base_creeps", None),
         (bent_bracket, "bracket_bends", None),
         (warmed, "lens_grows", np.array([1.5e-3 * (1.0 - np.exp(-3.0)), 0.0, 0.0])),
         (sagged, "lens_sags", 1e-3 * np.eye(9)[[3, 7]].sum(axis=0)),
@@ -623,21 +632,23 @@ def test_a_bump_is_in_the_covariance():
     assert misfit(edge, on_flange) + misfit(edge, later) < 2 * 6 * 1.5
 
 
-def test_the_views_before_a_bump_are_calibrated_as_advised(tmp_path, monkeypatch):
+def test_the_views_after_a_bump_are_calibrated_as_advised(tmp_path, monkeypatch):
+    """Picks come after the session, when the camera stands where it was last."""
     cell = simulate(OPEN)
     session = cell_session(later(9, camera_moved_m=2e-3)(cell), "bumped", seen="corners")
     monkeypatch.chdir(tmp_path)
     session.save("bumped")
     advised = calibrate(session).verdict.causes[0].do
-    assert advised.words.endswith("or calibrate the 9 views before it alone.")
-    assert advised.command == "visioncal calibrate SESSION -o NEW --views 0-8"
-    options = ("calibrate", "bumped", "-o", "before", "--no-report", "--no-recording", "--views")
-    assert visioncal(*options, "0-8").status == 0
-    alone = Calibration.load("before")
+    assert advised.words.endswith("or calibrate the 9 views after it alone.")
+    assert advised.command == "visioncal calibrate SESSION -o NEW --views 9-17"
+    options = ("calibrate", "bumped", "-o", "after", "--no-report", "--no-recording", "--views")
+    assert visioncal(*options, "9-17").status == 0
+    alone = Calibration.load("after")
     assert {cause.kind for cause in alone.verdict.causes} == {"few_stops"}
-    assert [view.view for view in alone.views] == list(range(9))
+    assert [view.view for view in alone.views] == list(range(9, 18))
     edge = alone.edges["flange_from_cam"]
-    away = invert(cell.transforms["flange_from_cam"]) @ edge.matrix
+    moved = simulate(replace(OPEN, camera_moved_m=2e-3)).transforms["flange_from_cam"]
+    away = invert(moved) @ edge.matrix
     # By chance one cell in a hundred is farther away.
     assert 1e3 * np.linalg.norm(away[:3, 3]) < 3.0 * edge.sigma_mm
     refused = visioncal(*options, "8-0")

@@ -12,7 +12,7 @@ from visioncal.fit import processes
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
-from visioncal.fit.linearise import Pair, images_of, linearised
+from visioncal.fit.linearise import Pair, images_of, linearised, predicted
 from visioncal.fit.score import best_field, of_effect, of_rows
 from visioncal.fit.sizes import most_likely
 from visioncal.fit.unknowns import (
@@ -23,6 +23,7 @@ from visioncal.fit.unknowns import (
     lens_field,
     random_effect,
 )
+from visioncal.model import MeasuredPose
 from visioncal.model.effects import (
     NAMED,
     SIGNIFICANT,
@@ -38,6 +39,7 @@ from visioncal.model.effects import (
     MountSteps,
     Play,
     RowMotion,
+    SightSteps,
     Springs,
     Stood,
     Weight,
@@ -129,6 +131,7 @@ def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     yield from of_arms(fit, pairs)
     yield from of_images(fit, pairs)
     yield from scored(fit, creeps_of_frames(fit))
+    yield from of_distances(fit, pairs)
     for flange in fit.unknowns.erring:
         yield from scored(fit, effects_of_frames(fit, flange), flange)
     for camera in fit.unknowns.lenses:
@@ -157,6 +160,34 @@ def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
             size, gain = score.best(np.ones(len(score.pull)), bounds.low, bounds.high)
             if size * float(np.mean(effect.lens.matrix[:2])) > _LEAST_PX:
                 yield Candidate(gain, starting_at(random_effect(effect), size), effect)
+
+
+def of_distances(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
+    """Distances of measured poses that changed at once: as noise, they have a size of their own.
+
+    That hides them from a score.
+    """
+    used, known = np.flatnonzero(fit.used), {effect.name for effect in fit.unknowns.effects}
+    for camera in {fit.cell.sightings[at].seer for at in used} & fit.cell.cameras.keys():
+        seen = [fit.cell.sightings[at] for at in used if fit.cell.sightings[at].seer == camera]
+        stops = np.unique([one.stop for one in seen])
+        is_measured = all(isinstance(one.evidence, MeasuredPose) for one in seen)
+        if (
+            not is_measured
+            or len(stops) < processes.ENOUGH_STOPS
+            or f"sight steps {camera}" in known
+        ):
+            continue
+        progress = fit.cell.moments.progress[stops]
+        tried = [
+            SightSteps(camera, float(progress[at])) for at in evenly(len(stops) - 3, _ZOOMS) + 1
+        ]
+        scores = [of_effect(fit, one) for one in tried]
+        best = int(
+            np.argmax([float(one.pull @ one.pull / one.information[0, 0]) for one in scores])
+        )
+        gain = gain_of(fit, pairs, tried[best]) - np.log(len(tried))
+        yield Candidate(gain, random_effect(tried[best]), tried[best])
 
 
 def stops_of(fit: Fit, camera: str) -> IntArray:
@@ -191,7 +222,9 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
         lasting = [one[0] for one in found if one[0].typical is one[0]]
         clear = [one[0] for one in found if one[0] in lasting and 4.0 * one[2] >= SIGNIFICANT]
         if any(isinstance(one, BaseCreeps | MountCreeps) for one in clear):
-            clear += [one for one in steps(fit, flange) if one.name not in known]
+            creeps = [(one[2], one[0].about_m) for one in found if isinstance(one[0], BaseCreeps)]
+            _, place = max(creeps, default=(0.0, ()))
+            clear += [one for one in steps(fit, flange, place) if one.name not in known]
         beside = processes.scored(fit, flange, clear) if clear else []
         others = [one for one in found if one[0] not in (clear if beside else ())]
         found = [*others, *((one, *best) for one, best in zip(clear, beside, strict=False))]
@@ -253,8 +286,26 @@ def effects_of_frames(fit: Fit, flange: str) -> Iterator[Effect]:
     stood = stops[np.isfinite(poses[stops, 0, 0])]
     if len(stood) >= processes.ENOUGH_STOPS:
         is_swept = any(sweep.flange == flange for sweep in fit.cell.sweeps)
+        stood_there = Stood(poses, stood, is_swept, _beside(fit, flange))
         for kind in NAMED:
-            yield from kind.of_flange(flange, Stood(poses, stood, is_swept))
+            yield from kind.of_flange(flange, stood_there)
+
+
+def _beside(fit: Fit, flange: str) -> tuple[float, ...]:
+    """Where a robot's base has what stands beside it, on average [m]; empty of nothing."""
+    branches = fit.cell.tree.branches
+    base = branches[flange].parent
+    cell = branches[base].parent if base in branches else base
+    stand = [at for at in fit.cell.unknown if at != base and branches[at].parent in (cell, base)]
+    if not stand:
+        return ()
+    seen = (fit.cell.tree.path(base, at) for at in stand)
+    moments = fit.cell.moments.take(np.zeros(1, int))
+    places = [
+        predicted(fit.cell, fit.unknowns, fit.state, path, moments, {}).poses[0, :3, 3]
+        for path in seen
+    ]
+    return tuple(np.mean(places, axis=0).tolist())
 
 
 def creeps_of_frames(fit: Fit) -> Iterator[Effect]:
@@ -271,11 +322,11 @@ def creeps_of_frames(fit: Fit) -> Iterator[Effect]:
             yield FrameCreeps(name)
 
 
-def steps(fit: Fit, flange: str) -> Iterator[Effect]:
-    """Effects of frames of an arm that were moved at once: rivals to those that creep."""
+def steps(fit: Fit, flange: str, place: tuple[float, ...]) -> Iterator[Effect]:
+    """Effects of frames that were moved at once: rivals to those that creep, about a place [m]."""
     progress = fit.cell.moments.progress
     for at in (evenly(len(progress) - 3, _STEPS) + 1).tolist():
-        yield BaseSteps(flange, float(progress[at]))
+        yield BaseSteps(flange, place, float(progress[at]))
         yield MountSteps(flange, float(progress[at]))
 
 

@@ -19,6 +19,7 @@ from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.error_sizes import (
+    ErrorSizes,
     MeasuredErrors,
     error_sizes,
     measured_errors,
@@ -92,7 +93,7 @@ def solve(
     measured = measured_errors(None if observed.scenes else start.solved)
     start = _with_shapes(start, measured)
     try:
-        cell_fit = _fit(start, observed, arms, level, measured.sizes)
+        cell_fit = _fit(start, observed, arms, level, measured)
     except (VisioncalError, np.linalg.LinAlgError):
         # Along an undetermined direction the fit of lens and frames diverges.
         if start.cell.mount is not None and not observed.misread:
@@ -124,14 +125,15 @@ def _fit(
     observed: Observed,
     arms: Mapping[str, RobotArm],
     level: str,
-    sizes: Mapping[str, float],
+    measured: MeasuredErrors,
 ) -> CellFit:
     """Alternates between inliers, lenses and boards, and arms."""
-    cell, poses = start.cell, start.poses
+    cell, poses, sizes = start.cell, start.poses, measured.sizes
     misread = observed.misread
     inliers = all_as_inliers(start.problem, start.state) if misread else initial_inliers(start)
     others = (*clock_effects(cell, observed.clocks), *creep_effects(inliers.problem))
-    initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, others)
+    known = ErrorSizes(opened=measured.stepped)
+    initial = CellFit(cell, inliers, None, poses, start.untied, arms, level, others, sizes=known)
     if misread:
         # Misread poses determine neither lens, board and arm nor which views are outliers.
         return _of_misread(initial, observed)

@@ -58,15 +58,12 @@ class Cell:
         return f"from view {self.stops[station]} on"
 
     def or_separately(self, do: str, station: int) -> Remedy:
-        """Advice to `do` something and record again, or to calibrate the longer part alone.
+        """Advice to `do` something and record again, or to calibrate what follows it alone.
 
-        The later part begins at a station.
+        Picks come after the session: what was before a station is no more.
         """
-        parts: dict[str, list[int]] = {"before": [], "after": []}
-        for row in (*self.rows, *self.held):
-            parts["before" if row.station < station else "after"].append(row.view)
-        where, views = max(parts.items(), key=lambda part: len(part[1]))
-        words = f"{do}, and record again; or calibrate the {len(views)} views {where} it alone."
+        views = [row.view for row in (*self.rows, *self.held) if row.station >= station]
+        words = f"{do}, and record again; or calibrate the {len(views)} views after it alone."
         either = or_alone(words, views)
         return either if either.command else Remedy(f"{do}, and record again.")
 

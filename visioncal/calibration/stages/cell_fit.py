@@ -142,7 +142,7 @@ class CellFit:
         stop_of = {row.view: at for row, at in zip(self.cell.rows, stops, strict=True)}
         for frame, scene in scenes.items():
             corners: dict[int, Corners] = {
-                view.view: sizes.steadied(frame, stop_of[view.view], view.corners)
+                view.view: sizes.steadied(frame, stop_of.get(view.view, -1), view.corners)
                 for view in views[frame]
                 if view.corners is not None
             }

@@ -17,7 +17,7 @@ from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
-from visioncal.model.effects import Effect, LensGrows, LensSags, LensSteps
+from visioncal.model.effects import Effect, LensGrows, LensSags, LensSteps, SightSteps
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions, first_corners
@@ -69,16 +69,22 @@ class ErrorSizes:
     # Other lenses that changed, by camera: the fit has them as lenses that vary from view to view,
     # since what is linear at one lens is not so at another.
     zoomed: Mapping[str, Zoom] = field(default_factory=dict)
-    opened: tuple[Effect, ...] = ()  # Of frames that move.
+    opened: tuple[Effect, ...] = ()  # Of frames that move; of measured poses, their steps alone.
     rivals: Mapping[str, frozenset[str]] = field(default_factory=dict)  # See `Unknowns.rivals`.
     # Whether boards keep their stated sizes: errors of arms are confounded with them.
     holds_scales: bool = False
 
     def steadied(self, camera: str, station: int, corners: Corners) -> Corners:
-        """Corners of an image as a lens shows them that neither grows nor sags."""
+        """Corners of an image as a lens shows them that neither grows nor sags.
+
+        Args:
+            camera: The camera's frame.
+            station: Where the robot stood; -1 where that is not known.
+            corners: The corners.
+        """
         px = corners.px
         for found in self.grown:
-            if found.effect.frame == camera:
+            if found.effect.frame == camera and 0 <= station < len(found.columns):
                 moves, lens = (found.columns[station] @ found.values)[:4], found.effect.lens.matrix
                 px = px - moves[2:] - (px - lens[2:]) * (moves[:2] / lens[:2])
         return replace(corners, px=px)
@@ -152,6 +158,7 @@ class MeasuredErrors:
     # flange from stop to stop.
     noise: Mapping[int, FloatArray] = field(default_factory=dict)
     sizes: Mapping[str, float] = field(default_factory=dict)  # Sigmas of scales, by frame.
+    stepped: tuple[Effect, ...] = ()  # Cameras whose distances changed at once.
 
 
 def measured_errors(solved: CellFit | None) -> MeasuredErrors:
@@ -181,7 +188,8 @@ def measured_errors(solved: CellFit | None) -> MeasuredErrors:
         middle = np.zeros(3) if board is None else corner_positions(board).mean(axis=0)
         factor = np.linalg.inv(sight_weights(pose.matrix[None], middle)[0]) * sigmas
         noise[one.view] = factor @ factor.T + of_flange
-    return MeasuredErrors(noise, sizes)
+    stepped = (at for at in fit.unknowns.opened if isinstance(at, SightSteps))
+    return MeasuredErrors(noise, sizes, tuple(stepped))
 
 
 def solve_session(observed: Observed) -> CellFit:

@@ -34,6 +34,7 @@ from visioncal.model.effects import (
     MountCreeps,
     MountSteps,
     Named,
+    SightSteps,
     Stood,
 )
 from visioncal.model.effects import Effect as GrowingEffect
@@ -88,6 +89,8 @@ def random_effects(
             for kind in NAMED
             if kind is not MountCreeps or any(isinstance(at, kind) for at in opened)
         ]
+        if any(isinstance(at, SightSteps) for at in sizes.opened):
+            kinds = [kind for kind in kinds if not issubclass(kind, BaseCreeps | MountCreeps)]
         creeps = [at for at in opened if not isinstance(at, BaseSteps | MountSteps)]
         tried = _of_flange(problem, robot, stops, kinds, creeps)
         chosen, value = _with_sizes(inliers, tried, nuisance)

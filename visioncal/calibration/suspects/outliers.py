@@ -36,6 +36,9 @@ _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CAL
 # A half turn about the line of sight; a picture that is turned differs by less [mm, deg], of a lens
 # whose principal point is off the middle.
 _HALF, _IN_PLACE = np.diag([-1.0, -1.0, 1.0]), (10.0, 4.0)
+# Views among many outliers of one end that agree by chance, one of so many; what a step that few
+# times exceeds the noise leaves of these, and poses that are wrong apart never do.
+_BY_CHANCE, _AT_END = 4, 0.6
 _WRONG = "its pose or its reading is wrong, or something had moved"
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
@@ -157,30 +160,35 @@ def _fault(
 
 
 def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
-    """Outliers that are all views at one end of the session and agree, as where something moved."""
+    """Outliers that are the views at one end of the session and agree, as where something moved."""
     inliers, rows = cell_fit.inlier_fit, cell_fit.cell.rows
     order = np.argsort(inliers.problem.observations.stops, kind="stable")
-    used = np.flatnonzero(inliers.used[order])
-    before, after = order[: used[0]], order[used[-1] + 1 :]
-    run = max(before, after, key=len)
-    when = f"from view {rows[int(run[0])].view} on" if len(run) else ""
-    if len(run) < FEWEST_VIEWS or (change := _common_change(inliers, run)) is None:
+    is_used = inliers.used[order]
+    ends = np.append(0, np.cumsum(np.where(is_used, -_BY_CHANCE, 1)))
+    first, last = int(ends.argmin()), int(ends.argmax())
+    before, after = order[:last][~is_used[:last]], order[first:][~is_used[first:]]
+    run, at = (before, last) if len(before) > len(after) else (after, first)
+    words = "Fasten camera and target, keep one board, and one tool and base frame in the "
+    words += "controller, and record again"
+    most = _AT_END if len(run) > FEWEST_VIEWS else 1.0 / CLEAR_RATIO
+    if len(run) >= FEWEST_VIEWS and (change := _common_change(inliers, run, most)) is not None:
+        # Picks come after the session.
+        later = [rows[row].view for row in np.sort(order[at:]).tolist()]
+        when = f"{'before' if run is before else 'from'} view {rows[int(order[at])].view}"
+        when += " on" * (run is after)
+        do = or_alone(f"{words}; or calibrate the {len(later)} views from there on alone.", later)
+    else:
         # Views here and there, as of every second row.
-        run, when = order[~inliers.used[order]], "in all of these"
-        if len(run) < FEWEST_VIEWS or (change := _common_change(inliers, run)) is None:
+        run, when = order[~is_used], "in all of these"
+        most = 1.0 / CLEAR_RATIO
+        if len(run) < FEWEST_VIEWS or (change := _common_change(inliers, run, most)) is None:
             return
+        some = [rows[row].view for row in np.sort(run).tolist()]
+        words += ". The result is that of the other views; calibrate these alone, too."
+        do = or_alone(words, some)
     what, how = _changed_words(cell_fit, *change)
-    if run is before:
-        last = rows[int(run[-1])].station
-        following = min((row for row in rows if row.station > last), key=lambda row: row.station)
-        when = f"before view {following.view}"
     outliers = np.sort(run).tolist()
     views = tuple(rows[row].view for row in outliers)
-    do = or_alone(
-        "Fasten camera and target, keep one board, and one tool and base frame in the controller, "
-        "and record again. The result is that of the other views; calibrate these alone, too.",
-        views,
-    )
     if cell_fit.may_be_of_arms(change[1]):
         how += OTHER_POSTURE
     words = f"{{views}} were left out: {when}, {what} was another one{how}."
@@ -235,8 +243,12 @@ def other_frame(before: FloatArray, after: FloatArray) -> str:
     return f"({x}, {y}, {z}) mm and {figure(pose_difference(np.eye(4), other)[1])} deg"
 
 
-def _common_change(inliers: InlierFit, rows: IntArray) -> tuple[str, FloatArray] | None:
+def _common_change(
+    inliers: InlierFit, rows: IntArray, most: float
+) -> tuple[str, FloatArray] | None:
     """The frame whose step explains most of some outliers, and the step; None where none does.
+
+    It leaves `most` of them, as a share, at most.
 
     Its name is empty where another size of the target does, or steps of several frames alike. Rows
     with other poses, or of other images, have none in common.
@@ -263,7 +275,7 @@ def _common_change(inliers: InlierFit, rows: IntArray) -> tuple[str, FloatArray]
     # A tool that is longer along the line of sight looks like another size, too.
     if CLEAR_RATIO * of_size < min(1.0, CLEAR_RATIO**2 * ratio):
         return "", np.eye(4)
-    if CLEAR_RATIO * ratio >= 1.0:
+    if ratio >= most:
         return None
     is_alone = all(CLEAR_RATIO * ratio < rival for rival, other, _ in found if other != frame)
     return (frame if is_alone else ""), step

@@ -68,11 +68,14 @@ def _words(step: Step, run: RunState) -> str:
             f"{figure(changed_deg)} deg (sigma {figure(sigma_deg)}) from what it read before, as "
             "where an encoder slipped or a zero was lost"
         )
+    # A program whose poses are given may go over to another lens, or another origin.
+    source = ", or what measures its poses was set otherwise"
+    source *= run.cell_fit.linearised_corners is None
     if step.kind == SIZE:
         return (
             f"{thing} is another one: {when}, it is {figure(100.0 * abs(first))} % "
             f"{'larger' if first > 0.0 else 'smaller'} (sigma {figure(100.0 * sigma)} %) than "
-            "before, by the robot's motion"
+            f"before, by the robot's motion{source}"
         )
     moved = mm_and_deg(*pose_difference(np.eye(4), exp(step.value)))
     if step.kind == DRIFT:
@@ -84,7 +87,7 @@ def _words(step: Step, run: RunState) -> str:
     on_flange = (mount == "eye-in-hand") == step.of.startswith("cam")
     # Things beside a robot move relative to its base.
     of_base = "" if mount is None or on_flange else ", or the robot's base,"
-    words = f"{thing}{of_base} moved at once: {when}, it is {moved} from where it was"
+    words = f"{thing}{of_base} moved at once: {when}, it is {moved} from where it was{source}"
     if run.cell_fit.may_be_of_arms(exp(step.value)):
         words += OTHER_POSTURE
     if mount is not None and far_mm > _LIMITS.arm_errors[0]:

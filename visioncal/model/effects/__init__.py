@@ -10,6 +10,7 @@ from visioncal.model.effects.creep import BaseSteps as BaseSteps
 from visioncal.model.effects.creep import FrameCreeps as FrameCreeps
 from visioncal.model.effects.creep import MountCreeps as MountCreeps
 from visioncal.model.effects.creep import MountSteps as MountSteps
+from visioncal.model.effects.creep import SightSteps as SightSteps
 from visioncal.model.effects.effect import SIGNIFICANT as SIGNIFICANT
 from visioncal.model.effects.effect import Effect as Effect
 from visioncal.model.effects.effect import Named as Named

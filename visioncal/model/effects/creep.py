@@ -16,6 +16,9 @@ from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect, Named, Stood
 from visioncal.model.effects.lens_grows import TIME_CONSTANTS
 
+# By which motion fades over the session: evenly, as what warms up, as what settles in some stops.
+_RATES = (0.0, TIME_CONSTANTS, 20.0)
+
 
 @dataclass(frozen=True, eq=False)
 class _Moves(Effect):
@@ -33,12 +36,21 @@ class _Moves(Effect):
 
 @dataclass(frozen=True, eq=False)
 class _OfBase(_Moves):
-    """Motion of a base, or of what stands in it."""
+    """Motion of a base, or of what stands in it, about a place [m].
+
+    A camera beside the robot that turns moves what it sees by centimetres about the base, and no
+    base that slips turns about the camera.
+    """
+
+    about_m: tuple[float, ...] = ()  # Empty for the base's origin.
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
-        twists = adjoint(invert(moments.poses[self.frame])) / np.repeat([LEVER_M, 1.0], 3)
+        place = np.eye(4)
+        place[:3, 3] = self.about_m or 0.0
+        flange_from_place = invert(moments.poses[self.frame]) @ place
+        twists = adjoint(flange_from_place) / np.repeat([LEVER_M, 1.0], 3)
         return np.asarray(twists * self.left(moments))
 
 
@@ -64,8 +76,7 @@ class _Creep(_Moves, Named):
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
         """Evenly; as what warms up; as what settles in the first stops."""
         del stood
-        for rate in (0.0, TIME_CONSTANTS, 20.0):
-            yield cls(flange, rate)
+        yield from (cls(flange, rate=rate) for rate in _RATES)
 
     @classmethod
     def says(cls, values: FloatArray) -> str:
@@ -88,6 +99,12 @@ class BaseCreeps(_Creep, _OfBase):
         "Fasten the base, the fixed camera and the fixed target, let the cell warm up, and record "
         "again."
     )
+
+    @classmethod
+    def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
+        """As all do, about the base and about what stands in it."""
+        for place in dict.fromkeys([(), stood.beside_m]):
+            yield from (cls(flange, place, rate) for rate in _RATES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,3 +146,15 @@ class MountSteps(_Step, _OfMount):
     """A sudden move of all that the flange carries."""
 
     kind = "mount steps"
+
+
+@dataclass(frozen=True, eq=False)
+class SightSteps(_Step):
+    """A camera, or what measures poses by it, whose distances changed at once."""
+
+    kind, count = "sight steps", 1
+
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """See `Effect`."""
+        del distances
+        return np.asarray(self.left(moments) * np.eye(6)[:, 5:])

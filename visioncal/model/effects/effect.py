@@ -101,6 +101,7 @@ class Stood:
     poses: FloatArray  # (s, 4, 4) `base_from_flange` at the cell's stops; NaN where unknown.
     seen: IntArray  # (k,) stops at which something was seen.
     is_swept: bool  # Whether it moved meanwhile.
+    beside_m: tuple[float, ...] = ()  # Where its base has what stands in it; empty of nothing [m].
 
 
 class Named(ABC):
