@@ -6,13 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 from support.cells import calibrated
 from support.edges import inliers_of
 from support.problems import ROBOT_SIGMAS, away, observed, pose, swung, true_state, world
 from support.slopes import jacobian
 
 from visioncal.core.errors import ConvergenceError
-from visioncal.core.transforms import adjoint, exp, invert, log
+from visioncal.core.transforms import adjoint, compose, exp, invert, log
 from visioncal.estimation import joint
 from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.budget import Sources, covariance_by_source
@@ -643,6 +644,22 @@ def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():
     measured = cell.cam_from_target @ exp(noise)
     found = inliers_of(chain("eye-in-hand", cell.robot.base_from_flange, measured))
     assert np.flatnonzero(~found.used).tolist() == [17]
+
+
+@pytest.mark.parametrize("wrong", [[2], [1, 6]])
+def test_boards_read_upside_down_are_left_out_however_noisy_the_others_are(wrong):
+    """A fit of all would follow them, and none would be far from it."""
+    rng, count = np.random.default_rng(3), 12
+    rotation = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, (count, 3))).as_matrix()
+    poses, edges = (
+        compose(rotation, rng.uniform(-0.3, 0.3, (count, 3))),
+        exp(rng.uniform(-1, 1, (2, 6))),
+    )
+    noise = rng.standard_normal((count, 6)) * np.repeat([0.02, 0.006], 3)
+    measured = invert(poses @ edges[0]) @ edges[1] @ exp(noise)
+    measured[wrong] = measured[wrong] @ exp(np.array([0.0, 0.0, np.pi, 0.1, 0.05, 0.0]))
+    found = inliers_of(chain("eye-in-hand", poses, measured))
+    assert np.flatnonzero(~found.used).tolist() == wrong
 
 
 def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it():

@@ -569,8 +569,16 @@ def test_the_robots_fields_are_not_the_cameras_as_well(rows):
     found = read_foreign(both, named)
     # One conversion to a vector and back, in double precision.
     np.testing.assert_allclose(found.camera.poses(), CAM_FROM_TARGET, atol=1e-14)
-    with pytest.raises(DataError, match=r"'tvec' may be robot\.tvec, board\.tvec"):
-        read_foreign(both, replace(HAND, robot=PoseImportOptions(("tvec", "rvec"))))
+    # Of equal names, those under a side's own word are its.
+    same = PoseImportOptions(("tvec", "rvec"))
+    for whose, poses in (("robot", BASE_FROM_FLANGE), ("camera", CAM_FROM_TARGET)):
+        found = getattr(read_foreign(both, replace(HAND, robot=same, camera=same)), whose)
+        np.testing.assert_allclose(found.poses(), poses, atol=1e-14)
+    other = rows(
+        lambda at: {"first": vector(BASE_FROM_FLANGE[at]), "other": vector(CAM_FROM_TARGET[at])}
+    )
+    with pytest.raises(DataError, match=r"'tvec' may be first\.tvec, other\.tvec"):
+        read_foreign(other, replace(HAND, robot=same))
 
 
 def test_half_a_pose_is_refused_by_its_row(logged):

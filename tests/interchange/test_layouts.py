@@ -28,6 +28,7 @@ from visioncal.interchange.formats.sources import describe
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 from visioncal.session import Session
+from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 from visioncal.session.depth import ply_of, read_depth
 from visioncal.vision.boards.charuco import charuco_board
 from visioncal.vision.targets import target_document
@@ -1270,16 +1271,81 @@ def test_numbered_columns_of_a_pose_and_of_joints_are_read(tmp_path):
 
 def test_two_files_of_poses_ask_whose_they_are_with_the_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    poses, _, _ = world()
-    for name, turned in (("TrackerToFiducial", poses[::-1]), ("RobotBaseToTip", poses)):
+    poses, _, session = world()
+    seen = np.array([view.cam_from_target().as_matrix() for view in session.views])
+    for name, turned in (("TrackerToFiducial", seen), ("RobotBaseToTip", poses)):
         vectors = Rotation.from_matrix(turned[:, :3, :3]).as_rotvec()
         rows = np.hstack([turned[:, :3, 3], vectors]).tolist()
         write(tmp_path / f"in/{name}.txt", "\n".join(" ".join(map(repr, row)) for row in rows))
-    followed = follow("convert", "in", "out", "--mount", "eye-to-hand")
+    followed = follow("convert", "in", "out", "--mount", session.mount)
     assert "whose they are is not said" in followed.runs[0].refused().err
     assert len(followed.runs) == 2
     view = Session.load(tmp_path / "out").views[0]
     np.testing.assert_allclose(view.base_from_flange().as_matrix(), poses[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("is_inverse", [False, True])
+def test_the_numbers_of_one_side_never_serve_as_both(tmp_path, monkeypatch, is_inverse):
+    """They agree with each other to the last digit, and say nothing of the camera."""
+    monkeypatch.chdir(tmp_path)
+    poses, _, session = world()
+    both = np.array([poses, np.linalg.inv(poses) if is_inverse else poses])
+    records = [{"pose": a.tolist(), "board": b.tolist()} for a, b in both.swapaxes(0, 1)]
+    write(tmp_path / "in.json", json.dumps(records))
+    said = ("--mount", "eye-in-hand", "--robot-key", "pose", "--camera-key", "board")
+    for more in ((), ("--guess", "--yes")):
+        refused = visioncal("convert", "in.json", "out", *said, *more).refused().err
+        assert f"are {'inverse' if is_inverse else 'the same'} in all 9 rows" in refused
+        assert "Name the poses of each with --robot-key and --camera-key" in refused
+    # A session of such rows, written by other means.
+    Session.assemble(
+        {"schema": 1, "name": "out", "mount": "eye-in-hand"},
+        ["view", *POSE, *MEASURED_CAM_POSE],
+        [[*map(str, (at, *seven(a), *seven(b)))] for at, (a, b) in enumerate(both.swapaxes(0, 1))],
+        session.images,
+    ).save(tmp_path / "out")
+    assert "serve as both" in visioncal("calibrate", "out").refused().err
+    assert "serve as both" in visioncal("doctor", "out").out
+
+
+def test_files_of_two_sides_are_told_by_their_names(tmp_path, monkeypatch):
+    """Keys of both are the same; the camera's pose is there as a matrix, too."""
+    monkeypatch.chdir(tmp_path)
+    poses, _, session = world()
+    seen = [view.cam_from_target().as_matrix() for view in session.views]
+    for at, (pose, board) in enumerate(zip(poses, seen, strict=True)):
+        for side, each, more in (("hand", pose, {}), ("eye", board, {"T": board.tolist()})):
+            parts = {"R": each[:3, :3].tolist(), "t": each[:3, 3:].tolist()}
+            write(tmp_path / f"in/{side}/{side}_{at}.json", json.dumps(parts | more))
+    tables = {"robotData": poses, "cameraData": np.array(seen)}
+    for name, each in tables.items():
+        turns = Rotation.from_matrix(each[:, :3, :3]).as_euler("xyz")
+        rows = np.hstack([1e3 * each[:, :3, 3], turns]).tolist()
+        write(tmp_path / f"two/{name}.txt", "\n".join(" ".join(map(repr, row)) for row in rows))
+    said = ("--mount", session.mount)
+    for at, (source, more) in enumerate(
+        [("in", ()), ("in", ("--robot-key", "R,t", "--camera-key", "R,t")), ("two", ())]
+    ):
+        visioncal("convert", source, f"out{at}", *said, *more).good()
+        found = Session.load(tmp_path / f"out{at}").views
+        sides = zip(found, poses, seen, strict=True)
+        for view, pose, board in sides:
+            np.testing.assert_allclose(view.base_from_flange().as_matrix(), pose, atol=1e-9)
+            np.testing.assert_allclose(view.cam_from_target().as_matrix(), board, atol=1e-9)
+
+
+def test_a_mount_that_is_not_as_stated_is_said_before_a_form_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    poses, _, session = world()
+    seen = [view.cam_from_target().as_matrix() for view in session.views]
+    other = "eye-to-hand" if session.mount == "eye-in-hand" else "eye-in-hand"
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    rows = np.hstack([poses[:, :3, 3], turns]).tolist()
+    boards = [{"pose": row, "board": at.tolist()} for row, at in zip(rows, seen, strict=True)]
+    write(tmp_path / "in.json", json.dumps(boards))
+    refused = visioncal("convert", "in.json", "out", "--mount", other).refused().err
+    assert "the camera is not mounted as stated" in refused
+    assert f"Say --mount {session.mount}" in refused
 
 
 @pytest.mark.parametrize("is_printed", [False, True])

@@ -479,6 +479,20 @@ def test_a_checkerboard_cut_within_its_outermost_squares_is_found(surround):
     assert min(away) < 0.2
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_a_grid_of_circles_leaves_no_row_of_the_plate_over(turns):
+    """Of 7 x 11 circles, 5 x 14 are a grid, too: of seven rows the last is left over."""
+    board, part = circles(7, 11, asymmetric=True), circles(5, 14, asymmetric=True)
+    places = kind_of(board).corners(board)[:, :2] / board.square_m * 24.0 + 60.0
+    image = np.full((360, 440), 220, dtype=np.uint8)
+    for at in places:
+        cv2.circle(image, np.rint(at).astype(int).tolist(), 9, 30, -1, cv2.LINE_AA)
+    image = np.ascontiguousarray(np.rot90(image, turns))
+    seen = kind_of(board).seen_in(image)
+    assert (seen.columns, seen.rows, seen.asymmetric) == (7, 11, True)
+    assert isinstance(kind_of(part).search(image, part), NotFound)
+
+
 @pytest.mark.parametrize("asymmetric", [False, True])
 def test_a_blob_that_continues_a_grid_of_circles_is_none_of_it(asymmetric):
     """A screw where the next circle would be."""

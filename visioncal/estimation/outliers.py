@@ -34,7 +34,7 @@ from visioncal.estimation.moves import (
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import UNEVEN, Noise, State
-from visioncal.estimation.robust import Distances, half_of, nearest, settled, widened
+from visioncal.estimation.robust import ROUNDS, Distances, half_of, nearest, settled, widened
 from visioncal.estimation.solve import (
     Solution,
     estimate_noise,
@@ -58,6 +58,8 @@ _GROSS = 20.0
 _MOST_NOISE = np.array([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M])
 # Least share of inliers; with fewer, the outliers cannot be identified.
 _LEAST_SHARE = 0.5
+# Least share that agrees but for noise larger than robots have, where others are gross outliers.
+_MOST_AGREE = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +208,9 @@ def find_inliers(
     """Finds the inliers where nothing moved; `used` are (n,) presumed ones, if any, of some noise.
 
     Where fewer than half are inliers, or their noise exceeds any accepted result's, the outliers
-    cannot be identified: all stay except gross outliers.
+    cannot be identified: all stay except gross outliers. These are few that are far from what the
+    inliers predict, however much noise they have: a fit of all would follow a board that was read
+    upside down.
     """
     all_rows = np.ones(len(problem), dtype=bool)
     if len(problem) > FEWEST_COMPARED:
@@ -219,6 +223,14 @@ def find_inliers(
         is_noise = bool(np.all(found.fit.noise.robots < _MOST_NOISE))
         if found.used.sum() >= max(_LEAST_SHARE * len(problem), FEWEST_COMPARED) and is_noise:
             return found
+        fit, near = found.fit, _near(problem, found.fit.state, all_rows)
+        for _ in range(ROUNDS):
+            if near.sum() < max(_MOST_AGREE * len(problem), FEWEST_COMPARED) or near.all():
+                break
+            before, fit = near, fit_problem(problem.subset(near), fit.state)
+            near = _near(problem, fit.state, before)
+            if np.array_equal(near, before):
+                return _inlier_fit(problem, near, fit, ())
     fit = fit_problem(problem, state)
     near = _near(problem, fit.state, all_rows, _GROSS)
     if not FEWEST_COMPARED <= near.sum() < len(problem):

@@ -10,7 +10,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from visioncal.core.documents.columns import Column, TableReader, as_whole
 from visioncal.core.documents.tables import TextTable, csv_text, parse_table
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose
+from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
 from visioncal.robot import Loads
 from visioncal.session import columns as cols
@@ -21,6 +22,8 @@ MOST_VIEWS = 20_000
 # Columns that observe without an image.
 _OBSERVED = ("cft_x_m", "meas_x_m")
 _CENTRE, _FORCE = cols.LOAD[1:4], cols.LOAD[4:]
+# Poses of robot and camera that agree so are one's; a robot moves by more.
+_SAME_M, _MOVED_M = 1e-6, 1e-3
 # Approach direction of the joints to a stop, by the cells of column approach.
 SIDES = {"+": 1.0, "-": -1.0, "": 0.0}
 
@@ -133,6 +136,43 @@ def reported_matrices(views: Sequence[View]) -> dict[int, FloatArray]:
     values = np.array([[view.numbers[name] for name in cols.POSE] for view in reported])
     poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:]))
     return dict(zip((view.number for view in reported), poses.as_matrix(), strict=True))
+
+
+def check_two_sides(name: str, views: Sequence[View], next_step: str) -> None:
+    """Checks that poses of robot and camera are not the same numbers, nor inverse to each other.
+
+    Two devices never agree to a micrometre: they would calibrate to an identity without an error.
+
+    Args:
+        name: Name of the session, for the message.
+        views: Its rows.
+        next_step: The remedy.
+
+    Raises:
+        DataError: All rows with both poses are the same.
+    """
+    seen_poses = {view.number: view.matrix(cols.MEASURED_CAM_POSE) for view in views}
+    given = {number: pose for number, pose in seen_poses.items() if pose is not None}
+    reported = reported_matrices(views) if given else {}
+    both = [number for number in given if number in reported]
+    if len(both) < FEWEST_VIEWS:
+        return
+    robot, camera = (np.array([poses[number] for number in both]) for poses in (reported, given))
+    if np.ptp(robot[:, :3, 3], axis=0).max() < _MOVED_M:
+        return
+    places, inverse = robot[:, :3, 3], invert(robot)[:, :3, 3]
+    seen, turned = camera[:, :3, 3], invert(camera)[:, :3, 3]
+    # The rotations may be the same numbers in another form.
+    pairs = ("the same", places - seen), ("inverse", places - turned), ("inverse", inverse - seen)
+    for how, away in pairs:
+        if np.abs(away).max() < _SAME_M:
+            raise DataError(
+                f"{name}: the poses of the robot and those of the camera are {how} in all "
+                f"{len(robot)} rows: the numbers of one serve as both, and say nothing of the "
+                "other.",
+                culprits=[name],
+                next_step=next_step,
+            )
 
 
 def parse_csv(text: str, label: str) -> TextTable:

@@ -27,9 +27,14 @@ from visioncal.core.number_format import counted
 from visioncal.core.verdict import NOTE, Finding, Remedy
 from visioncal.session import STREAMS, Session
 from visioncal.session.columns import column_warnings
+from visioncal.session.table import check_two_sides
 
 # Place that warnings about the robot's model begin with.
 _OF_MODEL = re.compile(r"session\.toml: robots?\.(\w+\.)?model: ")
+_OF_ONE = (
+    "Write the robot's own poses into x_m to qw of views.csv, or the camera's into cft_x_m to "
+    "cft_qw; or convert the source again, with the fields or the file of each named."
+)
 _MODEL_STEP = "Correct the robot's model in session.toml, or the file that it names."
 
 
@@ -37,7 +42,8 @@ def read_cell_inputs(run: RunState) -> RunState:
     """Reads the robots' reported poses, and notes what of the session is not used.
 
     Raises:
-        DataError: The session has no views, none that the fit may use, or no pose of the robot.
+        DataError: The session has no views, none that the fit may use, or no pose of the robot; or
+            its poses are those of the camera once more.
     """
     session = run.session
     if not session.views:
@@ -53,6 +59,7 @@ def read_cell_inputs(run: RunState) -> RunState:
     run = replace(run, notes=(*run.notes, *session.declaration.corrected, *session.notes))
     if len(run.held_back) == len(session.views):
         raise all_held_back(run)
+    check_two_sides(f"session {session.name!r}", session.views, _OF_ONE)
     # Views with only a time get their poses once the camera's are known.
     return run if waits_for_clock(session) else _reported(run)
 

@@ -24,11 +24,16 @@ from visioncal.robot.files import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session import ImageStore, Session, Stream
 from visioncal.session import columns as session_columns
 from visioncal.session.images import CLOUD_ENDINGS, ListedImages
+from visioncal.session.table import check_two_sides
 from visioncal.vision.boards.imaging import image_size, looks_like_image
 from visioncal.vision.targets import target_name
 
 _TARGET = (
     "--target with a name in targets/, a .toml, or a description such as checkerboard_9x6_23.6mm."
+)
+_SIDES = (
+    "Name the poses of each with --robot-{0} and --camera-{0}, or the robot's file, and that of "
+    "the camera with --camera-file."
 )
 
 
@@ -155,6 +160,8 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     session = Session.assemble(
         document, names, cells, store, target_document=target, robot_document=robot
     )
+    named = named_by(foreign.robot.places[0])
+    check_two_sides(foreign.name, session.views, _SIDES.format(named))
     stream = foreign.stream
     if stream is not None:
         rows = pose_cells(stream.poses, session_columns.POSE)

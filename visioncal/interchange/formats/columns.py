@@ -79,7 +79,8 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     is_seeing = first.images or {"meas_x_m", "point"} & first.columns.keys()
     apart = None if is_seeing or first.camera is not None else tables_apart(source, requested)
     if apart is not None:
-        raise apart
+        robot, camera = apart
+        return _read(robot, replace(requested, camera_file=camera))
     if not is_clear:
         first = replace(
             first, doubt=unknown(source, requested, [each for _, each, _ in readings[:1]])
@@ -335,8 +336,8 @@ def with_camera_file(
     Raises:
         DataError: Either holds no poses, or their numbers differ.
     """
-    robot, robot_names, first = _poses(robot_fields, requested.robot, "robot")
-    camera, camera_names, second = _poses(camera_fields, requested.camera, "camera")
+    robot, robot_names, first, of_robot = _poses(robot_fields, requested.robot, "robot")
+    camera, camera_names, second, of_camera = _poses(camera_fields, requested.camera, "camera")
     notes, name = (*first, *second), robot_fields.name
     robot_stamp = stamp_name(robot_fields, robot_names)
     camera_stamp = stamp_name(camera_fields, camera_names)
@@ -365,20 +366,27 @@ def with_camera_file(
             "times, but must be as many of both.",
             culprits=[robot.places[-1], camera.places[-1]],
         )
-    return ForeignRecording(name=name, robot=robot, camera=camera, notes=notes)
+    return ForeignRecording(
+        name=name,
+        robot=robot,
+        camera=camera,
+        makers=makers_of(robot_names),
+        notes=notes,
+        unstated={"robot": of_robot, "camera": of_camera},
+    )
 
 
 def _poses(
     fields: Fields, requested: PoseImportOptions, whose: Side
-) -> tuple[PoseNumbers, tuple[str, ...], tuple[str, ...]]:
-    """Reads the poses of one file: (poses, the fields that hold them, notes on assumptions)."""
+) -> tuple[PoseNumbers, tuple[str, ...], tuple[str, ...], Unstated]:
+    """Reads the poses of one file: (poses, their fields, notes on assumptions, what is assumed)."""
     # A file of camera poses alone may use the names of a robot's file.
     candidates = (pose_names(fields, requested.names, name, ()) for name in (whose, "robot"))
     names = next(filter(None, candidates), ())
     if not names:
         raise _unnamed(fields, whose)
-    poses, notes, _ = poses_from(fields, names, requested, whose)
-    return poses, names, notes
+    poses, notes, unstated = poses_from(fields, names, requested, whose)
+    return poses, names, notes, unstated
 
 
 def _timed(fields: Fields, stamp: str, numbers: PoseNumbers) -> tuple[FloatArray, PoseNumbers]:

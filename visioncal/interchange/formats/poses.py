@@ -328,10 +328,10 @@ def pose_names(
             for item in possible_poses(fields):
                 if f".{given[0]}." in f".{item.names[0]}.":
                     return item.names
-        return tuple(map(fields.find, given))
+        return tuple(_of_side(fields, name, whose) for name in given)
     first = next(iter(ranked_poses(fields, whose, taken, by_shape=by_shape)), [])
     if first:
-        return first[0].names if len(first) == 1 else ()
+        return first[0].names if len(first) == 1 or _are_one(fields, first) else ()
     # A field whose rows are irregular is refused by its row.
     ragged = (
         PoseFields((name,), tuple(words_of(name)))
@@ -346,6 +346,27 @@ def pose_names(
         ),
         (),
     )
+
+
+def _of_side(fields: Fields, name: str, whose: str) -> str:
+    """The full name of a field; of equal ones in several files, that in the side's own."""
+    known = dict.fromkeys([*fields.numbers, *fields.texts])
+    own = [word for word in known if word.endswith(f".{name}") and name not in known]
+    own = [word for word in own if PoseFields((word,), tuple(words_of(word))).sides == [whose]]
+    return own[0] if len(own) == 1 else fields.find(name)
+
+
+def _are_one(fields: Fields, items: Sequence[PoseFields]) -> bool:
+    """Whether several fields are the same poses, as a matrix beside its position and rotation."""
+    places = list[FloatArray]()
+    for item in items:
+        blocks = [fields.column(name) for name in item.names]
+        sizes = [block.shape[1] for block in blocks]
+        if sum(sizes) in (12, 16) and 9 not in sizes:
+            places.append(split_matrices(np.hstack(blocks))[0])
+        else:
+            places.append(_split(fields, item.names, blocks, "robot")[0])
+    return all(np.allclose(places[0], other, atol=1e-9, equal_nan=True) for other in places)
 
 
 def ranked_poses(

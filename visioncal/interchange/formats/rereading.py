@@ -119,16 +119,19 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
 
     Raises:
         DataError: Nothing determines which fields are poses, or a form of rotations that is not
-            said; or the images show another board than declared.
+            said; the images show another board than declared, or the camera is mounted otherwise;
+            or the poses of one side serve as both's.
     """
     unstated = frozenset[str]().union(*foreign.unstated.values())
-    if foreign.stream is not None or not (unstated - {"inverse"} or foreign.doubt):
-        return foreign
-    if foreign.mount is None:
+    is_known = foreign.stream is not None or not (unstated - {"inverse"} or foreign.doubt)
+    if is_known or foreign.mount is None:
         return foreign
     if lacks_target(foreign):
         then = " Forms of poses that are not stated are then found by the images."
         raise unknown_target(foreign, "--target", then)
+    if foreign.camera is not None:
+        # Refuses the numbers of one side as both's, of which any reading agrees.
+        assemble(replace(foreign, images=()))
     readings = [(0, foreign), *foreign.rivals]
     other_orders = [(rank, each) for rank, item in readings for each in _reordered(item)]
     why, other = "too few rows have a pose and what the camera saw", None
@@ -162,7 +165,7 @@ def _tested(
     Raises DataError where several agree alike, and are not the same.
     """
     found: list[tuple[float, int, ForeignRecording]] = []
-    why = ""
+    why, other_mount = "", ""
     for rank, item in readings:
         try:
             guess = seen.guess(item)
@@ -174,6 +177,16 @@ def _tested(
             done = _applied(item, guess, is_measured=seen.run is not None)
             score = guess.best.log_posterior - CLEAR * rank
             found += [] if done is None else [(score, rank, done)]
+            mount = guess.best.hypothesis.mount
+            if done is None and guess.stands_out and mount != item.mount:
+                other_mount = other_mount or f"{mount}: {guess.sentence}"
+    if other_mount and not found:
+        right, _, sentence = other_mount.partition(": ")
+        raise DataError(
+            f"{readings[0][1].name}: the camera is not mounted as stated. {sentence}",
+            culprits=["--mount"],
+            next_step=f"Say --mount {right}.",
+        )
     if not found:
         return None, why
     score, rank, best = max(found, key=lambda each: each[0])

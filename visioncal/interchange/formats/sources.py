@@ -29,11 +29,13 @@ from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.intrinsics import LENS_KEYS, lenses_in
 from visioncal.interchange.formats.joints import joint_names
 from visioncal.interchange.formats.poses import (
+    PoseFields,
     column_groups,
     columns_named,
     pose_names,
     possible_poses,
     ranked_poses,
+    words_of,
 )
 from visioncal.interchange.formats.reading import (
     DOCUMENTS,
@@ -257,10 +259,10 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
     )
 
 
-def tables_apart(source: Source, requested: ImportOptions) -> DataError | None:
-    """The error of a folder with two files of poses, the robot's and the camera's; None of others.
+def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] | None:
+    """The robot's file and the camera's of a folder with two files of poses; None of others.
 
-    Nothing in them says whose they are; the names of the files may.
+    The names of the files say whose they are. Raises DataError where they do not.
     """
     files = [
         (part.group.files[0], fields)
@@ -272,14 +274,22 @@ def tables_apart(source: Source, requested: ImportOptions) -> DataError | None:
         return None
     files.sort(key=lambda each: _OF_ROBOT.search(each[0].stem) is None)
     (robot, fields), (camera, _) = files
+    of_robot, of_camera = (PoseFields((at.stem,), _words(at)).sides for at in (robot, camera))
+    if of_robot == ["robot"] and of_camera == ["camera"]:
+        return robot, camera
     command = [str(robot) if word == str(source.path) else word for word in requested.command]
-    return DataError(
+    raise DataError(
         f"{source.path} has {len(fields)} poses in {robot.name} and as many in {camera.name}: "
         "whose they are is not said.",
         culprits=[str(robot), str(camera)],
         next_step=f"Name the file of the robot, and that of the camera with --camera-file:\n"
         f"{shlex.join([*command, '--camera-file', str(camera)])}",
     )
+
+
+def _words(file: Path) -> tuple[str, ...]:
+    """The words of a file's name: `robotData`, `cam_poses_2`."""
+    return tuple(words_of(re.sub(r"[0-9]+", "_", file.stem)))
 
 
 def _joined(source: Source) -> list[Fields]:

@@ -175,7 +175,7 @@ class CircleGrid(Board):
         """The grid of circles of any count that a (h, w) grey image shows whole."""
         for picture in (image, 255 - image):
             blobs, lattice, members = _circles(picture)
-            px, grids = blobs.px[members], list[tuple[float, Target]]()
+            px, grids = blobs.px[members], list[tuple[int, float, Target]]()
             for turn, asymmetric in product(_BASES if len(members) else (), (False, True)):
                 places = lattice @ (turn @ _STAGGER if asymmetric else turn)
                 across, down = (np.ptp(places, axis=0) + 1).tolist()
@@ -189,9 +189,10 @@ class CircleGrid(Board):
                     # Blurred squares of a checkerboard are wider.
                     if share < _NAMED * (1.4 if asymmetric else 1.0):
                         board = replace(board, diameter_m=share)
-                        grids.append((_turn_rad(px[order], columns), board))
+                        # The one that leaves the fewest circles over.
+                        grids.append((-len(order), _turn_rad(px[order], columns), board))
             if grids:
-                return min(grids, key=lambda grid: grid[0])[1]
+                return min(grids, key=lambda grid: grid[:2])[2]
         return None
 
 
@@ -363,8 +364,9 @@ def _order(places: IntArray, px: FloatArray, target: Target) -> IntArray | None:
     """
     expected = circle_places(target.columns, target.rows, asymmetric=target.asymmetric)
     wider = np.ptp(places, axis=0) - np.ptp(expected, axis=0)
-    # A screw or a hole beside a grid may continue it.
-    if not 0 <= len(places) - len(expected) <= len(expected) // 10 or (wider < 0).any():
+    # A screw or a hole beside a grid may continue it; a whole row of circles is a larger grid's.
+    most = min(len(expected) // 10, target.columns - 1, target.rows - 1)
+    if not 0 <= len(places) - len(expected) <= most or (wider < 0).any():
         return None
     at = {place: index for index, place in enumerate(map(tuple, places.tolist()))}
     first = expected + places.min(axis=0)
