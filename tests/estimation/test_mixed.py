@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from support.cells import calibrated, known_of
+from support.marks import slow
 from support.problems import observed as observed_world
 from support.problems import world
 from support.slopes import jacobian
@@ -264,9 +265,10 @@ def test_a_focus_that_is_fixed_neither_breathes_nor_jitters():
     assert (levels.breathing, levels.jitter) == (0.0, 0.0)
 
 
-def test_a_focus_that_chance_explains_leaves_the_flange_its_noise():
+@pytest.mark.parametrize("draws", [range(2, 5), slow(range(2, 9))], ids=str)
+def test_a_focus_that_chance_explains_leaves_the_flange_its_noise(draws):
     """Else errors along the lens's axis alone shrink the noise of all directions."""
-    for seed in range(2, 9):
+    for seed in draws:
         cell = simulate(replace(FINE, pixel_sigma_px=0.003, views=12, seed=seed))
         session = cell_session(cell, "cell", seen="corners")
         camera = session.document["camera"] | {"focus": "fixed"}

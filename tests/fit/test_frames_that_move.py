@@ -98,9 +98,10 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
         *(("steps", 1.5e-3), ("knocks", 1.5e-3)),
     ],
 )
-def test_what_moves_is_opened_and_its_result_is_fair(kind, size):
+@pytest.mark.parametrize("draws", seeds(3, 4))
+def test_what_moves_is_opened_and_its_result_is_fair(kind, size, draws):
     squares, found = [], 0
-    for seed in range(4):
+    for seed in draws:
         small = moving(kind, seed, size)
         fit = solve(small.cell).fit
         names = {effect.name for effect in fit.unknowns.effects} - fit.unknowns.closed
@@ -109,7 +110,7 @@ def test_what_moves_is_opened_and_its_result_is_fair(kind, size):
         assert "lens grows cam" not in names
         away = log(invert(small.edges["cam"]) @ fit.edge("cam"))
         squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away) / 6)
-    assert found >= 3
+    assert found > 0.6 * len(draws)
     assert np.mean(squares) < 2.5
 
 
@@ -155,7 +156,7 @@ def slow(seed, kinds=(), walks=False):
 @pytest.mark.parametrize(
     ("kinds", "walks"), [(("creeps",), False), (("creeps", "slips"), False), ((), True)]
 )
-@pytest.mark.parametrize("draws", seeds(4, 6))
+@pytest.mark.parametrize("draws", seeds(2, 6))
 def test_what_is_slow_is_told_from_errors_that_last_where_joints_are_known(kinds, walks, draws):
     squares, named = [], 0
     for seed in draws:
@@ -166,7 +167,7 @@ def test_what_is_slow_is_told_from_errors_that_last_where_joints_are_known(kinds
         # What creeps is stated of the end of the session, what walks of its mean.
         away = log(invert(truth["cam"]) @ fit.edge("cam"))
         squares.append(away @ np.linalg.solve(fit.covariance(("edge", "cam")), away) / 6)
-    assert named >= len(draws) - 1
+    assert named >= 0.8 * len(draws)
     # A walk is what it does beyond its mean: the covariance is that of sessions to come.
     low, high = chi2.ppf([0.001, 0.999], 6 * len(draws)) / (6 * len(draws))
     assert np.mean(squares) < high

@@ -283,7 +283,7 @@ def assert_left_out_as_by_refits(fit, left_out):
 
 
 @pytest.mark.parametrize(("given", "in_hand"), [(True, True), (False, True), (True, False)])
-@pytest.mark.parametrize("draws", seeds(30, 60))
+@pytest.mark.parametrize("draws", seeds(15, 60))
 def test_errors_are_as_large_as_the_covariance_says(given, in_hand, draws):
     squares = []
     for seed in draws:
@@ -321,9 +321,10 @@ def test_errors_of_200_cells_scatter_as_the_covariance_says_in_every_direction(i
     assert np.abs(between - np.eye(6)).max() < 4.0 / np.sqrt(200)
 
 
-def test_predictions_err_as_much_as_they_say():
+@pytest.mark.parametrize("draws", seeds(12, 40))
+def test_predictions_err_as_much_as_they_say(draws):
     squares = []
-    for seed in range(40):
+    for seed in draws:
         small = made(seed, stops=12)
         fit = solve(small.cell).fit
         moments = small.cell.moments.take(np.arange(3))
@@ -333,4 +334,5 @@ def test_predictions_err_as_much_as_they_say():
         each = np.linalg.solve(found.calibration, away[:, :, None])[:, :, 0]
         squares.append(np.sum(away * each, axis=1).mean())
         assert (np.trace(found.noise, axis1=1, axis2=2) > 0.0).all()
-    assert np.mean(squares) / 6 == pytest.approx(1.0, abs=0.35)  # three sigma of 40 cells
+    # Three sigma of so many cells.
+    assert np.mean(squares) / 6 == pytest.approx(1.0, abs=2.2 / np.sqrt(len(draws)))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from support.core_worker import on_one_clock
+from support.marks import seeds
 from support.small_cells import BOARD, PX, TABLE, made
 
 from visioncal.core.transforms import exp, invert, log
@@ -66,9 +67,10 @@ def squares_of(small, fit, values):
 
 
 @pytest.mark.parametrize("in_hand", [True, False])
-def test_a_clock_and_a_readout_are_found_within_their_covariance(in_hand):
+@pytest.mark.parametrize("draws", seeds(4, 8))
+def test_a_clock_and_a_readout_are_found_within_their_covariance(in_hand, draws):
     squares = []
-    for seed in range(8):
+    for seed in draws:
         small = moving(seed, ahead_s=4e-3, readout_s=0.012, in_hand=in_hand)
         fit = solve(small.cell).fit
         assert fit.used.sum() >= 15
@@ -78,15 +80,17 @@ def test_a_clock_and_a_readout_are_found_within_their_covariance(in_hand):
         assert fit.covariance(("effect", "clock cam flange"))[0, 0] < (0.1 * SIGMA_S) ** 2
         assert fit.covariance(("effect", "rolling cam"))[0, 0] < 1e-3**2
     edges, clocks, readouts = np.mean(squares, axis=0)
-    # Means of 48, and of 8 degrees of freedom, one in a thousand beyond.
-    assert chi2.ppf(0.001, 48) / 8 < edges < chi2.ppf(0.999, 48) / 8
-    low, high = chi2.ppf([0.001, 0.999], 8) / 8
+    # Means of six degrees of freedom a seed, and of one, one in a thousand beyond.
+    count = len(draws)
+    assert chi2.ppf(0.001, 6 * count) / count < edges < chi2.ppf(0.999, 6 * count) / count
+    low, high = chi2.ppf([0.001, 0.999], count) / count
     assert low < clocks < high
     assert low < readouts < high
 
 
-def test_a_shutter_that_opens_at_once_is_no_rolling_one():
-    for seed in range(8):
+@pytest.mark.parametrize("draws", seeds(4, 8))
+def test_a_shutter_that_opens_at_once_is_no_rolling_one(draws):
+    for seed in draws:
         fit = solve(moving(seed).cell).fit
         assert "rolling cam" in fit.unknowns.closed
         assert [effect.kind for effect in fit.unknowns.effects] == ["clock", "rolling"]
@@ -142,9 +146,12 @@ def stopping(seed, share, *, onwards=False):
 
 
 @pytest.mark.parametrize("kind", ["stops short", "moves on"])
-def test_an_arm_that_moves_between_pose_and_image_is_found_and_one_that_stands_does_not(kind):
+@pytest.mark.parametrize("draws", seeds(4, 8))
+def test_an_arm_that_moves_between_pose_and_image_is_found_and_one_that_stands_does_not(
+    kind, draws
+):
     squares = []
-    for seed in range(8):
+    for seed in draws:
         small = stopping(seed, -0.01, onwards=kind == "moves on")
         fit = solve(small.cell).fit
         (short,) = (effect for effect in fit.unknowns.effects if effect.kind == kind)
@@ -157,6 +164,6 @@ def test_an_arm_that_moves_between_pose_and_image_is_found_and_one_that_stands_d
         squares.append(squares_of(small, fit, {})[0])
         sound = solve(stopping(seed, 0.0).cell).fit
         assert kind not in {effect.kind for effect in sound.unknowns.effects}
-    assert np.mean(squares) < chi2.ppf(0.999, 48) / 8
+    assert np.mean(squares) < chi2.ppf(0.999, 6 * len(draws)) / len(draws)
     other = replace(small.cell.moments, stops=np.full(16, -1))
     assert not short.columns(other, np.ones(16)).any()

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.marks import seeds
 from support.small_cells import ROBOT_M, ROBOT_RAD, made, pose
 from support.whole_cells import OPTIONS, recorded
 
@@ -64,9 +65,10 @@ def lasting(seed, share):
     return replace(small, cell=replace(small.cell, arms=arms, moments=moments))
 
 
-def test_errors_that_last_move_the_estimate_and_are_in_the_covariance():
+@pytest.mark.parametrize("draws", seeds(10, 30))
+def test_errors_that_last_move_the_estimate_and_are_in_the_covariance(draws):
     squares, lengths = {True: [], False: []}, {True: [], False: []}
-    for seed in range(30):
+    for seed in draws:
         small = lasting(seed, 0.95)
         fit = solve(small.cell).fit
         for is_considered in (True, False):

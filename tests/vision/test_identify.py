@@ -40,6 +40,8 @@ from visioncal.vision.targets import (
 )
 
 CASES = Path(__file__).parents[3] / "shared/data/field/cases"
+# Commands search the same pictures again and again; `identify` is called itself, beside them.
+SEARCHES_ONCE = True
 MARKED = ("charuco", "aprilgrid", "gridboard", "marker")
 
 

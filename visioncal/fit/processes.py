@@ -12,8 +12,9 @@ What each stop alone says of its flange follows from the factorisation.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby, pairwise
-from typing import Self
+from typing import Self, TypeAlias, TypeVar
 
 import numpy as np
 from scipy.linalg import lapack
@@ -34,6 +35,9 @@ from visioncal.fit.unknowns import Key, Prior
 from visioncal.model.effects import Effect
 from visioncal.model.effects.posture import PostureEffect, twists_of_frames
 
+T = TypeVar("T")
+# Log-likelihood of what is tried, what it leaves of further columns, and squares of boards.
+Judged: TypeAlias = tuple[float, FloatArray, FloatArray]
 # Lengths of processes by posture [rad], with the lever per radian, and by time [stops].
 _RANGES, _MEMORIES = (POSTURE_RANGE_RAD, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
 # Sizes of a process, and of what is independent beside it, over the level of the noise.
@@ -168,17 +172,14 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     boards, logs, free = _boards(fit), list[float](), list[float]()
     off, levels = list[FloatArray](), list[tuple[Process | None, float, float]]()
 
-    def weighed(tried: Tried) -> FloatArray:
-        ways = (False, True) if boards else (False,)
-        found = [judged(tried, boards, is_free=is_free) for is_free in ways]
+    grid, beside = _grid_of(fit, flange, alone, creeps=True)
+
+    weighed = partial(_in_all_ways, beside=beside, boards=boards)
+    for tried, found in _climb(grid, weighed, _logs_of):
         logs.append(tried.prior + found[0][0])
         free.append(tried.prior + found[-1][0])
         off.append(found[-1][2])
         levels.append((tried.process, tried.size, tried.white))
-        return np.array([logs[-1], free[-1]])
-
-    grid, beside = _grid_of(fit, flange, alone, creeps=True)
-    _climb(grid, lambda one: weighed(beside(one)))
     odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs))
     mean_squares = np.exp(free - np.logaddexp.reduce(free)) @ np.array(off)
     shares = np.exp(logs - np.logaddexp.reduce(logs)).tolist()
@@ -212,6 +213,18 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     excess += _of_frames(fit, flange, alone, gains)
     by_board = dict(zip(held_boards(fit), mean_squares.tolist(), strict=True))
     return Considered(shift, excess - np.outer(shift, shift), odds, by_board)
+
+
+def _in_all_ways(
+    one: "Tried", beside: Callable[["Tried"], "Tried"], boards: Sequence["_Board"]
+) -> "tuple[Tried, list[Judged]]":
+    """What is tried beside the stops, judged with boards as stated, and of any size."""
+    seen, ways = beside(one), (False, True) if boards else (False,)
+    return seen, [judged(seen, boards, is_free=is_free) for is_free in ways]
+
+
+def _logs_of(weighed: "tuple[Tried, list[Judged]]") -> FloatArray:
+    return np.array([weighed[0].prior + way[0] for way in weighed[1]])
 
 
 def _of_frames(fit: Fit, flange: str, alone: StopErrors, gains: FloatArray) -> FloatArray:
@@ -324,23 +337,36 @@ def _grid_of(
     return _grid(kinds, _SIZES, rest, by_boards), lambda one: one.beside(rows, shared)
 
 
-def _climb(grid: Iterable[Tried], weighed: Callable[[Tried], FloatArray]) -> None:
-    """Weighs what is tried, but for sizes and levels beyond those that are as good as ruled out.
+def _climb(
+    grid: Iterable[Tried],
+    weighed: Callable[[Tried], T],
+    logs_of: Callable[[T], FloatArray],
+    far: float = _FAR,
+) -> Iterator[T]:
+    """Yields what is weighed, but for sizes and levels beyond those that are as good as ruled out.
 
     Along sizes, and along levels, a likelihood has one peak.
+
+    Args:
+        grid: What is tried, with sizes and levels in their order.
+        weighed: Weighs one of it.
+        logs_of: Logarithms of evidence, in one way or in several.
+        far: Logarithm below the most evidence from which less is not looked for.
     """
-    most = np.full(2, -np.inf)
+    most = np.full(1, -np.inf)
     for _, of_process in groupby(grid, lambda one: one.process):
-        before = np.full(2, -np.inf)
+        before = np.full(1, -np.inf)
         for _, of_size in groupby(of_process, lambda one: one.size):
-            last = best = np.full(2, -np.inf)
+            last = best = np.full(1, -np.inf)
             for one in of_size:
                 found = weighed(one)
-                best, most = np.maximum(best, found), np.maximum(most, found)
-                if np.all(found < np.minimum(last, most - _FAR)):
+                logs = logs_of(found)
+                best, most = np.maximum(best, logs), np.maximum(most, logs)
+                yield found
+                if np.all(logs < np.minimum(last, most - far)):
                     break
-                last = found
-            if np.all(best < np.minimum(before, most - _FAR)):
+                last = logs
+            if np.all(best < np.minimum(before, most - far)):
                 break
             before = best
 
@@ -393,17 +419,28 @@ def _by_groups(
 ) -> list[tuple[Tried, float]]:
     """The same by some groups of stops; what a group excludes is not tried on others."""
     # Most arms have next to none.
-    left = [*_grid(kinds, (0.1, *_SIZES), alone.rest, np.zeros((alone.count, 0)))]
-    logs = np.zeros(len(left))
-    for group in groups:
+    grid = [*_grid(kinds, (0.1, *_SIZES), alone.rest, np.zeros((alone.count, 0)))]
+    left = [(one, 0.0) for one in grid]
+    for at, group in enumerate(groups, 1):
         rows = alone.rows[group].reshape(-1, alone.count + 1)
-        shared = _Shared.of(alone, group, {one.process for one in left if one.process})
-        left = [one.beside(rows, shared) for one in left]
-        logs = np.array([one.prior + judged(one, (), is_free=False)[0] for one in left])
-        logs -= np.logaddexp.reduce(logs[: len(_WHITE)])
-        kept = np.flatnonzero((logs > np.log(_LITTLE)) | (np.arange(len(logs)) < len(_WHITE)))
-        left, logs = [left[at] for at in kept], logs[kept]
-    return [*zip(left, logs.tolist(), strict=True)]
+        shared = _Shared.of(alone, group, {one.process for one, _ in left if one.process})
+        weighed = partial(_evidence, rows=rows, shared=shared)
+        # Further groups may change what is far.
+        far = _FAR if at == len(groups) else np.inf
+        found = [*_climb((one for one, _ in left), weighed, lambda pair: np.array([pair[1]]), far)]
+        none = np.logaddexp.reduce([log for one, log in found if one.process is None])
+        left = [
+            (one, float(log - none))
+            for one, log in found
+            if one.process is None or log - none > np.log(_LITTLE)
+        ]
+    return left
+
+
+def _evidence(one: Tried, rows: FloatArray, shared: "_Shared") -> tuple[Tried, float]:
+    """What is tried beside more stops, and the logarithm of its evidence, boards as stated."""
+    seen = one.beside(rows, shared)
+    return seen, seen.prior + judged(seen, (), is_free=False)[0]
 
 
 def _combined(
@@ -546,9 +583,7 @@ def _boards(fit: Fit) -> list[_Board]:
     return [_Board(column, prior, float(past[column])) for column, prior in each]
 
 
-def judged(
-    tried: Tried, boards: Sequence[_Board], *, is_free: bool
-) -> tuple[float, FloatArray, FloatArray]:
+def judged(tried: Tried, boards: Sequence[_Board], *, is_free: bool) -> Judged:
     """The restricted log-likelihood of a process, with boards as stated or of any size.
 
     Args:
