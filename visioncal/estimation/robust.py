@@ -24,6 +24,8 @@ State = TypeVar("State")
 ROUNDS = 10
 # Number of small sets: with 40 % outliers, all 60 sets of three contain one with probability 3e-7.
 SETS = 60
+# Starts that concentration steps refine.
+REFINED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +88,7 @@ def trimmed_start(
 ) -> tuple[Mask, State]:
     """Least-trimmed-squares start: the units nearest to the state that they determine.
 
-    The five best starts are refined by concentration steps.
+    The best starts are refined by concentration steps.
 
     Args:
         starts: States to try, of all units and of small sets.
@@ -99,7 +101,7 @@ def trimmed_start(
     """
     candidates = [(start, away(start)) for start in starts]
     candidates.sort(key=lambda pair: trimmed_sum(pair[1], count))
-    refined = [_concentrated(*pair, away, solve, count) for pair in candidates[:5]]
+    refined = [_concentrated(*pair, away, solve, count) for pair in candidates[:REFINED]]
     return min(refined, key=lambda pair: pair[0])[1:]
 
 

@@ -1,6 +1,6 @@
 """Consensus transforms of one pair of frames: one, two with a robot between, or three."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Self
@@ -14,7 +14,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 from visioncal.estimation.linalg import NULL_SHARE, covariance_from, eigenvalue_shares
-from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
+from visioncal.estimation.robust import REFINED, nearest, trimmed_start, trimmed_sum
 
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
 # probability (1 - 1/8)^40 = 0.5 %.
@@ -108,16 +108,15 @@ def _trimmed_edges(
         rows = np.flatnonzero(mask)
         return _solve_edges(robot, candidates, rows, edges.picks[rows], solver)
 
-    every, *sets = _starts(candidates)
-    rows, picks = (np.array(part) for part in zip(*sets, strict=True))
-    many = _solve_edges(robot, candidates, rows, picks, solver)
-    starts = [_solve_edges(robot, candidates, *every, solver)]
-    starts += map(PairEdges, many.x, many.z, many.residuals)
+    count, every = max(len(robot) // 2 + 1, FEWEST_VIEWS), np.arange(len(robot))
+    # All views' best by image, and the best of the triples.
+    starts = [_solve_edges(robot, candidates, every, np.zeros_like(every), solver)]
+    many = _solve_edges(robot, candidates, *_triples(candidates), solver)
+    sums = np.sort(many.residuals.min(axis=2), axis=1)[:, :count].sum(axis=1)
+    best = np.argsort(sums, kind="stable")[:REFINED]
+    starts += map(PairEdges, many.x[best], many.z[best], many.residuals[best])
     half, edges = trimmed_start(
-        starts,
-        lambda item: np.asarray(item.residuals.min(axis=1)),
-        solve,
-        max(len(robot) // 2 + 1, FEWEST_VIEWS),
+        starts, lambda item: np.asarray(item.residuals.min(axis=1)), solve, count
     )
     return half, edges, float(edges.residuals.min(axis=1)[half].mean())
 
@@ -200,17 +199,18 @@ def between_arms(
     return (middle[best, 0], float(medians[best])) if medians[best] < AGREE_M else None
 
 
-def _starts(candidates: Candidates) -> Iterator[tuple[IntArray, IntArray]]:
-    """Views and picks to solve from: all views' best by image, then triples of views."""
-    yield np.arange(len(candidates)), np.zeros(len(candidates), dtype=np.int64)
+def _triples(candidates: Candidates) -> tuple[IntArray, IntArray]:
+    """(s, 3) views and picks to solve from, with all combinations of each triple's candidates."""
     rng = np.random.default_rng(0)
     # Views with few candidates first: they need the fewest combinations.
     counts = candidates.valid.sum(axis=1)
-    weights = 1.0 / counts**2
+    weights, rows, picks = 1.0 / counts**2, [], []
     for _ in range(_TRIPLES):
         triple = rng.choice(len(candidates), FEWEST_VIEWS, replace=False, p=weights / weights.sum())
         options = [list(range(counts[at])) for at in triple]
         # A turn of the target in all views alike changes its frame and is no other solution.
         options[0] = [at for at in options[0] if candidates.turns[triple[0], at] == 0]
-        for picks in product(*options):
-            yield triple, np.array(picks)
+        more = [*product(*options)]
+        picks += more
+        rows += [triple] * len(more)
+    return np.array(rows), np.array(picks)
