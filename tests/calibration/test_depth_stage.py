@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.depth_cells import SMALL, TRUE, calibrated, picks
+from support.marks import slow
 
 from visioncal import simulation
 from visioncal.calibration.stages.depth import with_depth
@@ -68,7 +69,7 @@ def again(change, **document):
     return findings, result.camera.depth
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand")])
 def test_a_false_depth_is_found_with_a_box_before_the_board(mount):
     _, result = made(mount)
     depth = result.calibration.camera.depth
@@ -309,7 +310,7 @@ def test_without_depth_nothing_of_it_is_loaded():
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
 def test_picks_by_depth_are_within_their_radius(mount):
     cell, _, result = calibrated(1, mount, FALSE, 12)
     error, raw, radius = picks(cell, result, FALSE, np.random.default_rng(2), 300).T
