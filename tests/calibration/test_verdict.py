@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 from support.cells import calibrated, pairs_session, reporting, showing
+from support.marks import slow
 from support.sound_findings import SOUND, changed, directions, views
 
 from visioncal.calibration.pipeline.checkup import doctor
@@ -289,7 +290,7 @@ def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> No
     assert "late_poses" not in {found.kind for found in sound.findings}
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_images_that_are_shifted_from_some_view_on_are_told_from_a_camera_that_moved(mount) -> None:
     cell = simulate(CellOptions(views=24, mount=mount, pixel_sigma_px=0.1, seed=2))
     shifts = np.where(np.arange(24)[:, None] < 10, 0.0, [24.0, -16.0])

@@ -218,7 +218,7 @@ def consider(fit: Fit, flange: str) -> Considered | None:
 def _in_all_ways(
     one: "Tried", beside: Callable[["Tried"], "Tried"], boards: Sequence["_Board"]
 ) -> "tuple[Tried, list[Judged]]":
-    """What is tried beside the stops, judged with boards as stated, and of any size."""
+    """One that is tried beside the stops, judged with boards as stated, and of any size."""
     seen, ways = beside(one), (False, True) if boards else (False,)
     return seen, [judged(seen, boards, is_free=is_free) for is_free in ways]
 
@@ -438,7 +438,7 @@ def _by_groups(
 
 
 def _evidence(one: Tried, rows: FloatArray, shared: "_Shared") -> tuple[Tried, float]:
-    """What is tried beside more stops, and the logarithm of its evidence, boards as stated."""
+    """One that is tried beside more stops, and the logarithm of its evidence, boards as stated."""
     seen = one.beside(rows, shared)
     return seen, seen.prior + judged(seen, (), is_free=False)[0]
 
