@@ -22,7 +22,7 @@ from visioncal.core.transforms import adjoint, apply_each, exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.results import Calibration
 from visioncal.simulation import BOARDS, CAMERAS, CellOptions, SimulatedCell, cell_session, simulate
-from visioncal.vision.camera import project
+from visioncal.vision.camera import normalise, project
 from visioncal.vision.targets import corner_positions
 
 FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
@@ -236,6 +236,18 @@ def later(since, **changes):
     return change
 
 
+def rectified_midway(cell):
+    """A driver that rectifies the pictures from the ninth view on."""
+    camera = cell.options.camera
+    flat = replace(camera, distortion=0.0 * camera.distortion)
+
+    def rectified(corners):
+        rays = np.pad(normalise(camera, corners.px), ((0, 0), (0, 1)), constant_values=1.0)
+        return replace(corners, px=project(flat, rays))
+
+    return showing(cell, [*cell.corners[:8], *map(rectified, cell.corners[8:])])
+
+
 def zoomed_midway(cell):
     """A focal length that is longer by 2 % from the eighth view on."""
     return zoomed(cell, 0.02 * (np.arange(len(cell.corners)) >= 7))
@@ -309,6 +321,13 @@ WORLDS: dict[str, World] = {
         seed=2,
         causes=("something_moved", "arm_errors"),
         words=("from view 24 on, the camera",),
+        of=NONE,
+    ),
+    "rectified midway": World(
+        OPEN,
+        rectified_midway,
+        causes=("focus",),
+        words=("from view 8 on, its distortion is another one",),
         of=NONE,
     ),
     "bump": World(

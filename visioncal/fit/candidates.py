@@ -34,6 +34,7 @@ from visioncal.model.effects import (
     FocusJitter,
     FrameCreeps,
     Heat,
+    LensChanges,
     LensSteps,
     MountCreeps,
     MountSteps,
@@ -106,7 +107,7 @@ def opened(
                 and other.lens in ("", one.lens)
                 and other.gain > one.gain - _RULED_OUT
             }
-            rivals.discard(kind)
+            rivals -= {kind, one.effect.wider}
             unknowns = replace(
                 unknowns,
                 effects=(*unknowns.effects, one.effect),
@@ -345,7 +346,8 @@ def zooms(fit: Fit, camera: str) -> Iterator[Effect]:
     grams = [(gram.stops, fit.used[gram.rows]) for gram in fit.grams if gram.pair[0] == camera]
     stops = np.unique(np.concatenate([own[used] for own, used in grams]))
     for at in (evenly(len(stops) - 3, _ZOOMS) + 2).tolist():
-        yield LensSteps(camera, fit.unknowns.lenses[camera], int(stops[at]))
+        for kind in (LensSteps, LensChanges):
+            yield kind(camera, fit.unknowns.lenses[camera], int(stops[at]))
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:

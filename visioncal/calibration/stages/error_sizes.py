@@ -32,6 +32,7 @@ _INSTEAD = {
     "bracket bends": "what the flange carries bends with its weight",
     "lens grows": "the lens crept",
     "lens sags": "the lens gives way with its weight",
+    "lens changes": "the lens was exchanged, or its pictures rectified",
     "lens steps": "the lens changed at once",
     "row motion": "the camera moved while rows of its images were read",
 }
@@ -55,6 +56,7 @@ class Zoom:
     station: int | None  # The first after it changed at once; None where it crept.
     share: float  # Of the focal length by which it is longer from there on, or at the end.
     shift_px: tuple[float, float] = (0.0, 0.0)  # By which its centre is elsewhere from there on.
+    kind: str = "lens grows"  # Of its effect.
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +302,7 @@ def _changed(fit: Fit) -> Iterator[tuple[Effect, Zoom, float]]:
             shift_px = float(focal_px * values[1]), float(focal_px * values[2])
             stops = np.array([one.stop for one in fit.cell.sightings if one.seer == effect.frame])
             before = float(np.mean(stops < effect.stop))
-            zoom = Zoom(fit.cell.stations[effect.stop], share, shift_px)
+            zoom = Zoom(fit.cell.stations[effect.stop], share, shift_px, effect.kind)
             yield effect, zoom, abs(share) * float(np.sqrt(before * (1.0 - before)))
         elif isinstance(effect, LensGrows) and size > effect.most:
             share = float(fit.state.values["effect", effect.name][0])

@@ -36,6 +36,7 @@ _CROPPED_PX, _EXPLAINED = 10.0, 0.1
 _LONE = ("gridboard", "marker")
 # Another model of a lens leaves so much less: more than an even field does.
 _BETTER = 1.1
+_ONE_LENS = "Keep one lens, and one setting of the driver that rectifies pictures"
 _NEW_LENS = mending(
     "the lens is estimated from these views (or calibrate the camera anew, and state its matrix "
     "and distortion)",
@@ -226,21 +227,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             # A bump of the camera explains it, which is named.
             continue
         if zoom is not None:
-            share = f"{figure(100.0 * abs(zoom.share))} % "
-            share += "longer" if zoom.share > 0.0 else "shorter"
-            words = f"{of} crept, as where focus or zoom give way: its focal length became {share}."
-            do, cell = Remedy("Fix zoom and focus, and record again."), run.cell_fit.cell
-            if zoom.station is not None:
-                first = cell.start_words(zoom.station)
-                do = cell.or_separately("Fix zoom and focus", zoom.station)
-                if np.hypot(*zoom.shift_px) > _SHIFTED_PX and not sizes.rivals.get("lens steps"):
-                    yield _shifted(of, zoom, f"{first}, ", do, changes[1])
-                    continue
-                words = f"{of} changed at once, as where it was zoomed, refocused or hit: {first}, "
-                words += f"its focal length is {share}."
-            words += " The result counts it as scatter."
-            words += sizes.instead_of("lens grows" if zoom.station is None else "lens steps")
-            yield Finding("focus", words, do, mahalanobis_sq=changes[1])
+            yield _zoomed(run, of, zoom, changes[1])
         elif how:
             yield Finding(
                 "focus",
@@ -271,6 +258,28 @@ def _moving(run: RunState) -> Iterator[Finding]:
                 mahalanobis_sq=levels.gains[3],
                 up_to_mm=1e3 * moved * mean_distance_m(fit, name),
             ).of("" if name == ONLY_CAMERA else name)
+
+
+def _zoomed(run: RunState, of: str, zoom: Zoom, gain: float) -> Finding:
+    """The finding that a lens changed by more than one that warms up."""
+    instead, cell = run.cell_fit.sizes.instead_of(zoom.kind), run.cell_fit.cell
+    share = f"{figure(100.0 * abs(zoom.share))} % "
+    share += "longer" if zoom.share > 0.0 else "shorter"
+    words = f"{of} crept, as where focus or zoom give way: its focal length became {share}."
+    do = Remedy("Fix zoom and focus, and record again.")
+    if zoom.station is not None:
+        first = cell.start_words(zoom.station)
+        do = cell.or_separately("Fix zoom and focus", zoom.station)
+        words = f"{of} changed at once, as where it was zoomed, refocused or hit: {first}, "
+        words += f"its focal length is {share}."
+        if zoom.kind == "lens changes":
+            words = f"{of} changed at once: {first}, its distortion is another one, as where "
+            words += "pictures are rectified in one part alone, or another lens was put on."
+            do = cell.or_separately(_ONE_LENS, zoom.station)
+        elif np.hypot(*zoom.shift_px) > _SHIFTED_PX and not instead:
+            return _shifted(of, zoom, f"{first}, ", do, gain)
+    words += f" The result counts it as scatter.{instead}"
+    return Finding("focus", words, do, mahalanobis_sq=gain)
 
 
 def _shifted(of: str, zoom: Zoom, first: str, do: Remedy, gain: float) -> Finding:

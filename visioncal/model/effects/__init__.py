@@ -20,6 +20,7 @@ from visioncal.model.effects.focus_jitter import FocusJitter as FocusJitter
 from visioncal.model.effects.heat import Heat as Heat
 from visioncal.model.effects.lens_grows import LensGrows as LensGrows
 from visioncal.model.effects.lens_sags import LensSags as LensSags
+from visioncal.model.effects.lens_steps import LensChanges as LensChanges
 from visioncal.model.effects.lens_steps import LensSteps as LensSteps
 from visioncal.model.effects.links import Links as Links
 from visioncal.model.effects.play import Play as Play

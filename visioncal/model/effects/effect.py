@@ -44,6 +44,7 @@ class Effect(ABC):
 
     place: ClassVar[Place] = "edge"
     kind: ClassVar[str]
+    wider: ClassVar[str] = ""  # Kind of one that has its columns and more: no rival of it.
     bounds: ClassVar[tuple[float, float, float]]  # `start`, `low` and `high` of its size.
     curvature: ClassVar[float] = (
         0.0  # Share by which slopes change, at most, for one of its values.

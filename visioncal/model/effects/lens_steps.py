@@ -1,4 +1,4 @@
-"""A lens that was zoomed, refocused or hit once."""
+"""A lens that was zoomed, refocused, hit or exchanged, or whose pictures are bent otherwise."""
 
 from dataclasses import dataclass
 
@@ -17,6 +17,7 @@ class LensSteps(LensEffect):
     """
 
     kind, bounds, count = "lens steps", (1e-2, 1e-6, 0.3), 3
+    wider = "lens changes"
     stop: int  # The first stop after it.
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
@@ -26,4 +27,18 @@ class LensSteps(LensEffect):
         before = (moments.stops >= 0) & (moments.stops < self.stop)
         found[before, :2, 0] = focal
         found[before, 2, 1] = found[before, 3, 2] = np.mean(focal)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class LensChanges(LensSteps):
+    """The same with the first two coefficients of distortion, as where pictures are rectified."""
+
+    kind, count, wider = "lens changes", 5, ""
+
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """See `Effect`."""
+        found = super().columns(moments, distances)
+        before = (moments.stops >= 0) & (moments.stops < self.stop)
+        found[before, 4, 3] = found[before, 5, 4] = 1.0
         return found
