@@ -35,6 +35,9 @@ from visioncal.vision.targets import corner_positions, first_corners
 T = TypeVar("T", bound=Observed)
 # Fewest views of which the scatter of a mean is known, and most that are needed.
 _FEWEST, _MOST_VIEWS = 8, 60
+# Fewest views in which a corner scatters: of fewer, poses and lens take so much of the others' noise
+# that one which they follow no more looks as if it had twice theirs.
+_FEWEST_STEADY = 12
 # Two unknowns a corner: larger boards are taken to be true.
 _MOST_POINTS = 150
 # Half waves of the image's field: a finer one would be that of single corners.
@@ -206,7 +209,7 @@ def _point_errors(
         weights = 1.0 / np.sqrt(np.maximum(ratios, 1.0))
     limit = chi2_limit(_UNSTEADY / len(ratios), 2 * views) / (2 * views)
     wrong = np.flatnonzero((ratios > limit) & (scatter > _LEAST_PX))
-    if len(wrong):
+    if len(wrong) and views >= _FEWEST_STEADY:
         rest = {view: at.take(~np.isin(at.ids, wrong)) for view, at in corners.items()}
         others = _point_errors(target, camera, rest, cam_from_target, is_moving=is_moving)
         if others is None:
