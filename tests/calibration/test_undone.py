@@ -127,7 +127,26 @@ def in_two_units(robot, boards, some, factor, axes=slice(3)):
     return robot, boards
 
 
+def in_radians(robot, boards, some, order):
+    """Some rows' angles are in radians, and taken for degrees."""
+    robot = robot.copy()
+    read = Rotation.from_matrix(robot[some, :3, :3])
+    wrong = Rotation.from_rotvec(np.deg2rad(read.as_rotvec()))
+    if order:
+        wrong = Rotation.from_euler(order, np.deg2rad(read.as_euler(order)))
+    robot[some, :3, :3] = wrong.as_matrix()
+    return robot, boards
+
+
 PLANTED = {
+    **{
+        f"mixed_units of angles {order}": (
+            partial(in_radians, some=slice(12, 24), order=order),
+            [*range(12, 24)],
+            "angles are in radians, and were taken for degrees",
+        )
+        for order in ("", "ZYX")
+    },
     "shifted_rows": (shifted, [*range(10, 22)], "From view 10 on, images and poses are 2 rows"),
     "turned_board": (turned, [1, 4, 5, 8, 11, 13, 16, 19], "turned by 180 deg"),
     "flipped_poses": (flipped, [0, 2, 10, 14, 15, 20], "tilted the other way"),

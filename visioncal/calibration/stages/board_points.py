@@ -35,8 +35,8 @@ from visioncal.vision.targets import corner_positions, first_corners
 T = TypeVar("T", bound=Observed)
 # Fewest views of which the scatter of a mean is known, and most that are needed.
 _FEWEST, _MOST_VIEWS = 8, 60
-# Fewest views in which a corner scatters: of fewer, poses and lens take so much of the others' noise
-# that one which they follow no more looks as if it had twice theirs.
+# Fewest views in which a corner scatters: of fewer, poses and lens take so much of the others'
+# noise that one which they follow no more looks as if it had twice theirs.
 _FEWEST_STEADY = 12
 # Two unknowns a corner: larger boards are taken to be true.
 _MOST_POINTS = 150

@@ -248,13 +248,13 @@ def _common_change(
 ) -> tuple[str, FloatArray] | None:
     """The frame whose step explains most of some outliers, and the step; None where none does.
 
-    It leaves `most` of them, as a share, at most.
+    It leaves a third of them; up to `most`, as a share, where that is as much as others scatter by.
 
     Its name is empty where another size of the target does, or steps of several frames alike. Rows
     with other poses, or of other images, have none in common.
     """
     some, state = np.isin(np.arange(len(inliers.problem)), rows), inliers.fit.state
-    part = inliers.problem.subset(some)
+    part, others = inliers.problem.subset(some), inliers.part
     if not part.observations.has_rotation.all():
         return None
     measured, predicted = (
@@ -266,11 +266,13 @@ def _common_change(
     for frame in filter(lambda name: part.observations.involves(name).all(), part.unknown):
         changes = part.change_of(frame, state)
         step = mean_transform(changes)
-        left, size = (
-            np.linalg.norm(log(change) / TWIST_UNITS, axis=-1)
-            for change in (invert(step) @ changes, step)
+        left, size, usual = (
+            np.median(np.linalg.norm(log(change) / TWIST_UNITS, axis=-1))
+            for change in (invert(step) @ changes, step, others.change_of(frame, state))
         )
-        found.append((float(np.median(left) / size), frame, step))
+        # Poses that are wrong may have much in common, and differ by far more than noise.
+        is_noise = CLEAR_RATIO * left < size or left < CLEAR_RATIO * usual
+        found.append((float(left / size) if is_noise else np.inf, frame, step))
     ratio, frame, step = min(found, default=(np.inf, "", np.eye(4)), key=lambda item: item[0])
     # A tool that is longer along the line of sight looks like another size, too.
     if CLEAR_RATIO * of_size < min(1.0, CLEAR_RATIO**2 * ratio):

@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 
 from visioncal.calibration.guess.fit import CLOSING_SCORE, robust_fits
@@ -217,6 +218,7 @@ def likeliest(run: RunState) -> Undoing | None:
         *_flipped(record, best, own, apart, float(base)),
         *_signed(record, best, own, apart, float(base)),
         *_mixed_units(record, own, float(base)),
+        *_mixed_angles(record, own, float(base)),
         *_turned(record, best, own, apart, float(base)),
         *_shifted(record, every, pairs, float(base)),
     ]
@@ -360,19 +362,12 @@ def _mixed_units(record: _Record, own: IntArray, base: float) -> Iterator[Undoin
         (1e3, sizes_m < _NEAREST_M, "a thousandth as large", "xyz"),
         *single,
     ):
-        rows = wrong[own] & (own >= 0)
-        if np.sum(rows) < 1 or np.sum(~rows & (own >= 0)) < 1:
-            continue
         is_scaled = wrong[:, None] & np.array([name in part for name in "xyz"])
         scaled = compose(flanges[:, :3, :3], flanges[:, :3, 3] * np.where(is_scaled, factor, 1.0))
-        edges = _Edges.by(replace(record, robot=robot_part(scaled, record.mount)), own, own >= 0)
-        if edges is None:
+        log = _of_changed(record, own, wrong, scaled)
+        if log is None:
             continue
-        squares = edges.of(own)
-        (log,), (agrees,) = _evidence(squares[None])
-        if squares[agrees].mean() > CLOSING_SCORE**2 or np.sum(agrees & rows) < 0.6 * np.sum(rows):
-            continue
-        views = tuple(record.views[record.rows[rows]].tolist())
+        views = tuple(record.views[record.rows[wrong[own] & (own >= 0)]].tolist())
         whose = "the robot's position" if part == "xyz" else f"{part} of the robot's position"
         short = f"{whose} is {unit} as in the others, as where it is in another unit"
         axes = ",".join(f"{factor:g}*{at}_m" if at in part else at for at in "xyz")
@@ -383,6 +378,62 @@ def _mixed_units(record: _Record, own: IntArray, base: float) -> Iterator[Undoin
                 f"In {view_words(views)} {short}: in the same one, they agree with the others. "
                 "They were left out.",
                 mending("all have one unit", f"--positions {ranges(views)}:{axes}"),
+                views,
+            ),
+            short,
+        )
+
+
+def _of_changed(record: _Record, own: IntArray, wrong: Mask, flanges: FloatArray) -> float | None:
+    """Log evidence of other poses of the robot in (n,) some rows; None where most disagree."""
+    rows = wrong[own] & (own >= 0)
+    if np.sum(rows) < 1 or np.sum(~rows & (own >= 0)) < 1:
+        return None
+    edges = _Edges.by(replace(record, robot=robot_part(flanges, record.mount)), own, own >= 0)
+    if edges is None:
+        return None
+    squares = edges.of(own)
+    (log,), (agrees,) = _evidence(squares[None])
+    is_close = squares[agrees].mean() < CLOSING_SCORE**2
+    return float(log) if is_close and np.sum(agrees & rows) > 0.6 * np.sum(rows) else None
+
+
+def _mixed_angles(record: _Record, own: IntArray, base: float) -> Iterator[Undoing]:
+    """Views whose angles are in radians where the others' are in degrees.
+
+    Read as degrees, they are of a robot that hardly turns.
+    """
+    flanges = robot_part(record.robot, record.mount)
+    angles = np.where(np.isfinite(flanges[:, 0, 0]), rotation_angle(flanges), np.inf)
+    wrong = angles < np.deg2rad(np.pi * np.sqrt(3.0))
+    if not wrong.any() or wrong[own].all():
+        return
+    read = Rotation.from_matrix(flanges[wrong, :3, :3])
+    turned = flanges.copy()
+    for order in ("", "ZYX", "xyz", "ZYZ", "XYZ"):
+        right = Rotation.from_rotvec(np.rad2deg(read.as_rotvec()))
+        if order:
+            right = Rotation.from_euler(order, np.rad2deg(read.as_euler(order)))
+        turned[wrong, :3, :3] = right.as_matrix()
+        log = _of_changed(record, own, wrong, turned)
+        if log is None:
+            continue
+        rows = wrong[own] & (own >= 0)
+        views = tuple(record.views[record.rows[rows]].tolist())
+        short = "the robot's angles are in radians, and were taken for degrees"
+        words = (
+            "In the log, write their angles in degrees (times 57.29578) as the others' are, and "
+        )
+        yield Undoing(
+            EVIDENCE * float(log - base) + _MISTAKE,
+            Finding(
+                "mixed_units",
+                f"In {view_words(views)} {short}: in the same unit, they agree with the others. "
+                "They were left out.",
+                or_alone(
+                    f"{words}convert it anew; or calibrate the other views alone.",
+                    record.views[record.rows[~rows]].tolist(),
+                ),
                 views,
             ),
             short,
