@@ -29,6 +29,8 @@ from visioncal.vision.camera import intrinsics, normalise, project, with_intrins
 _LEAST_MOVE_PX = 0.1
 # A step of the centre by more is that of the image: a lens that is hit moves it by less [px].
 _SHIFTED_PX = 3.0
+# Share of the focal length by which no zoom creeps unseen: a board that curls looks so.
+_MOST_CREEP = 0.03
 # A part of a picture begins farther from its corner than any centre is wrong [px]; what is left of
 # the move where stated intrinsics were misread.
 _CROPPED_PX, _EXPLAINED = 10.0, 0.1
@@ -225,6 +227,8 @@ def _beyond(run: RunState) -> Iterator[Finding]:
         zoom = sizes.zoomed.get(name)
         if zoom is not None and any((name, zoom.station) == (at.frame, at.stop) for at in moves):
             # A bump of the camera explains it, which is named.
+            continue
+        if zoom is not None and zoom.station is None and abs(zoom.share) > _MOST_CREEP:
             continue
         if zoom is not None:
             yield _zoomed(run, of, zoom, changes[1])
