@@ -326,7 +326,8 @@ LINE = np.outer(np.arange(8), [50, 0, 0])
         ({"points_mm": CAD_MM[:2], "names": NAMES[:2]}, "takes at least 3"),
         ({"scale": 1000.0}, "these look like millimetres. "),
         ({"scale": 0.001}, "metres read as millimetres"),
-        ({"names": NAMES[::-1]}, "the points do not fit the drawing"),
+        ({"names": NAMES[::-1]}, "The points have each other's names (P1 is P8, P2 is P7,"),
+        ({"names": NAMES[1:] + NAMES[:1]}, "P8 is P7): corrected, all points agree to 0."),
         ({"names": ("p1", "P22", *NAMES[2:])}, "cad.csv has no point P22; it has P1, P2"),
         ({"names": ("", *NAMES[1:])}, "touches.csv, line 2: which point was touched is not said"),
         ({"names": ("",) * 8}, "touches.csv: which point was touched is not said"),
@@ -348,6 +349,8 @@ def test_features_need_their_kinds(tmp_path, tool_file):
     run(("",) * 7).refused("kind is missing, but must be one of origin, x, xy", "--cad")
     run(("orgin", *KINDS[1:])).refused("line 2: kind is 'orgin'", "Did you mean origin?")
     run(KINDS[:3]).refused("no touch of kind xy")
+    other = {"origin": "origin", "x": "xy", "xy": "x"}
+    run([other[kind] for kind in KINDS]).refused("each other's kinds (x is xy, xy is x): corrected")
     on_a_line = 0.1 * np.outer([0.0, 1.0, 3.0], [1.0, 0.0, 0.0])
     poses = touching(on_a_line, np.random.default_rng(2), NOISE_M)
     run(("origin", "x", "xy")).refused(
@@ -617,7 +620,19 @@ def test_another_order_of_the_quaternion_is_a_bad_tool(tmp_path):
     path = write_table(tmp_path / "touches.csv", POSE, rows)
     done = visioncal("tcp", path)
     assert done.status == 3
-    assert "poses that are read wrongly (--robot-form, --robot-inverse)" in done.out
+    assert "with their rotations in another form, quaternion-wxyz; and to" in done.out
+    assert "--robot-form quaternion-wxyz" in done.out.partition("What to do next")[2]
+    assert visioncal("tcp", path, "--robot-form", "quaternion-wxyz").good()
+
+
+def test_touches_of_another_point_are_named(tmp_path):
+    """Four of ten are of a point that has no name."""
+    poses = touched(Job(), 12).touches.base_from_flange.copy()
+    poses[6:, :3, 3] += [0.1, -0.2, 0.05]
+    done = visioncal("tcp", write_poses(tmp_path / "touches.csv", poses))
+    assert "Touches 6, 7, 8, 9 (touches.csv, line 8 and below) agree on a point" in done.out
+    names = ["a"] * 6 + ["b"] * 4
+    visioncal("tcp", write_poses(tmp_path / "named.csv", poses, {"point": names})).good()
 
 
 # --- What cannot be is refused.

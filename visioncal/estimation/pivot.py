@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import apply_each, compose, invert, nearest_rotation
+from visioncal.core.transforms import apply, apply_each, compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.linalg import covariance_from
@@ -122,6 +122,16 @@ def tool_problem(touches: Touches, noise: Noise = _NO_NOISE, *, oriented: bool) 
         turn_rad=turn_rad,
         oriented=oriented,
     )
+
+
+def scatter_m(touches: Touches) -> float:
+    """Root mean square distance of the tips from their points, by all touches of kind `point`."""
+    are_tips = touches.are("point")
+    state = _start(touches, np.flatnonzero(are_tips), oriented=False)
+    tips = apply(touches.base_from_flange[are_tips], state.frame[None, :3, 3])[:, 0]
+    points = touches.points[are_tips]
+    middles = np.array([tips[points == at].mean(axis=0) for at in range(len(touches.names))])
+    return float(np.sqrt(np.mean(np.sum((tips - middles[points]) ** 2, axis=1))))
 
 
 def _start(touches: Touches, rows: IntArray, *, oriented: bool) -> Placement:

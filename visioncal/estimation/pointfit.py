@@ -8,18 +8,19 @@ There the others only matter by their side, which is positive.
 The scale of a drawing is estimated separately, never absorbed.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.quantiles import FALSE_REJECTION, t_chance
-from visioncal.core.transforms import compose, nearest_rotation
+from visioncal.core.transforms import apply, compose, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.observability import Direction
@@ -30,6 +31,18 @@ from visioncal.estimation.robust import SETS, small_sets
 
 FeatureKind: TypeAlias = Literal["origin", "x", "xy"]
 FEATURE_KINDS: tuple[FeatureKind, ...] = ("origin", "x", "xy")
+# Names that are tried in all pairs, and in any order; and frames by three points that are tried.
+_MOST_NAMES, _FRAMES = 12, 40
+# Noise beyond which touches of features may be of other kinds [m].
+_DISAGREE_M = 1e-3
+# Units of a drawing in place of those that it has, by the ratio of the part to it.
+_UNITS = {
+    25.4: "inches read as millimetres (--cad-unit inch)",
+    1 / 25.4: "millimetres read as inches (--cad-unit mm)",
+    1e3: "metres read as millimetres (--cad-unit m)",
+    1e-3: "millimetres read as metres (--cad-unit mm)",
+    10.0: "centimetres read as millimetres (--cad-unit cm)",
+}
 # Those of x, y, z in the fixture's frame that are stated, by kind; empty for a drawn point.
 _STATED = {
     "": (True, True, True),
@@ -166,21 +179,47 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
     problem = fixture_problem(touches)
     agreement = find_inlier_groups(problem, expected_noise_m)
     fit = agreement.fit
+    _refuse_exchanged_kinds(touches, fit.sigma)
     local = problem.local(fit.state)
     reaches = local[touches.rows("x"), 0].max(), local[touches.rows("xy"), 1].max()
     reach_mm = 1e3 * np.maximum(reaches, 0.0).round(9)
+    rows = zip(touches.labels, agreement.doubtful, strict=True)
+    doubtful = some_of([label for label, is_doubtful in rows if is_doubtful])
+    words = f", as touches {doubtful} contradict each other" if doubtful else ""
+    farther = "touch the x axis farther from the origin and the plane farther from the x axis"
     _refuse_poor(
         touches,
         fit,
         np.zeros(3),
         f"the x axis was touched up to {figure(reach_mm[0])} mm from the origin and the plane up "
-        f"to {figure(reach_mm[1])} mm from the x axis, at a noise of {figure(1e3 * fit.sigma)} mm",
-        "Touch the x axis farther from the origin and the plane farther from the x axis, or say "
-        "how well the points are touched.",
+        f"to {figure(reach_mm[1])} mm from the x axis, at a noise of {figure(1e3 * fit.sigma)} mm"
+        f"{words}",
+        f"Touch {doubtful} again, and see to their kinds; or {farther}."
+        if doubtful
+        else f"T{farther[1:]}, or say how well the points are touched.",
     )
     along = {"x": local[:, 0], "xy": local[:, 1]}
     check_sides("fixture", touches.labels, touches.kinds, agreement.mask, along)
     return agreement
+
+
+def _refuse_exchanged_kinds(touches: PointPairs, sigma_m: float) -> None:
+    """Refuses touches that agree with other kinds, where they do not at some noise [m]."""
+    if sigma_m < _DISAGREE_M:
+        return
+    for others in permutations(FEATURE_KINDS):
+        renamed = dict(zip(FEATURE_KINDS, others, strict=True))
+        kinds = tuple(renamed[kind] for kind in touches.kinds)
+        fit = fit_groups(fixture_problem(replace(touches, kinds=kinds)))
+        if fit.freedom > 1 and CLEAR_RATIO * fit.sigma < sigma_m:
+            wrong = [f"{a} is {b}" for a, b in renamed.items() if a != b]
+            agree_mm, off_mm = (figure(1e3 * level) for level in (fit.sigma, sigma_m))
+            raise DataError(
+                f"fixture: the touches have each other's kinds ({some_of(wrong)}): corrected, all "
+                f"agree to {agree_mm} mm per axis, and to {off_mm} mm as they are.",
+                culprits=touches.labels,
+                next_step="Look what was touched, and correct the column kind.",
+            )
 
 
 def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> DrawingFit:
@@ -220,50 +259,94 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Draw
         f"the points reach {figure(1e3 * extents[0])} mm from their centre (rms) and "
         f"{figure(1e3 * extents[1])} mm across, at a noise of {figure(1e3 * level_m)} mm",
         "Measure points that are farther apart and not nearly on one line, or measure them better.",
-        f" The part is {scale.value:.4g} times as large as drawn." if scale.differs else "",
+        f" The part is {scale.value:.4g} times as large as drawn{_unit_words(scale.value)}."
+        if scale.differs
+        else "",
     )
     # Points within five sigmas of a plane lie in it.
     return DrawingFit(agreement, scale, float(extents[2]) < 5.0 * level_m)
+
+
+def _unit_words(ratio: float) -> str:
+    """The units whose ratio it is, to a percent, after a comma; else empty."""
+    near = (words for value, words in _UNITS.items() if abs(np.log(ratio / value)) < 0.01)
+    return f", as with {words}" if (words := next(near, "")) else ""
 
 
 @dataclass(frozen=True)
 class Mistake:
     """A mistake that makes all points agree with their drawing."""
 
-    # Pairs of points, of which one has its names exchanged; an empty pair: the drawing is mirrored.
-    exchanged: tuple[tuple[str, ...], ...]
+    # Rivals: the drawing's name of each point that has another; none: the drawing is mirrored.
+    renamed: tuple[Mapping[str, str], ...]
     rms_m: float  # How far off the points then are, root mean square [m].
     declared_m: float  # The same as they are named and drawn [m].
 
 
 def mistake_of(pairs: PointPairs) -> Mistake | None:
-    """Two exchanged names, or a mirrored drawing; None where none of these makes all agree.
+    """Wrong names, or a mirrored drawing; None where none of these makes all points agree.
 
     Any mirror image of a drawing is any other one, turned. Symmetric points leave several open.
+    Where no two exchanged names do it, any order of up to a dozen is sought.
     """
+    labels = np.array(pairs.labels)
+    drawn = dict(zip(pairs.labels, pairs.nominal, strict=True))
 
     def off_m(nominal: FloatArray) -> FloatArray:
         frame = align(pairs.measured, nominal)
         off = pairs.measured - nominal @ frame[:3, :3].T - frame[:3, 3]
         return np.asarray(np.linalg.norm(off, axis=1))
 
-    def rms_m(nominal: FloatArray) -> float:
-        return float(np.sqrt(np.mean(off_m(nominal) ** 2)))
+    def rms_m(renamed: Mapping[str, str], sign: float = 1.0) -> float:
+        nominal = np.array([drawn[renamed.get(name, name)] for name in pairs.labels])
+        return float(np.sqrt(np.mean(off_m(nominal * [1.0, 1.0, sign]) ** 2)))
 
-    declared_m, labels = rms_m(pairs.nominal), np.array(pairs.labels)
-    tried: dict[tuple[str, ...], float] = {(): rms_m(pairs.nominal * [1.0, 1.0, -1.0])}
+    declared_m = rms_m({})
     # Of many points, the two are among those that are off most.
-    worst = dict.fromkeys(labels[np.argsort(-off_m(pairs.nominal), kind="stable")].tolist())
-    for names in combinations(sorted([*worst][:12]), 2):
-        first, second = (labels == name for name in names)
-        nominal = pairs.nominal.copy()
-        nominal[first], nominal[second] = pairs.nominal[second][0], pairs.nominal[first][0]
-        tried[names] = rms_m(nominal)
-    least_m = min(tried.values())
+    worst = [*dict.fromkeys(labels[np.argsort(-off_m(pairs.nominal), kind="stable")].tolist())]
+    tried: list[tuple[Mapping[str, str], float]] = [({}, rms_m({}, -1.0))]
+    exchanged = ({a: b, b: a} for a, b in combinations(sorted(worst[:_MOST_NAMES]), 2))
+    tried += [(renamed, rms_m(renamed)) for renamed in exchanged]
+    is_pair = CLEAR_RATIO * min(off for _, off in tried) < declared_m
+    if not is_pair and FEWEST_POINTS < len(worst) <= _MOST_NAMES:
+        tried = [(renamed, rms_m(renamed)) for renamed in _orders(pairs, sorted(worst))]
+    least_m = min((off for _, off in tried), default=np.inf)
     if not CLEAR_RATIO * least_m < declared_m:
         return None
-    rivals = tuple(names for names, off_m in tried.items() if off_m < CLEAR_RATIO * least_m)
-    return Mistake(rivals, least_m, declared_m)
+    rivals = [renamed for renamed, off in tried if off < CLEAR_RATIO * least_m]
+    # Turned onto itself, a symmetric pattern has others, of more names.
+    fewest = min(len(renamed) for renamed in rivals) or 2
+    rivals = [renamed for renamed in rivals if len(renamed) in (0, fewest)]
+    return Mistake(tuple(rivals), least_m, declared_m)
+
+
+def _orders(pairs: PointPairs, names: Sequence[str]) -> list[dict[str, str]]:
+    """The drawing's names of points that have other ones, by where all of them lie.
+
+    Three of them that are far apart have the sides of three of the drawing, and so a frame, in
+    which each point has the name of its place.
+    """
+    labels = np.array(pairs.labels)
+    measured, drawn = (
+        np.array([points[labels == name].mean(axis=0) for name in names])
+        for points in (pairs.measured, pairs.nominal)
+    )
+    triples = np.array([*permutations(range(len(names)), 3)], dtype=np.int64).reshape(-1, 3)
+
+    def sides(points: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(points - np.roll(points, 1, axis=-2), axis=-1))
+
+    three = triples[int(np.argmax(sides(measured[triples]).min(axis=1)))]
+    apart = np.abs(sides(drawn[triples]) - sides(measured[three])).max(axis=1)
+    nearest = triples[np.argsort(apart, kind="stable")[:_FRAMES]]
+    frames = align(measured[three], drawn[nearest])
+    places = apply(frames, drawn)
+    off_m = np.linalg.norm(measured[:, None] - places[:, None, :, :], axis=-1)
+    orders = {tuple(linear_sum_assignment(each**2)[1].tolist()) for each in off_m}
+    return [
+        {name: names[at] for name, at in zip(names, order, strict=True) if names[at] != name}
+        for order in sorted(orders)
+    ]
 
 
 def _fit_inliers(pairs: PointPairs, expected_noise_m: float | None) -> tuple[GroupInliers, Scale]:

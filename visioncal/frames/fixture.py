@@ -46,6 +46,8 @@ _THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
 
 # Thermal expansion or an arm's scale error is below this share; the wrong drawing differs by more.
 _WARM = 1e-3
+# Orders of names that are listed where points are symmetric.
+_ORDERS = 2
 # Smallest cosine between the points' plane normal and the drawing's z for the plane to be an xy
 # plane, and between the tool's direction and z for the touched side to be known.
 _FLAT, _ASIDE = 0.9, 0.3
@@ -454,18 +456,25 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Fit
 
 
 def _finding_of(mistake: Mistake, drawing: NominalPoints) -> Finding:
-    """The finding that two names are exchanged, or the drawing mirrored."""
-    pairs = ", or of ".join(" and ".join(names) for names in mistake.exchanged if names)
+    """The finding that points have wrong names, or the drawing is mirrored."""
     good, off = (figure(1e3 * rms_m) for rms_m in (mistake.rms_m, mistake.declared_m))
     mirror = f"{drawing.source} is a mirror image of the part: with the other sign of one axis, or "
     mirror += (
         f"two axes exchanged, all points agree to {good} mm (rms), and to {off} mm as they are."
     )
-    if not pairs:
+    rivals = [renamed for renamed in mistake.renamed if renamed]
+    if not rivals:
         do = Remedy("Correct the sign or the order of its columns, as the part has them.", AGAIN)
         return Finding("mirrored", mirror, do, is_fatal=True)
-    words = f"Of {pairs}, the names are exchanged: with the other name for each, all points agree "
-    words += f"to {good} mm (rms), and to {off} mm as they are."
-    words += f" Or {mirror}" * (() in mistake.exchanged)
+    agree = f"all points agree to {good} mm (rms), and to {off} mm as they are."
+    if len(rivals[0]) == 2:
+        pairs = ", or of ".join(" and ".join(renamed) for renamed in rivals)
+        words = f"Of {pairs}, the names are exchanged: with the other name for each, {agree}"
+    else:
+        orders = (
+            ", ".join(f"{a} is {b}" for a, b in renamed.items()) for renamed in rivals[:_ORDERS]
+        )
+        words = f"The points have each other's names ({'; or '.join(orders)}): corrected, {agree}"
+    words += f" Or {mirror}" * ({} in mistake.renamed)
     do = Remedy("Look which points were touched, and write their names in the rows.", AGAIN)
     return Finding("exchanged_names", words, do)

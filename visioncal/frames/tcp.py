@@ -1,16 +1,20 @@
 """Tool frame from touches (TCP calibration), with its verdict."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
 
 from visioncal.core.arguments import typed
-from visioncal.core.limits import ToolLimits
-from visioncal.core.number_format import figure
+from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.limits import CLEAR_RATIO, WIDE_RAD, ToolLimits
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import AGAIN, Finding, Remedy
-from visioncal.estimation.pivot import PivotFit, Touches, TouchKind, fit_pivot
+from visioncal.estimation.pivot import PivotFit, Touches, TouchKind, fit_pivot, scatter_m
 from visioncal.estimation.placing import assumed_words
 from visioncal.frames.fixture import FitSettings, PointsFit
 from visioncal.frames.touches import TouchRows, flange_poses, refuse_copies, robot_noise
@@ -18,6 +22,8 @@ from visioncal.results import Calibration, Edge, Frame
 from visioncal.robot import Robot
 
 TOUCH_KINDS = ("point", "z", "xz")
+# Distance within which touches are of one point, over the noise of a touch per axis.
+_NEAR = 6.0
 
 
 @typed
@@ -57,7 +63,15 @@ def touched_tool(
         rows.labels,
         tuple(numbers),
     )
-    fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
+    options = options or ToolLimits()
+    other = _other_reading(touches, rows.numbers, 1e-3 * options.noise_mm[0])
+    try:
+        fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
+    except DegenerateError as error:
+        if other is None or other.do is None:
+            raise
+        step = f"{other.do.words[:-1]}: {other.do.command.removeprefix(AGAIN).strip()}."
+        raise DataError(f"tcp: {other.words}", culprits=[rows.source], next_step=step) from error
     fitted = PointsFit(
         rows.source,
         rows.labels,
@@ -83,7 +97,7 @@ def touched_tool(
     setting = FitSettings(
         touch_noise_m,
         doubts,
-        options=options or ToolLimits(),
+        options=options,
         noisy="Touch again with a sharp tip; an arm that was never calibrated is off by a "
         "millimetre from posture to posture, and poses that are read wrongly (--robot-form, "
         "--robot-inverse) by more.",
@@ -105,7 +119,59 @@ def touched_tool(
         "points_m": dict(zip(names, fit.agreement.fit.state.points.tolist(), strict=True)),
         "points_sigma_mm": dict(zip(names, sigmas_mm, strict=True)),
     }
-    return fitted.frame(method, more, details, setting)
+    first = [other] if other is not None else [*_other_points(fit, touches, rows.places)]
+    return fitted.frame(method, more, details, setting, first)
+
+
+def _other_reading(touches: Touches, numbers: PoseNumbers | None, limit_m: float) -> Finding | None:
+    """The finding that rotations are in another form, by which all touches agree; None without."""
+    declared_m = scatter_m(touches)
+    if numbers is None or declared_m < limit_m:
+        return None
+    given = numbers.reading
+    tried: dict[str, float] = {}
+    for name in ROTATION_FORMS.keys() - {given.rotation}:
+        # Beyond two turns, radians are none; and other numbers are no rotation in some forms.
+        if name.endswith("-rad") and np.nanmax(np.abs(numbers.rotations)) > WIDE_RAD:
+            continue
+        with suppress(DataError):
+            poses = numbers.read_as(replace(given, rotation=name)).poses()
+            tried[name] = scatter_m(replace(touches, base_from_flange=poses))
+    least_m = min(tried.values(), default=np.inf)
+    if not CLEAR_RATIO * least_m < declared_m:
+        return None
+    rivals = sorted(name for name, off_m in tried.items() if off_m < CLEAR_RATIO * least_m)
+    words = (
+        f"The touches agree to {figure(1e3 * least_m)} mm (rms) with their rotations in another "
+        f"form, {some_of(rivals, 3)}; and to {figure(1e3 * declared_m)} mm as they are read."
+    )
+    remedy = Remedy(
+        "Look up what the controller writes, and say it.", f"{AGAIN} --robot-form {rivals[0]}"
+    )
+    return Finding("other_reading", words, remedy, is_fatal=True)
+
+
+def _other_points(fit: PivotFit, touches: Touches, places: Sequence[str]) -> Iterator[Finding]:
+    """Findings on touches that were left out, and agree on a point of their own."""
+    inliers = fit.agreement
+    tips = touches.base_from_flange @ np.append(fit.flange_from_tool[:3, 3], 1.0)
+    for at in range(len(touches.names)):
+        of_point = touches.are("point") & (touches.points == at)
+        out = np.flatnonzero(of_point & ~inliers.mask)
+        middle = np.median(tips[out, :3], axis=0) if len(out) else np.zeros(3)
+        off_m = np.linalg.norm(tips[out, :3] - middle, axis=1)
+        near = off_m < _NEAR * inliers.fit.sigma
+        if near.sum() < 2:
+            continue
+        apart_m = float(np.linalg.norm(middle - inliers.fit.state.points[at]))
+        chosen = out[near].tolist()
+        words = (
+            f"Touches {some_of([touches.labels[row] for row in chosen])} "
+            f"({places[chosen[0]]} and below) agree on a point of their own, "
+            f"{figure(1e3 * apart_m)} mm from that of the others, to {figure(1e3 * off_m.max())} mm."
+        )
+        step = "Name the points in a column point, this one otherwise: then both count."
+        yield Finding("other_point", words, Remedy(step, AGAIN))
 
 
 def _findings(fit: PivotFit, touches: Touches, setting: FitSettings) -> Iterator[Finding]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M, WIDE_RAD
 from visioncal.core.number_format import did_you_mean, figure, some_of
@@ -39,6 +40,8 @@ class TouchRows:
     joints_rad: FloatArray | None
     kinds: tuple[str, ...]  # (n,) kinds of the touches; empty where not stated.
     points: tuple[str, ...]  # (n,) names of the touched points; empty where not stated.
+    # The poses as they are written in a table, which may be meant otherwise.
+    numbers: PoseNumbers | None = None
 
     def __len__(self) -> int:
         return len(self.labels)

@@ -41,7 +41,7 @@ def read_touches(
     """
     if path.is_dir() or path.suffix.lower() == ".rrd":
         return touches_of(Session.load(path), robot)
-    given, joints_rad = requested.robot, None
+    given, joints_rad, written = requested.robot, None, None
     fields = _of_robot(read_fields(path, given.form or given.usual), robot)
     named = pose_names(fields, given.names, "robot", (), by_shape=False)
     if positions and (not named or (given.names and len(named) == 3)):
@@ -62,12 +62,13 @@ def read_touches(
             )
         foreign = foreign_from(fields, requested)
         check_radians(foreign.robot, given, "robot", guesses=False)
-        poses, joints_rad = foreign.robot.poses(), foreign.joints_rad
+        written, joints_rad = foreign.robot, foreign.joints_rad
+        poses = written.poses()
     numbers = fields.views or view_numbers(fields) or range(len(fields))
     texts = {name.lower(): cells for name, cells in fields.texts.items()}
     kinds, points = (texts.get(name, ("",) * len(fields)) for name in ("kind", "point"))
     labels = tuple(map(str, numbers))
-    return TouchRows(path.name, labels, fields.places, poses, joints_rad, kinds, points)
+    return TouchRows(path.name, labels, fields.places, poses, joints_rad, kinds, points, written)
 
 
 def read_typed(path: Path, given: PoseImportOptions) -> tuple[tuple[str, ...], PoseNumbers] | None:
