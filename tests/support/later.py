@@ -22,13 +22,14 @@ FITTED = 40
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What has changed: twists (6,) on the right of x and z, joints' offsets, noise, size."""
+    """What has changed: twists (6,) on the right of x and z, joints' offsets, noise, sizes."""
 
     camera: FloatArray = field(default_factory=lambda: np.zeros(6))
     board: FloatArray = field(default_factory=lambda: np.zeros(6))
     joints_rad: FloatArray = field(default_factory=lambda: np.zeros(6))
     noise_factor: float = 1.0
     board_scale: float = 1.0
+    lens_scale: float = 1.0  # Of the focal length.
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,18 +73,20 @@ def again(
     x, z = cell.transforms.values()
     moved = x @ exp(change.camera), z @ exp(change.board)
     poses = target_in_camera(options.mount, *moved, flange)
-    corners = tuple(
-        _detected(cell, at, pose, rng, change.board_scale) for at, pose in enumerate(poses)
-    )
+    corners = tuple(_detected(cell, at, pose, rng, change) for at, pose in enumerate(poses))
     return reporting(showing(fresh, corners), true_base_from_flange=flange)
 
 
 def _detected(
-    cell: SimulatedCell, view: int, pose: FloatArray, rng: np.random.Generator, scale: float
+    cell: SimulatedCell, view: int, pose: FloatArray, rng: np.random.Generator, change: Change
 ) -> Corners:
     """The board as it was printed, as a detector reports it."""
     camera = cell.options.camera
-    px = project(camera, scale * corners_m(cell.board()) @ pose[:3, :3].T + pose[:3, 3])
+    grown = camera.matrix * np.array([change.lens_scale, change.lens_scale, 1.0, 1.0])
+    camera = replace(camera, matrix=grown)
+    px = project(
+        camera, change.board_scale * corners_m(cell.board()) @ pose[:3, :3].T + pose[:3, 3]
+    )
     ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
     noise = cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))
     return Corners(view, ids, px[ids] + noise, cell.options.blur_px)

@@ -231,6 +231,7 @@ CHANGES = {
     "slip": (slip(3, -0.05), ["joint 3"], [np.deg2rad(-0.05)], "Joint 3 (elbow_joint) off by -0.0"),
     # Five stops know it to some hundredths of a percent.
     "larger board": (Change(board_scale=1.005), ["board_size"], [0.005], "0.5 % larger"),
+    "longer lens": (Change(lens_scale=1.01), ["lens"], [0.01], "The lens is 1 % longer"),
     "other board": (knocked(7, board=(5.0, 1.0), board_scale=0.99), ["board_replaced"], None, ""),
     "two": (knocked(6, camera=(2.0, 0.3), board=(2.0, 0.3)), ["camera_and_board"], None, ""),
     "noise": (Change(noise_factor=8.0), ["robot_noise"], None, ""),
@@ -291,6 +292,28 @@ def test_a_view_at_another_pose_than_is_written_beside_it_is_told(place):
     found = checked_of(known_of(reporting(cell, joints=joints)), place.calibration)
     assert names(found) == ["view 2"]
     assert "View 2 alone contradicts" in verdict_of(found).reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        ((0, 3, 2, 1, 4), "those of views 1 and 3 are exchanged"),
+        ((0, 1, 3, 4, 2), "those of views 2, 3, 4 fit the poses of views 4, 2, 3"),
+    ],
+)
+def test_images_in_other_rows_than_their_poses_are_named(place, order, words):
+    cell = again(place.cell, np.random.default_rng(6))
+    rows = list(order)
+    poses = {
+        "joints": cell.robot.joints[rows],
+        "base_from_flange": cell.robot.base_from_flange[rows],
+    }
+    found = checked_of(known_of(reporting(cell, **poses)), place.calibration)
+    assert names(found) == ["pairing"]
+    assert found.explained
+    finding = verdict_of(found).findings[0]
+    assert words in finding.words
+    assert ("--exchange 1,3 && visioncal verify" in finding.do.command) == ("exchanged" in words)
 
 
 @pytest.mark.slow

@@ -81,6 +81,8 @@ class ChangeHypothesis:
     # Factors on the noise of the stops, where larger noise is the change.
     noise_factors: tuple[float, ...] = (1.0,)
     at: int = 0  # Index of the board or joint.
+    # Views whose images belong to the poses of others, and these.
+    pairs: tuple[tuple[int, int], ...] = ()
 
     @property
     def kind(self) -> str:

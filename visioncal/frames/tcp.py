@@ -165,10 +165,11 @@ def _other_points(fit: PivotFit, touches: Touches, places: Sequence[str]) -> Ite
             continue
         apart_m = float(np.linalg.norm(middle - inliers.fit.state.points[at]))
         chosen = out[near].tolist()
+        some = some_of([touches.labels[row] for row in chosen])
         words = (
-            f"Touches {some_of([touches.labels[row] for row in chosen])} "
-            f"({places[chosen[0]]} and below) agree on a point of their own, "
-            f"{figure(1e3 * apart_m)} mm from that of the others, to {figure(1e3 * off_m.max())} mm."
+            f"Touches {some} ({places[chosen[0]]} and below) agree on a point of their own, "
+            f"{figure(1e3 * apart_m)} mm from that of the others, to "
+            f"{figure(1e3 * off_m[near].max())} mm."
         )
         step = "Name the points in a column point, this one otherwise: then both count."
         yield Finding("other_point", words, Remedy(step, AGAIN))

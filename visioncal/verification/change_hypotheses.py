@@ -6,15 +6,17 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.limits import FEWEST_VIEWS
-from visioncal.core.transforms import adjoint, invert, log, mean_transform
+from visioncal.core.transforms import adjoint, exp, invert, log, mean_transform
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import ArmModel
+from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.model_evidence import TURN_PER_M, ChangeHypothesis
 from visioncal.verification.calibration_prior import CalibrationPrior
-from visioncal.verification.prediction import PredictedStops
+from visioncal.verification.prediction import PredictedStops, board_changes
 
-CAMERA, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW = (
+CAMERA, LENS, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW, PAIRING = (
     "camera",
+    "lens",
     "board",
     "camera_and_board",
     "board_size",
@@ -23,11 +25,18 @@ CAMERA, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW = (
     "arm_length",
     "robot_noise",
     "view",
+    "pairing",
 )
 # Two simultaneous changes.
 PAIRS = (BOTH, REPLACED)
 # Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
 _OTHER_SIZE_PER_M = 10.0
+# Shares by which a lens grows: whose motions are proportional, and from which on it is another one;
+# and steps in which poses are found.
+_SMALL_SHARE, _LARGE_SHARE, _STEPS = 1e-3, 0.5, 5
+# Displacement from which on a board is not in place, as by a millimetre and 4 mrad for each of
+# these [m]; and unit of a change that is one or none.
+_FAR_M, _WHOLE = 5e-3, 10.0
 # Units of a twist, for a change of one metre.
 MOTION_UNITS: FloatArray = np.repeat([TURN_PER_M, 1.0], 3)
 
@@ -52,7 +61,7 @@ def causes_of(
     # A board that is larger by a share is seen nearer by the same share.
     nearer = np.zeros((len(measured), 6, 1))
     nearer[:, 3:, 0] = np.einsum("nji,nj->ni", measured[:, :3, :3], measured[:, :3, 3])
-    causes, names = [camera], tuple(prior.targets) or ("",)
+    causes, names = [camera, *_focal_length(predicted, changes)], tuple(prior.targets) or ("",)
     for at, index in enumerate(prior.boards):
         shown = predicted.boards == at
         if not shown.any():
@@ -76,8 +85,38 @@ def causes_of(
         # The robot's noise may have grown by 2 to 32 times.
         factors = tuple((2.0 ** np.arange(1, 6)).tolist())
         causes.append(ChangeHypothesis(NOISE, np.zeros(0), noise_factors=factors))
-        causes += _views(predicted, prior, changes)
+        causes += [*_views(predicted, prior, changes), *_pairing(predicted, prior, changes)]
     return tuple(causes)
+
+
+def _focal_length(predicted: PredictedStops, changes: FloatArray) -> Iterator[ChangeHypothesis]:
+    """Another focal length, as of a lens that was focused again, where corners are seen."""
+    observed = predicted.observed
+    corners = [observed.poses[view].corners for view in predicted.views]
+    seen = {view: each for view, each in zip(predicted.views, corners, strict=True) if each}
+    if (free := observed.free) is None or len(seen) < len(corners):
+        return
+    stack = CornerStack.of(seen, free.positions + free.basis @ free.appearance.board)
+    camera, measured = free.appearance.camera, predicted.problem.observations.measured
+
+    def undoing(share: float) -> FloatArray:
+        """(n, 6, 1) motion of each board that shows the same corners by a longer lens."""
+        grown = camera.matrix * [1.0 + share, 1.0 + share, 1.0, 1.0]
+        poses, longer = measured, replace(camera, matrix=grown)
+        for _ in range(_STEPS):
+            shown = reproject(stack, longer, poses, lens=False)
+            information = stack.products_by_view(shown.by_pose, shown.by_pose)
+            gradient = stack.products_by_view(shown.by_pose, shown.residuals[:, :, None])
+            step = np.asarray(np.linalg.solve(information, gradient), dtype=float)[:, :, 0]
+            poses = np.asarray(poses @ exp(-step), dtype=float)
+        return log(invert(measured) @ poses)[:, :, None] / share
+
+    small = undoing(_SMALL_SHARE)
+    share = -float(np.sum(small[:, :, 0] * changes) / np.sum(small**2))
+    is_small = not _SMALL_SHARE < abs(share) < _LARGE_SHARE
+    # Large ones bend.
+    by_share, share = (small, 0.0) if is_small else (undoing(share), share)
+    yield ChangeHypothesis(LENS, np.ones(1), by_share, start=np.array([share]))
 
 
 def _simultaneous(kind: str, one: ChangeHypothesis, other: ChangeHypothesis) -> ChangeHypothesis:
@@ -138,3 +177,42 @@ def _views(
             start=changes[first],
             at=int(predicted.boards[first]),
         )
+
+
+def _pairing(
+    predicted: PredictedStops, prior: CalibrationPrior, changes: FloatArray
+) -> Iterator[ChangeHypothesis]:
+    """Images that belong to the poses of other stops: of exchanged, shifted or repeated rows.
+
+    Such an image shows its board in place from another stop than its own. One image may do so from
+    none, as the first of shifted rows; its board then moves by itself.
+    """
+    problem = predicted.problem
+    ((robot, poses),) = problem.poses.items()
+    own, at = problem.observations.stops, np.arange(len(problem))
+    away = np.zeros((len(poses), len(problem), 4, 4))
+    for shift in range(len(poses)):
+        others = np.roll(poses, -shift, axis=0)
+        by_others = board_changes(replace(problem, poses={robot: others}), prior.state)
+        away[(own + shift) % len(poses), at] = by_others
+    off_m = np.linalg.norm(log(away) / MOTION_UNITS, axis=2)
+    nearest = np.argmin(off_m, axis=0)
+    is_off, is_placed = off_m[own, at] > _FAR_M, off_m[nearest, at] < _FAR_M
+    moved, lost = np.flatnonzero(is_off & is_placed), np.flatnonzero(is_off & ~is_placed)
+    if not len(moved) or len(lost) > 1:
+        return
+    by_sensor = np.zeros((len(problem), 6, 1 + 6 * len(lost)))
+    undone = invert(away[own[moved], moved]) @ away[nearest[moved], moved]
+    by_sensor[moved, :, 0] = log(undone)
+    start, units = np.ones(1), np.full(1, _WHOLE)
+    if len(lost):
+        by_sensor[lost[0], :, 1:] = -np.eye(6)
+        start = np.append(start, changes[lost[0]])
+        units = np.append(units, MOTION_UNITS)
+    views = np.array(predicted.views)
+    pairs = zip(
+        views[moved].tolist(),
+        views[np.unique(own, return_index=True)[1][nearest[moved]]].tolist(),
+        strict=True,
+    )
+    yield ChangeHypothesis(PAIRING, units, by_sensor, start=start, pairs=tuple(pairs))

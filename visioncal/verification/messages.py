@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.core.limits import CONTRADICTION, CheckLimits
-from visioncal.core.number_format import counted, figure, listed
+from visioncal.core.number_format import counted, figure, listed, view_words
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import (
@@ -28,7 +28,9 @@ from visioncal.verification.change_hypotheses import (
     CAMERA,
     JOINT,
     LENGTH,
+    LENS,
     NOISE,
+    PAIRING,
     REPLACED,
     SIZE,
     VIEW,
@@ -56,9 +58,17 @@ _OTHER_POSES = Remedy(
     "and the convention of the calibrated ones, which doctor finds.",
     "visioncal doctor SESSION",
 )
+_PAIR_AGAIN = Remedy(
+    "Bring the images to the rows of their poses; then verify again.", "visioncal doctor SESSION"
+)
 # Words for each kind of change, a part of a sentence, and the advice on it.
 _KINDS = {
     CAMERA: ("the camera {moved}", Remedy(f"Fasten the camera, and {_ANEW}", CALIBRATE_ANEW)),
+    LENS: (
+        "the lens is {percent} % {longer} (sigma {sigma}) than it was, as where its focus or zoom "
+        "was touched",
+        Remedy(f"Fasten its focus, and {_ANEW}", CALIBRATE_ANEW),
+    ),
     BOARD: (
         "the {name} {moved}",
         Remedy(
@@ -96,6 +106,10 @@ _KINDS = {
             AGAIN,
         ),
     ),
+    PAIRING: (
+        "images are in other rows than their poses: {pairs}",
+        _PAIR_AGAIN,
+    ),
     VIEW: (
         "{name} alone contradicts the calibration: its board {moved}",
         Remedy(
@@ -132,6 +146,8 @@ def verdict_of(check: Check) -> Verdict:
     # No camera or board moves farther; poses in another unit seem to.
     if found.get(CAMERA, found).get("moved_mm", 0.0) > 5e3:
         step = _OTHER_POSES
+    if kind == PAIRING:
+        step = _exchange(likeliest.cause.pairs)
     reasons = [Finding(kind, words, step, probability=share, by_limit=not is_alone)]
     if others:
         reasons.append(_rivals(check, likeliest, others))
@@ -182,6 +198,7 @@ def change_words(check: Check, change: PossibleChange) -> str:
         "aluminium": abs(share) / _ALUMINIUM,
         "steel": abs(share) / _STEEL,
         "factor": found.get("noise_factor", 1.0),
+        "pairs": _pair_words(change.cause.pairs),
     }
     if change.cause.kind == JOINT:
         unit = "mm" if "offset_mm" in found else "deg"
@@ -192,6 +209,23 @@ def change_words(check: Check, change: PossibleChange) -> str:
             "offset": f"{sign}{figure(abs(offset))} {unit} (sigma {figure(sigma)})",
         }
     return _KINDS[change.cause.kind][0].format(**facts)
+
+
+def _pair_words(pairs: Sequence[tuple[int, int]]) -> str:
+    """Images, and the rows of their poses."""
+    images, rows = ([pair[at] for pair in pairs] for at in (0, 1))
+    if pairs and set(images) == set(rows) and len(pairs) == 2:
+        return f"those of views {images[0]} and {images[1]} are exchanged"
+    return f"those of {view_words(images)} fit the poses of {view_words(rows)}"
+
+
+def _exchange(pairs: Sequence[tuple[int, int]]) -> Remedy:
+    """The command that exchanges two images again, where only pairs are exchanged."""
+    if {(b, a) for a, b in pairs} != set(pairs):
+        return _PAIR_AGAIN
+    option = ",".join(f"{a},{b}" for a, b in pairs if a < b)
+    command = f"visioncal convert SESSION FIXED --exchange {option}"
+    return Remedy(_PAIR_AGAIN.words, f"{command} && visioncal verify FIXED --against OUT")
 
 
 def _moved_words(move: Mapping[str, Any]) -> str:
@@ -214,6 +248,8 @@ def _estimates(check: Check, change: PossibleChange) -> dict[str, Any]:
     kind, explained = change.cause.kind, change.explained
     if kind == NOISE:
         return {"noise_factor": explained.noise_factor}
+    if kind == PAIRING:
+        return {"pairs": change.cause.pairs}
     if kind == BOTH:
         return {CAMERA: _motion(check, change, 0), BOARD: _motion(check, change, 6)}
     value, sigma = float(explained.values[-1]), float(np.sqrt(explained.covariance[-1, -1]))
@@ -222,8 +258,8 @@ def _estimates(check: Check, change: PossibleChange) -> dict[str, Any]:
         is_prismatic = robot is not None and robot.chain.prismatic[change.cause.at]
         unit, scale = ("mm", 1e3) if is_prismatic else ("deg", float(np.rad2deg(1.0)))
         return {f"offset_{unit}": scale * value, f"sigma_{unit}": scale * sigma}
-    share = {"share": value, "sigma": sigma} if kind in (LENGTH, SIZE, REPLACED) else {}
-    return share | (_motion(check, change, 0) if kind not in (LENGTH, SIZE) else {})
+    share = {"share": value, "sigma": sigma} if kind in (LENGTH, LENS, SIZE, REPLACED) else {}
+    return share | (_motion(check, change, 0) if kind not in (LENGTH, LENS, SIZE) else {})
 
 
 def _motion(check: Check, change: PossibleChange, first: int) -> dict[str, Any]:
