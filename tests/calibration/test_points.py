@@ -235,15 +235,34 @@ def test_a_table_of_corners_that_was_cut_off_is_named(folder):
 def test_numbers_that_do_not_lie_as_drawn_are_refused_or_left_out_by_name():
     for target, columns, rows in ((CHARUCO, 6, 9), (CHECKERS, 8, 7)):
         session = replace(seen(target)[1], target=replace(target, columns=columns, rows=rows))
-        caught = raised(DataError, "do not lie as its drawing numbers them", detect, session)
-        assert "Compare columns, rows and the order" in caught.next_step
+        stated = f"columns = {target.columns} and rows = {target.rows}"
+        caught = raised(DataError, f"lie as on a board with {stated}, and ", detect, session)
+        assert f"Write {stated} in the board's .toml" in caught.next_step
     _, session = seen(CHARUCO)
     table = session.corner_table
     by_column = table.points % 5 * 8 + table.points // 5
+    everywhere = replace(session, corner_table=replace(table, points=by_column))
+    caught = raised(DataError, "do not lie as its drawing numbers them", detect, everywhere)
+    assert "Compare columns, rows and the order" in caught.next_step
     points = np.where(table.views == 2, by_column, table.points)
     (rejection,) = detect(replace(session, corner_table=replace(table, points=points))).rejections
     assert rejection.view == 2
     assert "do not lie as the target's drawing numbers them" in rejection.reason
+
+
+@pytest.mark.parametrize("kind", ["aprilgrid", "gridboard"])
+def test_tags_of_another_spacing_are_named(kind):
+    """Of 32 mm, 9.6 mm apart: 0.3 of a side, where 0.28 is stated, and 1.9 % in a scale."""
+    described = {"kind": kind, "columns": 6, "rows": 4, "size_m": 0.032, "spacing": 0.3}
+    target = target_from_document({**described, "dictionary": "DICT_APRILTAG_36h11"}, "tags")
+    session = seen(target)[1]
+    detect(session)
+    for spacing in (0.28, 0.32):
+        other = replace(session, target=replace(target, spacing=spacing))
+        caught = raised(
+            DataError, f"spacing = 0.3, and tags has spacing = {spacing}", detect, other
+        )
+        assert "Write spacing = 0.3" in caught.next_step
 
 
 def test_one_image_of_two_targets_is_two_views_and_rows_name_their_targets(tmp_path):

@@ -18,7 +18,7 @@ from visioncal.core.documents.toml import DocumentTable, find_described, read_to
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import apply, compose
-from visioncal.core.types import FloatArray, IntArray, Target
+from visioncal.core.types import Corners, FloatArray, IntArray, Target
 from visioncal.vision.boards import KINDS, kind_of
 
 # Edges of a unit box as one line strip.
@@ -187,6 +187,11 @@ def first_corners(targets: Sequence[Target]) -> IntArray:
     """Indices (b,) of the targets' first corners in the concatenation of all corners."""
     counts = [len(corner_positions(target)) for target in targets]
     return np.cumsum([0, *counts], dtype=np.int64)[:-1]
+
+
+def otherwise(target: Target, corners: Sequence[Corners]) -> dict[str, object]:
+    """What a detector's corners contradict in a target's description, by key, as it should be."""
+    return kind_of(target).otherwise(target, [at.ids for at in corners], [at.px for at in corners])
 
 
 def is_seen_in_part(target: Target) -> bool:

@@ -5,18 +5,25 @@ under a tenth of the corners' spread. Numbers of another board leave nearly all 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 
 import cv2
 import numpy as np
+import tomli_w
 
+from visioncal.calibration.stages.other_board import OtherBoardError, board_correction
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray, Mask, Rejection, Target
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.poses import FEWEST_CORNERS, determines_pose
 from visioncal.session import Session, View
-from visioncal.vision.targets import corner_positions, point_numbers
+from visioncal.vision.targets import corner_positions, otherwise, point_numbers
 
 # Largest homography residual as a share of the corners' spread.
 _MOST_LEFT = 0.3
+# Such a share of a board with the right counts, and columns and rows that are tried.
+_LIKE, _MOST_COUNT = 0.05, 41
 # Distance outside the image from which on corners are none, as a share of its size.
 _OUTSIDE = 0.1
 
@@ -54,7 +61,7 @@ def usable_corners(
         mine = [corners[view.number] for view in views if session.board_of(view) == name]
         usable |= {at.view: _usable(at, target, outside[at.view], resolution) for at in mine}
         numbered = [at for at in mine if isinstance(usable[at.view], Corners)]
-        for view in _misnumbered(numbered, target):
+        for view in _misnumbered(session, name, numbered):
             usable[view] = Rejection(
                 view, "its corners in corners.csv do not lie as the target's drawing numbers them"
             )
@@ -91,13 +98,30 @@ def lack_of_corners(corners: Corners, target: Target, needed: int) -> str:
     return ""
 
 
-def _misnumbered(views: Sequence[Corners], target: Target) -> list[int]:
+def _misnumbered(session: Session, name: str, views: Sequence[Corners]) -> list[int]:
     """Views whose corners contradict the numbering of the target's drawing."""
+    target = session.boards[name]
     points = corner_positions(target)
-    if np.ptp(points[:, 2]) > 0.0:
+    if np.ptp(points[:, 2]) > 0.0 or not views:
         return []
     wrong = [at.view for at in views if _residual(points[at.ids, :2], at.px) > _MOST_LEFT]
-    if 2 * len(wrong) > len(views):
+    is_other = 2 * len(wrong) > len(views)
+    if figures := _counts(target, views) if is_other else otherwise(target, views):
+        named = " and ".join(tomli_w.dumps(figures).splitlines())
+        words, command = board_correction(session, name, named)
+        step = Remedy(f"{words[0].upper()}{words[1:]}, or name another target.", command)
+        of_inner = target.kind == "checkerboard" and "columns" in figures
+        stated = " and ".join(f"{key} = {getattr(target, key):g}" for key in figures)
+        raise OtherBoardError.of(
+            Finding(
+                "other_board",
+                f"The corners of corners.csv lie as on a board with {named}, and {target.name} has "
+                f"{stated}{', which count inner corners, not squares' * of_inner}.",
+                step,
+                tuple(at.view for at in views),
+            )
+        )
+    if is_other:
         raise DataError(
             f"target {target.name!r}: in {len(wrong)} of {len(views)} views the corners of "
             "corners.csv do not lie as its drawing numbers them: the drawing is of another board, "
@@ -106,6 +130,19 @@ def _misnumbered(views: Sequence[Corners], target: Target) -> list[int]:
             next_step="Compare columns, rows and the order of the points with the detector's.",
         )
     return wrong
+
+
+def _counts(target: Target, views: Sequence[Corners]) -> dict[str, object]:
+    """Columns and rows by which corners lie as they are numbered row by row; empty without any."""
+    if target.is_rig or not target.columns:
+        return {}
+    largest, some = max(int(at.ids.max()) for at in views), views[:: len(views) // 3 + 1]
+    for columns, rows in product(range(2, _MOST_COUNT), repeat=2):
+        points = corner_positions(replace(target, columns=columns, rows=rows))[:, :2]
+        enough = largest < len(points) <= largest + len(points) // rows
+        if enough and all(_residual(points[at.ids], at.px) < _LIKE for at in some):
+            return {"columns": columns, "rows": rows}
+    return {}
 
 
 def _residual(points: FloatArray, px: FloatArray) -> float:

@@ -32,6 +32,8 @@ from visioncal.vision.boards.layout import (
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
 from visioncal.vision.boards.template import SQUARE
 
+# Error of a print's gaps, as a share of a side.
+_TRUE = 0.01
 # Dark modules around bits, at most; the gap between markers that detectors need, at most, and
 # usually, as shares of their side.
 _MOST_BORDER, _LEAST_SPACING, _MOST_SPACING, _USUAL_SPACING = 2, 0.04, 4.0, 0.3
@@ -142,7 +144,7 @@ class GridBoard(BoardKind):
         """Corners of the markers in a (h, w) grey image, or why there are none."""
         seen = self.located(image, target)
         if isinstance(seen, DetectedCorners) and (
-            why := self.other_spacing(target, *self.whole(target, seen))
+            why := self.other_spacing(target, *self.whole(target, seen.ids, seen.px))
         ):
             return NotFound(why, misfit=True)
         return seen
@@ -190,11 +192,24 @@ class GridBoard(BoardKind):
             f"spacing = {target.spacing:g}{unit}"
         )
 
-    def whole(self, target: Target, seen: DetectedCorners) -> tuple[FloatArray, FloatArray]:
+    def whole(self, target: Target, ids: IntArray, px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(t, 2) columns and rows of tags that are seen whole, and their (t, 4, 2) corners [px]."""
-        numbers, counts = np.unique(seen.ids // 4, return_counts=True)
-        of_whole = np.isin(seen.ids // 4, numbers[counts == 4])
-        return self.page_places(target, numbers[counts == 4]), seen.px[of_whole].reshape(-1, 4, 2)
+        order = np.argsort(ids, kind="stable")
+        ids, px = ids[order], px[order]
+        numbers, counts = np.unique(ids // 4, return_counts=True)
+        of_whole = np.isin(ids // 4, numbers[counts == 4])
+        return self.page_places(target, numbers[counts == 4]), px[of_whole].reshape(-1, 4, 2)
+
+    def otherwise(
+        self, target: Target, ids: Sequence[IntArray], px: Sequence[FloatArray]
+    ) -> dict[str, object]:
+        """Another spacing, by the gaps between neighbours that are seen whole."""
+        seen = [self.whole(target, *view) for view in zip(ids, px, strict=True)]
+        share, scatter = side_share(*zip(*seen, strict=True))
+        spacing = 1.0 / share - 1.0
+        # A print's gaps are true to a hundredth of a side, unless corners scatter by more.
+        is_other = abs(spacing - target.spacing) > max(_TRUE, scatter)
+        return {"spacing": round(spacing, 2)} if is_other else {}
 
 
 def foreign(others: Sequence[int]) -> NotFound:

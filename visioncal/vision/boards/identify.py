@@ -218,7 +218,7 @@ class _Look:
                 return
             notes.insert(0, f"Its corners are not found in this image: {seen.reason}.")
         elif isinstance(kind, GridBoard):
-            refined, _ = side_share(*([part] for part in kind.whole(board, seen)))
+            refined, _ = side_share(*([part] for part in kind.whole(board, seen.ids, seen.px)))
             board = replace(board, spacing=round(1.0 / refined - 1.0, 3)) if refined > 0 else board
         yield Identity(
             board,

@@ -177,6 +177,19 @@ class BoardKind(ABC):
             diameter_m=factor * target.diameter_m,
         )
 
+    def otherwise(
+        self, target: Target, ids: Sequence[IntArray], px: Sequence[FloatArray]
+    ) -> dict[str, object]:
+        """What a detector's corners contradict in a description, by key, as it should be.
+
+        Args:
+            target: The description.
+            ids: (n,) numbers of the corners in each image.
+            px: (n, 2) these corners [px].
+        """
+        del target, ids, px
+        return {}
+
     def extent_m(self, target: Target) -> tuple[FloatArray, FloatArray]:
         """Low and high x, y of the printed pattern in the target's frame, (2,) each [m]."""
         places = self.corners(target)[:, :2]
