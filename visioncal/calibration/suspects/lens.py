@@ -306,24 +306,41 @@ def _of_fisheye(run: RunState, name: str, of: str) -> Finding | None:
         return None
     if not look.lens.estimated or look.table.model == "fisheye":
         return None
-    corners = {view: px for view, px in look.corners.items() if view in run.used}
     targets = tuple(run.session.boards.values())
-    try:
-        taken_px, fisheye_px = (
-            estimate_intrinsics(corners, targets, look.resolution, model).sigma_px
-            for model in (look.table.model, "fisheye")
-        )
-    except VisioncalError:
-        return None
-    gained_px = np.sqrt(max(taken_px**2 - fisheye_px**2, 0.0))
-    if fisheye_px * _BETTER > taken_px or gained_px < _LEAST_MOVE_PX:
-        return None
-    return Finding(
-        "lens_model",
-        f"{of} is of another model: as a fisheye lens it leaves corners {figure(fisheye_px)} px "
-        f"from any pose of the board, and {figure(taken_px)} px as the model {look.table.model}.",
-        Remedy('In session.toml, write model = "fisheye" in [camera].', CALIBRATE),
-    )
+    used = {view: px for view, px in look.corners.items() if view in run.used}
+    # A wide view that another model cannot explain is left out, and would tell the most.
+    for corners in (used, look.corners)[: 1 + (len(used) < len(look.corners))]:
+        try:
+            taken, fisheye = (
+                estimate_intrinsics(corners, targets, look.resolution, model)
+                for model in (look.table.model, "fisheye")
+            )
+        except VisioncalError:
+            continue
+        taken_px, fisheye_px = taken.sigma_px, fisheye.sigma_px
+        gained_px = np.sqrt(max(taken_px**2 - fisheye_px**2, 0.0))
+        px = np.concatenate([seen.px for seen in corners.values()])
+        is_better = fisheye_px * _BETTER <= taken_px and gained_px >= _LEAST_MOVE_PX
+        if is_better and _bends(fisheye.camera, px):
+            return Finding(
+                "lens_model",
+                f"{of} is of another model: as a fisheye lens it leaves corners "
+                f"{figure(fisheye_px)} px from any pose of the board, and {figure(taken_px)} px as "
+                f"the model {look.table.model}.",
+                Remedy('In session.toml, write model = "fisheye" in [camera].', CALIBRATE),
+            )
+    return None
+
+
+def _bends(lens: Camera, px: FloatArray) -> bool:
+    """Whether a fisheye lens is nearer to one than to a lens that keeps straight lines straight.
+
+    At the farthest of (n, 2) pixels: its radius is that of the angle, or that of its tangent.
+    """
+    off = (px - lens.matrix[2:]) / lens.matrix[:2]
+    farthest = int(np.argmax(np.sum(off**2, axis=1)))
+    tangent = float(np.linalg.norm(normalise(lens, px[[farthest]])))
+    return bool(np.linalg.norm(off[farthest]) < (np.arctan(tangent) + tangent) / 2.0)
 
 
 # A held lens that the corners contradict looks like a board of another size or shape, and, by the
