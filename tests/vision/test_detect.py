@@ -29,7 +29,7 @@ from visioncal.simulation.render import light_on
 from visioncal.vision.boards import DetectedCorners, NotFound, find_target, kind_of
 from visioncal.vision.boards.charuco import charuco_board
 from visioncal.vision.boards.identify import identify
-from visioncal.vision.boards.imaging import blur_at_corners, decode_image
+from visioncal.vision.boards.imaging import blur_at_corners, decode_image, poor_image_reason
 from visioncal.vision.targets import (
     corner_positions,
     load_target,
@@ -294,6 +294,20 @@ def test_blur_is_measured_in_pixels(charuco):
         blurred = cv2.GaussianBlur(images[0], (0, 0), sigma)
         # Variances add; pixels, noise and oblique edges leave the measure good to a sixth.
         assert blur_at_corners(blurred, corners) == pytest.approx(np.hypot(before, sigma), rel=0.17)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 30.0, 45.0])
+def test_motion_is_seen_along_which_half_of_the_edges_stay_sharp(turn_deg):
+    """A motion of 24 px along rows leaves edges of 24 / sqrt(12) px, at any turn of the board."""
+    squares = np.kron(np.indices((8, 8)).sum(axis=0) % 2, np.full((40, 40), 200)) + 25
+    turn = cv2.getRotationMatrix2D((160, 160), turn_deg, 1.0)
+    sharp = cv2.warpAffine(squares.astype(np.uint8), turn, (320, 320), flags=cv2.INTER_AREA)
+    sharp = cv2.GaussianBlur(sharp, (0, 0), 0.7)
+    assert poor_image_reason(sharp, 4.0) == ""
+    assert "blurred" in poor_image_reason(cv2.blur(sharp, (24, 1)), 4.0)
+    assert "along one direction" in poor_image_reason(
+        cv2.blur(squares.astype(np.uint8), (24, 1)), 4.0
+    )
 
 
 SHIPPED = {name: load_target(name) for name in target_names()}

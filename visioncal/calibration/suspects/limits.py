@@ -12,7 +12,15 @@ from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.calibration.suspects.suspect import UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg, sigma_words
-from visioncal.core.verdict import LEAST_NEED_MM, REVIEW, Finding, Remedy, look_at, without
+from visioncal.core.verdict import (
+    CALIBRATE,
+    LEAST_NEED_MM,
+    REVIEW,
+    Finding,
+    Remedy,
+    look_at,
+    without,
+)
 from visioncal.estimation.arm import LEVER_M
 from visioncal.results import Rms, ViewResult
 
@@ -296,14 +304,18 @@ def _lost_views(sensor: Sensor) -> Iterator[Finding]:
     others = [rejection for rejection in sensor.lost if rejection.view not in sensor.outliers]
     if share <= check or not others:
         return
+    step = Remedy(
+        "Correct the first of them and those like it, or repeat what is missing.",
+        look_at(others[0].view),
+    )
+    if 2 * sum("the image is blurred" in other.reason for other in others) > len(others):
+        words = "Focus, and let the arm stand still before each image; these are read by --dense."
+        step = Remedy(words, f"{CALIBRATE} --dense")
     yield Finding(
         "lost_views",
         f"{count} of {total} views {'is' if count == 1 else 'are'} not used. The first but for "
         f"outliers: view {others[0].view}, {others[0].reason}.",
-        Remedy(
-            "Correct the first of them and those like it, or repeat what is missing.",
-            look_at(others[0].view),
-        ),
+        step,
         tuple(rejection.view for rejection in sensor.lost),
         is_fatal=share > bad,
     )
