@@ -159,14 +159,15 @@ def _need_words(findings: Findings, met: NeedMet) -> str:
 
 
 def _agreement(findings: Findings, *, is_enough: bool) -> Finding:
-    used = sum(view.used for view in findings.views)
+    total, used = len(findings.views), sum(view.used for view in findings.views)
+    of_total = f" of {total}" if used < total else ""
     worst_known = "".join(
         f"; {worst.words}, its least certain direction, is known to {figure(1e3 * worst.sigma)} mm"
         for worst in findings.worst[:1]
     )
     return Finding(
         AGREEMENT,
-        f"All {used} used views agree. Checked with views that were not used in the fit: "
+        f"All {used} used views{of_total} agree. Checked with views that were not used in the fit: "
         f"{findings.held_out.words} (rms){worst_known}.",
         findings.use if is_enough else None,
     )
