@@ -51,8 +51,9 @@ _RULED_OUT = float(np.log(CheckLimits.ruled_out))
 # Most stops after which a frame may have been moved, and a lens.
 _STEPS, _ZOOMS = 12, 60
 # Most stops at which images may move while they are read, of four unknowns each, and what counts
-# between their first row and their last [px]: below, other errors of images look so.
-_MOVING, _LEAST_PX = 120, 0.1
+# between their first row and their last [px]: below, other errors of images look so; and its size
+# at most, over that which each image shows by itself.
+_MOVING, _LEAST_PX, _SHOWN = 120, 0.1, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +161,9 @@ def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
             score, bounds = of_rows(fit, pairs, effect.typical), effect.size
             size, gain = score.best(np.ones(len(score.pull)), bounds.low, bounds.high)
             if size * float(np.mean(effect.lens.matrix[:2])) > _LEAST_PX:
-                yield Candidate(gain, starting_at(random_effect(effect), size), effect)
+                # Tilts of a plane look much like it: beyond, arms' errors would be taken for it.
+                member = starting_at(random_effect(effect), size, _SHOWN * size)
+                yield Candidate(gain, member, effect)
 
 
 def of_distances(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
@@ -236,10 +239,12 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
         yield Candidate(gain - choices, starting_at(random_effect(effect), size), effect)
 
 
-def starting_at(member: Vector, size: float) -> Vector:
-    """An unknown whose sizes start at a value."""
+def starting_at(member: Vector, size: float, most: float = np.inf) -> Vector:
+    """An unknown whose sizes start at a value, and are at most another."""
     priors = tuple(
-        replace(prior, size=replace(prior.size, start=size)) if prior.size else prior
+        replace(prior, size=replace(prior.size, start=size, high=min(prior.size.high, most)))
+        if prior.size
+        else prior
         for prior in member.priors
     )
     return replace(member, priors=priors)
