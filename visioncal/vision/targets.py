@@ -190,7 +190,7 @@ def first_corners(targets: Sequence[Target]) -> IntArray:
 
 
 def otherwise(target: Target, corners: Sequence[Corners]) -> dict[str, object]:
-    """What a detector's corners contradict in a target's description, by key, as it should be."""
+    """Keys of a description that a detector's corners contradict, as they should be."""
     return kind_of(target).otherwise(target, [at.ids for at in corners], [at.px for at in corners])
 
 

@@ -180,7 +180,7 @@ class BoardKind(ABC):
     def otherwise(
         self, target: Target, ids: Sequence[IntArray], px: Sequence[FloatArray]
     ) -> dict[str, object]:
-        """What a detector's corners contradict in a description, by key, as it should be.
+        """Keys of a description that a detector's corners contradict, as they should be.
 
         Args:
             target: The description.
