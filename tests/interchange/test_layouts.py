@@ -1348,6 +1348,67 @@ def test_a_mount_that_is_not_as_stated_is_said_before_a_form_is_asked_for(tmp_pa
     assert f"Say --mount {session.mount}" in refused
 
 
+def test_moves_of_a_urscript_are_poses_of_the_tool_that_it_sets(tmp_path):
+    """In a text of any ending; a named pose, one by a literal, and moves of joints between."""
+    poses, _, _ = world()
+    numbers = [[*p[:3, 3], *Rotation.from_matrix(p[:3, :3]).as_rotvec()] for p in poses]
+    literals = [f"p[{', '.join(map(repr, map(float, each)))}]" for each in numbers]
+    lines = ["def Program():", "  Tool = p[0, 0, 0.215, 1.2092, -1.2092, 1.2092]", "  Weight = 3"]
+    lines += [
+        "  set_tcp(Tool)",
+        f"  first = {literals[0]}",
+        "  movej([0.7, -1.5, 1.5, -1.5, -1.5, 0])",
+    ]
+    for at in ("first", *literals[1:]):
+        lines += [f"  movel({at}, a=3.1416, v=0.5, r=0)", '  popup("wait", blocking=True)']
+    write(
+        tmp_path / "in/program.txt",
+        "\n".join([*lines, "  movej([0.7, -1.5, 1.5, -1.5, -1.5, 0])", "end"]),
+    )
+    shoot(tmp_path / "in", "{}.png")
+    foreign = read_foreign(tmp_path / "in", ImportOptions(mount="eye-in-hand"))
+    np.testing.assert_allclose(foreign.robot.poses(), poses, atol=1e-12)
+    assert foreign.form == "ur"
+    assert [image.stem for image in foreign.images] == [*map(str, range(len(poses)))]
+    assert any("a tool whose tip is 215 mm from the flange" in note for note in foreign.notes)
+
+
+def test_files_that_are_each_a_recording_are_named_at_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    poses, _, session = world()
+    rows = [
+        {"robot_pose": pose.tolist(), "target_pose": view.cam_from_target().as_matrix().tolist()}
+        for pose, view in zip(poses, session.views, strict=True)
+    ]
+    for name, count in (("merged", 9), ("with_filter", 7), ("plain", 8)):
+        write(tmp_path / f"my runs/{name}.json", json.dumps(rows[:count]))
+    for at in range(9):
+        write(tmp_path / f"my runs/code/file{'abcdefghi'[at]}.h", "int main;")
+    followed = follow("convert", "my runs", "out", "--mount", session.mount)
+    refused = followed.runs[0].refused().err
+    assert "3 files that are each a recording: merged.json (9 rows)" in refused
+    assert len(followed.runs) == 2
+    assert len(Session.load(tmp_path / "out").views) == 9
+    # Of code a count suffices.
+    listed = describe(tmp_path / "my runs").words()
+    assert "3 other kinds not read" in listed
+    assert listed.count(": not read") == 6
+
+
+def test_joints_of_a_gripper_and_settings_of_each_row_are_none_of_the_arm(tmp_path):
+    """Nine joints of an arm of seven with two fingers, beside the shape of each image."""
+    rng = np.random.default_rng(0)
+    q = np.hstack([rng.uniform(-1.5, -0.5, (9, 7)), np.full((9, 2), 0.04)])
+    for at, row in enumerate(q.tolist()):
+        record = {"joint_values": row, "image_shape": [720, 1280, 3]}
+        write(tmp_path / f"in/view_{at}.json", json.dumps(record))
+    shoot(tmp_path / "in", "view_{}.png")
+    foreign = read_foreign(tmp_path / "in", ImportOptions(mount="eye-in-hand", robot_model="panda"))
+    np.testing.assert_allclose(foreign.joints_rad, q[:, :7])
+    assert "meas_x_m" not in foreign.columns
+    assert any("Of 9 joint angles a row the first 7 are taken" in note for note in foreign.notes)
+
+
 @pytest.mark.parametrize("is_printed", [False, True])
 def test_joints_are_in_the_order_of_the_arm_s_names(tmp_path, is_printed):
     """ROS writes the joints of a message in the order of the alphabet."""

@@ -281,6 +281,23 @@ def test_kalibrs_own_file_describes_a_board(tmp_path):
     assert Session.load(tmp_path / "copy").target == replace(read, name="april_6x4")
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "num_X: 9\nnum_Y: 6\nlen_squares: 0.04\nlen_markers: 0.035\nmarkers_dictionary: 2\n",
+        "board_squaresX: 9\nboard_squaresY: 6\nboard_square_size: 40\nboard_marker_size: 35.0\n"
+        "aruco_dictionary: DICT_4X4_250\nanimate: false\n",
+    ],
+)
+def test_the_settings_of_a_program_describe_a_charuco_board(tmp_path, text):
+    """Numbers are OpenCV's of its dictionaries; lengths from one on are millimetres."""
+    (tmp_path / "board.yaml").write_text(text)
+    stated = target_named("charuco_9x6_40mm_35mm_DICT_4X4_250")
+    assert replace(load_target(tmp_path / "board.yaml"), name=stated.name) == stated
+    (tmp_path / "board.yaml").write_text(text.replace("len_squares", "len").replace("e_size", "e"))
+    raised(DataError, "target_type", load_target, tmp_path / "board.yaml")
+
+
 def test_the_grid_of_a_kalibr_target_in_one_word():
     expected = {"kind": "aprilgrid", "columns": 6, "rows": 5, "size_m": 0.088, "spacing": 0.3}
     assert read_target_description("aprilgrid_6x5_88mm_0.3") == expected

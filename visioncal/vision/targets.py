@@ -6,6 +6,7 @@ of the tag at the upper left, for a single marker its centre. x runs along colum
 (down the printed page), and z into the board. A rig of points has the frame of its table.
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +21,7 @@ from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import apply, compose
 from visioncal.core.types import Corners, FloatArray, IntArray, Target
 from visioncal.vision.boards import KINDS, kind_of
+from visioncal.vision.boards.kind import dictionary_numbered
 
 # Edges of a unit box as one line strip.
 _BOX = np.array(
@@ -91,12 +93,47 @@ def read_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[st
     return target_from_document(document, path.stem), document
 
 
+# Keys of ChArUco boards in programs' settings: `num_X`, `board_squaresX`, `len_squares`.
+_IN_SETTINGS = {
+    "columns": r"(?:.*(?:num|squares|count|n|size)_?x|columns|cols)",
+    "rows": r"(?:.*(?:num|squares|count|n|size)_?y|rows)",
+    "square_m": r"(?!.*[xy]$).*(?:(?:len|size|side).*square|square.*(?:len|size|side)).*",
+    "marker_m": r".*(?:(?:len|size|side).*marker|marker.*(?:len|size|side)).*",
+    "dictionary": r".*dict(?:ionary)?(?:_?id|_?name)?",
+}
+
+
+def _of_settings(stated: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The content of a `.toml` of a ChArUco board by a program's settings; None of others.
+
+    Lengths are in metres, from one on in millimetres; a number is a dictionary of OpenCV's.
+    """
+    found: dict[str, Any] = {"kind": "charuco"}
+    for own, pattern in _IN_SETTINGS.items():
+        keys = [key for key in stated if re.fullmatch(pattern, str(key), re.IGNORECASE)]
+        if len(keys) != 1:
+            return None
+        value = stated[keys[0]]
+        if own.endswith("_m") and isinstance(value, int | float):
+            value = value if value < 1.0 else value / 1e3
+        if own == "dictionary" and isinstance(value, int):
+            value = dictionary_numbered(value)
+        found[own] = value
+    return found
+
+
 def _of_kalibr(path: Path) -> dict[str, Any]:
-    """The content of a `.toml` by Kalibr's target `.yaml` (its wiki, "Calibration targets")."""
+    """The content of a `.toml` by Kalibr's target `.yaml` (its wiki, "Calibration targets").
+
+    Or by the settings of a program.
+    """
     # Imported here, as few boards are described so.
     from visioncal.core.documents.structured import read_yaml
 
     stated = read_yaml(path)
+    settings = _of_settings(stated) if isinstance(stated, Mapping) else None
+    if settings is not None:
+        return settings
     table = DocumentTable(stated if isinstance(stated, Mapping) else {}, str(path))
     kind = table.choice("target_type", ("aprilgrid", "checkerboard"))
     if kind == "aprilgrid":

@@ -42,9 +42,19 @@ from visioncal.interchange.formats.foreign import (
 from visioncal.interchange.formats.joints import joint_names, joints_from
 from visioncal.interchange.formats.poses import columns_named, makers_of, pose_names, poses_from
 from visioncal.interchange.formats.reading import read_fields
-from visioncal.interchange.formats.sources import describe, proposed, tables_apart, unknown
+from visioncal.interchange.formats.sources import (
+    describe,
+    proposed,
+    several_recordings,
+    tables_apart,
+    unknown,
+)
+from visioncal.robot import Robot
+from visioncal.robot.files import read_robot_document
 from visioncal.session.columns import INSTRUMENT_POSITION
 
+# Most joints of a gripper that stand behind the arm's in one list.
+_FINGERS = 2
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
 
 
@@ -56,6 +66,8 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     source = describe(path, requested.robot.form)
     if path.is_file() and source.parts[0].fault:
         raise source.parts[0].fault
+    if several := several_recordings(source, requested):
+        raise several
     is_beside = path.is_file() and requested.target and not requested.images
     images = images_of(path.parent) if is_beside else source.images
     lens, notes = (None, ()) if requested.intrinsics else source.lens()
@@ -126,6 +138,7 @@ def _recordings(
     poses: dict[Side, PoseNumbers] = {"robot": PoseNumbers.empty(fields.places)}
     unstated: dict[Side, Unstated] = {}
     joints, notes = _joint_angles(fields, joint_fields, requested, bool(names["robot"]))
+    notes += fields.notes
     for whose, of_side in names.items():
         if of_side:
             asked = requested.robot if whose == "robot" else requested.camera
@@ -223,6 +236,13 @@ def _joint_angles(
         if requested.joints or not has_poses:
             raise
         return None, [f"The joint angles are left aside: {error.message}"]
+    if requested.robot_model is None or len(names) > 1:
+        return joints, [*notes]
+    robot = Robot.from_document(read_robot_document(requested.robot_model))
+    count, arm = joints.shape[1], robot.joint_count
+    if arm < count <= arm + _FINGERS:
+        note = f"Of {count} joint angles a row the first {arm} are taken: {robot.name} has {arm}, "
+        return joints[:, :arm], [*notes, f"{note}and others may be those of a gripper."]
     return joints, [*notes]
 
 
@@ -233,7 +253,11 @@ def _readings(
     arrays = [
         (name,)
         for name, numbers in fields.numbers.items()
-        if numbers.ndim > 1 and numbers[0].size == 3 and name not in used
+        if numbers.ndim > 1
+        and numbers[0].size == 3
+        and name not in used
+        # The same numbers in all rows, as the shape of images, are no readings.
+        and bool((numbers != numbers[0]).any())
     ]
     names = columns_named(fields, ("x", "y", "z")) or (arrays[0] if len(arrays) == 1 else ())
     if not (names := points or names):

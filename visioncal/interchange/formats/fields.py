@@ -80,6 +80,7 @@ class Fields:
     # Faults of fields whose rows differ in shape, by name.
     shape_errors: Mapping[str, "ShapeFault"] = field(default_factory=dict)
     form: str = ""  # A name among `POSE_FORMS` where the rows state the form of the robot's poses.
+    notes: tuple[str, ...] = ()  # Remarks on the source, for the user.
 
     def __len__(self) -> int:
         return len(self.places)
@@ -87,7 +88,7 @@ class Fields:
     def rows(self, chosen: Sequence[int]) -> Self:
         """The same values for some rows only."""
         return replace(
-            chosen_rows(self, list(chosen)),
+            chosen_rows(self, list(chosen), "notes"),
             numbers={name: number[list(chosen)] for name, number in self.numbers.items()},
             texts={name: tuple(text[at] for at in chosen) for name, text in self.texts.items()},
         )

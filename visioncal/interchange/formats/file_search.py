@@ -1,6 +1,7 @@
 """Finds files: those of a source in groups of one kind, and the image of each row."""
 
 import re
+import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -367,7 +368,8 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         raise DataError(
             f"Each row has several images: {some_of([group.listed() for group in rivals])}.",
             culprits=[group.label for group in rivals],
-            next_step=f"Say --images {rivals[0].files[0]}, or the first file of the others.",
+            next_step=f"Say --images {shlex.quote(str(rivals[0].files[0]))}, or the first file of "
+            "the others.",
         )
     (chosen, match), how = ranked[0], ranked[0][1].how
     images = chosen.taken(match.rows)

@@ -14,6 +14,8 @@ from visioncal.core.conventions import write_pose
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
+from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.number_format import figure
 from visioncal.interchange.formats.fields import POSE_SIZES, Fields, fields_of_records, separate
 
 # Robots' programs, of which the poses alone are read.
@@ -30,6 +32,10 @@ COMMENTS = ("#", "%", "//", "!")
 # The name of a taught point: `DECL E6POS XP1={`, `CONST robtarget p10:=`, `P[1]{`, `P1: X ..`.
 _POINT = re.compile(r"([\w\s]++(?:\[\w++)?+)\]?+\s*+[:={]")
 _HEADED = re.compile(r"\s*([^\d\W][^:=]*?)\s*[:=]\s*(.*?)\s*")
+# A pose of a URScript, a name that is assigned one, and a move.
+_LITERAL = r"p\[[^\]\[]*\]"
+_ASSIGNED = re.compile(rf"\b(\w+)[ \t]*=[ \t]*({_LITERAL})")
+_MOVED = re.compile(rf"\bmove[jlpc]\s*\(\s*(?:get_inverse_kin\s*\(\s*)?({_LITERAL}|\w+)")
 # A list within a line of text.
 _INNER = re.compile(r"[\[(]([^\[\]()]*)[\])]")
 # Lines with their places.
@@ -188,6 +194,44 @@ def declared_poses(text: str, path: Path) -> list[Fields]:
             fields = fields_of_records(records, places, path.stem, path.parent)
             found.append(replace(fields, stems=names))
     return found
+
+
+def script_poses(text: str, path: Path) -> Fields | None:
+    """Poses to which a URScript moves, in its order; None of other texts, or of fewer than three.
+
+    They are literals p[x, y, z, rx, ry, rz], or names that were assigned one.
+    """
+    if not re.search(r"^\s*def \w+\(.*\)\s*:", text, re.MULTILINE):
+        return None
+    assigned = {match[1]: match[2] for match in _ASSIGNED.finditer(text)}
+    records, places, names = list[dict[str, object]](), list[str](), list[str]()
+    for place, line in placed(text, path, COMMENTS):
+        for match in _MOVED.finditer(line):
+            numbers = [*separate(assigned.get(match[1], match[1]).lstrip("p"))]
+            if len(numbers) == 6:
+                records.append(dict(zip(_NAMES[6], map(np.float64, numbers), strict=True)))
+                places.append(place)
+                names.append(match[1])
+    if len(records) < FEWEST_VIEWS:
+        return None
+    fields = fields_of_records(records, places, path.stem, path.parent)
+    is_named = len({*names}) == len(names) and {*names} <= {*assigned}
+    stems = tuple(names) if is_named else ()
+    return replace(fields, form="ur", stems=stems)
+
+
+def tool_note(text: str, path: Path) -> tuple[str, ...]:
+    """A note on the tool that a URScript sets, of which its poses are; empty where it sets none."""
+    assigned = {match[1]: match[2] for match in _ASSIGNED.finditer(text)}
+    for match in re.finditer(rf"\bset_tcp\s*\(\s*({_LITERAL}|\w+)", text):
+        numbers = np.array([*separate(assigned.get(match[1], match[1]).lstrip("p"))])
+        if len(numbers) == 6 and numbers.any():
+            away = figure(1e3 * float(np.linalg.norm(numbers[:3])))
+            return (
+                f"{path.name} sets a tool whose tip is {away} mm from the flange (set_tcp): its "
+                "poses are those of the tip, and so is what the result calls the flange.",
+            )
+    return ()
 
 
 def pendant_poses(text: str, path: Path, form: str | None) -> Fields | None:

@@ -50,6 +50,8 @@ from visioncal.interchange.formats.lines import (
     declared_poses,
     pendant_poses,
     placed,
+    script_poses,
+    tool_note,
 )
 from visioncal.session.columns import pose_row
 
@@ -247,8 +249,9 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
             return rows_of_document(literals, path)
     if declared := () if is_program or "=" not in text else declared_poses(text, path):
         return declared
-    if lines := pendant_poses(text, path, form if form in POSE_FORMS else None):
-        return [lines]
+    moves = None if is_program else script_poses(text, path)
+    if lines := moves or pendant_poses(text, path, form if form in POSE_FORMS else None):
+        return [replace(lines, notes=tool_note(text, path))]
     try:
         table = read_table(path, text)
     except DataError:

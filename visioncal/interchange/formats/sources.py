@@ -46,6 +46,8 @@ from visioncal.interchange.formats.reading import (
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 
+# Files without poses that are listed one by one.
+_LISTED = 6
 # Readings of one source that are tested, and names of rows that are a robot's.
 _MOST_READINGS, _NAMED = 16, re.compile("pose|robot|arm", re.IGNORECASE)
 _OF_ROBOT = re.compile("robot|arm|gripper|flange|tcp|hand", re.IGNORECASE)
@@ -89,12 +91,20 @@ class Source:
     def words(self) -> str:
         """The text form: a line a kind of file, and one each for its fields."""
         lines = [f"{self.path} holds {counted(len(self.parts), 'kind')} of files:"]
-        for part in self.parts:
+        read = [part for part in self.parts if part.rows or part.lenses or part.group.is_images]
+        others = [part for part in self.parts if part not in read]
+        # Of a repository's own code a count suffices.
+        listed = sorted(others, key=lambda part: part.fault is None)[:_LISTED]
+        for part in [part for part in self.parts if part in read or part in listed]:
             lines.append(f"  {part.group.listed()}: {_kind(part)}")
             for fields in part.rows:
                 lines += [f"    {line}" for line in _field_lines(fields)]
             lines += [f"    {place}: looks like a lens" for place in part.lenses]
-        return "\n".join(lines[:60])
+        rest = [part.group.label for part in others if part not in listed]
+        lines = lines[:60]
+        if rest:
+            lines.append(f"  {counted(len(rest), 'other kind')} not read: {some_of(rest, 3)}")
+        return "\n".join(lines)
 
 
 def _kind(part: Part) -> str:
@@ -256,6 +266,31 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         f"{source.words()}\nWhich of these are the robot's poses is not known.",
         culprits=[str(source.path)],
         next_step=step or "Write the poses into a CSV with a header, a row a view.",
+    )
+
+
+def several_recordings(source: Source, requested: ImportOptions) -> DataError | None:
+    """The error of a folder with several files that are each a whole recording; None of others.
+
+    Each has the same fields, with poses of both sides: rows of one are none of another's.
+    """
+    alike: dict[tuple[str, ...], list[tuple[Path, int]]] = {}
+    for part in source.parts:
+        for fields in part.rows if len(part.group.files) == 1 else ():
+            if sum(item.is_named for item in possible_poses(fields)) > 1:
+                own = alike.setdefault(tuple(sorted(fields.numbers)), [])
+                own.append((part.group.files[0], len(fields)))
+    found = max(alike.values(), key=len, default=[])
+    if len(found) < 2:
+        return None
+    first = max(found, key=lambda each: each[1])[0]
+    command = [str(first) if word == str(source.path) else word for word in requested.command]
+    files = [f"{file.name} ({counted(count, 'row')})" for file, count in found]
+    return DataError(
+        f"{source.path} has {len(found)} files that are each a recording: {some_of(files)}.",
+        culprits=[str(file) for file, _ in found],
+        next_step="Convert one of them"
+        + (f":\n{shlex.join(command)}" if requested.command else "."),
     )
 
 

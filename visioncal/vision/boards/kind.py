@@ -303,6 +303,12 @@ def aruco_dictionary(name: str) -> "cv2.aruco.Dictionary":
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
+def dictionary_numbered(number: int) -> str:
+    """Name of a dictionary by OpenCV's number of it; empty where there is none."""
+    names = (name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+    return next((name for name in names if getattr(cv2.aruco, name) == number), "")
+
+
 def marker_cells(dictionary_name: str, marker_id: int, border: int = 1) -> Mask:
     """(n, n) mask of a marker's dark cells, including a border of `border` cells."""
     dictionary = aruco_dictionary(dictionary_name)
