@@ -99,6 +99,12 @@ def test_transforms_come_from_the_rows(folder):
     assert first.joints_rad is None
 
 
+def test_quaternions_of_two_decimals_are_said_to_be_rounded(folder):
+    edit(folder, "views.csv", "0.6,0,0,0.8", "0.61,0,0,0.8")
+    caught = raised(DataError, "norm is 1.006", Session.load, folder)
+    assert "rounded to two decimals, by which a pose turns by up to 0.57 deg" in caught.next_step
+
+
 def test_a_quaternion_is_stored_as_read_and_normalised_in_the_transform(folder):
     edit(folder, "views.csv", "0.6,0,0,0.8", "0.6003,0,0,0.8")
     view = Session.load(folder).views[1]

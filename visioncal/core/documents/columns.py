@@ -203,6 +203,15 @@ def _unit_step(names: Sequence[str], numbers: FloatArray, norms: FloatArray) -> 
         if rest.max() > 10.0 * NORM_TOLERANCE and away < 2.0 * NORM_TOLERANCE:
             which = ", ".join(names[at] for at in chosen)
             return f"Divide {which} by {factor:.6g} in all rows: then all norms are 1."
+    for decimals in (1, 2):
+        off = np.abs(numbers[:, known] - np.round(numbers[:, known], decimals)).max(initial=0.0)
+        # Each of four numbers is off by half of its last digit, at most.
+        if off < 1e-9 and np.abs(norms[known] - 1.0).max(initial=0.0) < 10.0**-decimals:
+            return (
+                f"They are rounded to {'one decimal' if decimals == 1 else 'two decimals'}, by "
+                f"which a pose turns by up to {np.rad2deg(10.0**-decimals):.2g} deg: write the "
+                "robot's poses with six."
+            )
     # Poses by the camera are read in one form alone.
     if names[3] != "qw" or norms.max(initial=0.0, where=known) <= 1.5:
         return ""
