@@ -209,7 +209,7 @@ def _point_errors(
         weights = 1.0 / np.sqrt(np.maximum(ratios, 1.0))
     limit = chi2_limit(_UNSTEADY / len(ratios), 2 * views) / (2 * views)
     wrong = np.flatnonzero((ratios > limit) & (scatter > _LEAST_PX))
-    if len(wrong) and views >= _FEWEST_STEADY:
+    if len(wrong):
         rest = {view: at.take(~np.isin(at.ids, wrong)) for view, at in corners.items()}
         others = _point_errors(target, camera, rest, cam_from_target, is_moving=is_moving)
         if others is None:
@@ -217,6 +217,9 @@ def _point_errors(
         unsteady = np.union1d(others.unsteady, wrong)
         most = max(others.unsteady_px, float(np.sqrt(np.mean(scatter[wrong] ** 2))))
         if len(unsteady) <= len(positions) / 3:
+            # Of few views they are not named, but say nothing of the board either.
+            named = views >= _FEWEST_STEADY
+            unsteady, most = (unsteady, most) if named else (unsteady[:0], 0.0)
             return replace(others, unsteady=unsteady, unsteady_px=most)
     each = stack.sum_by_view(np.einsum("nai,na->ni", rows, left))
     products = each @ each.T
