@@ -1,12 +1,15 @@
 """A lens that was zoomed, refocused, hit or exchanged, or whose pictures are bent otherwise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import LensEffect
+from visioncal.model.effects.effect import LensEffect, Size
+
+# Likelihood ratio of a change that moves corners by pixels: ten noises in each of some views.
+_BY_PIXELS = 400.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +38,11 @@ class LensChanges(LensSteps):
     """The same with the first two coefficients of distortion, as where pictures are rectified."""
 
     kind, count, wider = "lens changes", 5, ""
+
+    @property
+    def size(self) -> Size:
+        """See `Effect`: each picture shows it by pixels, or a lens that gave way is likelier."""
+        return replace(super().size, limit=_BY_PIXELS)
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
