@@ -625,6 +625,18 @@ def test_another_order_of_the_quaternion_is_a_bad_tool(tmp_path):
     assert visioncal("tcp", path, "--robot-form", "quaternion-wxyz").good()
 
 
+def test_poses_by_joint_angles_have_no_other_reading(tmp_path):
+    """Angles of no common point: a bad tool, by numbers that are in no column."""
+    bent = np.array([0.0, -1.2, 1.5, -1.8, -1.5, 0.0])
+    angles = bent + np.random.default_rng(3).uniform(-1.0, 1.0, (8, 6))
+    names = [f"q{at}_rad" for at in range(1, 7)]
+    path = write_table(tmp_path / "touches.csv", names, angles.tolist())
+    done = visioncal("tcp", path, "--robot-model", "ur5e")
+    assert done.status == 3
+    assert "The touches agree to" in done.out
+    assert "another form" not in done.out
+
+
 def test_touches_of_another_point_are_named(tmp_path):
     """Four of ten are of a point that has no name."""
     poses = touched(Job(), 12).touches.base_from_flange.copy()
@@ -643,6 +655,9 @@ def test_too_few_touches_are_refused(tmp_path):
         "2 touches of kind point", "at least 3 of one point", "tilted by 20 to 45"
     )
     assert not (tmp_path / "frames.json").exists()
+    poses = touched(Job(), 1).touches.base_from_flange[:4]
+    axes = write_poses(tmp_path / "axes.csv", poses, {"kind": ["z"] * 4})
+    visioncal("tcp", axes).refused("0 touches of kind point")
 
 
 def test_touches_that_turn_about_one_axis_name_what_is_open(tmp_path):

@@ -64,10 +64,11 @@ def touched_tool(
         tuple(numbers),
     )
     options = options or ToolLimits()
-    other = _other_reading(touches, rows.numbers, 1e-3 * options.noise_mm[0])
+    limit_m = 1e-3 * options.noise_mm[0]
     try:
         fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
     except DegenerateError as error:
+        other = _other_reading(touches, rows.numbers, limit_m)
         if other is None or other.do is None:
             raise
         step = f"{other.do.words[:-1]}: {other.do.command.removeprefix(AGAIN).strip()}."
@@ -119,6 +120,7 @@ def touched_tool(
         "points_m": dict(zip(names, fit.agreement.fit.state.points.tolist(), strict=True)),
         "points_sigma_mm": dict(zip(names, sigmas_mm, strict=True)),
     }
+    other = _other_reading(touches, rows.numbers, limit_m)
     first = [other] if other is not None else [*_other_points(fit, touches, rows.places)]
     return fitted.frame(method, more, details, setting, first)
 
@@ -126,7 +128,9 @@ def touched_tool(
 def _other_reading(touches: Touches, numbers: PoseNumbers | None, limit_m: float) -> Finding | None:
     """The finding that rotations are in another form, by which all touches agree; None without."""
     declared_m = scatter_m(touches)
-    if numbers is None or declared_m < limit_m:
+    # Poses by joint angles are in none.
+    is_read = numbers is not None and np.array_equal(numbers.poses(), touches.base_from_flange)
+    if numbers is None or not is_read or declared_m < limit_m:
         return None
     given = numbers.reading
     tried: dict[str, float] = {}
