@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.limits import FEWEST_VIEWS
-from visioncal.core.transforms import adjoint, exp, invert, log, mean_transform
+from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.corners import CornerStack, reproject
+from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.model_evidence import TURN_PER_M, ChangeHypothesis
+from visioncal.estimation.poses import fit_poses
 from visioncal.verification.calibration_prior import CalibrationPrior
 from visioncal.verification.prediction import PredictedStops, board_changes
 
@@ -31,9 +32,8 @@ CAMERA, LENS, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW, PAIRING =
 PAIRS = (BOTH, REPLACED)
 # Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
 _OTHER_SIZE_PER_M = 10.0
-# Shares by which a lens grows: whose motions are proportional, and from which on it is another one;
-# and steps in which poses are found.
-_SMALL_SHARE, _LARGE_SHARE, _STEPS = 1e-3, 0.5, 5
+# Shares by which a lens grows: whose motions are proportional, and from which on it is another one.
+_SMALL_SHARE, _LARGE_SHARE = 1e-3, 0.5
 # Displacement from which on a board is not in place, as by a millimetre and 4 mrad for each of
 # these [m]; and unit of a change that is one or none.
 _FAR_M, _WHOLE = 5e-3, 10.0
@@ -102,13 +102,7 @@ def _focal_length(predicted: PredictedStops, changes: FloatArray) -> Iterator[Ch
     def undoing(share: float) -> FloatArray:
         """(n, 6, 1) motion of each board that shows the same corners by a longer lens."""
         grown = camera.matrix * [1.0 + share, 1.0 + share, 1.0, 1.0]
-        poses, longer = measured, replace(camera, matrix=grown)
-        for _ in range(_STEPS):
-            shown = reproject(stack, longer, poses, lens=False)
-            information = stack.products_by_view(shown.by_pose, shown.by_pose)
-            gradient = stack.products_by_view(shown.by_pose, shown.residuals[:, :, None])
-            step = np.asarray(np.linalg.solve(information, gradient), dtype=float)[:, :, 0]
-            poses = np.asarray(poses @ exp(-step), dtype=float)
+        poses = fit_poses(stack, replace(camera, matrix=grown), measured).cam_from_target
         return log(invert(measured) @ poses)[:, :, None] / share
 
     small = undoing(_SMALL_SHARE)

@@ -165,7 +165,7 @@ def _tested(
     Raises DataError where several agree alike, and are not the same.
     """
     found: list[tuple[float, int, ForeignRecording]] = []
-    why, other_mount = "", ""
+    why, others = "", list[Guess]()
     for rank, item in readings:
         try:
             guess = seen.guess(item)
@@ -177,15 +177,13 @@ def _tested(
             done = _applied(item, guess, is_measured=seen.run is not None)
             score = guess.best.log_posterior - CLEAR * rank
             found += [] if done is None else [(score, rank, done)]
-            mount = guess.best.hypothesis.mount
-            if done is None and guess.stands_out and mount != item.mount:
-                other_mount = other_mount or f"{mount}: {guess.sentence}"
-    if other_mount and not found:
-        right, _, sentence = other_mount.partition(": ")
+            is_other = guess.stands_out and guess.best.hypothesis.mount != item.mount
+            others += [guess] if done is None and is_other else []
+    if others and not found:
         raise DataError(
-            f"{readings[0][1].name}: the camera is not mounted as stated. {sentence}",
+            f"{readings[0][1].name}: the camera is not mounted as stated. {others[0].sentence}",
             culprits=["--mount"],
-            next_step=f"Say --mount {right}.",
+            next_step=f"Say --mount {others[0].best.hypothesis.mount}.",
         )
     if not found:
         return None, why

@@ -201,11 +201,11 @@ def poor_image_reason(image: Image, max_blur_px: float) -> str:
             f"({_LEAST_CONTRAST:.0f} are needed)"
         )
     dv, du = _slopes(image[None].astype(np.float32))
-    steepness = np.hypot(dv, du).ravel() / (high - low)
+    steepness = np.hypot(dv, du)[0] / (high - low)
     # Of the sharpest edges, and of those across each of eight directions, half of them twice.
     blur = float(_sigma_of(np.percentile(steepness, 99.5)))
     # Of every third row.
-    third = np.hypot(dv[0, ::3], du[0, ::3]).ravel() / (high - low)
+    third = steepness[::3].ravel()
     sectors = np.floor(np.arctan2(dv[0, ::3], du[0, ::3]).ravel() * (16.0 / np.pi)).astype(int) % 16
     by_sector = np.full(16, 0.0)
     for at in range(16):
