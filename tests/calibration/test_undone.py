@@ -359,10 +359,11 @@ def located(session):
     return run_stages(RunState(session), STAGES[:5])
 
 
+@pytest.mark.parametrize("seeds", [3, slow(6)])
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_sound_and_otherwise_wrong_sessions_are_not_accused(mount):
+def test_sound_and_otherwise_wrong_sessions_are_not_accused(mount, seeds):
     rng = np.random.default_rng(3)
-    for seed in range(3):
+    for seed in range(seeds):
         robot, boards = poses_of(mount, 20, seed)
         assert likeliest(located(pairs_session(mount, robot, boards))) is None
         boards[[2, 9]] = boards[[2, 9]] @ exp(rng.normal(0, 0.3, (2, 6)))
