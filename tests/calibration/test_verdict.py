@@ -446,6 +446,23 @@ def test_a_tool_that_was_active_is_asked_for(mount, tool_mm, where) -> None:
         assert finding.words in " ".join(verdict.top)
 
 
+def test_a_camera_behind_its_flange_where_no_bracket_has_it_is_a_doubt() -> None:
+    cell, tool = simulate(CellOptions(views=14)), np.eye(4)
+    tool[2, 3] = 0.17
+    pairs = "eye-in-hand", cell.robot.base_from_flange @ tool, cell.cam_from_target
+    verdict = calibrate(pairs_session(*pairs)).verdict
+    assert (verdict.status, ids(verdict)[:1]) == ("check", ["tool_active"])
+    assert "the camera is 111 mm behind the flange" in verdict.first_reason
+    assert "Was a tool active on the controller" in verdict.first_reason
+    # It is there where session.toml says so.
+    place = {"z_m": -0.112, "sigma_m": 0.005}
+    known = pairs_session(*pairs)
+    known.document["prior"] = {"flange_from_cam": place}
+    verdict = calibrate(known).verdict
+    assert (verdict.status, verdict.causes) == ("good", ())
+    assert "tool_active" not in [finding.kind for finding in verdict.findings]
+
+
 @pytest.mark.parametrize(("freedom", "places", "flat"), [(np.inf, 1, 1.0), (15.0, 7, 0.03)])
 def test_the_chance_is_that_of_drawn_errors(freedom: float, places: int, flat: float) -> None:
     rng, count = np.random.default_rng(places), 200_000

@@ -12,8 +12,9 @@ from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, Remedy
 
 # A part on a flange may be so far from it [m], also where the poses are in the board's frame;
-# seldom so far, or a camera so far behind the flange: more than the length of one beside the wrist.
-_NEAR_M, _FAR_M, _BEHIND_M = 0.3, 0.5, 0.05
+# seldom so far, or a camera so far behind the flange: more than the length of one beside the wrist;
+# farther behind than the last link is long, no bracket has it.
+_NEAR_M, _FAR_M, _BEHIND_M, _FAR_BEHIND_M = 0.3, 0.5, 0.05, 0.08
 
 
 def _found(run: RunState) -> Iterator[Finding]:
@@ -50,19 +51,24 @@ def _found(run: RunState) -> Iterator[Finding]:
     where = f"{carried_m:.2f} m away from" if carried_m > _FAR_M else ""
     if in_hand and depth_m > _BEHIND_M + 3.0 * sigma_m:
         where = f"{figure(1e3 * depth_m)} mm behind"
-    if where:
-        thing = "camera" if in_hand else "target"
+    # Where session.toml has its place, that was measured.
+    measured = [prior.second for prior in run.cell_fit.cell.priors if prior.axes]
+    if where and carried not in measured:
+        thing, is_odd = ("camera" if in_hand else "target"), in_hand
+        is_odd &= bool(depth_m > _FAR_BEHIND_M + 3.0 * sigma_m)
+        stated = f" If it is, state its z_m in [prior.flange_from_{carried}] of session.toml." * is_odd
         yield Finding(
-            "carried_away",
+            "tool_active" if is_odd else "carried_away",
             f"By the robot's poses, the {thing} is {where} the flange that carries it. Was a tool "
             "active on the controller when they were recorded? Then they are of its tip, and the "
             "transform is from there, and not from the flange.",
             Remedy(
                 f"Measure roughly how far the {thing} is from the flange. If it is not {where} it, "
                 "set the controller's tool to zero and record again, or use the result with that "
-                "tool active alone."
+                f"tool active alone.{stated}"
             ),
         )
 
 
 MIRRORED_CELL = Suspect("mirrored_cell", _found, 1e-2)
+TOOL_ACTIVE = Suspect("tool_active", chance=1e-2)

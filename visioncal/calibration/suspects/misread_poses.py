@@ -343,6 +343,6 @@ def _both_sides(
 BY_CHAIN = (
     *(*STEPS, ARM_ERRORS, "prior"),
     *("board_size", "board_shape", "lens", "lens_field", "corner_noise", "tool_frame"),
-    "carried_away",
+    *("carried_away", "tool_active"),
 )
 MISREAD_POSES = Suspect("misread_poses", None, 1e-3, True, (CHAIN, *BY_CHAIN), SOURCES)

@@ -96,6 +96,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     rounded_poses.ROUNDED_POSES,
     turned_views.TURNED_VIEWS,
     late_poses.LATE_POSES,
+    mirrored_cell.TOOL_ACTIVE,
     Suspect("carried_away", is_doubt=False),
     Suspect("untied", _unconnected, FACT),
     Suspect("unseen_target"),
