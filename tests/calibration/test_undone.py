@@ -347,6 +347,22 @@ def test_rows_are_any_few_apart(by):
     assert f":{by} &&" in cause.do.command
 
 
+@pytest.mark.parametrize(("first", "last", "by"), [(6, 14, 1), (10, 16, -2), slow(4, 9, 1)])
+def test_rows_amid_the_table_that_are_apart_are_one_command(tmp_path, monkeypatch, first, last, by):
+    monkeypatch.chdir(tmp_path)
+    robot, boards = poses_of(MOUNTS[0])
+    # The log has the pose of a neighbouring row in these, as where it was late for a while.
+    late = robot.copy()
+    late[first : last + 1] = robot[first - by : last + 1 - by]
+    pairs_session(MOUNTS[0], late, boards).save(tmp_path / "cell")
+    cause, mended = followed("cell")
+    assert cause.kind == "shifted_rows"
+    assert f"--shift {first}-{last}:{by} " in cause.do.command
+    assert sum(view.used for view in mended.views) == len(robot) - abs(by)
+    for name, edge in calibrated(MOUNTS[0]).edges.items():
+        np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
+
+
 def test_a_whole_table_two_rows_apart_is_named():
     session = pairs_session(MOUNTS[1], *shifted(*poses_of(MOUNTS[1]), 0, 2))
     cause = visioncal.calibrate(session).verdict.causes[0]

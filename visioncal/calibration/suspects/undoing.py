@@ -46,8 +46,9 @@ _MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
 _NEAR_RAD, _SAME = 0.1, 1e-9
 # Of so few views, one that is wrong bends the fit of all.
 _FEW = 7
-# Views are alike within so many medians.
+# Views are alike within so many medians; log-ratios of squares count as one so clear at most.
 _UNEVEN = 7.0
+_CLIPPED = -2.0 * float(np.log(_UNEVEN)), 2.0 * float(np.log(_UNEVEN))
 # A flange is nearer to the base than this, and farther from its origin [m]; other positions are in
 # another unit.
 _FARTHEST_M, _NEAREST_M = 20.0, 0.01
@@ -520,17 +521,26 @@ def _squares_on(marks: FloatArray, shifts: FloatArray) -> tuple[Mask, FloatArray
 def _shifted(
     record: _Record, every: list[_Edges], pairs: dict[int, IntArray], base: float
 ) -> Iterator[Undoing]:
-    """The likeliest row from which on, or before which, images and poses are rows apart."""
+    """The likeliest rows at an end of the record, or amid it, in which images and poses are apart.
+
+    By rows.
+    """
     count = len(record.rows)
     behind = np.arange(count) >= np.arange(count)[:, None]
-    sides = np.concatenate([behind, ~behind[FEWEST_VIEWS:]])
+    ends = np.concatenate([behind, ~behind[FEWEST_VIEWS:]])
     orders = [record.paired(order(len(record.views))) for order in ROW_ORDERS.values()]
     found = []
     for edges in every:
         squares = {by: edges.of(pairs[by]) for by in _SHIFTS}
         for by in _SHIFTS[1:]:
+            amid = _apart_amid(record, squares[0], squares[by], by)
+            sides = np.concatenate([ends, amid[None]])
             mixed = np.where(sides[..., None], squares[by], squares[0])
+            # Amid the record, a pose is of one image.
+            mixed[-1, amid & ~np.isin(pairs[by], record.rows[amid])] = np.inf
             logs, agrees = _evidence(mixed)
+            # Both ends are a free choice.
+            logs[-1] -= float(np.log(count)) / EVIDENCE
             at = int(logs.argmax())
             closes = mixed[at][agrees[at]].mean() < CLOSING_SCORE**2
             found.append((float(logs[at]), by, sides[at], agrees[at], closes))
@@ -550,6 +560,7 @@ def _shifted(
     apart = counted(abs(by), "row")
     rows = f"{apart} {'later' if by > 0 else 'earlier'}"
     when = f"From view {first} on" if side[-1] else f"Up to view {last}"
+    when = when if side[-1] or side[0] else f"From view {first} to view {last}"
     # A pose is of one image.
     partners = set(record.rows[side].tolist())
     both = zip(views, pairs[by][side].tolist(), strict=True)
@@ -566,3 +577,24 @@ def _shifted(
         ),
         f"its image belongs to the robot's pose {rows}",
     )
+
+
+def _apart_amid(record: _Record, own: FloatArray, other: FloatArray, by: int) -> Mask:
+    """(m,) the run of views, and so many whose pose these have, that other poses explain best.
+
+    Args:
+        record: The record.
+        own: (m, 2) squares by the poses of their own rows.
+        other: The same by those of the rows apart.
+        by: By how many rows.
+    """
+    here, there = (np.where(np.isfinite(at), at, 1.0).sum(axis=1) for at in (own, other))
+    gains = np.log((here + _LEAST**2) / (there + _LEAST**2))
+    # What explains a view no better ends the run.
+    sums = np.append(0.0, np.cumsum(np.clip(gains, *_CLIPPED) - 1.0))
+    last = int(np.argmax(sums - np.minimum.accumulate(sums)))
+    rows = record.rows[int(np.argmin(sums[: last + 1])) : last]
+    if not len(rows):
+        return np.zeros(len(own), dtype=bool)
+    first, end = int(rows[0]) + min(by, 0), int(rows[-1]) + max(by, 0)
+    return (record.rows >= first) & (record.rows <= end)
