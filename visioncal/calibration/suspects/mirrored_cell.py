@@ -56,7 +56,7 @@ def _found(run: RunState) -> Iterator[Finding]:
     if where and carried not in measured:
         thing, is_odd = ("camera" if in_hand else "target"), in_hand
         is_odd &= bool(depth_m > _FAR_BEHIND_M + 3.0 * sigma_m)
-        stated = f" If it is, state its z_m in [prior.flange_from_{carried}] of session.toml." * is_odd
+        stated = f" If it is, state z_m of [prior.flange_from_{carried}] in session.toml." * is_odd
         yield Finding(
             "tool_active" if is_odd else "carried_away",
             f"By the robot's poses, the {thing} is {where} the flange that carries it. Was a tool "
