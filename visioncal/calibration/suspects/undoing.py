@@ -590,7 +590,7 @@ def _apart_amid(record: _Record, own: FloatArray, other: FloatArray, by: int) ->
     """
     here, there = (np.where(np.isfinite(at), at, 1.0).sum(axis=1) for at in (own, other))
     gains = np.log((here + _LEAST**2) / (there + _LEAST**2))
-    # What explains a view no better ends the run.
+    # A view that neither explains ends the run.
     sums = np.append(0.0, np.cumsum(np.clip(gains, *_CLIPPED) - 1.0))
     last = int(np.argmax(sums - np.minimum.accumulate(sums)))
     rows = record.rows[int(np.argmin(sums[: last + 1])) : last]
