@@ -19,7 +19,7 @@ poor solution here; it is refused later, where the Fisher information is known.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import wraps
+from functools import lru_cache, wraps
 from types import MappingProxyType
 from typing import TypeAlias
 
@@ -27,7 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import compose, exp, invert, nearest_rotation, quaternions, skew
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, IntArray
 
 _GROUP = 100
 # Scalar products of the quaternions from which pairs count in full: up to 165 degrees.
@@ -81,12 +81,18 @@ class Pairs:
         return np.asarray(weighted @ np.swapaxes(self.camera[..., 1:, :], -1, -2))
 
 
+@lru_cache(maxsize=8)
+def upper_pairs(count: int) -> tuple[IntArray, IntArray]:
+    """First and second indices (p,) of all pairs of so many, the first one the smaller."""
+    return np.triu_indices(count, 1)
+
+
 def rotation_pairs(robot: FloatArray, camera: FloatArray) -> Pairs:
     """Forms the relative motions of pairs of (..., m, 4, 4) views."""
     views = robot.shape[-3]
     order = np.random.default_rng(0).permutation(views) if views > _GROUP else np.arange(views)
     groups = np.array_split(order, -(-views // _GROUP))
-    both = [np.triu_indices(len(group), 1) for group in groups]
+    both = [upper_pairs(len(group)) for group in groups]
     first, second = (
         np.concatenate([group[pair[at]] for group, pair in zip(groups, both, strict=True)])
         for at in (0, 1)

@@ -36,7 +36,8 @@ from visioncal.calibration.guess.unwrapping import unwrapped
 from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, IntArray, Mount
+from visioncal.core.types import FloatArray, IntArray, Mask, Mount
+from visioncal.estimation.closed_form import upper_pairs
 
 # With fewer views too many readings agree; more than the second add time and no certainty.
 FEWEST_ROWS, _FITTED_ROWS = 4, 30
@@ -385,14 +386,19 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
     """Low quantile of the differences [rad] by which robot and camera turn under a reading."""
     of_camera = recording.camera.rows(rows)
 
+    @cache
+    def ordered(order: str) -> tuple[PoseNumbers, Mask]:
+        at = ROW_ORDERS[order](len(recording.robot))[rows]
+        return recording.robot.rows(np.maximum(at, 0)), at < 0
+
     # Transposed or mirrored rotations turn by the same angles.
     @cache
     def by_robot(fields: _Rotations, order: str) -> FloatArray:
         rotation, written, terms, angle_unit = fields
         reading = SideReading(rotation, written=written, terms=terms, angle_unit=angle_unit)
-        at = ROW_ORDERS[order](len(recording.robot))[rows]
-        rotations = reading.rotations(recording.robot.rows(np.maximum(at, 0)))
-        rotations[at < 0] = np.nan
+        numbers, is_missing = ordered(order)
+        rotations = reading.rotations(numbers)
+        rotations[is_missing] = np.nan
         return relative_angles(rotations)
 
     @cache
@@ -403,7 +409,9 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
     def away(fields: _Rotations, order: str, of_camera: str) -> float:
         difference = np.abs(by_robot(fields, order) - by_camera(of_camera))
         rank = int(PAIRS_SHARE * len(difference))
-        return float(np.partition(np.nan_to_num(difference, nan=np.inf), rank)[rank])
+        # NaN is the largest.
+        found = float(np.partition(difference, rank)[rank])
+        return np.inf if np.isnan(found) else found
 
     def mismatch(reading: Hypothesis) -> float:
         robot = reading.robot
@@ -416,5 +424,5 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
 def relative_angles(rotations: FloatArray) -> FloatArray:
     """(p,) angles [rad] of the relative rotations of all pairs of (n, 3, 3) rotations."""
     flat = rotations.reshape(-1, 9)
-    traces = (flat @ flat.T)[np.triu_indices(len(flat), 1)]
+    traces = (flat @ flat.T)[upper_pairs(len(flat))]
     return np.asarray(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))

@@ -98,8 +98,12 @@ def identify(images: Image | Sequence[Image], declared: Target | None = None) ->
             return identity
     for shown in sets:
         negatives = [np.asarray(cv2.bitwise_not(picture), np.uint8) for picture in shown]
-        identity = next(_Look(negatives, declared).boards(), None)
-        if identity is not None and identity.board.dictionary:
+        look = _Look(negatives, declared)
+        identity = next(look.of_markers(0), None)
+        if identity is None and (identity := next(look.of_markers(2, 1), None)) is not None:
+            # Searched last, as it takes longest and hardly any get here.
+            identity = identity if next(look.plain(), None) is None else None
+        if identity is not None:
             return replace(identity, is_negative=True)
     # Wider edges hide the bits of small markers.
     why = poor_image_reason(pictures[0], 6.0)
@@ -127,13 +131,16 @@ class _Look:
 
     def boards(self) -> Iterator[Identity]:
         """Boards; the quickest search first, and mirror images where the images show none."""
-        for mirrored in (False, True):
-            yield from self._of_markers(0, mirrored=mirrored)
-        yield from self._plain()
-        for mirrored, border in product((False, True), (2, 1)):
+        yield from self.of_markers(0)
+        yield from self.plain()
+        yield from self.of_markers(2, 1)
+
+    def of_markers(self, *borders: int) -> Iterator[Identity]:
+        """Boards of markers with such borders, in the images or in their mirror images."""
+        for mirrored, border in product((False, True), borders):
             yield from self._of_markers(border, mirrored=mirrored)
 
-    def _plain(self) -> Iterator[Identity]:
+    def plain(self) -> Iterator[Identity]:
         """Boards without markers: the one that most images show, of these the largest."""
         for kind in KINDS.values():
             found = [board for image in self.pictures if (board := kind.seen_in(image)) is not None]
