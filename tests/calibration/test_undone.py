@@ -23,17 +23,19 @@ from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
 from visioncal.core.errors import DegenerateError
+from visioncal.core.number_format import ranges
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.verdict import GUESS_AND_CALIBRATE
 from visioncal.interchange.formats.mending import shift_views, turn_boards
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import simulate
-from visioncal.vision.targets import corner_positions
+from visioncal.vision.targets import corner_positions, load_target
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 HALF_TURN = compose(np.diag([-1.0, -1.0, 1.0]), np.array([0.16, 0.12, 0.0]))
 BOARD = "charuco_9x6_30mm"
+POINTS = corner_positions(load_target(BOARD))
 CASES = Path(__file__).parents[3] / "shared/data/field/cases"
 
 
@@ -96,6 +98,20 @@ def flipped(robot, boards, some=(0, 2, 10, 14, 15, 20)):
         )
         boards[view] = compose(cv2.Rodrigues(turns[1])[0], places[1].ravel())
     return robot, boards
+
+
+def corners_of(mount):
+    """Poses of the flange, and each view's corners of a board, all in the image of a lens."""
+    boards = poses_of(mount)[1]
+    boards[:, :2, 3] = 0.3 * boards[:, :2, 3] - 0.1
+    x, z = exp(np.array([0.1, -0.2, 0.3, 0.05, 0.02, 0.1])), exp(np.array([0, 0, 0.4, 0.7, 0, 0]))
+    robot = z @ invert(boards) @ invert(x)
+    matrix = np.array([[1100.0, 0.0, 655.0], [0.0, 1100.0, 471.0], [0.0, 0.0, 1.0]])
+    rng, seen = np.random.default_rng(2), []
+    for pose in boards:
+        px = cv2.projectPoints(POINTS, *split(pose), matrix, None)[0][:, 0]
+        seen.append((np.arange(len(POINTS)), px + rng.normal(0, 0.1, px.shape)))
+    return robot if mount == "eye-in-hand" else invert(robot), seen
 
 
 def split(pose):
@@ -399,26 +415,13 @@ def test_of_long_sessions_every_row_is_named():
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_corners_that_are_numbered_a_column_on_get_their_own_numbers(tmp_path, monkeypatch, mount):
     monkeypatch.chdir(tmp_path)
-    boards = poses_of(mount)[1]
-    # All of them in the image.
-    boards[:, :2, 3] = 0.3 * boards[:, :2, 3] - 0.1
-    x, z = exp(np.array([0.1, -0.2, 0.3, 0.05, 0.02, 0.1])), exp(np.array([0, 0, 0.4, 0.7, 0, 0]))
-    robot = z @ invert(boards) @ invert(x)
-    robot = robot if mount == "eye-in-hand" else invert(robot)
-    matrix = np.array([[1100.0, 0.0, 640.0], [0.0, 1100.0, 480.0], [0.0, 0.0, 1.0]])
-    rng, seen, wrong, board = np.random.default_rng(2), [], (1, 6, 12, 15), "charuco_9x6_30mm"
-    empty = [(np.arange(0), np.zeros((0, 2)))] * len(robot)
-    session = Session.from_corners(empty, robot, board, (1280, 960))
-    points = corner_positions(next(iter(session.boards.values())))
-    for view, pose in enumerate(boards):
-        px = cv2.projectPoints(points, *split(pose), matrix, None)[0][:, 0]
-        px += rng.normal(0, 0.1, px.shape)
+    (robot, seen), wrong = corners_of(mount), (1, 6, 12, 15)
+    first, *_, last = np.unique(POINTS[:, 0])
+    for view in wrong:
         # The first column is in the shade there.
-        shown = points[:, 0] > points[:, 0].min() + 0.01
-        last = points[:, 0] < points[:, 0].max() - 0.01
-        ids = np.arange(len(points))
-        seen.append((ids[last], px[shown]) if view in wrong else (ids, px))
-    Session.from_corners(seen, robot, board, (1280, 960), mount=mount).save(tmp_path / "cell")
+        ids, px = seen[view]
+        seen[view] = ids[POINTS[:, 0] < last], px[POINTS[:, 0] > first]
+    Session.from_corners(seen, robot, BOARD, (1280, 960), mount=mount).save(tmp_path / "cell")
     cause = visioncal.calibrate(tmp_path / "cell").verdict.causes[0]
     assert (cause.kind, cause.views) == ("turned_board", wrong), cause.words
     assert "numbered some squares on" in cause.words
@@ -433,13 +436,53 @@ def test_pictures_that_are_turned_from_a_view_on_are_no_other_camera(mount):
     robot, boards = poses_of(mount)
     boards[14:] = compose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ boards[14:]
     cause = visioncal.calibrate(pairs_session(mount, robot, boards)).verdict.causes[0]
-    assert cause.views == (*range(14, 24),)
-    assert "from view 14 on, the pictures are turned by 180 deg" in cause.words
+    assert (cause.kind, cause.views) == ("turned_pictures", (*range(14, 24),))
+    assert "From view 14 on, the pictures are turned by 180 deg" in cause.words
     # Half a turn elsewhere is another camera's or tool's.
     boards[14:, 0, 3] += 0.05
     cause = visioncal.calibrate(pairs_session(mount, robot, boards)).verdict.causes[0]
     assert cause.views == (*range(14, 24),)
     assert "pictures" not in cause.words
+
+
+@pytest.mark.parametrize(
+    ("kind", "degrees", "mount"),
+    [
+        ("corners", 180, MOUNTS[0]),
+        ("pairs", 270, MOUNTS[1]),
+        slow("corners", 90, MOUNTS[1]),
+        slow("pairs", 180, MOUNTS[0]),
+    ],
+)
+def test_turned_pictures_are_turned_back_by_the_printed_command(
+    tmp_path, monkeypatch, kind, degrees, mount
+):
+    """Here and there or from a view on; with a lens of a centre off the middle, to be estimated."""
+    monkeypatch.chdir(tmp_path)
+    if kind == "pairs":
+        some, (robot, boards) = [1, 4, 5, 9], poses_of(mount)
+        turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        sound = calibrated(mount)
+        boards[some] = compose(turn, np.zeros(3)) @ boards[some]
+        session = pairs_session(mount, robot, boards)
+    else:
+        some, (robot, seen) = [*range(14, 24)], corners_of(mount)
+        sound = visioncal.calibrate(
+            Session.from_corners(seen, robot, BOARD, (1280, 960), mount=mount)
+        )
+        for view in some:
+            ids, (u, v) = seen[view][0], seen[view][1].T
+            turned = {180: (1279 - u, 959 - v), 90: (959 - v, u)}[degrees]
+            seen[view] = ids, np.column_stack(turned)
+        session = Session.from_corners(seen, robot, BOARD, (1280, 960), mount=mount)
+    session.save(tmp_path / "cell")
+    cause, mended = followed("cell")
+    assert (cause.kind, cause.views) == ("turned_pictures", (*some,))
+    assert f"turned by {degrees} deg" in cause.words
+    assert f"--turned {ranges(some)}:{degrees} " in cause.do.command
+    assert sum(view.used for view in mended.views) == len(robot)
+    for name, edge in sound.edges.items():
+        np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -259,6 +259,7 @@ def changed_images(folder, change, every=1):
     ("change", "every", "said"),
     [
         (lambda it: 255 - it, 1, "printed in white on black"),
+        slow(lambda it: it[::-1, ::-1], 4, "the pictures are turned by 180 deg"),
         slow(lambda it: cv2.rotate(it, cv2.ROTATE_90_COUNTERCLOCKWISE), 3, "turned or scaled"),
         slow(
             lambda it: cv2.resize(it, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA),
@@ -266,7 +267,7 @@ def changed_images(folder, change, every=1):
             "turned or scaled",
         ),
     ],
-    ids=["negatives", "quarter turns", "half size"],
+    ids=["negatives", "upside down", "quarter turns", "half size"],
 )
 def test_images_that_were_changed_are_mended_as_is_printed(
     tmp_path, monkeypatch, change, every, said

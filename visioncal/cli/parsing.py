@@ -66,9 +66,10 @@ def shift_in(words: str, option: str) -> tuple[tuple[int, ...], int]:
 
 
 def turn_in(words: str, option: str) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Parses views, and an angle [deg] and a point [mm], written as 3,7:180,80,60."""
+    """Parses views, and an angle [deg] and, of boards, a point [mm], written as 3,7:180,80,60."""
     views, _, turn = words.partition(":")
-    return views_in(views, option), numbers_in(turn, option, "deg,x,y")
+    parts = "deg,x,y" if "," in turn else "deg"
+    return views_in(views, option), numbers_in(turn, option, parts)
 
 
 def places_in(

@@ -404,7 +404,7 @@ class ConvertOptions(RobotPoseOptions):
     )
     turned: tuple[tuple[int, ...], tuple[float, ...]] | None = _doubt(
         "Views whose board is read turned, by degrees about a point in mm: 3,7:180,80,60; or, by 0 "
-        "degrees, shifted to it.",
+        "degrees, shifted to it. By degrees alone: whose pictures are turned.",
         parse=turn_in,
     )
     positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = _doubt(

@@ -139,3 +139,17 @@ def _projected(
     by_intrinsics = jacobian[:, :, by_lens if lens else slice(0)]
     parts = map(np.ascontiguousarray, (jacobian[:, :, by_point], by_intrinsics))
     return Projection(np.asarray(px, float).reshape(-1, 2), *parts)
+
+
+def turned_back(px: FloatArray, size: tuple[int, int], quarters: int) -> FloatArray:
+    """(n, 2) pixels of a picture that was turned clockwise, as they were.
+
+    Args:
+        px: Pixels of the turned picture, pixel centres at integers.
+        size: (width, height) of the picture before [px].
+        quarters: By how many quarters it was turned: 1, 2 or 3.
+    """
+    u, v = np.asarray(px, float).T
+    last_u, last_v = size[0] - 1, size[1] - 1
+    back = {1: (v, last_v - u), 2: (last_u - u, last_v - v), 3: (last_u - v, u)}
+    return np.column_stack(back[quarters])

@@ -1,7 +1,7 @@
 """A session's images as its camera took them: mirrored and turned back, positive, of one size."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import PurePath
 
@@ -12,18 +12,16 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.detect import is_scaled
 from visioncal.calibration.stages.other_board import spread
+from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import ranges
-from visioncal.core.transforms import rotation_angle
 from visioncal.core.types import Image, Progress
-from visioncal.session import MemoryImages, Session
+from visioncal.session import MemoryImages, Session, View
 from visioncal.vision.boards.identify import identify
 from visioncal.vision.boards.imaging import decode_image, encode_png, exif_turn, grey_of
 
-# A half turn about the optical axis.
-_HALF = np.diag([-1.0, -1.0, 1.0])
-# Views whose angles to the others show a half turn, at least, and how much better they fit then.
-_FEWEST, _CLEARLY = 4, 3.0
+# Turns back by quarters, counterclockwise, in words.
+_TURNED = {1: "turned back by a quarter", 2: "turned by a half", 3: "turned on by a quarter"}
 
 
 def mend_images(session: Session, progress: Progress | None = None) -> Session:
@@ -62,22 +60,45 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
                 images[name] = np.asarray(cv2.bitwise_not(images[name]), np.uint8)
                 done[name].append("turned from negatives")
     mended = _with(session, images, done)
-    upside_down = _half_turned(mended, progress)
-    for view in (view for view in present if view.number in upside_down):
-        images[view.image] = np.ascontiguousarray(images[view.image][::-1, ::-1])
-        done[view.image].append("turned by a half")
+    for name, quarters in _turned(mended, present, progress).items():
+        images[name] = np.ascontiguousarray(np.rot90(images[name], quarters))
+        done[name].append(_TURNED[quarters])
     if not any(done.values()):
         raise DataError(
             f"session {session.name!r}: nothing was written, as no image is mirrored, turned, a "
             "negative or of another size.",
             next_step="visioncal doctor says what else is wrong.",
         )
-    if any(view.text.get("depth") for view in present if done.get(view.image)):
-        raise DataError(
-            f"session {session.name!r} has depth pictures beside images that are to be changed.",
-            next_step="Record it again, with color and depth of one orientation and size.",
-        )
     return _with(session, images, done)
+
+
+def with_turned_images(session: Session, views: Sequence[View], quarters: int) -> Session:
+    """A session with the images of some views turned back by quarters; itself where none has any.
+
+    Raises:
+        DataError: It has depth pictures, which would have to follow.
+    """
+    files = {view.image: session.images.read(view.image) for view in views if view.image}
+    read = {name: decode_image(data, colour=True) for name, data in files.items()}
+    turned = {
+        name: np.ascontiguousarray(np.rot90(image, quarters))
+        for name, image in read.items()
+        if not isinstance(image, str)
+    }
+    done = {name: [_TURNED[quarters]] for name in turned}
+    return _with(session, turned, done) if turned else session
+
+
+def _turned(session: Session, views: Sequence[View], progress: Progress | None) -> dict[str, int]:
+    """Images that the robot's motion shows turned beside others, and by how many quarters."""
+    found, names = dict[int, int](), {"robot", "detect", "intrinsics", "pnp"}
+    with suppress(VisioncalError):
+        state = RunState(session, progress)
+        state = run_stages(state, [stage for stage in STAGES if stage.name in names])
+        while (mistake := likeliest(state)) is not None and not state.misread:
+            found |= dict.fromkeys(mistake.found.views, mistake.quarters)
+            state = undone(state, mistake)
+    return {view.image: found[view.number] for view in views if found.get(view.number)}
 
 
 def _usual_size(session: Session, images: Mapping[str, Image]) -> tuple[int, int]:
@@ -104,7 +125,15 @@ def _sized(image: Image, usual: tuple[int, int], data: bytes) -> tuple[Image, li
 
 
 def _with(session: Session, images: Mapping[str, Image], done: Mapping[str, list[str]]) -> Session:
-    """The session with changed images, and a note of what was done to which views."""
+    """The session with changed images, and a note of what was done to which views.
+
+    Raises DataError with depth pictures, which would have to follow.
+    """
+    if any(view.text.get("depth") for view in session.views if done.get(view.image)):
+        raise DataError(
+            f"session {session.name!r} has depth pictures beside images that are to be changed.",
+            next_step="Record it again, with color and depth of one orientation and size.",
+        )
     names = {name: str(PurePath(name).with_suffix(".png")) for name in done if done[name]}
     kept = {view.image for view in session.views} - names.keys()
     if kept & {*names.values()} or len({*names.values()}) < len(names):
@@ -125,38 +154,3 @@ def _with(session: Session, images: Mapping[str, Image], done: Mapping[str, list
     corrected = [*session.declaration.corrected, *notes]
     document = {**session.document, "corrected": corrected} if notes else session.document
     return session.with_content(document=document, cells=cells, images=MemoryImages(files))
-
-
-def _half_turned(session: Session, progress: Progress | None) -> set[int]:
-    """Views whose images are upside down beside the others', by how far the robot turned.
-
-    Between two views camera and robot turn by the same angle, whatever the unknown frames are.
-    """
-    names = {"robot", "detect", "intrinsics", "pnp"}
-    try:
-        state = RunState(session, progress)
-        state = run_stages(state, [stage for stage in STAGES if stage.name in names])
-    except VisioncalError:
-        return set()
-    shown = [view for view in state.poses_of_one_board if view in state.base_from_flange]
-    if len(shown) < _FEWEST or state.mount is None:
-        return set()
-    robot = np.array([state.base_from_flange[view][:3, :3] for view in shown])
-    camera = np.array([state.poses[view].cam_from_target[0, :3, :3] for view in shown])
-    by_robot = rotation_angle(np.swapaxes(robot, 1, 2)[:, None] @ robot[None])
-    away = [
-        np.abs(by_robot - rotation_angle(camera[:, None] @ np.swapaxes(turned, 1, 2)[None]))
-        for turned in (camera, _HALF @ camera)
-    ]
-    # One view shows which of the others are turned relative to it; most are upright.
-    rows = np.minimum(*away)
-    best = int(np.argmin(np.median(rows, axis=1)))
-    is_turned = away[1][best] < away[0][best]
-    if is_turned.sum() > len(shown) / 2:
-        is_turned = ~is_turned
-    as_is = np.where(is_turned[:, None] == is_turned[None], away[0], away[1])
-    if not is_turned.any():
-        return set()
-    before = np.median(away[0][is_turned][:, ~is_turned])
-    clear = _CLEARLY * np.median(as_is) < before
-    return {view for view, at in zip(shown, is_turned.tolist(), strict=True) if at and clear}

@@ -9,12 +9,10 @@ import numpy as np
 
 from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
-from visioncal.calibration.stages.other_board import MEND_IMAGES
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, some_of, view_words
 from visioncal.core.transforms import (
-    compose,
     exp,
     invert,
     log,
@@ -33,9 +31,6 @@ from visioncal.vision.targets import rotation_transforms
 
 EXCHANGED = "exchanged_views"  # The kind of finding, which others name.
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
-# A half turn about the line of sight; a picture that is turned differs by less [mm, deg], of a lens
-# whose principal point is off the middle.
-_HALF, _IN_PLACE = np.diag([-1.0, -1.0, 1.0]), (10.0, 4.0)
 # Views among many outliers of one end that agree by chance, one of so many; what a step that few
 # times exceeds the noise leaves of these, and poses that are wrong apart never do.
 _BY_CHANCE, _AT_END = 4, 0.6
@@ -188,40 +183,10 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         do = or_alone(words, some)
     what, how = _changed_words(cell_fit, *change)
     outliers = np.sort(run).tolist()
-    views = tuple(rows[row].view for row in outliers)
     if cell_fit.may_be_of_arms(change[1]):
         how += OTHER_POSTURE
     words = f"{{views}} were left out: {when}, {what} was another one{how}."
-    if _turns_pictures(*change):
-        words = (
-            f"{{views}} were left out: {when}, the pictures are turned by 180 deg, as where the "
-            "camera's driver was set otherwise. The camera's transform is that of the other "
-            "pictures, and differs by this half turn for pictures as these."
-        )
-        do = _pictures_turned_back(cell_fit, views)
     yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
-
-
-def _turns_pictures(frame: str, step: FloatArray) -> bool:
-    """Whether a frame's step is a camera's half turn about its line of sight, in its place."""
-    mm, deg = pose_difference(step, compose(_HALF, np.zeros(3)))
-    return frame.startswith("cam") and mm < _IN_PLACE[0] and deg < _IN_PLACE[1]
-
-
-def _pictures_turned_back(cell_fit: CellFit, views: tuple[int, ...]) -> Remedy:
-    """Advice to turn some views' pictures back, or their corners where these are given."""
-    driver = "Have the camera's driver turn all pictures alike from now on"
-    some = [view for view in cell_fit.cell.session.views if view.number in views]
-    if all(view.image and not view.has_corners for view in some):
-        return Remedy(
-            f"{driver}, write a copy with these turned back, and calibrate it.", MEND_IMAGES
-        )
-    if any(view.has_corners for view in some):
-        driver += (
-            "; in these views' rows of corners.csv write width - 1 - u_px for u_px, and "
-            "height - 1 - v_px for v_px"
-        )
-    return or_alone(f"{driver}. Or calibrate these views alone.", views)
 
 
 def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str, str]:

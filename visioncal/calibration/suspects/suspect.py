@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 ARM_ERRORS, UNEXPLAINED = "arm_errors", "unexplained"
 UNDONE = (
     *("shifted_rows", "turned_board", "flipped_poses", "copied_poses", "lost_sign"),
-    "mixed_units",
+    *("mixed_units", "turned_pictures"),
 )
 # All that explains that views disagree, or that the flange is off.
 CHAIN = "chain"

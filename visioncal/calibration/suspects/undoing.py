@@ -22,13 +22,16 @@ from visioncal.calibration.guess.fit import CLOSING_SCORE, robust_fits
 from visioncal.calibration.guess.readings import ROW_ORDERS, shifted
 from visioncal.calibration.guess.search import CLEAR, EVIDENCE
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.cameras import estimate_lenses, locate_targets
 from visioncal.calibration.stages.clocks import waits_for_clock
+from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
 from visioncal.core.number_format import counted, ranges, some_of, view_words
 from visioncal.core.transforms import apply, compose, exp, invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Rejection
 from visioncal.core.verdict import Finding, mending, or_alone
 from visioncal.estimation.chain import robot_part
+from visioncal.vision.camera import turned_back
 from visioncal.vision.targets import corner_positions, rotation_transforms
 
 _SHIFTS = (0, 1, -1, 2, -2, 3, -3)
@@ -42,8 +45,9 @@ _LEAST = 5e-4
 # reports one pose twice to the last digit though it moved.
 _WRONG = float(np.log(0.05)) - 6.0 * float(np.log(2.0))
 _MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
-# A turn of a board differs by less from a quarter or half one [rad]; copies of poses by less.
-_NEAR_RAD, _SAME = 0.1, 1e-9
+# A turn of a board differs by less from a quarter or half one, and one of a picture whose lens has
+# its centre off the middle [rad]; copies of poses by less.
+_NEAR_RAD, _NEAR_TURN_RAD, _SAME = 0.1, 0.3, 1e-9
 # Of so few views, one that is wrong bends the fit of all.
 _FEW = 7
 # Views are alike within so many medians; log-ratios of squares count as one so clear at most.
@@ -52,6 +56,8 @@ _CLIPPED = -2.0 * float(np.log(_UNEVEN)), 2.0 * float(np.log(_UNEVEN))
 # A flange is nearer to the base than this, and farther from its origin [m]; other positions are in
 # another unit.
 _FARTHEST_M, _NEAREST_M = 20.0, 0.01
+# A camera is in its place within this [m].
+_IN_PLACE_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +180,7 @@ class Undoing:
     odds: float  # Its log odds against views that are wrong for no known reason.
     found: Finding  # The finding; its views are left out.
     short: str  # The same as a clause, for each of the views.
+    quarters: int = 0  # By how many the views' pictures are turned clockwise.
 
 
 def undone(run: RunState, found: Undoing) -> RunState:
@@ -217,6 +224,7 @@ def likeliest(run: RunState) -> Undoing | None:
     rivals = [
         *_copied(record, apart, own, agrees),
         *_flipped(record, best, own, apart, float(base)),
+        *_turned_pictures(run, record, best, own, apart, float(base)),
         *_signed(record, best, own, apart, float(base)),
         *_mixed_units(record, own, float(base)),
         *_mixed_angles(record, own, float(base)),
@@ -303,6 +311,80 @@ def _flipped(
         ),
         short,
     )
+
+
+def _turned_pictures(
+    run: RunState, record: _Record, edges: _Edges, own: IntArray, apart: FloatArray, base: float
+) -> Iterator[Undoing]:
+    """Views whose picture is turned: the camera is, about the line of sight."""
+    for degrees in (180, 90, 270):
+        turn = exp(np.array([0.0, 0.0, np.deg2rad(degrees), 0.0, 0.0, 0.0]))
+        turned = replace(edges, record=replace(record, camera=invert(turn) @ record.camera))
+        if record.is_numbered:
+            wrong = (own >= 0) & (turned.of(own)[:, 1] < _NEAR_TURN_RAD**2)
+            wrong &= turned.of(own)[:, 1] < apart[:, 1]
+            odds = _by_pixels(run, record, own, wrong, degrees // 90, base)
+        else:
+            squares = turned.of(own)
+            odds, wrong = _chosen(own, apart, squares, base)
+            # A picture turns about the lens: by more than others scatter, the camera was moved.
+            usual = max(9.0 * float(np.median(apart[:, 0])), (_IN_PLACE_M / edges.lever) ** 2)
+            if not wrong.any() or np.median(squares[wrong, 0]) > usual:
+                continue
+        views = tuple(record.views[record.rows[wrong]].tolist())
+        if not views:
+            continue
+        is_end = bool(wrong[int(np.argmax(wrong)) :].all()) and len(views) > 1
+        when = f"From view {views[0]} on" if is_end else f"In {view_words(views)}"
+        yield Undoing(
+            odds - float(np.log(3.0)),
+            Finding(
+                "turned_pictures",
+                f"{when}, the pictures are turned by {degrees} deg, as where the camera's driver "
+                "was set otherwise, or the target's poses are. They were left out: the camera's "
+                "transform is that of the other pictures, and differs by this turn for pictures "
+                "as these.",
+                mending("they are turned back", f"--turned {ranges(views)}:{degrees}"),
+                views,
+            ),
+            "its picture is turned",
+            degrees // 90,
+        )
+
+
+def _by_pixels(
+    run: RunState, record: _Record, own: IntArray, wrong: Mask, quarters: int, base: float
+) -> float:
+    """Log odds that (m,) some views' pictures are turned: with these turned back, and a lens anew.
+
+    As poses alone they would not agree: a lens's centre is off the middle of the pictures.
+    """
+    views = {*record.views[record.rows[wrong]].tolist()}
+    if not views or len(views) == len(own):
+        return -np.inf
+    for frame, look in run.cameras.items():
+        if look.resolution is None:
+            return -np.inf
+        back = {
+            view: replace(at, px=turned_back(at.px, look.resolution, quarters))
+            for view, at in look.corners.items()
+            if view in views
+        }
+        run = run.with_camera(frame, replace(look, corners={**look.corners, **back}))
+    try:
+        run = locate_targets(estimate_lenses(run))
+    except VisioncalError:
+        return -np.inf
+    mended = _Record.of(run)
+    pairs = mended.paired(np.arange(len(mended.views)))
+    fitted = _Edges.by(mended, pairs, ~mended.copies & ~mended.lingering)
+    if fitted is None or len(pairs) < len(own):
+        return -np.inf
+    squares = fitted.of(pairs)
+    (log,), (agrees,) = _evidence(squares[None])
+    is_close = squares[agrees].mean() < CLOSING_SCORE**2
+    is_close &= bool(np.sum(agrees & wrong) > 0.6 * np.sum(wrong))
+    return EVIDENCE * float(log - base) + 2.0 * _MISTAKE if is_close else -np.inf
 
 
 def _chosen(own: IntArray, apart: FloatArray, other: FloatArray, base: float) -> tuple[float, Mask]:

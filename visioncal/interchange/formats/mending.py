@@ -8,10 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.pipeline.guess_inputs import numbers_in
+from visioncal.calibration.pipeline.mended_images import with_turned_images
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import ranges, some_of
 from visioncal.core.transforms import apply, compose, invert
+from visioncal.core.types import FloatArray
 from visioncal.session import Session
 from visioncal.session.columns import (
     INSTRUMENT_POSITION,
@@ -20,6 +22,8 @@ from visioncal.session.columns import (
     POSE,
     pose_row,
 )
+from visioncal.session.kinds import name_of
+from visioncal.vision.camera import turned_back
 from visioncal.vision.targets import corner_positions
 
 # Columns of what a view shows; the rest of its row is the robot's pose.
@@ -128,29 +132,32 @@ def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
 
 
 def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -> Session:
-    """Turns the board back that was read turned in some views.
+    """Turns the board back that was read turned in some views, or these views' pictures.
 
     Args:
-        session: A session of measured poses or corners.
+        session: A session of measured poses or corners; where pictures are turned, of images, too.
         views: Their numbers.
         turn: Angle in the board's plane [deg], and the point about which it turns [mm]; of no
-            angle, the shift in that plane [mm].
+            angle, the shift in that plane [mm]. An angle alone, 90, 180 or 270 deg, is that by
+            which pictures are turned clockwise.
 
     Raises:
-        DataError: There are no such views, or corners are none of the board's once turned.
+        DataError: There are no such views, corners are none of the board's once turned, or the
+            pictures cannot be turned back so.
     """
     chosen = _chosen_views(session, views, "--turned")
     degrees, *centre = turn
+    if not centre:
+        return _turn_pictures(session, chosen, degrees)
     rotation = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     middle = 1e-3 * np.array([*centre, 0.0])
     right_from_read = compose(rotation, middle - (rotation @ middle if degrees else 0.0))
-    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
-    numbers = numbers_in(session, MEASURED_CAM_POSE)
-    poses, is_turned = numbers.poses(), [view.number in chosen for view in session.views]
-    for row, pose, mine in zip(cells, poses @ invert(right_from_read), is_turned, strict=True):
-        if mine and np.isfinite(pose).all():
-            row.update({f"cft_{name}": repr(value) for name, value in pose_row(pose).items()})
-    corners, boards = session.corner_table, session.boards
+    poses = numbers_in(session, MEASURED_CAM_POSE).poses() @ invert(right_from_read)
+    cells, corners, boards = (
+        _with_poses(session, chosen, poses),
+        session.corner_table,
+        session.boards,
+    )
     if corners is not None:
         ids = corners.points.copy()
         for view in chosen:
@@ -163,6 +170,48 @@ def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -
     by = f"{degrees:g} deg" if degrees else "({:g}, {:g}) mm".format(*centre)
     note = f"the board was turned back by {by} in views {ranges(chosen)}"
     return _with_cells(session, cells, note, corners=corners)
+
+
+def _with_poses(session: Session, chosen: Sequence[int], poses: FloatArray) -> list[dict[str, str]]:
+    """Cells of a session's rows, with (n, 4, 4) other measured poses in some views."""
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    for view, row, pose in zip(session.views, cells, poses, strict=True):
+        if view.number in chosen and np.isfinite(pose).all():
+            row.update({f"cft_{name}": repr(value) for name, value in pose_row(pose).items()})
+    return cells
+
+
+def _turn_pictures(session: Session, chosen: Sequence[int], degrees: float) -> Session:
+    """Turns images, corners and measured poses of some views back about the line of sight."""
+    if degrees not in (90.0, 180.0, 270.0):
+        words = f"pictures are turned by {degrees:g} deg, but must be by 90, 180 or 270 deg."
+        raise DataError(
+            words,
+            culprits=["--turned"],
+            next_step="State it so, or add a point of the board about which it was read turned.",
+        )
+    quarters, note = round(degrees / 90.0), f"turned back by {degrees:g} deg"
+    corners, rows = session.corner_table, [view for view in session.views if view.number in chosen]
+    if corners is not None:
+        px = corners.px.copy()
+        for view in (view for view in rows if view.has_corners):
+            size = session.cameras[name_of(session.declaration, "camera", view)].size
+            if size is None:
+                raise DataError(
+                    f"session {session.name!r} states no resolution, within which corners turn.",
+                    culprits=["resolution"],
+                    next_step="Write resolution = [width, height] of upright pictures in [camera].",
+                )
+            own = corners.views == view.number
+            px[own] = turned_back(px[own], size, quarters)
+        corners = replace(corners, px=px)
+    back_turn = Rotation.from_euler("z", -degrees, degrees=True).as_matrix()
+    poses = compose(back_turn, np.zeros(3)) @ numbers_in(session, MEASURED_CAM_POSE).poses()
+    session = with_turned_images(session, [view for view in rows if not view.has_corners], quarters)
+    if corners is None and "cft_qw" not in session.columns:
+        return session
+    note = f"corners and poses of the pictures of views {ranges(chosen)} were {note}"
+    return _with_cells(session, _with_poses(session, chosen, poses), note, corners=corners)
 
 
 def write_positions(

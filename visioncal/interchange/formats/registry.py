@@ -97,7 +97,7 @@ def convert(
         exchange: Pairs of views whose images, corners and readings are exchanged.
         shift: Views whose poses of the robot stand so many rows later (earlier where negative).
         turned: Views in which the board was read turned in its plane; by which angle [deg], and
-            about which point of the board [mm] (x, y).
+            about which point of the board [mm] (x, y). With an angle alone, pictures are turned.
         positions: Views whose positions are sums of columns, and these sums by axis: pairs of a
             factor and a column's name.
         mends_images: Whether images are mirrored, turned and scaled back: see `mend_images`.
