@@ -538,16 +538,20 @@ def _turned(
             by_squares, middle = _squares_on(record.marks, turned[near, :2, 3])
             near = near[by_squares]
         whole = compose(turn, np.array([*middle, 0.0]))
-        if len(near) < 2 or (degrees and not _is_reading(record, whole, edges.lever)):
+        if len(near) < (1 if degrees else 2):
+            continue
+        if degrees and not _is_reading(record, whole, edges.lever):
             continue
         squares = apart.copy()
         squares[near] = edges.squares(invert(whole) @ turned[near])
         (there,), (agrees,) = _evidence(squares[None])
         wrong = near[agrees[near]]
-        # The middle is known by these views themselves, two directions of their six.
-        odds = EVIDENCE * float(there - base) + 3.0 * _MISTAKE
-        if len(wrong) < 2 or squares[agrees].mean() > CLOSING_SCORE**2:
+        if not len(wrong) or squares[agrees].mean() > CLOSING_SCORE**2:
             continue
+        # The middle is known by these views themselves, in two directions of their six.
+        noise = float(np.sqrt(squares[agrees, 0].mean() / 3.0 + _LEAST**2))
+        odds = EVIDENCE * (float(there - base) - 2.0 * float(np.log(2.0 / noise)))
+        odds += _MISTAKE - float(np.log(4.0))
         views = tuple(record.views[record.rows[wrong]].tolist())
         centre = np.linalg.solve(np.eye(2) - turn[:2, :2], middle) if degrees else middle
         centre = np.round(1e3 * centre, 2) + 0.0
