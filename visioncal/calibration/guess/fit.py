@@ -7,14 +7,24 @@ The likelihood is by which readings are compared: a view is gaussian, with the s
 of its own fit, or one of a few outliers, with a broad tail.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
 from visioncal.core.limits import FEWEST_COMPARED
-from visioncal.core.number_format import mm_and_deg
-from visioncal.core.transforms import invert, rotation_angle
+from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.transforms import (
+    apply,
+    compose,
+    exp,
+    invert,
+    nearest_rotation,
+    rotation_angle,
+    skew,
+)
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.closed_form import SOLVERS
 
@@ -27,6 +37,9 @@ STARTS = 12
 # rows apart beside another mistake, which the second is for; fewer would agree with any reading.
 KEPT_SHARE, HALF_SHARE = 0.7, 0.45
 _SUBSET = 4
+# Places of a point read at so few stops determine where it and the instrument are; steps towards
+# their least squares.
+_PLACES_SUBSET, _STEPS = 6, 4
 # Starts that are followed.
 _FOLLOWED = 3
 # Smaller turns about a second axis, relative to the largest or absolute, are noise of the poses.
@@ -97,6 +110,8 @@ class Fit:
         if not self.is_readable:
             return "no rotations"
         shift_m, angle = self.rms
+        if not self.angle.any():
+            return f"{figure(1e3 * shift_m)} mm"
         return mm_and_deg(1e3 * shift_m, float(np.rad2deg(angle)))
 
     @cached_property
@@ -167,39 +182,132 @@ def robust_fits(
     kept = _kept_count(count, share)
     lever = np.maximum(np.median(np.linalg.norm(camera[..., :3, 3], axis=2), axis=1), 1e-12)
 
-    def solved(rows: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Edges (k, s, 2, 4, 4) by (k, s, m) rows, trimmed sums (k, s), rows with the least."""
+    def solved(rows: IntArray) -> _Solved:
         sides = (np.take_along_axis(side[:, None], rows[..., None, None], 2) for side in parts)
         edges = SOLVERS["park"](*sides)
         shift, angle = _away(robot[:, None], camera[:, None], (edges.x, edges.z))
         squares = (shift / lever[:, None, None]) ** 2 + angle**2
-        nearest = np.argpartition(squares, kept - 1)[..., :kept]
-        sums = np.take_along_axis(squares, nearest, axis=2).sum(axis=2)
-        return np.stack([edges.x, edges.z], axis=2), sums, nearest
+        return np.stack([edges.x, edges.z], axis=2), *_trimmed(squares, kept)
 
     parts = robot, camera
-    every = np.broadcast_to(np.arange(count), (len(robot), 1, count))
-    edges, sums, nearest = solved(every)
-    if starts and count > _SUBSET:
-        rng = np.random.default_rng(0)
-        subsets = np.array([rng.choice(count, _SUBSET, replace=False) for _ in range(starts)])
-        more = solved(np.broadcast_to(subsets, (len(robot), *subsets.shape)))
-        edges, sums = np.hstack([edges, more[0]]), np.hstack([sums, more[1]])
-        followed = np.arange(len(robot))[:, None], np.argsort(sums, axis=1)[:, :_FOLLOWED]
-        nearest = np.hstack([nearest, more[2]])[followed]
-        edges, sums = edges[followed], sums[followed]
-    for _ in range(6 if starts else 2):
-        trial, lower, rows = solved(nearest)
-        falls = lower < sums
-        if not falls.any():
-            break
-        edges[falls], sums[falls], nearest[falls] = trial[falls], lower[falls], rows[falls]
-    best = edges[np.arange(len(robot)), sums.argmin(axis=1)]
+    best = _least_trimmed(solved, len(robot), count, _random_sets(count, starts, _SUBSET))
     away = zip(*_away(robot, camera, (best[:, 0], best[:, 1])), lever.tolist(), strict=True)
     return [
         Fit(x, z, shift, angle, at, share=share)
         for (x, z), (shift, angle, at) in zip(best, away, strict=True)
     ]
+
+
+# Edges (k, s, 2, 4, 4), trimmed sums (k, s), and the rows with the least (k, s, kept).
+_Solved: TypeAlias = tuple[FloatArray, FloatArray, IntArray]
+
+
+def _trimmed(squares: FloatArray, kept: int) -> tuple[FloatArray, IntArray]:
+    """Sums of the least squares (k, s, n), and their rows."""
+    nearest = np.argpartition(squares, kept - 1)[..., :kept]
+    return np.take_along_axis(squares, nearest, axis=2).sum(axis=2), nearest
+
+
+def _random_sets(count: int, starts: int, size: int) -> list[IntArray]:
+    """(starts, size) random rows of `count`, if any; empty where all rows are as few."""
+    rng = np.random.default_rng(0)
+    sets = [rng.choice(count, size, replace=False) for _ in range(starts if count > size else 0)]
+    return [np.array(sets)] if sets else []
+
+
+def _least_trimmed(
+    solved: Callable[[IntArray], _Solved], readings: int, count: int, sets: Sequence[IntArray]
+) -> FloatArray:
+    """(k, 2, 4, 4) edges of the least trimmed squares that were found.
+
+    Args:
+        solved: Solves by (k, s, m) rows.
+        readings: Number k of readings.
+        count: Number of rows.
+        sets: (s, m) rows to start from, besides all.
+    """
+    edges, sums, nearest = solved(np.broadcast_to(np.arange(count), (readings, 1, count)))
+    for rows in sets:
+        more = solved(np.broadcast_to(rows, (readings, *rows.shape)))
+        edges, sums = np.hstack([edges, more[0]]), np.hstack([sums, more[1]])
+        nearest = np.hstack([nearest, more[2]])
+    if sets:
+        followed = np.arange(readings)[:, None], np.argsort(sums, axis=1)[:, :_FOLLOWED]
+        edges, sums, nearest = edges[followed], sums[followed], nearest[followed]
+    for _ in range(6 if sets else 2):
+        trial, lower, rows = solved(nearest)
+        falls = lower < sums
+        if not falls.any():
+            break
+        edges[falls], sums[falls], nearest[falls] = trial[falls], lower[falls], rows[falls]
+    return np.asarray(edges[np.arange(readings), sums.argmin(axis=1)])
+
+
+def mounting_fits(
+    flanges: FloatArray,
+    read: FloatArray,
+    starts: int = 0,
+    share: float = KEPT_SHARE,
+    window: int = 0,
+) -> list[Fit]:
+    """Fits where an instrument stands and where the point is that it reads, as `robust_fits`.
+
+    A linear solution for both, with any matrix as rotation, is projected on rotations, from which
+    Gauss-Newton steps start. X of a fit has the point's place in the flange, Z the instrument's
+    pose in the base, and no view a turn.
+
+    Args:
+        flanges: (k, n, 4, 4) `base_from_flange`.
+        read: (n, 3) places of the point in the instrument's frame.
+        starts: Number of random small subsets to start from, besides all views.
+        share: Share of the views that must agree.
+        window: Number of neighbouring views from which it starts, too; 0 for none.
+    """
+    count = len(read)
+    kept = _kept_count(count, share)
+    lever = max(float(np.median(np.linalg.norm(read - np.median(read, axis=0), axis=1))), 1e-12)
+
+    def solved(rows: IntArray) -> _Solved:
+        edges = _mounted(np.take_along_axis(flanges[:, None], rows[..., None, None], 2), read[rows])
+        squares = (_missed(flanges[:, None], read, edges) / lever) ** 2
+        return edges, *_trimmed(squares, kept)
+
+    sets = _random_sets(count, starts, _PLACES_SUBSET)
+    if 0 < window < count:
+        firsts = np.arange(0, count - window + 1, window // 2)
+        sets.append(firsts[:, None] + np.arange(window))
+    best = _least_trimmed(solved, len(flanges), count, sets)
+    still = np.zeros(count)
+    each = zip(best, _missed(flanges, read, best), strict=True)
+    return [Fit(x, z, shift, still, lever, share=share) for (x, z), shift in each]
+
+
+def _mounted(flanges: FloatArray, read: FloatArray) -> FloatArray:
+    """(..., 2, 4, 4) X and Z of (..., m, 4, 4) flanges and (..., m, 3) read places of a point."""
+    turned, places = flanges[..., :3, :3], flanges[..., :3, 3]
+    eye = np.broadcast_to(np.eye(3), turned.shape)
+    # Places are `matrix @ read + place - turned @ point`, linear in the rows of the matrix.
+    by_matrix = np.einsum("ij,...k->...ijk", np.eye(3), read).reshape(*turned.shape[:-1], 9)
+    flat = (*flanges.shape[:-3], -1)
+    design = np.concatenate([by_matrix, eye, -turned], axis=-1).reshape(*flat, 15)
+    linear = (np.linalg.pinv(design) @ places.reshape(*flat, 1))[..., :9, 0]
+    rotation = nearest_rotation(linear.reshape(*linear.shape[:-1], 3, 3))
+    values = np.zeros((*linear.shape[:-1], 9))
+    for _ in range(_STEPS):
+        pointed = read @ np.swapaxes(rotation, -1, -2)
+        design = np.concatenate([-skew(pointed), eye, -turned], axis=-1).reshape(*flat, 9)
+        values = (np.linalg.pinv(design) @ (places - pointed).reshape(*flat, 1))[..., 0]
+        turn = np.concatenate([values[..., :3], np.zeros_like(values[..., :3])], axis=-1)
+        rotation = exp(turn)[..., :3, :3] @ rotation
+    x = compose(np.broadcast_to(np.eye(3), rotation.shape), values[..., 6:])
+    return np.stack([x, compose(rotation, values[..., 3:6])], axis=-3)
+
+
+def _missed(flanges: FloatArray, read: FloatArray, edges: FloatArray) -> FloatArray:
+    """(..., n) distances of read places from the point on (..., n, 4, 4) flanges."""
+    points = (flanges @ edges[..., 0, None, :, :])[..., :3, 3]
+    away = points - apply(edges[..., 1, :, :], read)
+    return np.asarray(np.linalg.norm(away, axis=-1))
 
 
 def _away(

@@ -12,7 +12,14 @@ from itertools import combinations, product
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import STARTS, Fit, distances, is_about_one_axis, robust_fits
+from visioncal.calibration.guess.fit import (
+    STARTS,
+    Fit,
+    distances,
+    is_about_one_axis,
+    mounting_fits,
+    robust_fits,
+)
 from visioncal.calibration.guess.search import thinned
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.threads import one_blas_thread
@@ -193,7 +200,8 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
     Args:
         robot: The declared model.
         q: (m, n) joint angles as recorded [rad], of `FEWEST_COMPARED` rows or more.
-        poses: (m, 4, 4) `base_from_flange` of the same rows, up to a constant on either side.
+        poses: (m, 4, 4) `base_from_flange` of the same rows, up to a constant on either side; or
+            (m, 3) places of one point on the flange, in an instrument's frame.
 
     Returns:
         The reading; the declared one where it is right, where no other is clearly better, or where
@@ -202,7 +210,8 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
     rows, recorded = thinned(np.arange(len(q))), declared_reading(robot)
     with one_blas_thread():
         (declared,) = _fitted([recorded], q, poses, rows, STARTS)
-        if declared.score <= _FITS or is_about_one_axis(poses[:, :3, :3]):
+        is_poor = poses.ndim > 2 and is_about_one_axis(poses[:, :3, :3])
+        if declared.score <= _FITS or is_poor:
             return JointGuess(declared, declared)
         readings = [*joint_readings(robot), *_with_zeros(robot, q, poses, rows)]
         tried = _fitted(readings, q, poses, rows, STARTS)
@@ -240,6 +249,10 @@ def _fitted(
     tried: Sequence[JointReading], q: FloatArray, poses: FloatArray, rows: IntArray, starts: int = 0
 ) -> list[FittedJoints]:
     """Fits both constant transforms by some rows; residuals are of all rows where these are few."""
+    if poses.ndim == 2:
+        by_joints = np.array([reading.poses(q) for reading in tried])
+        each = zip(tried, mounting_fits(by_joints, poses, starts), strict=True)
+        return [FittedJoints(reading, fit) for reading, fit in each]
     flange_from_base = invert(poses)
     by_joints = np.array([reading.poses(q[rows]) for reading in tried])
     fits = robust_fits(np.broadcast_to(flange_from_base[rows], by_joints.shape), by_joints, starts)

@@ -233,7 +233,10 @@ def _arms(run: RunState) -> list[JudgedArm]:
         poses = problem.poses[robot][stops]
         judged = JudgedArm(
             len(stops),
-            has_posture_errors=arm.errors is not None and arm.errors.is_significant,
+            # Those of a calibrated arm are estimated, and what is left is noise.
+            has_posture_errors=arm.errors is not None
+            and arm.errors.is_significant
+            and (arm.errors.fit_sigmas is not None or arm.model is None),
             # The greater part of the variance.
             are_lasting=budget.get("arm", 0.0) > 0.7 * budget.get("total", np.inf),
             workspace_mm=None if accuracy is None else accuracy.median,

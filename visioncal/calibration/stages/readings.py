@@ -89,7 +89,7 @@ def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
     """Poses (4, 4) of a probe on the flange, in the instrument's frame, by one view of each stop.
 
     Without a probe they are fitted to all points of a stop, relative to the first complete stop;
-    empty with fewer than three points.
+    with fewer than three points they are the places (3,) of the one that was read most.
     """
     if readings.are_poses:
         return {number: _probe(view) for number, view in readings.views.items()}
@@ -99,10 +99,20 @@ def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
         stops[stop_of[number]][view.point] = view
     stopped = [[stop[name] for name in names] for stop in stops.values() if len(stop) == len(names)]
     if len(names) < 3 or not stopped:
-        return {}
+        return places_of_one_point(readings)
     positions = np.array([[view.reading_m for view in group] for group in stopped])
     pairs = zip(stopped, positions, strict=True)
     return {group[0].number: align(at, positions[0]) for group, at in pairs}
+
+
+def places_of_one_point(readings: Readings) -> dict[int, FloatArray]:
+    """(3,) places, by view, of the point that was read most, in the instrument's frame [m]."""
+    points = [view.point for view in readings.views.values()]
+    most = max(readings.names, key=points.count)
+    every = readings.views.items()
+    return {
+        at: _probe(view)[:3, 3] for at, view in every if readings.are_poses or view.point == most
+    }
 
 
 def stops_of_views(session: Session) -> dict[int, Hashable]:

@@ -25,6 +25,9 @@ from visioncal.session.table import loads_of
 
 T = TypeVar("T", bound=Observed)
 
+# Zeros that are off by less are estimated with the arm [rad].
+_ESTIMATED_RAD = 0.1
+
 
 def read_robots(observed: T) -> T:
     """Reads the reported poses and joints of the robots.
@@ -165,8 +168,8 @@ def check_joints(observed: T, *, drops: bool) -> T:
 def check_read_joints(observed: Observed, probes: Mapping[int, FloatArray]) -> None:
     """Refuses joints that only another reading makes fit an instrument's readings.
 
-    `probes` has (4, 4) `instrument_from_probe` by view; it is empty where points do not determine
-    them. A lost zero is not refused: it is estimated with the arm.
+    `probes` has (4, 4) `instrument_from_probe` by view, or (3,) the places of one point. A small
+    lost zero is not refused: it is estimated with the arm.
 
     Raises:
         DataError: Joints are misread.
@@ -178,7 +181,9 @@ def check_read_joints(observed: Observed, probes: Mapping[int, FloatArray]) -> N
         # The instrument is fixed beside the robot, as a camera may be.
         seen = {view: probe for view, probe in probes.items() if view in joints}
         guess = _guessed(matched, joints, seen, observed.held_back)
-        if guess is not None and guess.stands_out and guess.zero is None:
+        if guess is None or not guess.stands_out:
+            continue
+        if guess.zero is None or np.abs(guess.zero.zeros).max() > _ESTIMATED_RAD:
             raise _misread(observed, reported, matched, guess, "what the instrument reads")
 
 
@@ -190,7 +195,7 @@ def _guessed(
 ) -> JointGuess | None:
     """Searches for the right reading of joint angles, with enough views.
 
-    `seen` has `base_from_flange` by view, up to the two unknown edges.
+    `seen` has `base_from_flange` by view, up to the two unknown edges; or the places of a point.
     """
     views = [view for view in seen if view not in excluded]
     if len(views) < FEWEST_COMPARED:

@@ -102,6 +102,11 @@ def _unexplained_words(away: Rms) -> str:
         "servo arm; another tool in some rows)",
         "what was seen (a marker of few pixels, blur, a lens or a board that is not as stated)",
     ]
+    if away.deg is None:
+        sides = [
+            "the robot (a load that no column states, heat, play, commanded angles)",
+            "the readings (an instrument that was moved or is not warm, another nest)",
+        ]
     # Turns are seen worse than places, and arms err by both alike.
     turned_mm = 1e3 * LEVER_M * np.deg2rad(away.deg or 0.0)
     if turned_mm > away.mm:

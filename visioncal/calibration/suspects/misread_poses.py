@@ -17,6 +17,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
+from visioncal.calibration.suspects.misread_readings import misread_readings
 from visioncal.calibration.suspects.missing_axis import missing_axes
 from visioncal.calibration.suspects.other_rows import of_other_rows
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, CHAIN, SOURCES, STEPS, Suspect
@@ -123,7 +124,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
     first, where their chain does not close.
     """
     if run.mount is not None:
-        yield from _misread_poses(run)
+        yield from _misread_poses(run) if run.readings is None else misread_readings(run)
         return
     for robot in run.session.robots:
         poses, every = run.robots[robot].base_from_flange, pairs_of(run, robot)
@@ -345,4 +346,7 @@ BY_CHAIN = (
     *("board_size", "board_shape", "lens", "lens_field", "corner_noise", "tool_frame"),
     *("carried_away", "tool_active"),
 )
-MISREAD_POSES = Suspect("misread_poses", None, 1e-3, True, (CHAIN, *BY_CHAIN), SOURCES)
+MISREAD_POSES, MISREAD_READINGS = (
+    Suspect(kind, None, 1e-3, True, (CHAIN, *BY_CHAIN), SOURCES)
+    for kind in ("misread_poses", "misread_readings")
+)

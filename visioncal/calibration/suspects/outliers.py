@@ -10,9 +10,11 @@ import numpy as np
 from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
-from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS, CalibrationLimits
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, some_of, view_words
 from visioncal.core.transforms import (
+    apply,
+    compose,
     exp,
     invert,
     log,
@@ -24,6 +26,9 @@ from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import TWIST_UNITS
 from visioncal.estimation.moves import creep_effects
 from visioncal.estimation.outliers import InlierFit
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
+from visioncal.estimation.procrustes import align
 from visioncal.results import Moved
 from visioncal.robot import Robot
 from visioncal.session.frames import frame_name
@@ -165,6 +170,8 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
     run, at = (before, last) if len(before) > len(after) else (after, first)
     words = "Fasten camera and target, keep one board, and one tool and base frame in the "
     words += "controller, and record again"
+    if cell_fit.cell.mount == "instrument":
+        words = "Leave the instrument where it stands and one probe in one nest, and record again"
     most = _AT_END if len(run) > FEWEST_VIEWS else 1.0 / CLEAR_RATIO
     if len(run) >= FEWEST_VIEWS and (change := _common_change(inliers, run, most)) is not None:
         # Picks come after the session.
@@ -195,8 +202,12 @@ def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str
         return "the camera, the target or a frame of the controller", ""
     thing, edge = ("camera" if frame.startswith("cam") else "target"), cell_fit.fit.frames[frame]
     on_flange = (cell_fit.cell.mount == "eye-in-hand") == (thing == "camera")
+    if cell_fit.cell.mount == "instrument":
+        on_flange = not frame.startswith("instrument")
+        thing = "probe" if on_flange else "instrument"
     of_robot = f"controller's {'tool' if on_flange else 'base frame'}"
-    moved = mm_and_deg(*pose_difference(np.eye(4), step))
+    mm, deg = pose_difference(np.eye(4), step)
+    moved = mm_and_deg(mm, deg) if deg else f"{figure(mm)} mm"
     how = f": the {thing} by {moved}, or the {of_robot} by {other_frame(edge, edge @ step)}"
     return f"the {thing} or the {of_robot}", how
 
@@ -220,8 +231,9 @@ def _common_change(
     """
     some, state = np.isin(np.arange(len(inliers.problem)), rows), inliers.fit.state
     part, others = inliers.problem.subset(some), inliers.part
-    if not part.observations.has_rotation.all():
-        return None
+    are_places = not part.observations.has_rotation.all()
+    if are_places and len(part) < FEWEST_STOPS:
+        most = 1.0 / CLEAR_RATIO**2
     measured, predicted = (
         poses[:, :3, 3] for poses in (part.measured(state), part.predicted(state))
     )
@@ -229,23 +241,48 @@ def _common_change(
     of_size = float(np.ptp(sizes) / max(abs(np.median(sizes)), np.finfo(float).tiny))
     found = list[tuple[float, str, FloatArray]]()
     for frame in filter(lambda name: part.observations.involves(name).all(), part.unknown):
-        changes = part.change_of(frame, state)
-        step = mean_transform(changes)
-        left, size, usual = (
-            np.median(np.linalg.norm(log(change) / TWIST_UNITS, axis=-1))
-            for change in (invert(step) @ changes, step, others.change_of(frame, state))
-        )
+        # Rigid motions explain much of a few places.
+        if are_places and len(part) < FEWEST_STOPS and frame.startswith("instrument"):
+            continue
+        step, away = _step_of(part, frame, state)
+        usually = _step_of(others, frame, state, np.eye(4))[1]
+        size = np.linalg.norm(log(step) / TWIST_UNITS)
+        left, usual = np.median(away), np.median(usually)
         # Poses that are wrong may have much in common, and differ by far more than noise.
         is_noise = CLEAR_RATIO * left < size or left < CLEAR_RATIO * usual
         found.append((float(left / size) if is_noise else np.inf, frame, step))
     ratio, frame, step = min(found, default=(np.inf, "", np.eye(4)), key=lambda item: item[0])
     # A tool that is longer along the line of sight looks like another size, too.
-    if CLEAR_RATIO * of_size < min(1.0, CLEAR_RATIO**2 * ratio):
+    if not are_places and CLEAR_RATIO * of_size < min(1.0, CLEAR_RATIO**2 * ratio):
         return "", np.eye(4)
     if ratio >= most:
         return None
     is_alone = all(CLEAR_RATIO * ratio < rival for rival, other, _ in found if other != frame)
     return (frame if is_alone else ""), step
+
+
+def _step_of(
+    part: Problem, frame: str, state: State, step: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """The step of a frame that explains observations, or a given one, and what it leaves (n,).
+
+    Of places, a step of the instrument is rigid, and one of the point a shift.
+    """
+    if part.observations.has_rotation.all():
+        changes = part.change_of(frame, state)
+        step = mean_transform(changes) if step is None else step
+        return step, np.linalg.norm(log(invert(step) @ changes) / TWIST_UNITS, axis=-1)
+    measured, predicted = part.measured(state), part.predicted(state)
+    if frame.startswith("instrument"):
+        if step is None:
+            step = align(predicted[:, :3, 3], measured[:, :3, 3])
+        left = predicted[:, :3, 3] - apply(step, measured[:, :3, 3])
+    else:
+        left = (invert(predicted) @ measured)[:, :3, 3]
+        if step is None:
+            step = compose(np.eye(3), np.median(left, axis=0))
+        left = left - step[:3, 3]
+    return step, np.linalg.norm(left / TWIST_UNITS[3:], axis=-1)
 
 
 def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
@@ -280,13 +317,19 @@ def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFau
         each = f"{', '.join(f'{first} with {second}' for first, second in views)}"
         if len({sum(pair) for pair in views}) == 1:
             order = f", as where rows {min(views)[0]} to {min(views)[1]} are in reverse order"
+    shown = _shown(cell_fit)
     words = (
-        f"views {each} are exchanged: the image of each fits the pose in "
+        f"views {each} are exchanged: the {shown} of each fits the pose in "
         f"the other's row{order}. They were left out."
     )
     typed = ",".join(f"{first},{second}" for first, second in views)
-    do = mending("their images are exchanged", f"--exchange {typed}")
+    do = mending(f"their {shown}s are exchanged", f"--exchange {typed}")
     yield _fault(cell_fit, EXCHANGED, [row for pair in pairs for row in pair], words, do)
+
+
+def _shown(cell_fit: CellFit) -> str:
+    """The name of what stands beside a pose of the robot in a row."""
+    return "reading" if cell_fit.cell.mount == "instrument" else "image"
 
 
 def farthest_by_arms(robots: Iterable[Robot]) -> tuple[float, float]:
@@ -343,5 +386,5 @@ def _cause(
     if at in fitting:
         fits = [str(stops[index]) for index in fitting[at]]
         one = "stop" if len(fits) == 1 else "another stop, as"
-        cause = f"its image is of {one} {some_of(fits, 3)}; {cause}"
+        cause = f"its {_shown(cell_fit)} is of {one} {some_of(fits, 3)}; {cause}"
     return cause

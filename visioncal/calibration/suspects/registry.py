@@ -117,6 +117,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("corner_noise", chance=1e-4),
     # Conventions, clocks, joints.
     misread_poses.MISREAD_POSES,
+    misread_poses.MISREAD_READINGS,
     Suspect("misread_joints", None, 1e-3, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
     Suspect("joint_play", None, 1e-6, hides=("wrong_views",)),
     # The frames are by the poses, which a wrong model does not change.

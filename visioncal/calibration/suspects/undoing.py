@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 
-from visioncal.calibration.guess.fit import CLOSING_SCORE, robust_fits
+from visioncal.calibration.guess.fit import CLOSING_SCORE, mounting_fits, robust_fits
 from visioncal.calibration.guess.readings import ROW_ORDERS, shifted
 from visioncal.calibration.guess.search import CLEAR, EVIDENCE
 from visioncal.calibration.pipeline.run_state import RunState
@@ -43,8 +43,10 @@ _LEAST = 5e-4
 # Log-density of a wrong view's pose, over two radians and two distances by axis, with the prior
 # probability of wrong views; the prior of a mistake of the record; the probability that a robot
 # reports one pose twice to the last digit though it moved.
-_WRONG = float(np.log(0.05)) - 6.0 * float(np.log(2.0))
+_WRONG, _WIDTH = float(np.log(0.05)), 3.0 * float(np.log(2.0))
 _MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
+# Neighbouring rows by which a fit starts, too: those of one end of the session may be right alone.
+_WINDOW = 7
 # A turn of a board differs by less from a quarter or half one, and one of a picture whose lens has
 # its centre off the middle [rad]; copies of poses by less.
 _NEAR_RAD, _NEAR_TURN_RAD, _SAME = 0.1, 0.3, 1e-9
@@ -62,7 +64,10 @@ _IN_PLACE_M = 0.01
 
 @dataclass(frozen=True, eq=False)
 class _Record:
-    """The poses of one robot and what one camera saw of one board, by row of the session."""
+    """The poses of one robot and what one camera saw of one board, by row of the session.
+
+    Or an instrument of its probe, which it sees as a fixed camera a board.
+    """
 
     views: IntArray  # (n,) numbers of the session's rows.
     robot: FloatArray  # (n, 4, 4) the robot's part of the chain; NaN where unknown.
@@ -71,6 +76,8 @@ class _Record:
     camera: FloatArray  # (m, c, 4, 4) `cam_from_target` with all rivals.
     marks: FloatArray  # (k, 3) corners of the board [m]; empty of several and of unknown ones.
     is_numbered: bool  # Whether the camera's poses are of corners, which have numbers.
+    shows: str  # The name of what is beside a row's pose: its image or its reading.
+    are_places: bool  # Whether only the places of a point were read, whose rotations mean nothing.
 
     @classmethod
     def of(cls, run: RunState) -> Self:
@@ -89,11 +96,15 @@ class _Record:
                 camera.append((seen[view].cam_from_target[:, None] @ own).reshape(-1, 4, 4))
         most = max(map(len, camera), default=0)
         padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
+        read = run.readings
         mount: Mount = run.mount or "eye-in-hand"
+        mount = mount if read is None else "eye-to-hand"
         known, shown = robot_part(robot, mount), np.array(rows, dtype=int)
         marks = corner_positions(*session.boards.values()) if len(turns) == 1 else np.zeros((0, 3))
         is_numbered = bool(run.corners) and len(marks) > 0
-        return cls(np.array(views), known, mount, shown, np.array(padded), marks, is_numbered)
+        shows, are_places = ("image", False) if read is None else ("reading", not read.are_poses)
+        of_rows = np.array(views), known, mount, shown, np.array(padded), marks, is_numbered
+        return cls(*of_rows, shows, are_places)
 
     def paired(self, order: IntArray) -> IntArray:
         """(m,) the robot's row of each view that shows the board; -1 where it has no pose."""
@@ -133,8 +144,12 @@ class _Edges:
         some = np.flatnonzero(among & (pairs >= 0))
         if len(some) < FEWEST_COMPARED:
             return None
-        sides = record.robot[pairs[some]][None], record.camera[some, 0][None]
-        fit = robust_fits(*sides, starts, share=_KEPT)[0]
+        robot, seen = record.robot[pairs[some]][None], record.camera[some, 0]
+        if record.are_places:
+            # Of a reading, the chain is that of the point on the flange.
+            fit = mounting_fits(invert(robot), seen[:, :3, 3], starts, _KEPT, _WINDOW)[0]
+            return cls(record, fit.z, fit.x, fit.lever)
+        fit = robust_fits(robot, seen[None], starts, share=_KEPT)[0]
         return cls(record, fit.x, fit.z, fit.lever)
 
     def turned(self, pairs: IntArray) -> FloatArray:
@@ -145,12 +160,14 @@ class _Edges:
         return np.asarray(placed[np.arange(len(pairs)), away.argmin(axis=1)])
 
     def squares(self, turned: FloatArray) -> FloatArray:
-        """(..., 2) squared distances and angles without unit."""
+        """(..., 2) squared distances and angles without unit; (..., 1) distances of places."""
         shift = np.linalg.norm(turned[..., :3, 3], axis=-1) / self.lever
+        if self.record.are_places:
+            return np.asarray(shift[..., None] ** 2)
         return np.stack([shift, rotation_angle(turned)], axis=-1) ** 2
 
     def of(self, pairs: IntArray) -> FloatArray:
-        """(m, 2) squares of a pairing; infinite where a view has no pose."""
+        """(m, 2) squares of a pairing, (m, 1) of places; infinite where a view has no pose."""
         return np.where(pairs[:, None] < 0, np.inf, self.squares(self.turned(pairs)))
 
 
@@ -158,16 +175,17 @@ def _evidence(squares: FloatArray) -> tuple[FloatArray, Mask]:
     """Log marginal likelihoods of (k, m, 2) squares, and the (k, m) views that agree.
 
     The noise of positions and of rotations is integrated over (a Student distribution); the number
-    of agreeing views is the likeliest, and both edges take six directions of each.
+    of agreeing views is the likeliest, and both edges take six directions of each. Of (k, m, 1)
+    squares of places alone they take nine.
     """
-    count = squares.shape[1]
+    count, sides = squares.shape[1:]
     order = np.argsort(squares.sum(axis=2), axis=1, kind="stable")
     sums = np.cumsum(np.take_along_axis(squares, order[..., None], 1) + 3.0 * _LEAST**2, axis=1)
     agreeing = np.arange(FEWEST_COMPARED, count + 1)
-    freedom = 3.0 * agreeing - 6.0
+    freedom = 3.0 * agreeing - (6.0 if sides == 2 else 9.0)
     by_level = gammaln(0.5 * freedom) - 0.5 * freedom * np.log(np.pi)
-    logs = 2.0 * by_level - 0.5 * freedom * np.log(sums[:, agreeing - 1]).sum(axis=2)
-    logs += _WRONG * (count - agreeing)
+    logs = sides * by_level - 0.5 * freedom * np.log(sums[:, agreeing - 1]).sum(axis=2)
+    logs += (_WRONG - sides * _WIDTH) * (count - agreeing)
     best = logs.argmax(axis=1)
     agrees = np.argsort(order, axis=1) < agreeing[best][:, None]
     return logs[np.arange(len(logs)), best], agrees
@@ -199,7 +217,7 @@ def likeliest(run: RunState) -> Undoing | None:
 
     Of one robot and one camera whose poses stand beside their images, after the stage `pnp`.
     """
-    if run.mount in (None, "instrument") or run.misread or waits_for_clock(run.session):
+    if run.mount is None or run.misread or waits_for_clock(run.session):
         return None
     record = _Record.of(run)
     if len(record.rows) < FEWEST_COMPARED:
@@ -221,16 +239,16 @@ def likeliest(run: RunState) -> Undoing | None:
     best = max(every, key=lambda edges: float(_evidence(edges.of(own)[None])[0][0]))
     apart = best.of(own)
     (base,), (agrees,) = _evidence(apart[None])
-    rivals = [
-        *_copied(record, apart, own, agrees),
-        *_flipped(record, best, own, apart, float(base)),
-        *_turned_pictures(run, record, best, own, apart, float(base)),
-        *_signed(record, best, own, apart, float(base)),
-        *_mixed_units(record, own, float(base)),
-        *_mixed_angles(record, own, float(base)),
-        *_turned(record, best, own, apart, float(base)),
-        *_shifted(record, every, pairs, float(base)),
-    ]
+    rivals = [*_copied(record, apart, own, agrees), *_shifted(record, every, pairs, float(base))]
+    if record.shows == "image":
+        rivals += [
+            *_flipped(record, best, own, apart, float(base)),
+            *_turned_pictures(run, record, best, own, apart, float(base)),
+            *_signed(record, best, own, apart, float(base)),
+            *_mixed_units(record, own, float(base)),
+            *_mixed_angles(record, own, float(base)),
+            *_turned(record, best, own, apart, float(base)),
+        ]
     found = max(rivals, key=lambda rival: rival.odds, default=None)
     return found if found is not None and found.odds > CLEAR else None
 
@@ -242,9 +260,13 @@ def _copied(record: _Record, apart: FloatArray, own: IntArray, agrees: Mask) -> 
         (
             record.copies,
             "the robot's pose",
-            "the images differ: the log repeated a pose that was read before",
+            f"the {record.shows}s differ: the log repeated a pose that was read before",
         ),
-        (record.lingering, "the target's pose", "the robot moved: the last that was seen lingered"),
+        (
+            record.lingering,
+            "the target's pose" if record.shows == "image" else "the reading",
+            "the robot moved: the last that was seen lingered",
+        ),
     ):
         copied = copies & ~agrees & (own >= 0)
         if not copied.any() or not closes:
@@ -638,8 +660,8 @@ def _shifted(
     partnered = side & (pairs[by] >= 0)
     if not by or not closes or np.sum(agrees & partnered) < max(2.0, 0.6 * partnered.sum()):
         return
-    # One row, in all views, is a reading of the whole recording.
-    if side.all() and abs(by) == 1:
+    # One row, in all views, is a reading of the whole recording, which is tried of images.
+    if side.all() and abs(by) == 1 and record.shows == "image":
         return
     views = record.views[record.rows[side]].tolist()
     first, last = views[0], views[-1]
@@ -647,6 +669,7 @@ def _shifted(
     rows = f"{apart} {'later' if by > 0 else 'earlier'}"
     when = f"From view {first} on" if side[-1] else f"Up to view {last}"
     when = when if side[-1] or side[0] else f"From view {first} to view {last}"
+    when, left = ("In all views", "") if side.all() else (when, " They were left out.")
     # A pose is of one image.
     partners = set(record.rows[side].tolist())
     both = zip(views, pairs[by][side].tolist(), strict=True)
@@ -656,12 +679,12 @@ def _shifted(
         EVIDENCE * (log - base) + _MISTAKE - float(np.log(2.0 * count * len(_SHIFTS))),
         Finding(
             "shifted_rows",
-            f"{when}, images and poses are {apart} apart: the image of each row belongs to the "
-            f"robot's pose {rows}. They were left out.{dropped}",
+            f"{when}, {record.shows}s and poses are {apart} apart: the {record.shows} of each row "
+            f"belongs to the robot's pose {rows}.{left}{dropped}",
             mending("each has its own pose", f"--shift {first}-{last}:{by}"),
             tuple(views),
         ),
-        f"its image belongs to the robot's pose {rows}",
+        f"its {record.shows} belongs to the robot's pose {rows}",
     )
 
 
