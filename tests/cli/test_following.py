@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.commands import Done, visioncal
 from support.edited import rewritten
 from support.following import follow
-from support.fuzz.broken_sessions import BROKEN, edit, sound_session
+from support.fuzz.broken_sessions import BROKEN, SMALL, edit, sound_session
 from support.marks import slow
 
 from visioncal.session.columns import POSE
@@ -166,13 +166,13 @@ def test_a_size_that_poses_gave_is_known_no_better_than_so(place):
 
 @pytest.mark.parametrize("mistake", ["images named .jpg", "images in another folder"])
 def test_images_that_are_elsewhere_are_found(place, mistake):
-    BROKEN[mistake].plant(sound_session(place / "cell"))
+    BROKEN[mistake].plant(sound_session(place / "cell", SMALL))
     followed = follow("calibrate", "cell", "-o", "out")
     assert [run.status for run in followed.runs] == [2, 0]
 
 
 def test_mirrored_images_are_named_and_mirrored_back(place):
-    BROKEN["mirrored images"].plant(of_few_views(sound_session(place / "cell")))
+    BROKEN["mirrored images"].plant(of_few_views(sound_session(place / "cell", SMALL)))
     followed = follow("calibrate", "cell", "-o", "out")
     assert "The images are mirrored" in followed.runs[0].refused().said
     assert followed.last.good().said.startswith("good")

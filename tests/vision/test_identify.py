@@ -11,7 +11,7 @@ import pytest
 import tomli_w
 from support.commands import visioncal as command
 from support.following import follow
-from support.fuzz.broken_sessions import Mistake, edit, sound_session
+from support.fuzz.broken_sessions import SMALL, Mistake, edit, sound_session
 from support.marks import slow
 from support.photographed import (
     HARD,
@@ -273,7 +273,7 @@ def test_images_that_were_changed_are_mended_as_is_printed(
     tmp_path, monkeypatch, change, every, said
 ):
     monkeypatch.chdir(tmp_path)
-    folder = sound_session(tmp_path / "cell")
+    folder = sound_session(tmp_path / "cell", SMALL)
     changed_images(folder, change, every)
     followed = follow("calibrate", "cell", "-o", "out")
     assert said in followed.runs[0].said
@@ -283,7 +283,7 @@ def test_images_that_were_changed_are_mended_as_is_printed(
 
 def test_images_upside_down_are_found_by_the_robot(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    folder = sound_session(tmp_path / "cell")
+    folder = sound_session(tmp_path / "cell", SMALL)
     changed_images(folder, lambda it: it[::-1, ::-1], 4)
     command("convert", "cell", "mended", "--mend-images").good()
     text = (tmp_path / "mended/session.toml").read_text("utf-8")
@@ -294,7 +294,7 @@ def test_images_upside_down_are_found_by_the_robot(tmp_path, monkeypatch):
 
 
 def test_sound_images_are_not_mended(tmp_path):
-    folder = sound_session(tmp_path / "cell")
+    folder = sound_session(tmp_path / "cell", SMALL)
     said = command("convert", folder, tmp_path / "mended", "--mend-images").refused().said
     assert "no image is mirrored" in said
 
@@ -310,7 +310,7 @@ def test_a_board_of_another_kind_is_no_circle(tmp_path, monkeypatch, drawn, decl
     monkeypatch.chdir(tmp_path)
     folder = sound_session(
         tmp_path / "cell",
-        Mistake(options=replace(Mistake().options, target=BOARDS[drawn], views=9)),
+        Mistake(options=replace(SMALL.options, target=BOARDS[drawn], views=9)),
     )
     side_m = BOARDS[drawn].square_m
     more = {"marker_m": 0.7 * side_m, "dictionary": "DICT_5X5_100"}

@@ -17,7 +17,7 @@ import tomli_w
 from scipy.spatial.transform import Rotation
 from support.edited import Rows, edit_rows
 
-from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.simulation import CAMERAS, CellOptions, simulate, write_session
 
 POSITION, QUATERNION = ("x_m", "y_m", "z_m"), ("qx", "qy", "qz", "qw")
 
@@ -32,6 +32,15 @@ class Mistake:
     plant: Callable[[Path], object] = lambda _: None  # Breaks a sound session's folder.
     options: CellOptions = _CELL  # What the cell is otherwise like.
     joints: bool = False  # Whether its table has joint angles, and its session.toml a robot.
+
+
+# Nothing is wrong, and pictures have a quarter of the pixels.
+_LENS = CAMERAS["wide"]
+SMALL = Mistake(
+    options=replace(
+        _CELL, camera=replace(_LENS, resolution=(640, 400), matrix=_LENS.matrix / 2), blur_px=0.5
+    )
+)
 
 
 @cache
