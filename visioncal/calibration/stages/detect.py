@@ -40,6 +40,8 @@ from visioncal.vision.boards.imaging import (
 from visioncal.vision.targets import corner_positions
 
 Size = tuple[int, int]
+# What helps where some images are turned or scaled.
+_MADE_ALIKE = Remedy("Write a copy of the session in which all are alike.", MEND_IMAGES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,14 +164,22 @@ def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Sea
         for view, (width, height) in sizes.items()
         if (width, height) != stated
     ]
+    of_sizes = f"{culprits[0]}, and session.toml has {stated[0]} x {stated[1]} px."
+    if stated in counts and all(
+        _is_turned_or_scaled(size, stated) for size in {*counts} - {stated}
+    ):
+        raise DataError(
+            f"{len(culprits)} of {len(sizes)} images are turned or scaled: {of_sizes}",
+            culprits=culprits,
+            next_step=str(_MADE_ALIKE),
+        )
     lens = (
         ""
         if all(table.matrix is None for table in tables)
         else (", and delete matrix and distortion: they are of other images")
     )
     raise DataError(
-        f"{len(culprits)} of {len(sizes)} images are of another size: {culprits[0]}, and "
-        f"session.toml has {stated[0]} x {stated[1]} px.",
+        f"{len(culprits)} of {len(sizes)} images are of another size: {of_sizes}",
         culprits=culprits,
         next_step=f"In session.toml, write resolution = [{usual[0]}, {usual[1]}]{lens}.",
     )
@@ -180,9 +190,7 @@ def other_sizes(detections: Detections) -> Iterator[Finding]:
     usual = detections.resolution
     sizes = {view: at.size for view, at in detections.searches.items() if at.size is not None}
     odd = [
-        view
-        for view, size in sizes.items()
-        if size != usual and (size == usual[::-1] or is_scaled(size, usual))
+        view for view, size in sizes.items() if size != usual and _is_turned_or_scaled(size, usual)
     ]
     if odd:
         width, height = sizes[odd[0]]
@@ -190,7 +198,7 @@ def other_sizes(detections: Detections) -> Iterator[Finding]:
             "image_sizes",
             f"{len(odd)} of {len(sizes)} images are turned or scaled: view {ranges(odd)}, such as "
             f"{width} x {height} px, and the camera's are {usual[0]} x {usual[1]}.",
-            Remedy("Write a copy of the session in which all are alike.", MEND_IMAGES),
+            _MADE_ALIKE,
             tuple(odd),
         )
 
@@ -237,6 +245,10 @@ def unshown_rows(session: Session, detections: Detections) -> Iterator[Finding]:
             Remedy(f"Count the rows, and {write}; where they are covered, uncover them.", command),
             tuple(in_view),
         )
+
+
+def _is_turned_or_scaled(size: Size, usual: Size) -> bool:
+    return size == usual[::-1] or is_scaled(size, usual)
 
 
 def is_scaled(size: Size, usual: Size) -> bool:
