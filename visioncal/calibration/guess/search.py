@@ -36,7 +36,7 @@ from visioncal.calibration.guess.unwrapping import unwrapped
 from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, IntArray, Mask, Mount
+from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.estimation.closed_form import upper_pairs
 
 # With fewer views too many readings agree; more than the second add time and no certainty.
@@ -384,22 +384,28 @@ def _near(tried: Sequence[Hypothesis], scores: Sequence[float]) -> list[Hypothes
 
 def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], float]:
     """Low quantile of the differences [rad] by which robot and camera turn under a reading."""
-    of_camera = recording.camera.rows(rows)
-
-    @cache
-    def ordered(order: str) -> tuple[PoseNumbers, Mask]:
-        at = ROW_ORDERS[order](len(recording.robot))[rows]
-        return recording.robot.rows(np.maximum(at, 0)), at < 0
+    of_camera, pairs = recording.camera.rows(rows), upper_pairs(len(rows))
+    rows_of = {name: order(len(recording.robot))[rows] for name, order in ROW_ORDERS.items()}
+    used = np.unique(np.maximum(np.concatenate([*rows_of.values()]), 0))
+    numbers = recording.robot.rows(used)
 
     # Transposed or mirrored rotations turn by the same angles.
     @cache
-    def by_robot(fields: _Rotations, order: str) -> FloatArray:
+    def traces(fields: _Rotations) -> FloatArray:
         rotation, written, terms, angle_unit = fields
         reading = SideReading(rotation, written=written, terms=terms, angle_unit=angle_unit)
-        numbers, is_missing = ordered(order)
-        rotations = reading.rotations(numbers)
-        rotations[is_missing] = np.nan
-        return relative_angles(rotations)
+        return _traces(np.append(reading.rotations(numbers), np.full((1, 3, 3), np.nan), axis=0))
+
+    @cache
+    def places(order: str) -> tuple[IntArray, IntArray]:
+        at = rows_of[order]
+        # The last is missing.
+        of_rows = np.where(at < 0, len(used), np.searchsorted(used, at))
+        return of_rows[pairs[0]], of_rows[pairs[1]]
+
+    @cache
+    def by_robot(fields: _Rotations, order: str) -> FloatArray:
+        return _angles(traces(fields)[places(order)])
 
     @cache
     def by_camera(rotation: str) -> FloatArray:
@@ -423,6 +429,14 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
 
 def relative_angles(rotations: FloatArray) -> FloatArray:
     """(p,) angles [rad] of the relative rotations of all pairs of (n, 3, 3) rotations."""
+    return _angles(_traces(rotations)[upper_pairs(len(rotations))])
+
+
+def _traces(rotations: FloatArray) -> FloatArray:
+    """(n, n) traces of the relative rotations of (n, 3, 3) rotations."""
     flat = rotations.reshape(-1, 9)
-    traces = (flat @ flat.T)[upper_pairs(len(flat))]
+    return np.asarray(flat @ flat.T)
+
+
+def _angles(traces: FloatArray) -> FloatArray:
     return np.asarray(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
