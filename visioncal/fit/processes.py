@@ -293,9 +293,13 @@ class Tried:
     def beside(self, rows: FloatArray, shared: "_Shared") -> Self:
         """The same with rows (d k, r + c + 1) of k more stops."""
         covariance = shared.independent[self.white]
+        is_new = self.process is not None
         if self.process is not None:
             covariance = covariance + self.size**2 * shared.lasting[self.process]
-        root = np.linalg.cholesky(covariance)
+        # By columns, as LAPACK has it: NumPy's copies take as long as the solution of few columns.
+        root, failed = lapack.dpotrf(covariance.T, lower=1, clean=0, overwrite_a=is_new)
+        if failed:
+            raise np.linalg.LinAlgError("a covariance of stops is not positive definite")
         solved, _ = lapack.dtrtrs(root, rows, lower=1)
         log_det = self.log_det + 2.0 * float(np.log(np.diag(root)).sum())
         return replace(self, total=solved.T @ solved + self.total, log_det=log_det)
@@ -334,6 +338,7 @@ def _grid_of(
     kinds = tuple(processes(poses, levels, creeps=creeps))
     shared = _Shared.of(alone, some, kinds)
     rows, rest, by_boards = _combined(alone, some, shared.independent[1.0], boards)
+    rows = np.asfortranarray(rows)
     return _grid(kinds, _SIZES, rest, by_boards), lambda one: one.beside(rows, shared)
 
 
@@ -422,7 +427,7 @@ def _by_groups(
     grid = [*_grid(kinds, (0.1, *_SIZES), alone.rest, np.zeros((alone.count, 0)))]
     left = [(one, 0.0) for one in grid]
     for at, group in enumerate(groups, 1):
-        rows = alone.rows[group].reshape(-1, alone.count + 1)
+        rows = np.asfortranarray(alone.rows[group].reshape(-1, alone.count + 1))
         shared = _Shared.of(alone, group, {one.process for one, _ in left if one.process})
         weighed = partial(_evidence, rows=rows, shared=shared)
         # Further groups may change what is far.
