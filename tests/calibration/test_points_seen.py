@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.ball_seen import session_of, squared
 from support.commands import visioncal
+from support.marks import slow
 from support.refusals import raised
 
 import visioncal as package
@@ -15,7 +16,7 @@ from visioncal.core.errors import DegenerateError
 BALL = Path(__file__).parents[3] / "shared/data/field/cases/ball-points/ball.csv"
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
 def test_a_ball_gives_the_camera_within_its_covariance(mount):
     name = "flange_from_cam" if mount == "eye-in-hand" else "base_from_cam"
     squares = []

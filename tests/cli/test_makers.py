@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from support import readers
 from support.aligned_cells import made_up_cell
 from support.commands import turned_poses, visioncal, write_poses, write_table
-from support.makers import MAKERS, NUMBER, pose_of, shown, written
+from support.makers import BY_FORM, MAKERS, NUMBER, pose_of, shown, written
 from support.refusals import raised
 from support.rotations import CASES
 
@@ -284,7 +284,7 @@ def test_a_shown_pose_is_the_pose_and_is_read_again(maker):
             assert np.abs(read_pose(line, "the line", maker).pose - pose).max() < SHOWN
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", BY_FORM)
 def test_the_touch_test_sends_the_robot_by_its_own_form(work, of_maker, maker):
     words = ("touch-test", work[0] / "look", "-c", of_maker(maker), *GAUGE)
     said = visioncal(*words).good().out
@@ -341,7 +341,7 @@ def tool(work):
     return work[0] / "tool.json"
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", BY_FORM)
 def test_touches_are_read_and_frames_are_told_in_the_robot_s_form(of_maker, tool, maker, tmp_path):
     rng = np.random.default_rng(2)
     poses = turned_poses(rng, PIVOT, TIP, np.eye(3))

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from support.marks import slow
 
 
 def _euler(order, *, degrees=True):
@@ -49,6 +50,10 @@ MAKERS = {
     # U about z, V about y, W about x (SPEL+ language reference, point data).
     "epson": ("X,Y,Z,U,V,W", *_euler("ZYX")),
 }
+# Makers one of each form, and those whose poses are written as another one's: left to the long run
+# where only the form of the poses counts.
+ALIKE = {"yaskawa", "xarm", "mecademic", "kawasaki", "comau", "techman", "epson"}
+BY_FORM = [slow(maker) if maker in ALIKE else maker for maker in MAKERS]
 # Of these, those in metres and radians.
 METRES = ("ur", "realman")
 NUMBER = r"-?\d+\.?\d*(?:e-?\d+)?"

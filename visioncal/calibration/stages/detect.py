@@ -40,7 +40,7 @@ from visioncal.vision.boards.imaging import (
 from visioncal.vision.targets import corner_positions
 
 Size = tuple[int, int]
-# What helps where some images are turned or scaled.
+# Remedy where some images are turned or scaled.
 _MADE_ALIKE = Remedy("Write a copy of the session in which all are alike.", MEND_IMAGES)
 
 
