@@ -72,6 +72,16 @@ def short_of_lines(cell):
     return reporting(cell, base_from_flange=sent @ exp(-0.01 * back))
 
 
+def short_of_places(cell):
+    """As `short`, by 0.6 mm of each motion, in place alone: turns are reached."""
+    sent = cell.robot.base_from_flange
+    away = np.append(np.zeros((1, 3)), np.diff(sent[:, :3, 3], axis=0), axis=0)
+    length = np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    logged = sent.copy()
+    logged[:, :3, 3] += 6e-4 * away / length
+    return reporting(cell, base_from_flange=logged)
+
+
 def onwards(cell):
     """Poses that are read when the arm is a two-hundredth of the way to its next stop."""
     there = cell.robot.base_from_flange
@@ -594,7 +604,8 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
         (warmed, "lens_grows", np.array([1.5e-3 * (1.0 - np.exp(-3.0)), 0.0, 0.0])),
         (sagged, "lens_sags", 1e-3 * np.eye(9)[[3, 7]].sum(axis=0)),
         (short, "stops_short", None),
-        (short_of_lines, "stops_short", np.array([-0.01, 0.0, 0.0, 0.0])),
+        (short_of_lines, "stops_short", np.array([-0.01, 0.0, 0.0, 0.0, 0.0, 0.0])),
+        (short_of_places, "stops_short", np.array([0.0, 0.0, 0.0, 0.0, 0.0, -2e-3])),
         (onwards, "moves_on", None),
     ],
 )

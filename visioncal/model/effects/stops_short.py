@@ -20,11 +20,12 @@ class _AlongMotion(Effect, Named):
     """Where the arm stands along a motion: by a share of it, and by as much of each.
 
     The latter as a share of a motion of 0.3 m, with turns at a lever. The first two values are of a
-    straight line with an even turn, two more of how far a screw departs from it. At other moments
-    than the cell's stops the poses are right.
+    straight line with an even turn, two more of how far a screw departs from it, and two of the
+    place alone, as of a controller that waits for places and turns apart. At other moments than
+    the cell's stops the poses are right.
     """
 
-    count, bounds, most = 4, (1e-2, 1e-6, 0.1), 5e-2
+    count, bounds, most = 6, (1e-2, 1e-6, 0.1), 5e-2
     poses: FloatArray  # (s, 4, 4) `base_from_flange` at the cell's stops; NaN where unknown.
 
     @classmethod
@@ -36,7 +37,7 @@ class _AlongMotion(Effect, Named):
     @staticmethod
     @abstractmethod
     def motions(poses: FloatArray) -> FloatArray:
-        """(n, 2, 6) motions at stops of (n, 4, 4) poses: along lines, and screws beside these."""
+        """(n, 3, 6) motions at (n, 4, 4) poses: along lines, screws beside these, places."""
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
@@ -45,23 +46,31 @@ class _AlongMotion(Effect, Named):
 
     @cached_property
     def _of_stops(self) -> FloatArray:
-        stood, found = np.isfinite(self.poses[:, 0, 0]), np.zeros((len(self.poses), 6, 4))
+        stood, found = np.isfinite(self.poses[:, 0, 0]), np.zeros((len(self.poses), 6, 6))
         motions = self.motions(self.poses[stood])
-        length = np.linalg.norm(motions[:, 0] * np.repeat([LEVER_M, 1.0], 3), axis=1)
-        even = motions * (0.3 / np.maximum(length, 1e-6))[:, None, None]
-        found[stood] = np.swapaxes(np.stack([motions, even], axis=2).reshape(-1, 4, 6), 1, 2)
+        length = np.linalg.norm(motions * np.repeat([LEVER_M, 1.0], 3), axis=2)
+        # How far a screw departs from a line is small beside both.
+        length[:, 1] = length[:, 0]
+        even = motions * (0.3 / np.maximum(length, 1e-6))[:, :, None]
+        found[stood] = np.swapaxes(np.stack([motions, even], axis=2).reshape(-1, 6, 6), 1, 2)
         return found
+
+    @staticmethod
+    def off_m(values: FloatArray) -> float:
+        """How far beyond the end of a motion of 0.3 m it stands by (6,) values [m]."""
+        return 0.3 * float(values[[0, 1, 4, 5]].sum())
 
 
 def _between(poses: FloatArray, seen_from: FloatArray) -> FloatArray:
-    """(n - 1, 2, 6) motions from each of (n, 4, 4) poses to the next.
+    """(n - 1, 3, 6) motions from each of (n, 4, 4) poses to the next.
 
     In the frame of the (n - 1, 4, 4) one at which they are looked at.
     """
     screws, shifts = log(invert(poses[:-1]) @ poses[1:]), np.diff(poses[:, :3, 3], axis=0)
     along = np.einsum("nji,nj->ni", seen_from[:, :3, :3], shifts)
     beside = np.append(np.zeros_like(along), screws[:, 3:] - along, axis=1)
-    return np.stack([screws - beside, beside], axis=1)
+    places = np.append(np.zeros_like(along), along, axis=1)
+    return np.stack([screws - beside, beside, places], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +86,7 @@ class StopsShort(_AlongMotion):
     @classmethod
     def says(cls, values: FloatArray) -> str:
         """See `Named`."""
-        off = 0.3 * float(values[[0, 1]].sum())
+        off = cls.off_m(values)
         way = "short of" if off < 0.0 else "beyond"
         return (
             f"At each stop the arm stood {way} the pose that was logged, along its last motion: by "
@@ -87,7 +96,7 @@ class StopsShort(_AlongMotion):
     @staticmethod
     def motions(poses: FloatArray) -> FloatArray:
         """See `_AlongMotion`."""
-        return np.append(np.zeros((1, 2, 6)), _between(poses, poses[1:]), axis=0)
+        return np.append(np.zeros((1, 3, 6)), _between(poses, poses[1:]), axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +109,7 @@ class MovesOn(_AlongMotion):
     @classmethod
     def says(cls, values: FloatArray) -> str:
         """See `Named`."""
-        off = 0.3 * float(values[[0, 1]].sum())
+        off = cls.off_m(values)
         first, then = ("image", "pose") if off < 0.0 else ("pose", "image")
         return (
             f"The arm had moved on towards the next stop between {first} and {then}, of which the "
@@ -111,4 +120,4 @@ class MovesOn(_AlongMotion):
     @staticmethod
     def motions(poses: FloatArray) -> FloatArray:
         """See `_AlongMotion`."""
-        return np.append(_between(poses, poses[:-1]), np.zeros((1, 2, 6)), axis=0)
+        return np.append(_between(poses, poses[:-1]), np.zeros((1, 3, 6)), axis=0)
