@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from support.cells import board_numbers, calibrated, error_of, known_of, pairs_session, session_of
 from support.following import follow
+from support.marks import crossed
 from support.misfits import misfit
 from support.refusals import raised
 
@@ -587,8 +588,7 @@ def test_the_motion_is_not_to_blame_for_errors_that_last():
     assert "tilted" not in weak.do.words
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-@pytest.mark.parametrize("off", [0.0, 3e-4])
+@pytest.mark.parametrize(("off", "mount"), crossed([0.0, 3e-4], ["eye-in-hand", "eye-to-hand"]))
 def test_a_size_of_measured_distances_competes_with_the_lengths_of_an_arm(mount, off) -> None:
     """Both stay in the covariance: neither becomes an error of the frames."""
     errors = {"dh_sigma_m": off, "dh_sigma_rad": off, "offset_sigma_rad": off}

@@ -213,7 +213,10 @@ def test_positions_that_lost_a_sign_get_it_back_by_the_printed_command(
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
 
 
-@pytest.mark.parametrize(("kind", "mount"), crossed(["sign", "unit", "inverse"], MOUNTS))
+@pytest.mark.parametrize(
+    ("kind", "mount"),
+    [*crossed(["unit", "inverse"], MOUNTS), *(slow("sign", mount) for mount in MOUNTS)],
+)
 def test_poses_that_are_misread_and_rows_apart_are_mended_one_after_the_other(
     tmp_path, monkeypatch, mount, kind
 ):
@@ -664,7 +667,7 @@ def in_a_cell(seed, kind):
 
 
 @pytest.mark.parametrize("seed", [0, *map(slow, range(1, 5))])
-@pytest.mark.parametrize("kind", ["shifted_rows", "copied_poses", "nothing"])
+@pytest.mark.parametrize("kind", ["shifted_rows", slow("copied_poses"), "nothing"])
 def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind, seed):
     session, wrong = in_a_cell(seed, kind)
     causes = visioncal.calibrate(session).verdict.causes

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from support.core_worker import on_one_clock
-from support.marks import seeds
+from support.marks import seeds, slow
 from support.small_cells import BOARD, PX, TABLE, made
 
 from visioncal.core.transforms import exp, invert, log
@@ -112,7 +112,7 @@ def test_what_is_open_about_clocks_predicts_nothing_at_rest():
     assert not jacobians[1].any()
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
 def test_a_sweep_by_a_rolling_shutter_is_calibrated(mount):
     how = SweepOptions(stops=8, camera_minus_robot_s=0.037, readout_s=0.0124)
     cell = sweep(CellOptions(seed=1, mount=mount, pixel_sigma_px=0.1), how)

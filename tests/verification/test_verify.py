@@ -592,8 +592,7 @@ def test_an_act_ends_where_nothing_changed_and_where_the_proof_fails(cell, tmp_p
     assert (tmp_path / "act/exports/ur").exists()
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
-@pytest.mark.parametrize("what", ["camera", "board"])
+@pytest.mark.parametrize(("what", "mount"), crossed(["camera", "board"], MOUNTS))
 def test_half_a_turn_is_no_metre(what, mount):
     """By poses of the target, as a camera that is turned so far sees none in its image."""
     cell, rng = simulate(CellOptions(views=20, mount=mount)), np.random.default_rng(2)

@@ -384,7 +384,7 @@ def test_a_board_that_the_image_cuts_is_at_least_so_large():
     assert sideways.corners_seen < sideways.corners
 
 
-@pytest.mark.parametrize("sigma_px", [0.0, 3.0, 12.0])
+@pytest.mark.parametrize("sigma_px", [0.0, slow(3.0), 12.0])
 def test_an_image_without_a_board_is_refused(sigma_px):
     noise = np.random.default_rng(1).normal(0.0, 1.0, (600, 800))
     if sigma_px:
