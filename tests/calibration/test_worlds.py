@@ -18,7 +18,7 @@ from support.misfits import misfit
 
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.random_effects import KINDS
-from visioncal.core.transforms import adjoint, apply_each, exp, invert, log
+from visioncal.core.transforms import adjoint, apply, apply_each, compose, exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.results import Calibration
 from visioncal.simulation import BOARDS, CAMERAS, CellOptions, SimulatedCell, cell_session, simulate
@@ -646,6 +646,36 @@ def test_a_bracket_that_bends_alone_is_within_its_sigmas():
     # times as large, in one of six components: (9 + 5) / 6, and of four cells less than 4. Without
     # it, 8.
     assert 0.05 < np.mean(squares) < 4.0
+
+
+def test_a_tilted_window_is_no_motion_and_its_lens_seems_elsewhere():
+    """Picks through it are from where its lens seems to be; 6 mm of glass, or 4 mm tilted more."""
+    squares = []
+    for seed, (thick_m, tilt) in enumerate(((6e-3, 35.0), (6e-3, 30.0), (4e-3, 45.0))):
+        cell = simulate(replace(OPEN, views=24, seed=seed))
+        points, camera = corner_positions(cell.options.target), cell.options.camera
+        normal = Rotation.from_euler("zx", [40.0 * seed, tilt], degrees=True).as_matrix()[:, 2]
+
+        def nearer(seen, normal=normal, thick_m=thick_m):
+            """Snell's law: shifts along the normal by t (1 - tan inside / tan outside)."""
+            outside = np.arccos(seen @ normal / np.linalg.norm(seen, axis=-1))
+            inside = np.arcsin(np.sin(outside) / 1.52)
+            share = 1.0 - np.tan(inside) / np.tan(outside)
+            return thick_m * share[..., None] * normal
+
+        looks = list[Corners]()
+        for seen, pose in zip(cell.corners, cell.cam_from_target, strict=True):
+            at = apply(pose, points[seen.ids])
+            moved = project(camera, at - nearer(at)) - project(camera, at)
+            looks.append(replace(seen, px=seen.px + moved))
+        known = calibrated(showing(cell, looks), joints=False)
+        assert known.verdict.causes[0].kind == "window", known.verdict
+        assert not {"row_motion", "wrong_views"} & {one.kind for one in known.verdict.findings}
+        seems = compose(np.eye(3), nearer(np.array([0.0, 0.0, 1.0])))
+        place = cell.transforms["flange_from_cam"] @ seems
+        squares.append(misfit(known.assessment.edges["cam"], place) / 6.0)
+    # Of 18 squares; as motion of rows, or as a good result, it is 4 and more each.
+    assert np.mean(squares) < chi2.ppf(0.999, 18) / 18.0, squares
 
 
 def test_a_bump_is_in_the_covariance():

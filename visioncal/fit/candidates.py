@@ -13,7 +13,7 @@ from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
 from visioncal.fit.linearise import Pair, images_of, linearised, predicted
-from visioncal.fit.score import best_field, of_effect, of_rows
+from visioncal.fit.score import best_field, best_window, of_effect, of_rows
 from visioncal.fit.sizes import most_likely
 from visioncal.fit.unknowns import (
     State,
@@ -44,6 +44,7 @@ from visioncal.model.effects import (
     Springs,
     Stood,
     Weight,
+    Window,
 )
 
 # Log-likelihood ratio by which a rival is as good as ruled out.
@@ -152,7 +153,7 @@ def of_stops(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
 
 
 def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
-    """Motion of rows while they are read, of cameras whose motion is not known."""
+    """Motion of rows while they are read, of cameras whose motion is not known; panes of glass."""
     swept = {sweep.camera for sweep in fit.cell.sweeps}
     for camera in fit.unknowns.lenses.keys() - swept:
         effect = RowMotion(camera, fit.unknowns.lenses[camera], stops_of(fit, camera))
@@ -164,6 +165,9 @@ def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
                 # Tilts of a plane look much like it: beyond, arms' errors would be taken for it.
                 member = starting_at(random_effect(effect), size, _SHOWN * size)
                 yield Candidate(gain, member, effect)
+        if f"window {camera}" not in {known.name for known in fit.unknowns.effects}:
+            pane, size, gain = best_window(fit, pairs, Window.tried(camera))
+            yield Candidate(gain, starting_at(random_effect(pane), size), pane)
 
 
 def of_distances(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import block_diag, eigvalsh_tridiagonal, lapack
 
+from visioncal.core.transforms import apply_each
 from visioncal.core.types import FloatArray
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field, fields_of_lengths, orders_of_waves, waves
@@ -24,7 +25,8 @@ from visioncal.fit.linearise import (
     of_pose_alone,
 )
 from visioncal.fit.mixed import body_with, weights_at
-from visioncal.model.effects import Effect, RowMotion
+from visioncal.model.effects import Effect, RowMotion, Window
+from visioncal.vision.camera import project_with_jacobian
 
 # Columns from which on no eigenvectors are worked out.
 _MANY = 64
@@ -223,6 +225,58 @@ def of_rows(fit: Fit, pairs: Sequence[Pair], motion: RowMotion) -> Score:
     return Score(pull.ravel(), np.asarray(block_diag(*information)), fit.of_corners)
 
 
+def best_window(
+    fit: Fit, pairs: Sequence[Pair], windows: Sequence[Window]
+) -> tuple[Window, float, float]:
+    """The likeliest of some panes before one lens, its size, and its log-likelihood ratio."""
+    camera, count, added = windows[0].frame, len(windows), list[Added]()
+    lens = fit.unknowns.camera(fit.linearised, camera)
+    for gram, pair, rows in _of_images(fit, images_of(pairs, camera)):
+        kept = fit.used[gram.rows]
+        shape = pair.basis[pair.ids] @ fit.linearised.values["shape", pair.names[1]]
+        points = apply_each(gram.poses[pair.owner], pair.points[pair.ids] + shape)
+        slopes = project_with_jacobian(lens, points).jacobian_point
+        moved = np.stack([window.moved(points)[:, :, 0] for window in windows], axis=2)
+        each = slopes @ moved * pair.weights[:, None, None]
+        full = np.concatenate([rows.head, rows.residual[:, :, None]], axis=2)
+        left, right = (
+            pair.padded(part)[kept].reshape(int(kept.sum()), -1, part.shape[2])
+            for part in (each, full)
+        )
+        local, weight = np.swapaxes(left, 1, 2) @ right, _weight(fit, gram)
+        inner, taken = left.reshape(-1, count), gram if kept.all() else gram.take(kept)
+        added.append(_beside_poses(fit, taken, local, weight * inner.T @ inner))
+    found = score(fit, added, count, fit.of_corners)
+    alone = [
+        Score(found.pull[[at]], found.information[[at]][:, [at]], found.freedom).best(
+            np.ones(1), *windows[at].bounds[1:]
+        )
+        for at in range(count)
+    ]
+    best = max(range(count), key=lambda at: alone[at][1])
+    return windows[best], alone[best][0], alone[best][1] - float(np.log(count))
+
+
+def _beside_poses(fit: Fit, gram: Gram, local: FloatArray, product: FloatArray) -> Added:
+    """Columns of corners with the weights of their noise.
+
+    Args:
+        fit: The fit.
+        gram: The (k,) sightings.
+        local: (k, c, h + 1) products of the columns with the sightings' own, and with residuals.
+        product: (c, c) of the columns with themselves, weighted.
+    """
+    weight = _weight(fit, gram)
+    if len(gram.parts) > 1:
+        # The part that poses explain has another noise than the rest.
+        more, by_pose = _weight(fit, gram, 1) - weight, np.swapaxes(local[:, :, :6], 1, 2)
+        raw = np.asarray(sum(part.heads for part in gram.parts))
+        solved, count = of_pose_alone(raw) @ by_pose, len(product)
+        product = product + more * by_pose.reshape(-1, count).T @ solved.reshape(-1, count)
+        local = local + more / weight * np.swapaxes(solved, 1, 2) @ raw[:, :6]
+    return Added(gram, weight * local, product)
+
+
 def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
     """The score of all waves of a lens's field, along both axes."""
     added = _by_waves(fit, images_of(pairs, camera), camera)
@@ -232,7 +286,6 @@ def of_waves(fit: Fit, pairs: Sequence[Pair], camera: str) -> Score:
 def _by_waves(fit: Fit, own: Sequence[Pair], camera: str) -> Iterator[Added]:
     """The waves' columns, of some images at a time: those of all would fill the memory."""
     orders, width = orders_of_waves(), float(fit.unknowns.lenses[camera].resolution[0])
-    count = len(orders)
     for gram, pair, rows in _of_images(fit, own):
         kept = fit.used[gram.rows]
         predicted = pair.px - rows.residual / pair.weights[:, None]
@@ -244,14 +297,7 @@ def _by_waves(fit: Fit, own: Sequence[Pair], camera: str) -> Iterator[Added]:
         weight, local = _weight(fit, gram), local[kept]
         product = weight * np.asarray(np.kron(np.eye(2), inner.T @ inner))
         taken = gram if kept.all() else gram.take(kept)
-        if len(taken.parts) > 1:
-            # The part that poses explain has another noise than the rest.
-            more, by_pose = _weight(fit, gram, 1) - weight, np.swapaxes(local[:, :, :6], 1, 2)
-            raw = np.asarray(sum(part.heads for part in taken.parts))
-            solved = of_pose_alone(raw) @ by_pose
-            product += more * by_pose.reshape(-1, 2 * count).T @ solved.reshape(-1, 2 * count)
-            local = local + more / weight * np.swapaxes(solved, 1, 2) @ raw[:, :6]
-        yield Added(taken, weight * local, product)
+        yield _beside_poses(fit, taken, local, product)
 
 
 def _of_images(fit: Fit, own: Sequence[Pair]) -> Iterator[tuple[Gram, Pair, CornerRows]]:

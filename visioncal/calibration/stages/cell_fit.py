@@ -14,7 +14,7 @@ from visioncal.calibration.stages.error_sizes import ErrorSizes
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.transforms import pose_difference
+from visioncal.core.transforms import apply, pose_difference
 from visioncal.core.types import Corners, FloatArray, IntArray
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.fit import Fit
@@ -22,6 +22,7 @@ from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.scene import BoardSizes, CornerProblem, Scene
+from visioncal.vision.targets import corner_positions
 
 # An arm without joint angles may look like a step of a frame.
 OTHER_POSTURE = (
@@ -141,11 +142,12 @@ class CellFit:
         stops = self.inlier_fit.problem.observations.stops.tolist()
         stop_of = {row.view: at for row, at in zip(self.cell.rows, stops, strict=True)}
         for frame, scene in scenes.items():
-            corners: dict[int, Corners] = {
-                view.view: sizes.steadied(frame, stop_of.get(view.view, -1), view.corners)
-                for view in views[frame]
-                if view.corners is not None
-            }
+            corners, marks = dict[int, Corners](), corner_positions(*scene.targets)
+            for view in views[frame]:
+                if view.corners is not None:
+                    shown = scene.camera, apply(view.cam_from_target[0], marks[view.corners.ids])
+                    station = stop_of.get(view.view, -1)
+                    corners[view.view] = sizes.steadied(frame, station, view.corners, shown)
             problem, levels = CornerProblem.of(scene, corners, shares), sizes.levels.get(frame)
             problems[frame] = replace(
                 problem if levels is None else problem.with_levels(levels),

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
-from visioncal.core.types import Corners, FloatArray
+from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.estimation.lens_field import LensLevels, lens_part
 from visioncal.estimation.outliers import EARLY_SHARE
 from visioncal.estimation.scene import BoardSizes
@@ -17,9 +17,9 @@ from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
-from visioncal.model.effects import Effect, LensGrows, LensSags, LensSteps, SightSteps
+from visioncal.model.effects import Effect, LensGrows, LensSags, LensSteps, SightSteps, Window
 from visioncal.session import frame_name
-from visioncal.vision.camera import intrinsics
+from visioncal.vision.camera import intrinsics, project
 from visioncal.vision.targets import corner_positions, first_corners
 
 # Effects in words.
@@ -35,6 +35,7 @@ _INSTEAD = {
     "lens changes": "the lens was exchanged, or its pictures rectified",
     "lens steps": "the lens changed at once",
     "row motion": "the camera moved while rows of its images were read",
+    "window": "it was seen through a tilted pane of glass",
 }
 
 
@@ -46,6 +47,15 @@ class FoundEffect:
     columns: FloatArray  # See `Effect.columns`, at the session's stations.
     values: FloatArray  # (c,) estimates.
     covariance: FloatArray  # (c, c) of these.
+    gain: float  # Twice the gain in log-likelihood.
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPane:
+    """A pane of glass before a lens."""
+
+    pane: Window
+    values: FloatArray  # (3,) of it.
     gain: float  # Twice the gain in log-likelihood.
 
 
@@ -72,19 +82,27 @@ class ErrorSizes:
     # since what is linear at one lens is not so at another.
     zoomed: Mapping[str, Zoom] = field(default_factory=dict)
     opened: tuple[Effect, ...] = ()  # Of frames that move; of measured poses, their steps alone.
+    panes: tuple[FoundPane, ...] = ()  # Through which lenses look.
     rivals: Mapping[str, frozenset[str]] = field(default_factory=dict)  # See `Unknowns.rivals`.
     # Whether boards keep their stated sizes: errors of arms are confounded with them.
     holds_scales: bool = False
 
-    def steadied(self, camera: str, station: int, corners: Corners) -> Corners:
-        """Corners of an image as a lens shows them that neither grows nor sags.
+    def steadied(
+        self, camera: str, station: int, corners: Corners, shown: tuple[Camera, FloatArray]
+    ) -> Corners:
+        """Corners of an image as a lens shows them that neither grows nor sags, without a pane.
 
         Args:
             camera: The camera's frame.
             station: Where the robot stood; -1 where that is not known.
             corners: The corners.
+            shown: About the lens, and (n, 3) where it sees them [m].
         """
-        px = corners.px
+        px, (lens_now, seen) = corners.px, shown
+        for at in self.panes:
+            if at.pane.frame == camera:
+                nearer = seen + at.pane.moved(seen) @ at.values
+                px = px + project(lens_now, seen) - project(lens_now, nearer)
         for found in self.grown:
             if found.effect.frame == camera and 0 <= station < len(found.columns):
                 moves, lens = (found.columns[station] @ found.values)[:4], found.effect.lens.matrix
@@ -148,8 +166,13 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
         if abs(zoom.share) > grew.get(name, 0.0):
             zoomed[name], grew[name] = zoom, abs(zoom.share)
     effects = (at for at in fit.unknowns.effects if at.place == "edge" and _size(fit, at.name))
-    opened, rivals = tuple(effects), fit.unknowns.rivals
-    return ErrorSizes(levels, lenses, boards, grown, zoomed, opened, rivals, held)
+    panes = (
+        FoundPane(at, fit.state.values["effect", at.name], _gain(fit, at.name))
+        for at in fit.unknowns.effects
+        if isinstance(at, Window) and _size(fit, at.name)
+    )
+    known = tuple(effects), tuple(panes), fit.unknowns.rivals
+    return ErrorSizes(levels, lenses, boards, grown, zoomed, *known, held)
 
 
 @dataclass(frozen=True, eq=False)

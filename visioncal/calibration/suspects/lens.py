@@ -22,6 +22,7 @@ from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.estimation.joint import moved_mahalanobis_sq
 from visioncal.estimation.scene import ONLY_CAMERA
 from visioncal.model.effects.effect import SIGNIFICANT
+from visioncal.model.effects.window import nearer
 from visioncal.results.compare import intrinsics_names
 from visioncal.vision.camera import intrinsics, normalise, project, with_intrinsics
 
@@ -264,6 +265,29 @@ def _moving(run: RunState) -> Iterator[Finding]:
             ).of("" if name == ONLY_CAMERA else name)
 
 
+def _seen_through(run: RunState) -> Iterator[Finding]:
+    """Panes of glass before lenses."""
+    sizes = run.cell_fit.sizes
+    for found in sizes.panes:
+        camera, (thick_m, normal) = found.pane.frame, found.pane.pane(found.values)
+        shift_mm = 1e3 * thick_m * nearer(np.array([[0.0, 0.0, 1.0]]), normal)[0]
+        tilt = f"{np.rad2deg(np.arccos(normal[2])):.0f} deg"
+        where = ", ".join(f"{part:.1f}" for part in shift_mm.tolist())
+        yield Finding(
+            "window",
+            "The camera looks through a tilted pane of glass, as of a housing or a mirror's front: "
+            f"about {figure(1e3 * thick_m)} mm thick, tilted by {tilt}. It was taken out "
+            "of the corners, and the result is of the place from which the lens seems to look "
+            f"through it, ({where}) mm from where it is, along its own axes. It holds for looks "
+            f"through this pane.{sizes.instead_of(found.pane.kind)}",
+            Remedy(
+                "Take the pane away, or put it square to the line of sight, and record again; or "
+                "leave it as it is, and look with the middle of the image."
+            ),
+            mahalanobis_sq=found.gain,
+        ).of("" if camera == ONLY_CAMERA else camera)
+
+
 def _zoomed(run: RunState, of: str, zoom: Zoom, gain: float) -> Finding:
     """The finding that a lens changed by more than one that warms up."""
     instead, cell = run.cell_fit.sizes.instead_of(zoom.kind), run.cell_fit.cell
@@ -357,4 +381,5 @@ SHIFTED = Suspect(
     INFLATED,
 )
 MOTION = Suspect("row_motion", _moving, 1e-4, True)
+WINDOW = Suspect("window", _seen_through, 1e-4, True)
 MODEL = Suspect("lens_model", None, 1e-4, True, hides=("lens_field", "focus"))

@@ -85,6 +85,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     lens.FOCUS,
     lens.SHIFTED,
     lens.MOTION,
+    lens.WINDOW,
     lens.MODEL,
     Suspect("prior", _contradicted, 2.7e-3),
     lens.LENS,

@@ -32,6 +32,7 @@ from visioncal.model.effects.springs import Springs as Springs
 from visioncal.model.effects.springs import Weight as Weight
 from visioncal.model.effects.stops_short import MovesOn as MovesOn
 from visioncal.model.effects.stops_short import StopsShort as StopsShort
+from visioncal.model.effects.window import Window as Window
 from visioncal.model.effects.zeros import Zeros as Zeros
 
 # From these follow the trial in every cell, the columns of the fit, covariance, budget and finding.
