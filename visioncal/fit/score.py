@@ -238,7 +238,8 @@ def best_window(
         slopes = project_with_jacobian(lens, points).jacobian_point
         moved = np.stack([window.moved(points)[:, :, 0] for window in windows], axis=2)
         each = slopes @ moved * pair.weights[:, None, None]
-        full = np.concatenate([rows.head, rows.residual[:, :, None]], axis=2)
+        by_field = np.stack([np.kron(axis, rows.functions) for axis in np.eye(2)], axis=1)
+        full = np.concatenate([rows.head, by_field, rows.residual[:, :, None]], axis=2)
         left, right = (
             pair.padded(part)[kept].reshape(int(kept.sum()), -1, part.shape[2])
             for part in (each, full)
