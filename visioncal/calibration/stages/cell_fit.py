@@ -142,7 +142,8 @@ class CellFit:
         stops = self.inlier_fit.problem.observations.stops.tolist()
         stop_of = {row.view: at for row, at in zip(self.cell.rows, stops, strict=True)}
         for frame, scene in scenes.items():
-            corners, marks = dict[int, Corners](), corner_positions(*scene.targets)
+            corners = dict[int, Corners]()
+            marks = np.concatenate([corner_positions(target) for target in scene.targets])
             for view in views[frame]:
                 if view.corners is not None:
                     shown = scene.camera, apply(view.cam_from_target[0], marks[view.corners.ids])
