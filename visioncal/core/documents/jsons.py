@@ -19,6 +19,22 @@ from visioncal.core.files import MOST_BYTES, decode_text, read_bytes
 Array: TypeAlias = npt.NDArray[Any]
 
 
+_OPAQUE = "its values are a table or other objects of MATLAB"
+
+
+def _of_matlab(data: io.BytesIO) -> dict[str, Array]:
+    """The arrays of a .mat by name; raises TypeError where objects are all that it holds."""
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatlabOpaque
+
+    found = {name: each for name, each in loadmat(data).items() if name[:2] != "__"}
+    # Structures and cells are of other kinds.
+    arrays = {name: each for name, each in found.items() if each.dtype.kind in "fiubU"}
+    if not arrays and any(isinstance(each, MatlabOpaque) for each in found.values()):
+        raise TypeError(_OPAQUE)
+    return arrays
+
+
 def read_arrays(path: Path) -> Mapping[str, Array]:
     """Reads the arrays of an .npz or a .mat by their names, or the one of an .npy as `matrix`.
 
@@ -37,12 +53,7 @@ def read_arrays(path: Path) -> Mapping[str, Array]:
         if unpacked <= MOST_BYTES:
             # Memory is allocated lazily, so that a size beyond the data costs nothing.
             if path.suffix.lower() == ".mat":
-                from scipy.io import loadmat
-
-                found = loadmat(data)
-                arrays = {name: each for name, each in found.items() if name[:2] != "__"}
-                # Structures and cells are of other kinds.
-                return {name: each for name, each in arrays.items() if each.dtype.kind in "fiubU"}
+                return _of_matlab(data)
             loaded = np.load(data, allow_pickle=False)
             arrays = (
                 dict(loaded) if isinstance(loaded, np.lib.npyio.NpzFile) else {"matrix": loaded}
@@ -52,7 +63,10 @@ def read_arrays(path: Path) -> Mapping[str, Array]:
         raise DataError(
             f"{where} holds no arrays of numbers: {str(error)[:120]}.",
             culprits=[where],
-            next_step="numpy.save and numpy.savez write them; Python objects are not read.",
+            next_step="In MATLAB, writetable(T, 'poses.csv') writes a table, and T.A the matrix of "
+            "a rigidtform3d."
+            if str(error) == _OPAQUE
+            else "numpy.save and numpy.savez write them; Python objects are not read.",
         ) from error
     if unpacked > MOST_BYTES:
         raise DataError(

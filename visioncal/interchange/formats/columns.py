@@ -40,9 +40,16 @@ from visioncal.interchange.formats.foreign import (
     Unstated,
 )
 from visioncal.interchange.formats.joints import joint_names, joints_from
-from visioncal.interchange.formats.poses import columns_named, makers_of, pose_names, poses_from
+from visioncal.interchange.formats.poses import (
+    columns_named,
+    makers_of,
+    pose_names,
+    poses_from,
+    possible_poses,
+)
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.sources import (
+    Source,
     describe,
     proposed,
     several_recordings,
@@ -88,9 +95,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         raise faults[0]
     (rank, first), *others = sorted(found, key=lambda each: each[0])
     is_clear = not others or others[0][0] > rank
-    is_seeing = first.images or {"meas_x_m", "point"} & first.columns.keys()
-    apart = None if is_seeing or first.camera is not None else tables_apart(source, requested)
-    if apart is not None:
+    if apart := _files_apart(first, source, readings[0][2], readings[0][1]):
         robot, camera = apart
         return _read(robot, replace(requested, camera_file=camera))
     if not is_clear:
@@ -98,6 +103,24 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
             first, doubt=unknown(source, requested, [each for _, each, _ in readings[:1]])
         )
     return replace(first, rivals=tuple((at - rank, other) for at, other in others))
+
+
+def _files_apart(
+    first: ForeignRecording, source: Source, requested: ImportOptions, fields: Fields
+) -> tuple[Path, Path] | None:
+    """The robot's file and the camera's where a recording saw nothing; None of others.
+
+    Raises DataError where several of its fields may be the poses of the target.
+    """
+    if first.images or first.camera is not None or {"meas_x_m", "point"} & first.columns.keys():
+        return None
+    if apart := tables_apart(source, requested):
+        return apart
+    own = pose_names(fields, requested.robot.names, "robot", ())
+    others = possible_poses(fields, own) if first.robot.present.any() else ()
+    if any(item.is_of_target for item in others):
+        raise unknown(source, requested, [fields])
+    return None
 
 
 def foreign_from(

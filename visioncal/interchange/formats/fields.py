@@ -18,7 +18,7 @@ from visioncal.core.conventions import ROTATION_FORMS
 from visioncal.core.documents.pendants import is_marked_pose, line_numbers, read_pose
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
-from visioncal.core.limits import FAR_M
+from visioncal.core.limits import FAR_M, FEWEST_VIEWS
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.session.images import IMAGE_ENDINGS
@@ -197,7 +197,8 @@ def fields_of_records(
                 break
         else:
             empty = np.full(shape, np.nan)
-            numbers[key] = np.array([empty if value is None else value for value in values], float)
+            array = np.array([empty if value is None else value for value in values], float)
+            numbers[key] = _without_counts(array)
             if not shape:
                 # As cells of a table: whole numbers without a decimal point.
                 texts[key] = tuple(
@@ -205,6 +206,22 @@ def fields_of_records(
                     for each in numbers[key].tolist()
                 )
     return Fields(name, folder, tuple(places), numbers, texts, views, shape_errors=ragged)
+
+
+def _without_counts(numbers: FloatArray) -> FloatArray:
+    """(n, k) numbers of a position, a rotation or a pose without columns that count or name rows.
+
+    The first of them counts from zero or one; after it stand whole numbers, as of a marker.
+    """
+    if numbers.ndim != 2 or len(numbers) < FEWEST_VIEWS or numbers.shape[1] < 4:
+        return numbers
+    steps = numbers[:, 0] - np.arange(len(numbers))
+    if (steps != steps[0]).any() or steps[0] not in (0, 1):
+        return numbers
+    whole = int(np.argmin([*(numbers % 1 == 0).all(axis=0), False]))
+    sizes = (numbers.shape[1] - left for left in range(whole, 0, -1))
+    size = next((each for each in sizes if each in (3, *POSE_SIZES)), 0)
+    return numbers[:, -size:] if size and not appearance(numbers) else numbers
 
 
 def arrays_in_texts(values: list[object]) -> list[object]:

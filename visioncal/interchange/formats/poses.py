@@ -35,7 +35,10 @@ def _set(words: str) -> set[str]:
 
 _POSITION_WORDS = _set("translation position pos ort posición tvec tvecs trans xyz t")
 _ROTATION_WORDS = _set("rotation orientation quaternion quat rotvec rot r ori winkel drehung angle")
-_ROTATION_WORDS |= _set("ángulo giro rotación rvec rvecs rpy euler vector matrix xyzw wxyz theta")
+_POSITION_WORDS |= {"translational"}
+_ROTATION_WORDS |= _set(
+    "rotational ángulo giro rotación rvec rvecs rpy euler vector matrix xyzw wxyz theta"
+)
 # Of `p_RS_R_x` the last R is a frame.
 _PLACE = _set("p position")
 _POSE_WORDS = _set("pose poses transform transforms t h matrix")
@@ -99,6 +102,16 @@ class PoseFields:
             for frame in _FRAMES
             if {*self.words} & (_FRAMES[frame][0] | _FRAMES[frame][1] | _SIDE_WORDS[frame])
         ]
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether they are vectors of the target, as OpenCV and MATLAB call them."""
+        return not self.sides and any(map(_SEEN.search, self.names))
+
+    @property
+    def is_of_target(self) -> bool:
+        """Whether the names are those of poses of the target."""
+        return self.is_named and (self.is_seen or self.sides == ["camera"])
 
     def is_reversed(self, whose: str) -> bool:
         """Whether the words name the frames of a side in the order of the inverse pose."""
@@ -378,21 +391,22 @@ def ranked_poses(
     possible = possible_poses(fields, taken, by_shape=by_shape)
     for item in sorted(possible, key=lambda item: item.sides != [whose]):
         is_own, is_plain = item.sides == [whose], not item.sides
-        # OpenCV gives vectors of the target.
-        is_seen = is_plain and any(re.search("[rt]vecs?$", name) for name in item.names)
         fits = (
             is_own and item.is_named and not item.is_reversed(whose),
             is_own and item.is_named,
-            is_plain and item.is_named and not is_seen and whose == "robot",
-            is_seen and item.is_named,
-            (is_own or is_plain) and whose == "robot",
+            is_plain and item.is_named and not item.is_seen and whose == "robot",
+            item.is_seen and item.is_named and whose == "camera",
+            (is_own or (is_plain and not item.is_seen)) and whose == "robot",
             len(item.sides) > 1 and whose == "robot",
+            item.is_seen and whose == "robot",
         )
         if any(fits):
             groups[fits.index(True), bool({*item.words} & _ASKED_FOR)].append(item)
     return [groups[rank] for rank in sorted(groups)]
 
 
+# Vectors that a calibration of the camera gives.
+_SEEN = re.compile("[rt]vecs?$|(rotation|translation)(al)?_?vectors$", re.IGNORECASE)
 _ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)R(_|$)")
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
 

@@ -378,7 +378,8 @@ def read_document(path: Path) -> object:
         return read_json(path)
     if suffix == ".xml":
         root = read_xml(path)
-        return (root.tag != "opencv_storage" and rows_of_xml(root)) or read_opencv(path)
+        rows = root.tag != "opencv_storage" and rows_of_xml(root)
+        return rows or _with_extrinsics(read_opencv(path))
     text = read_plain_text(path)
     if suffix == ".toml":
         with suppress(tomllib.TOMLDecodeError):
@@ -388,7 +389,28 @@ def read_document(path: Path) -> object:
     parts = re.split(r"^---.*$", text, flags=re.MULTILINE)
     several = [part for part in parts if part.strip() and not part.startswith("%")]
     # As programs write that print one message after the other.
-    return [parse_yaml(part, str(path)) for part in several] if several[1:] else read_yaml(path)
+    if several[1:]:
+        return [parse_yaml(part, str(path)) for part in several]
+    return _with_extrinsics(read_yaml(path))
+
+
+def _with_extrinsics(document: object) -> object:
+    """A document whose poses of the board by OpenCV's calibration are a rotation and a position.
+
+    Source: OpenCV, samples/cpp/calibration.cpp, "a set of 6-tuples (rotation vector + translation
+    vector) for each view".
+    """
+    if not isinstance(document, Mapping) or "camera_matrix" not in document:
+        return document
+    called = {str(key).lower(): key for key in document}
+    key = called.get("extrinsic_parameters")
+    both = np.array([]) if key is None else np.asarray(document[key])
+    if both.ndim != 2 or both.shape[1] != 6:
+        return document
+    rest = {name: value for name, value in document.items() if name != key}
+    turns, places = np.split(both, 2, axis=1)
+    found = {"board_to_camera_rvecs": [*turns], "board_to_camera_tvecs": [*places]}
+    return {**rest, **{f"{key}.{name}": rows for name, rows in found.items()}}
 
 
 def _by_view(array: Array) -> Array:
@@ -469,8 +491,11 @@ def _row_lists(document: object, name: str = "") -> Iterator[_Rows]:
         values = [*document.values()]
         arrays = _arrays_of(values)
         named = all(is_image_name(str(key)) for key in document)
+        # Halves of poses by the names of their views: `rotational_vectors: {image0: [..]}`.
+        stems = {re.sub("[0-9]+$", "", str(key)) for key in document}
+        named |= arrays is not None and arrays[0].size == 3 and len(stems) == 1 < len(document)
         if arrays is not None and len(values) > 2 and (named or appearance(arrays) == "pose"):
-            yield name, [{name or "pose": value} for value in values], tuple(map(str, document))
+            yield name, [{name or "pose": each} for each in arrays], tuple(map(str, document))
             return
         is_counted = len(values) > 1 and all(re.search("[0-9]$", str(key)) for key in document)
         if (

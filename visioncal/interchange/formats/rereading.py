@@ -1,5 +1,6 @@
 """Finds another reading of a recording's poses, and applies it."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
@@ -26,7 +27,6 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside
 from visioncal.core.number_format import some_of
 from visioncal.core.types import MOUNTS, FloatArray, Progress, Searched, evenly
-from visioncal.core.verdict import Finding
 from visioncal.interchange.formats.assemble import (
     FileImages,
     assemble,
@@ -36,7 +36,7 @@ from visioncal.interchange.formats.assemble import (
     with_observations_only,
 )
 from visioncal.interchange.formats.fields import fields_of_records
-from visioncal.interchange.formats.foreign import ForeignRecording, rows_of
+from visioncal.interchange.formats.foreign import ForeignRecording, Side, rows_of
 from visioncal.interchange.formats.mending import noting
 from visioncal.interchange.formats.poses import makers_of, pose_names
 from visioncal.session import Session, Stream
@@ -54,6 +54,8 @@ _MOVE = (
     "First add 3 or more views in which the flange is tilted by 20 to 40 degrees about different "
     "axes: it takes them for any result, and they show the form, too. Or "
 )
+# The beginning of the reason where the robot's rotations do not differ, of whatever unit.
+_STILL, _SAME = "the robot does not turn: its rotations are the same", 1e-3
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 # Sigma of a board's size, as a share of it, that the distances of some poses gave: nobody measured
 # it, and the fit finds it better.
@@ -126,35 +128,52 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     is_known = foreign.stream is not None or not (unstated - {"inverse"} or foreign.doubt)
     if is_known or foreign.mount is None:
         return foreign
-    if lacks_target(foreign):
-        then = " Forms of poses that are not stated are then found by the images."
-        raise unknown_target(foreign, "--target", then)
-    if foreign.camera is not None:
-        # Refuses the numbers of one side as both's, of which any reading agrees.
-        assemble(replace(foreign, images=()))
+    _check_sides(foreign)
     readings = [(0, foreign), *foreign.rivals]
     other_orders = [(rank, each) for rank, item in readings for each in _reordered(item)]
-    why, other = "too few rows have a pose and what the camera saw", None
+    why, fault = "too few rows have a pose and what the camera saw", None
     searches = dict[Path, Searched]()
+    if _is_still(foreign):
+        # No image need be searched for what no reading can change.
+        return _untested(foreign, f"{_STILL} in all {len(foreign.robot)} rows")
     for least, most in pairwise((FEWEST_ROWS - 1, *_TESTED)):
         try:
             seen = _Seen.of(foreign, most, progress, searches)
         except VisioncalError as error:
-            other = error.finding if isinstance(error, OtherBoardError) else None
-            why = error.message.rstrip(".")
+            why, fault = error.message.rstrip("."), error
+            # Where a dozen images show nothing, the others of a short recording will not.
+            if isinstance(error, DataError) and len(foreign.robot) <= _TESTED[-1]:
+                break
             continue
         if seen.count <= least:
             break
+        fault = None
         searches |= seen.searches
         for tried in (readings, other_orders):
-            found, fault = _tested(tried, seen)
-            why = fault if tried is readings else why
+            found, reason = _tested(tried, seen)
+            why = reason if tried is readings else why
             if found is not None:
                 return found
             if why.startswith(ONE_AXIS):
                 # No order of the numbers closes the chain better than others.
                 break
-    return _untested(foreign, why, other)
+    return _untested(foreign, why, fault)
+
+
+def _check_sides(foreign: ForeignRecording) -> None:
+    """Raises DataError where nothing says what images show, or one side's numbers are both's."""
+    if lacks_target(foreign):
+        then = " Forms of poses that are not stated are then found by the images."
+        raise unknown_target(foreign, "--target", then)
+    if foreign.camera is not None:
+        # Of the same numbers any reading agrees.
+        assemble(replace(foreign, images=()))
+
+
+def _is_still(foreign: ForeignRecording) -> bool:
+    """Whether all rows have one rotation of the robot."""
+    turns = foreign.robot.rotations[foreign.robot.present]
+    return bool(turns.size) and float(np.ptp(turns, axis=0).max()) < _SAME
 
 
 def _tested(
@@ -352,12 +371,13 @@ def _applied(
 
 
 def _untested(
-    foreign: ForeignRecording, why: str, other: Finding | None = None
+    foreign: ForeignRecording, why: str, fault: VisioncalError | None = None
 ) -> ForeignRecording:
-    """Asks for a form of rotations that nothing determines, or for the `other` board that would.
+    """Asks for a form of rotations that nothing determines, or for the board that would.
 
-    Else notes that nothing was tested.
+    `fault` is what kept the images from being used. Else notes that nothing was tested.
     """
+    other = fault.finding if isinstance(fault, OtherBoardError) else None
     is_asked = foreign.doubt or any("rotation" in free for free in foreign.unstated.values())
     if is_asked and other is not None and other.kind == "other_board":
         raise DataError(
@@ -377,38 +397,51 @@ def _untested(
             culprits=["--robot-model"],
             next_step="Name the arm with --robot-model: a built-in robot, its .urdf or a DH table.",
         )
+    for whose, free in foreign.unstated.items():
+        if "rotation" in free:
+            raise _unsaid(foreign, whose, why, fault)
+    note = f"The form of the poses stays as first read: {why}."
+    note += " Convert with --guess --yes to read them so." if why.startswith("With ") else ""
+    return replace(foreign, notes=(*foreign.notes, note))
+
+
+def _unsaid(
+    foreign: ForeignRecording, whose: Side, why: str, fault: VisioncalError | None
+) -> DataError:
+    """The error of a form of rotations that is not said, and what kept the images from telling."""
     joints = (
         " Where the numbers are joint angles, name them with --joint-columns, and the arm with "
         "--robot-model."
     )
-    for whose, free in foreign.unstated.items():
-        if "rotation" in free:
-            numbers = foreign.robot if whose == "robot" else foreign.camera
-            size = 0 if numbers is None else numbers.rotations.shape[1]
-            forms = (
-                "quaternion-xyzw, or quaternion-wxyz"
-                if size == 4
-                else "rotation-vector, euler-xyz-rad, euler-ZYX-deg or another, or whose they are, "
-                "as kuka"
-            )
-            by_names = [name for name in foreign.makers if POSE_FORMS[name].likely]
-            if whose == "robot" and len(by_names) == 1:
-                forms = f"{by_names[0]}, as the columns' names suggest, or {forms}"
-            if why.startswith("With "):
-                joints += (
-                    " What else this reading changes is done to the session that is then written: "
-                    "visioncal convert SESSION NEW --guess --yes."
-                )
-            raise DataError(
-                f"{foreign.name}: the form of the {whose}'s rotations is not said, and nothing "
-                f"determines it: {why}.",
-                culprits=[f"--{whose}-form"],
-                next_step=(f"{_MOVE}say" if why.startswith(ONE_AXIS) else "Say")
-                + f" --{whose}-form {forms}.{joints if whose == 'robot' else ''}",
-            )
-    note = f"The form of the poses stays as first read: {why}."
-    note += " Convert with --guess --yes to read them so." if why.startswith("With ") else ""
-    return replace(foreign, notes=(*foreign.notes, note))
+    numbers = foreign.robot if whose == "robot" else foreign.camera
+    size = 0 if numbers is None else numbers.rotations.shape[1]
+    forms = (
+        "quaternion-xyzw, or quaternion-wxyz"
+        if size == 4
+        else "rotation-vector, euler-xyz-rad, euler-ZYX-deg or another, or whose they are, as kuka"
+    )
+    by_names = [name for name in foreign.makers if POSE_FORMS[name].likely]
+    if whose == "robot" and len(by_names) == 1:
+        forms = f"{by_names[0]}, as the columns' names suggest, or {forms}"
+    if why.startswith("With "):
+        joints += (
+            " What else this reading changes is done to the session that is then written: "
+            "visioncal convert SESSION NEW --guess --yes."
+        )
+    unsaid = f"the form of the {whose}'s rotations is not said"
+    # A fault of the images comes first: while it lasts, no form helps.
+    words = f"{unsaid}, and nothing determines it: {why}"
+    step = f"{_MOVE}say" if why.startswith((ONE_AXIS, _STILL)) else "Say"
+    if why.startswith(_STILL):
+        words = f"{why}. No calibration is determined so, and no form of these rotations"
+    elif fault is not None:
+        words = f"{re.sub('^session .*?: ', '', why)}. Beside that, {unsaid}"
+        step = f"{fault.next_step} Else say".strip()
+    return DataError(
+        f"{foreign.name}: {words}.",
+        culprits=[*(fault.culprits if fault else ()), f"--{whose}-form"],
+        next_step=f"{step} --{whose}-form {forms}.{joints if whose == 'robot' else ''}",
+    )
 
 
 def load_for_rereading(path: Path) -> DoubtfulSession:

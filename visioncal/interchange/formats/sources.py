@@ -94,7 +94,7 @@ class Source:
         read = [part for part in self.parts if part.rows or part.lenses or part.group.is_images]
         others = [part for part in self.parts if part not in read]
         # Of a repository's own code a count suffices.
-        listed = sorted(others, key=lambda part: part.fault is None)[:_LISTED]
+        listed = [part for part in others if part.fault is not None][:_LISTED]
         for part in [part for part in self.parts if part in read or part in listed]:
             lines.append(f"  {part.group.listed()}: {_kind(part)}")
             for fields in part.rows:
@@ -103,7 +103,7 @@ class Source:
         rest = [part.group.label for part in others if part not in listed]
         lines = lines[:60]
         if rest:
-            lines.append(f"  {counted(len(rest), 'other kind')} not read: {some_of(rest, 3)}")
+            lines.append(f"  {counted(len(rest), 'kind')} not read: {some_of(rest, 3)}")
         return "\n".join(lines)
 
 
@@ -114,7 +114,7 @@ def _kind(part: Part) -> str:
         return f"images, {image.size[0]} x {image.size[1]}, {image.words}{depth}"
     if part.rows:
         return f"{' and '.join(counted(len(each), 'row') for each in part.rows)} of named values"
-    return "not read" if part.fault is None else part.fault.message
+    return "" if part.fault is None else part.fault.message
 
 
 def _field_lines(fields: Fields) -> Iterator[str]:
@@ -163,6 +163,9 @@ def _array(fields: Fields) -> FloatArray | None:
 
 
 def _part(group: FileGroup, form: str | None) -> Part:
+    if group.label.lower().endswith((".pkl", ".pickle")):
+        fault = "a pickle, which runs code when it is opened: write its arrays as .npz or .json"
+        return Part(group, fault=DataError(f"{fault}.", culprits=[group.label]))
     if not group.is_data:
         return Part(group)
     first, *others = group.files
@@ -249,12 +252,19 @@ def _has(fields: Fields, given: Sequence[str]) -> bool:
 def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = ()) -> DataError:
     """The error of a source whose poses are not known, with a command that reads it."""
     possible = [(fields, item) for fields in rows for item in possible_poses(fields)]
-    possible.sort(key=lambda both: (both[1].sides != ["robot"], bool(both[1].sides)))
+    possible.sort(
+        key=lambda of: (of[1].is_seen, of[1].sides != ["robot"], bool(of[1].sides)),
+    )
     step, options = "", list[str]()
     if possible:
         fields, robot = possible[0]
-        others = [item for of, item in possible[1:] if of is fields and item.sides != ["robot"]]
+        own = {*robot.names}
+        others = [each for of, each in possible[1:] if of is fields and not own & {*each.names}]
+        others = [item for item in others if item.sides != ["robot"]]
         others = [item for item in others if item.sides] or others * (not source.images)
+        # Both sides of a recording have as many poses; a file with more is of other pictures.
+        counts = {each.name: len(each) for part in source.parts for each in part.rows}
+        others.sort(key=lambda item: counts.get(item.names[0].partition(".")[0], 0) > len(fields))
         for whose, item in zip(("robot", "camera"), (robot, *others[:1]), strict=False):
             options += [f"--{whose}-{named_by(fields.places[0])}", ",".join(item.names)]
         step = f"Say {' '.join(options)}, where these are its poses"
@@ -265,7 +275,9 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
     return DataError(
         f"{source.words()}\nWhich of these are the robot's poses is not known.",
         culprits=[str(source.path)],
-        next_step=step or "Write the poses into a CSV with a header, a row a view.",
+        next_step=step
+        or next((part.fault.next_step for part in source.parts if part.fault), "")
+        or "Write the poses into a CSV with a header, a row a view.",
     )
 
 

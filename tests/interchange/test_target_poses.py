@@ -1,0 +1,181 @@
+"""Poses of the target as programs of calibration store them, and what keeps a source unread."""
+
+import json
+import shlex
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from scipy.io.matlab import MatlabOpaque
+from scipy.spatial.transform import Rotation
+from support.commands import visioncal
+from support.samples import made_up
+
+from visioncal.core.errors import DataError
+from visioncal.interchange.formats import rereading
+from visioncal.interchange.formats.reading import read_fields
+from visioncal.interchange.formats.sources import describe
+from visioncal.session import Session
+
+
+@lru_cache
+def world():
+    """The robot's poses (n, 4, 4), those of the target in the camera, and the mount."""
+    session = made_up(9, images=False).session
+    poses = np.array([view.base_from_flange().as_matrix() for view in session.views])
+    seen = np.array([view.cam_from_target().as_matrix() for view in session.views])
+    return poses, seen, session.mount
+
+
+def halves(poses):
+    """(n, 3) positions and (n, 3) rotation vectors."""
+    return poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+
+
+def write(path: Path, document: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(document if isinstance(document, str) else json.dumps(document))
+
+
+def listed(name, rows):
+    """A matrix in OpenCV's YAML."""
+    cells = ", ".join(map(repr, np.ravel(rows).tolist()))
+    shape = f"   rows: {len(rows)}\n   cols: {np.size(rows[0])}\n   dt: d\n"
+    return f"{name}: !!opencv-matrix\n{shape}   data: [ {cells} ]\n"
+
+
+def opencv_s_calibration(folder):
+    """Extrinsic parameters with the rotation first, beside one XML a pose of numbered values."""
+    poses, seen, _ = world()
+    for at, pose in enumerate(poses):
+        turn = Rotation.from_matrix(pose[:3, :3])
+        w, v = turn.as_quat()[3], turn.as_quat()[:3]
+        values = [*pose[:3, 3], w, *v, *turn.as_euler("xyz")]
+        lines = (
+            f"<Position{n}>{each!r}</Position{n}>" for n, each in enumerate(map(float, values))
+        )
+        text = "\n".join(lines)
+        head = '<?xml version="1.0"?>\n<opencv_storage>'
+        write(folder / f"poses/robot{at}.xml", f"{head}\n{text}\n</opencv_storage>\n")
+    place, turn = halves(seen)
+    lens = listed("camera_matrix", np.array([[520.0, 0, 320], [0, 520, 200], [0, 0, 1]]))
+    rows = listed("extrinsic_parameters", np.hstack([turn, place]))
+    size = "image_width: 640\nimage_height: 400\n"
+    write(folder / "camera_data.yml", f"%YAML:1.0\n---\n{size}{lens}{rows}")
+
+
+def counted_rows(folder):
+    """Arrays whose first columns count the rows and name the marker."""
+    poses, seen, _ = world()
+    place, turn = halves(seen)
+    count = np.arange(1.0, 10.0)[:, None]
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    folder.mkdir()
+    np.savez(
+        folder / "data.npz",
+        gripper_pose=np.hstack([poses[:, :3, 3], quaternions]),
+        Target_tvecs=np.hstack([count, np.ones((9, 1)), place]),
+        Target_rvecs=np.hstack([count, turn]),
+    )
+
+
+def vectors_by_name(folder):
+    """A mapping of the views' names for each half of a pose."""
+    poses, seen, _ = world()
+    parts = zip(("translational", "rotational"), halves(seen), strict=True)
+    write(
+        folder / "board.json",
+        {
+            f"{part}_vectors": {f"image{at}": [[x] for x in row] for at, row in enumerate(rows)}
+            for part, rows in ((part, each.tolist()) for part, each in parts)
+        },
+    )
+    numbers = enumerate(np.hstack(halves(poses)).tolist())
+    names = ("x", "y", "z", "rx", "ry", "rz")
+    rows = {f"p{at}": dict(zip(names, row, strict=True)) for at, row in numbers}
+    write(folder / "robot.json", {"Poses": rows})
+
+
+@pytest.mark.parametrize("make", [opencv_s_calibration, counted_rows, vectors_by_name])
+def test_poses_of_the_target_come_in_as_programs_store_them(make, tmp_path):
+    poses, seen, mount = world()
+    make(tmp_path / "in")
+    visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", mount).good()
+    found = Session.load(tmp_path / "out").views
+    for view, pose, board in zip(found, poses, seen, strict=True):
+        np.testing.assert_allclose(view.base_from_flange().as_matrix(), pose, atol=1e-9)
+        np.testing.assert_allclose(view.cam_from_target().as_matrix(), board, atol=1e-9)
+
+
+def test_a_command_names_two_sides_of_as_many_rows(tmp_path):
+    """Beside a lens of its own pictures, whose vectors are more than the robot's poses."""
+    poses, seen, mount = world()
+    place, turn = halves(seen)
+    more = np.concatenate([place[::-1] + 0.3, place + 0.1])
+    rows = {f"Matrix{at:02d}": pose for at, pose in enumerate(poses)}
+    text = "".join(listed(name, pose) for name, pose in rows.items())
+    write(tmp_path / "in/handEye.yml", f"%YAML:1.0\n{text}")
+    for name, each in (("lens", (more, np.concatenate([turn, turn]))), ("seen", (place, turn))):
+        parts = zip(("TranslationVectors", "RotationVectors"), each, strict=True)
+        vectors = [(f"{part}{at:02d}", row) for part, rows in parts for at, row in enumerate(rows)]
+        text = "".join(listed(part, row[:, None]) for part, row in vectors)
+        write(tmp_path / f"in/{name}.yml", f"%YAML:1.0\n{text}")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", mount)
+    command = shlex.split(done.refused("handEye.Matrix").err.splitlines()[-1])
+    assert command[-4:] == [
+        "--robot-key", "handEye.Matrix", "--camera-key",
+        "seen.TranslationVectors,seen.RotationVectors",
+    ]  # fmt: skip
+    visioncal(*command[1:]).good()
+
+
+def test_no_field_is_proposed_for_both_sides(tmp_path):
+    pose = world()[0][:, :3]
+    turns = Rotation.from_matrix(pose[:, :, :3])
+    rows = np.hstack([pose[:, :, 3], turns.as_quat(), turns.as_euler("xyz")])
+    for at, row in enumerate(rows.tolist()):
+        write(tmp_path / f"in/{at}.json", {f"v{n}": each for n, each in enumerate(row)})
+    refused = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    command = shlex.split(refused.refused("--robot-key").err.splitlines()[-1])
+    assert command[-2:] == ["--robot-key", "v0,v1,v2,v3,v4,v5,v6"]
+
+
+def test_what_keeps_images_from_telling_a_form_comes_before_the_form(tmp_path, monkeypatch):
+    sample = made_up(9).session
+    sample.save(tmp_path / "shots")
+    poses = np.array([view.base_from_flange().as_matrix() for view in sample.views])
+    rows = np.hstack(halves(poses))
+    said = ("--images", tmp_path / "shots/images", "--mount", sample.mount)
+    np.savetxt(tmp_path / "rows.txt", rows)
+    other = ("--target", "checkerboard_31x28_20mm")
+    done = visioncal("convert", tmp_path / "rows.txt", tmp_path / "out", *said, *other).refused()
+    words = done.err.partition("error: ")[2]
+    assert words.index("board") < words.index("form of the robot's rotations")
+    # Rows of one rotation determine nothing, whatever the images show.
+    rows[:, 3:] = rows[0, 3:]
+    np.savetxt(tmp_path / "still.txt", rows)
+
+    def searched(*_, **__):
+        raise AssertionError("an image was searched")
+
+    monkeypatch.setattr(rereading, "_measured", searched)
+    said = (*said, "--target", sample.document["target"])
+    done = visioncal("convert", tmp_path / "still.txt", tmp_path / "out", *said)
+    done.refused("the same in all 9 rows", "tilted by 20 to 40 degrees")
+
+
+def test_files_of_objects_say_how_to_write_them(tmp_path, monkeypatch):
+    """A table of MATLAB, and a pickle."""
+    write(tmp_path / "in/frame.pkl", "numbers 0.1 0.2 0.3 0.4 0.5 0.6")
+    write(tmp_path / "in/read.m", "T = 1;")
+    write(tmp_path / "in/poses.mat", "a file of MATLAB")
+    table = MatlabOpaque(np.zeros(1, [("s0", "O"), ("s1", "O"), ("s2", "O"), ("arr", "O")]))
+    monkeypatch.setattr(scipy.io, "loadmat", lambda _: {"__version__": "1.0", "T": table})
+    words = describe(tmp_path / "in").words()
+    assert "frame.pkl: a pickle, which runs code when it is opened" in words
+    assert "poses.mat holds no arrays of numbers: its values are a table" in words
+    assert "1 kind not read: read.m" in words
+    with pytest.raises(DataError, match=r"writetable\(T, 'poses.csv'\)"):
+        read_fields(tmp_path / "in/poses.mat")
