@@ -630,6 +630,34 @@ def lines_of_lost_pictures(folder):
     write(folder / "poses.txt", "\n".join(lines))
 
 
+def lines_of_few_pictures(folder):
+    """A line a picture, of which two in three were deleted: their numbers have gaps."""
+    kept, lost = (1, 2, 4, 7, 8, 9, 12, 13, 24), iter(with_others(17)[:17])
+    lines = list[str]()
+    for number in range(1, 27):
+        at = kept.index(number) if number in kept else None
+        lines += map(",".join, sevens([next(lost) if at is None else world()[0][at]]))
+        if at is not None:
+            shoot_one(folder / f"img{number:02d}.png", at)
+    write(folder / "poses.txt", "\n".join(lines))
+
+
+def letters_of_a_lost_picture(folder):
+    """A line more than pictures, whose names count nothing: motion says which is over."""
+    for at in range(9):
+        shoot_one(folder / f"shot{'abcdefghi'[at]}.png", at)
+    poses = [*world()[0][:5], with_others(1)[0], *world()[0][5:]]
+    write(folder / "poses.txt", "\n".join(map(",".join, sevens(poses))))
+
+
+def letters_of_a_picture_too_many(folder):
+    """A picture more than lines, of nothing."""
+    for at in range(9):
+        shoot_one(folder / f"shot{'abcefghij'[at]}.png", at)
+    cv2.imwrite(str(folder / "shotd.png"), np.full((400, 640), 150, np.uint8))
+    write(folder / "poses.txt", "\n".join(map(",".join, sevens())))
+
+
 def lines_before_the_first_picture(folder):
     """Two lines more than pictures, which are counted from one."""
     for at in range(9):
@@ -979,7 +1007,8 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         lists_in_a_log, lists_beside_pictures, lists_alone, lists_over_lines,
         tf_echo, tf2_echo, tf_echo_each,
         job, within_braces, elements, nested_elements, sections,
-        lines_of_lost_pictures, lines_before_the_first_picture, urscript_with_a_start,
+        lines_of_lost_pictures, lines_of_few_pictures, letters_of_a_lost_picture,
+        letters_of_a_picture_too_many, lines_before_the_first_picture, urscript_with_a_start,
         named_with_depth, named_with_clouds,
     )
 }  # fmt: skip

@@ -35,6 +35,8 @@ _NO_DATA = (".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf",
 # Folders below a source that are looked through, and the most files in all; a source of more files
 # than a recording in folders has, such as a disk, is looked through less deep.
 _DEPTH, _FEW_FILES, _LESS_DEEP, _MOST_FILES = 8, 5_000, 3, 100_000
+# Fewest rows of which the motion may say which one has no image.
+_FEWEST_PAIRED = 8
 # Cells of rows without an image.
 _NO_IMAGE = ("", "n/a", "none", "null", "nan")
 # Words of pictures that a program drew: they are no camera's where there are others.
@@ -341,7 +343,7 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         found = matched(fields.keys, group.keys)
         fewest = min(len(fields), len(group.files))
         if found is None or (found.how == HOW[1] and (found.rows >= 0).sum() < fewest):
-            steps[group.label] = [*_in_step(fields, group)]
+            steps[group.label] = [*_in_step(fields, group)] or [*_one_over(fields, group)]
             found = found or next(iter(steps[group.label]), None)
         matches += [(group, found)] if found else []
 
@@ -427,8 +429,25 @@ def _orders(
     for rows in [other.rows for other in others] or one_off:
         at = int(np.argmax(rows >= 0))
         words = f"from {chosen.files[rows[at]].name} with {fields.places[at]} on"
+        if match.how == HOW[3] and len(chosen.files) != len(fields):
+            left = {*range(len(chosen.files))} - {*rows.tolist()}
+            lone = (
+                fields.places[int(np.argmin(rows))],
+                *(chosen.files[each].name for each in left),
+            )
+            words = f"in natural order, without {lone[-1]}"
         orders[words] = chosen.taken(rows)
     return orders
+
+
+def _one_over(fields: Fields, group: FileGroup) -> Iterator[Match]:
+    """Pairings in natural order with each row, or each file, in turn as the one that is over."""
+    rows, files = len(fields), len(group.files)
+    if min(rows, files) < _FEWEST_PAIRED or abs(rows - files) != 1:
+        return
+    for left in range(max(rows, files)):
+        every = np.delete(np.arange(max(rows, files)), left)
+        yield Match(HOW[3], every if files > rows else np.insert(np.arange(files), left, -1))
 
 
 def _unpaired(fields: Fields, group: FileGroup) -> DataError:
@@ -453,7 +472,9 @@ def _in_step(fields: Fields, group: FileGroup) -> Iterator[Match]:
     for own in (*fields.keys.found[HOW[1]].values(), range(1, len(fields) + 1)):
         numbers = {number for number in own if isinstance(number, int)}
         fewer, more = sorted((numbers, {*place}), key=len)
-        if not 2 < len(fewer) <= len(more) < 2 * len(fewer):
+        # Gaps in the numbers fit by chance less than numbers in a row.
+        has_gaps = max(fewer, default=0) - min(fewer, default=0) >= len(fewer)
+        if not 2 < len(fewer) <= len(more) < (4 if has_gaps else 2) * len(fewer):
             continue
         first, last, sign = min(fewer), max(fewer), 1 if len(numbers) <= len(place) else -1
         near = sorted((number - first for number in more), key=abs)

@@ -149,8 +149,9 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
             break
         fault = None
         searches |= seen.searches
+        is_last = most == _TESTED[-1] or seen.count < most
         for tried in (readings, other_orders):
-            found, reason = _tested(tried, seen)
+            found, reason = _tested(tried, seen, is_last=is_last)
             why = reason if tried is readings else why
             if found is not None:
                 return found
@@ -177,11 +178,11 @@ def _is_still(foreign: ForeignRecording) -> bool:
 
 
 def _tested(
-    readings: Sequence[tuple[int, ForeignRecording]], seen: "_Seen"
+    readings: Sequence[tuple[int, ForeignRecording]], seen: "_Seen", *, is_last: bool
 ) -> tuple[ForeignRecording | None, str]:
     """The reading that agrees best with what was seen, or why the first does not.
 
-    Raises DataError where several agree alike, and are not the same.
+    Raises DataError where several agree alike, are not the same, and no more rows can tell.
     """
     found: list[tuple[float, int, ForeignRecording]] = []
     why, others = "", list[Guess]()
@@ -210,6 +211,8 @@ def _tested(
     alike = (each for at, same, each in found if same == rank and at > score - CLEAR)
     doubt = next((item.doubt for _, item in readings), None)
     if doubt is not None and not all(_are_same(best, each) for each in alike):
+        if not is_last:
+            return None, why
         raise doubt
     return best, ""
 
