@@ -109,6 +109,42 @@ def test_poses_of_the_target_come_in_as_programs_store_them(make, tmp_path):
         np.testing.assert_allclose(view.cam_from_target().as_matrix(), board, atol=1e-9)
 
 
+@pytest.mark.parametrize("is_of_opencv", [True, False])
+def test_corners_of_another_program_are_the_session_s(tmp_path, is_of_opencv):
+    """One file a view beside a table that names them, or the points of OpenCV's calibration."""
+    poses, seen, mount = world()
+    grid = np.stack(np.meshgrid(np.arange(13), np.arange(10)), axis=-1).reshape(-1, 2)
+    points = np.hstack([0.015 * grid, np.zeros((130, 1)), np.ones((130, 1))])
+    lens = np.array([[520.0, 0, 320], [0, 520, 200], [0, 0, 1]])
+    shown = np.einsum("ij,njk,mk->nmi", lens, seen[:, :3], points)
+    px = shown[..., :2] / shown[..., 2:]
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_euler("xyz", degrees=True)
+    rows = np.hstack([poses[:, :3, 3], turns])
+    said = ["--mount", mount, "--target", "checkerboard_13x10_15mm"]
+    if is_of_opencv:
+        opencv_s_calibration(tmp_path / "in")
+        matrix = listed("image_points", px).replace("cols: 260", "cols: 130")
+        with (tmp_path / "in/camera_data.yml").open("a") as file:
+            file.write(matrix.replace("dt: d", 'dt: "2d"'))
+    else:
+        lines = ["file_name,x,y,z,rx(deg),ry(deg),rz(deg)"]
+        for at, row in enumerate(rows.tolist()):
+            write(tmp_path / f"in/shot_{at}.json", {"corners": {"pixel": px[at].tolist()}})
+            lines.append(",".join([f"shot_{at}.json", *map(repr, row)]))
+        write(tmp_path / "in/rows.csv", "\n".join(lines))
+        done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said)
+        done.refused("the corners do not say for which size", "--resolution")
+        lacking = visioncal("convert", tmp_path / "in", tmp_path / "out", *said[:2])
+        lacking.refused("has corners, but what target they show is not known", "--target")
+        said += ["--resolution", "640,400"]
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    assert "Found by the corners" in done.err
+    session = Session.load(tmp_path / "out")
+    for view, pose, points in zip(session.views, poses, px, strict=True):
+        np.testing.assert_allclose(view.base_from_flange().as_matrix(), pose, atol=1e-9)
+        np.testing.assert_allclose(session.corners[view.number].px, points, atol=1e-6)
+
+
 def test_a_command_names_two_sides_of_as_many_rows(tmp_path):
     """Beside a lens of its own pictures, whose vectors are more than the robot's poses."""
     poses, seen, mount = world()

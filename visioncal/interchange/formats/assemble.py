@@ -23,6 +23,7 @@ from visioncal.robot import Robot
 from visioncal.robot.files import ROBOT_SUFFIXES, read_robot_document
 from visioncal.session import ImageStore, Session, Stream
 from visioncal.session import columns as session_columns
+from visioncal.session.corners import CornerTable
 from visioncal.session.images import CLOUD_ENDINGS, ListedImages
 from visioncal.session.table import check_two_sides
 from visioncal.vision.boards.imaging import image_size, looks_like_image
@@ -145,11 +146,11 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     rows = _view_rows(foreign, paths)
     if foreign.lenses:
         document["cameras"] = {name: dict(lens) for name, lens in foreign.lenses.items()}
-    elif images:
+    elif images or foreign.corners:
         document["camera"] = _camera(foreign, store, images)
     elif (foreign.lens or {}).get("model") == "points":
         document["camera"] = {"model": "points"}
-    target = foreign.target if images else None
+    target = foreign.target if images or foreign.corners else None
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
     robot = _robot(foreign, document)
@@ -158,7 +159,13 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[row.get(name, "") for name in names] for row in rows]
     session = Session.assemble(
-        document, names, cells, store, target_document=target, robot_document=robot
+        document,
+        names,
+        cells,
+        store,
+        target_document=target,
+        robot_document=robot,
+        corners=_corner_table(foreign),
     )
     named = named_by(foreign.robot.places[0])
     check_two_sides(foreign.name, session.views, _SIDES.format(named))
@@ -178,6 +185,13 @@ def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Sessio
             f"{len(missing)} of {len(rows)} rows have no pose of the robot: {some_of(missing)}."
         )
     return replace(session, warnings=(*notes, *session.warnings))
+
+
+def _corner_table(foreign: ForeignRecording) -> CornerTable | None:
+    """The corners of a recording by its views' numbers; None without."""
+    views = foreign.views or range(len(foreign.robot))
+    found = [(n, px) for n, px in zip(views, foreign.corners, strict=False) if px is not None]
+    return CornerTable.of_lists([(n, np.arange(len(px)), px) for n, px in found]) if found else None
 
 
 def _with_depth(
@@ -204,6 +218,7 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
     saw = np.zeros(len(foreign.robot), dtype=bool)
     for cells in (foreign.images, *filter(None, readings)):
         saw |= np.array([bool(cell) for cell in cells] or [False])
+    saw |= np.array([px is not None for px in foreign.corners] or [False])
     if foreign.camera is not None:
         saw |= foreign.camera.present
     dropped = [foreign.robot.places[index] for index in np.flatnonzero(~saw)]
@@ -225,33 +240,37 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
 
 
 def lacks_target(foreign: ForeignRecording) -> bool:
-    """Whether there are images alone, and nothing says what they show."""
-    return bool(foreign.images) and foreign.target is None and foreign.camera is None
+    """Whether there are images or corners alone, and nothing says what they show."""
+    is_seen = bool(foreign.images or foreign.corners)
+    return is_seen and foreign.target is None and foreign.camera is None
 
 
 def unknown_target(foreign: ForeignRecording, culprit: str, then: str = "") -> DataError:
     """The error of images of which nothing says what they show, and what `then` follows."""
     return DataError(
-        f"{foreign.name} has images, but what target they show is not known.",
+        f"{foreign.name} has {'images' if foreign.images else 'corners'}, but what target they "
+        "show is not known.",
         culprits=[culprit],
         next_step=f"Say {_TARGET}{then}",
     )
 
 
 def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignRecording:
-    """Chooses between images and stored target poses where there are both."""
-    if not foreign.images:
+    """Chooses between images or corners and stored target poses where there are both."""
+    if not (foreign.images or foreign.corners):
         return foreign
     if foreign.target is not None:
         if foreign.camera is not None:
             notes.append(
-                "The stored poses of the target are left aside: the images determine them better."
+                "The stored poses of the target are left aside: the "
+                f"{'images' if foreign.images else 'corners'} determine them better."
             )
         return replace(foreign, camera=None)
     if lacks_target(foreign):
         raise unknown_target(foreign, "target")
-    notes.append("The images are left aside: no --target says what they show.")
-    return replace(foreign, images=())
+    seen = "images" if foreign.images else "corners"
+    notes.append(f"The {seen} are left aside: no --target says what they show.")
+    return replace(foreign, images=(), corners=())
 
 
 def _view_rows(foreign: ForeignRecording, paths: Sequence[str]) -> list[dict[str, str]]:
@@ -353,10 +372,11 @@ def _camera(foreign: ForeignRecording, store: ImageStore, paths: Sequence[str]) 
         size = next(filter(None, sizes), None)
         if size is not None:
             lens["resolution"] = list(size)
-        elif "matrix" in lens:
+        elif "matrix" in lens or not paths:
+            whose = "the intrinsics do not say" if "matrix" in lens else "the corners do not say"
             raise DataError(
-                f"{foreign.name}: the intrinsics do not say for which size of image they hold, and "
-                "no image can be read.",
+                f"{foreign.name}: {whose} for which size of image they hold, and no image can be "
+                "read.",
                 culprits=["resolution"],
                 next_step="Say --resolution WIDTH,HEIGHT.",
             )

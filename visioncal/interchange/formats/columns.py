@@ -13,6 +13,7 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Samples
 from visioncal.interchange.formats.fields import (
     Fields,
+    corners_in,
     in_seconds,
     is_image_name,
     named_by,
@@ -112,7 +113,12 @@ def _files_apart(
 
     Raises DataError where several of its fields may be the poses of the target.
     """
-    if first.images or first.camera is not None or {"meas_x_m", "point"} & first.columns.keys():
+    if (
+        first.images
+        or first.corners
+        or first.camera is not None
+        or {"meas_x_m", "point"} & first.columns.keys()
+    ):
         return None
     if apart := tables_apart(source, requested):
         return apart
@@ -181,6 +187,8 @@ def _recordings(
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
     pairing, image_name = _images(fields, requested.image, found, instead, used)
     used.add(image_name)
+    corner_name, px = ("", None) if pairing.images else corners_in(fields)
+    used.add(corner_name)
     if pairing.is_open and names["robot"]:
         unstated["robot"] |= {"images"}
     columns = _further(fields, columns, used, pairing)
@@ -191,6 +199,7 @@ def _recordings(
         camera=poses.get("camera"),
         mount="instrument" if "meas_x_m" in columns and not (points or pairing.images) else None,
         images=pairing.images,
+        corners=() if px is None else tuple(row if np.isfinite(row).all() else None for row in px),
         lens={"model": "points"} if points else None,
         joints_rad=joints,
         stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,

@@ -25,10 +25,15 @@ from visioncal.session.images import IMAGE_ENDINGS
 
 _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
 _NORM_TOLERANCE = 0.01
-# A pose with its covariance has fewer numbers; lists of corners and images have more.
-MOST_NUMBERS = 200
+# A pose with its covariance has fewer numbers; images have more, and corners, in pairs, may have.
+MOST_NUMBERS, _MOST_CORNERS = 200, 1_000
 # Numbers of a pose: three angles or a quaternion beside a position, and matrices.
 POSE_SIZES = (6, 7, 12, 16)
+
+
+# Names of corners in an image, and the fewest that are a board's.
+_CORNERS = re.compile("corner|pixel|im(a?ge?|g)_?(points|pts)|points_?2d", re.IGNORECASE)
+_FEWEST_CORNERS = 4
 
 
 def named_by(place: str) -> str:
@@ -286,6 +291,23 @@ def position_first(flat: FloatArray) -> FloatArray:
     """(n, 7) numbers with the position first, whichever four are unit quaternions."""
     is_last = _are_unit(flat[:, -4:]) or not _are_unit(flat[:, :4])
     return flat if is_last else np.roll(flat, 3, axis=1)
+
+
+def is_small(array: FloatArray) -> bool:
+    """Whether an array of a row may be a pose, other numbers of it, or (k, 2) corners."""
+    is_pairs = array.ndim > 1 and array.shape[-1] == 2
+    return array.size <= (2 * _MOST_CORNERS if is_pairs else MOST_NUMBERS)
+
+
+def corners_in(fields: Fields) -> tuple[str, FloatArray | None]:
+    """The only field of (n, k, 2) corners [px], by its name, and these; else empty and None."""
+    found = {
+        name: numbers.reshape(len(fields), -1, 2)
+        for name, numbers in fields.numbers.items()
+        if numbers.ndim > 2 and numbers.shape[-1] == 2 and _CORNERS.search(name)
+    }
+    found = {name: each for name, each in found.items() if each.shape[1] >= _FEWEST_CORNERS}
+    return next(iter(found.items())) if len(found) == 1 else ("", None)
 
 
 def holds_pose(fields: Fields) -> bool:

@@ -106,6 +106,9 @@ class ForeignRecording:
     # (n,) the image of each row; None in a row without one, empty where there are none.
     images: tuple[Path | None, ...] = ()
     store: ImageStore | None = None  # Where these are, if they are no files.
+    # (n,) the corners of the whole board in each row, (k, 2) [px] by their numbers, where another
+    # program found them; None in a row without, empty where there are none.
+    corners: tuple[FloatArray | None, ...] = ()
     # (n, j) joint angles [rad], NaN in a row without; None where they were not recorded.
     joints_rad: FloatArray | None = None
     stamps_s: FloatArray | None = None  # (n,) times [s]; None where they were not recorded.

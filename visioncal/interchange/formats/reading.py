@@ -38,6 +38,7 @@ from visioncal.interchange.formats.fields import (
     fields_of_records,
     holds_pose,
     is_image_name,
+    is_small,
     joined,
 )
 from visioncal.interchange.formats.lines import (
@@ -151,7 +152,7 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
             # Lists of numbers of any length are irregular, and not several kinds.
             return {name: record} if numbers else flat
         return {name: record}
-    return {name: array} if record is not None and array.size <= MOST_NUMBERS else {}
+    return {name: array} if record is not None and is_small(array) else {}
 
 
 # Lists of a joint each in a ROS message of joints, beside the joints' names.

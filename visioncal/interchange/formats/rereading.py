@@ -26,7 +26,7 @@ from visioncal.core.documents.toml import read_toml
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside
 from visioncal.core.number_format import some_of
-from visioncal.core.types import MOUNTS, FloatArray, Progress, Searched, evenly
+from visioncal.core.types import MOUNTS, FloatArray, IntArray, Progress, Searched, evenly
 from visioncal.interchange.formats.assemble import (
     FileImages,
     assemble,
@@ -166,8 +166,8 @@ def _check_sides(foreign: ForeignRecording) -> None:
     if lacks_target(foreign):
         then = " Forms of poses that are not stated are then found by the images."
         raise unknown_target(foreign, "--target", then)
-    if foreign.camera is not None:
-        # Of the same numbers any reading agrees.
+    if foreign.camera is not None or foreign.corners:
+        # Of the same numbers any reading agrees; corners need the size of their images.
         assemble(replace(foreign, images=()))
 
 
@@ -219,6 +219,8 @@ def _tested(
 
 def _are_same(first: ForeignRecording, second: ForeignRecording) -> bool:
     """Whether two readings have the same poses, but for what is written with fewer digits."""
+    if first.images != second.images:
+        return False
     if len(first.robot) != len(second.robot):
         return True
     away = np.abs(first.robot.poses() - second.robot.poses())
@@ -248,7 +250,8 @@ class _Seen:
     """Corners in some rows of a source, by which its readings are tested."""
 
     run: RunState | None  # With the board's poses by the images; None for poses of the target.
-    images: tuple[Path | None, ...]  # The images of these rows.
+    rows: IntArray  # These rows of the recording.
+    images: tuple[Path | None, ...]  # Their images; empty where corners were given.
     count: int  # The number of rows.
     progress: Progress | None
 
@@ -265,9 +268,10 @@ class _Seen:
         `searches` has what was found in images before.
         """
         seen = with_observations_only(foreign)
-        if not seen.images:
-            return cls(None, (), min(len(seen.robot), most), progress)
+        if not (seen.images or seen.corners):
+            return cls(None, np.arange(0), (), min(len(seen.robot), most), progress)
         there = [at for at, image in enumerate(seen.images) if image and image.is_file()]
+        there = there or [at for at, px in enumerate(seen.corners) if px is not None]
         rows = np.array(there, dtype=int)[evenly(len(there), most)]
         run = None
         if len(rows) >= FEWEST_ROWS:
@@ -276,7 +280,8 @@ class _Seen:
                 images = replace(session.images, searches=searches)
                 session = replace(session, images=images)
             run = _measured(session, progress)
-        return cls(run, tuple(seen.images[at] for at in rows), len(rows), progress)
+        shown = tuple(seen.images[at] for at in rows) if seen.images else ()
+        return cls(run, rows, shown, len(rows), progress)
 
     @property
     def searches(self) -> dict[Path, Searched]:
@@ -300,7 +305,7 @@ class _Seen:
             rows = rows[evenly(len(rows), self.count)]
             return DoubtfulSession.of(rows_of(item, rows)).guess(self.progress)
         row = {image: at for at, image in enumerate(item.images)}
-        rows = np.array([row.get(image, -1) for image in self.images])
+        rows = np.array([row.get(image, -1) for image in self.images] or self.rows)
         robot = item.robot
         if not robot.present.any():
             chain = chain_poses(assemble(item))
@@ -344,7 +349,8 @@ def _applied(
         if not (note.startswith("The ") and " taken for " in note)
         or (is_open and "positions" in note)
     )
-    notes = [f"Found by the {'images' if is_measured else 'poses'}: {guess.sentence}"]
+    means = ("images" if foreign.images else "corners") if is_measured else "poses"
+    notes = [f"Found by the {means}: {guess.sentence}"]
     if is_measured and best.camera.scale != declared.camera.scale:
         notes.append(
             "The session keeps the board's stated size: measure the board, and correct target.toml "
