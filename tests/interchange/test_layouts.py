@@ -658,6 +658,17 @@ def letters_of_a_picture_too_many(folder):
     write(folder / "poses.txt", "\n".join(map(",".join, sevens())))
 
 
+def headings_in_turn(folder):
+    """A number a line below the headings of a position and a quaternion, one after the other."""
+    shoot(folder / "pics", "{}.png")
+    names = ("translation: ", "x", "y", "z", "rotation: ", "x", "y", "z", "w")
+    lines = list[str]()
+    for row in sevens():
+        numbers = iter(row)
+        lines += [name if ":" in name else f"{name}: {next(numbers)}" for name in names]
+    write(folder / "tfs.txt", "\n".join(lines))
+
+
 def lines_before_the_first_picture(folder):
     """Two lines more than pictures, which are counted from one."""
     for at in range(9):
@@ -1007,7 +1018,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         lists_in_a_log, lists_beside_pictures, lists_alone, lists_over_lines,
         tf_echo, tf2_echo, tf_echo_each,
         job, within_braces, elements, nested_elements, sections,
-        lines_of_lost_pictures, lines_of_few_pictures, letters_of_a_lost_picture,
+        headings_in_turn, lines_of_lost_pictures, lines_of_few_pictures, letters_of_a_lost_picture,
         letters_of_a_picture_too_many, lines_before_the_first_picture, urscript_with_a_start,
         named_with_depth, named_with_clouds,
     )

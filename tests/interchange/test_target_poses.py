@@ -202,6 +202,24 @@ def test_what_keeps_images_from_telling_a_form_comes_before_the_form(tmp_path, m
     done.refused("the same in all 9 rows", "tilted by 20 to 40 degrees")
 
 
+def test_rows_of_another_recording_are_doubted_before_their_form(tmp_path):
+    poses, seen, mount = world()
+    rng = np.random.default_rng(0)
+    turns = Rotation.random(9, random_state=rng).as_rotvec()
+    rows = np.hstack([rng.uniform(-1.0, 1.0, (9, 3)), turns]).tolist()
+    records = [{"pose": a, "board": b.tolist()} for a, b in zip(rows, seen, strict=True)]
+    write(tmp_path / "in.json", records)
+    done = visioncal("convert", tmp_path / "in.json", tmp_path / "out", "--mount", mount)
+    words = done.refused("No reading that was tried stands out").err
+    assert words.index("these rows are those of these images") < words.index(
+        "Else say --robot-form"
+    )
+    # Columns that are one pose are described in one line.
+    pose = np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+    np.savetxt(tmp_path / "rows.txt", pose)
+    assert "1, 2, 3, 4, 5, 6, 7: look like a pose" in describe(tmp_path / "rows.txt").words()
+
+
 def test_files_of_objects_say_how_to_write_them(tmp_path, monkeypatch):
     """A table of MATLAB, and a pickle."""
     write(tmp_path / "in/frame.pkl", "numbers 0.1 0.2 0.3 0.4 0.5 0.6")

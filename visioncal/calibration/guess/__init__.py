@@ -1,5 +1,11 @@
 """Search for the right reading of recorded poses: units, inverses, rotations, pairing, mount."""
 
-from visioncal.calibration.guess.decide import ONE_AXIS, POSE_OPTIONS, Guess, guess_reading
+from visioncal.calibration.guess.decide import (
+    NO_READING,
+    ONE_AXIS,
+    POSE_OPTIONS,
+    Guess,
+    guess_reading,
+)
 from visioncal.calibration.guess.readings import Hypothesis
 from visioncal.calibration.guess.search import CLEAR, FEWEST_ROWS, Candidate

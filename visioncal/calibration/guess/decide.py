@@ -38,6 +38,7 @@ _SHUFFLES, _MOST_SCORE = 8, 0.3
 _BY_LENGTH = 10.0
 # How the sentence begins where the motion leaves the reading open.
 ONE_AXIS = "All views turn about one axis"
+NO_READING = "No reading that was tried stands out"
 # How a person states what several readings leave open, in options of `convert`.
 POSE_OPTIONS = "--robot-form, --robot-unit, --robot-inverse, or --robot-columns in the right order"
 # Poses of two readings that differ by less than this share of the residuals are the same.
@@ -271,7 +272,7 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
             f"they agree to {_figures(declared)}."
         )
     if not declared.fit.closes:
-        return f"No reading that was tried stands out: as first read, {closes}."
+        return f"{NO_READING}: as first read, {closes}."
     return f"The poses fit as first read: {closes}."
 
 

@@ -36,6 +36,8 @@ _HEADED = re.compile(r"\s*([^\d\W][^:=]*?)\s*[:=]\s*(.*?)\s*")
 _LITERAL = r"p\[[^\]\[]*\]"
 _ASSIGNED = re.compile(rf"\b(\w+)[ \t]*=[ \t]*({_LITERAL})")
 _MOVED = re.compile(rf"\bmove[jlpc]\s*\(\s*(?:get_inverse_kin\s*\(\s*)?({_LITERAL}|\w+)")
+# Numbers of a position or a quaternion, a line each below its heading.
+_PARTS = ("x", "y", "z", "w")
 # A list within a line of text.
 _INNER = re.compile(r"[\[(]([^\[\]()]*)[\])]")
 # Lines with their places.
@@ -109,7 +111,8 @@ def arrays_in(lines: _Lines) -> dict[str, list[float]]:
         above.append(heading)
     headed = {top for top, (name, row, _) in zip(above, entries, strict=True) if row}
     for top, (name, numbers, line) in zip(above, entries, strict=True):
-        named = top if name == "matrix" and len(headed - {"matrix"}) > 1 else name
+        is_headed = name == "matrix" or (name in _PARTS and len(numbers) == 1)
+        named = top if is_headed and len(headed - {"matrix"}) > 1 else name
         # A pose or a list that is written again replaces the first.
         is_whole = len(numbers) in POSE_SIZES or (named != "matrix" and "[" in line)
         is_again = is_whole and len(numbers) == len(arrays[named])

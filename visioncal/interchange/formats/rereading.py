@@ -9,7 +9,15 @@ from typing import Any, Self
 
 import numpy as np
 
-from visioncal.calibration.guess import CLEAR, FEWEST_ROWS, ONE_AXIS, Candidate, Guess, Hypothesis
+from visioncal.calibration.guess import (
+    CLEAR,
+    FEWEST_ROWS,
+    NO_READING,
+    ONE_AXIS,
+    Candidate,
+    Guess,
+    Hypothesis,
+)
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
@@ -443,6 +451,8 @@ def _unsaid(
     step = f"{_MOVE}say" if why.startswith((ONE_AXIS, _STILL)) else "Say"
     if why.startswith(_STILL):
         words = f"{why}. No calibration is determined so, and no form of these rotations"
+    elif why.startswith(NO_READING):
+        step = "Look whether these rows are those of these images or poses of the target. Else say"
     elif fault is not None:
         words = f"{re.sub('^session .*?: ', '', why)}. Beside that, {unsaid}"
         step = f"{fault.next_step} Else say".strip()

@@ -121,8 +121,10 @@ def _field_lines(fields: Fields) -> Iterator[str]:
     """A line a field: its name, the shape of a row, the range, and what it looks like."""
     poses = {name: item for item in possible_poses(fields) for name in item.names}
     columns = [name for name, numbers in fields.numbers.items() if numbers.ndim == 1]
+    for item in dict.fromkeys(item for name, item in poses.items() if name in columns):
+        yield f"{some_of(item.names, 16)}: look like a pose"
     for name, numbers in fields.numbers.items():
-        if name in columns and name not in poses:
+        if name in columns:
             continue
         shape = " x ".join(map(str, numbers.shape[1:])) or "1"
         sized = {3: "a position or three angles", 6: "a pose, or six joints"}
