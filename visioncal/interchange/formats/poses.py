@@ -627,7 +627,7 @@ def _likely_rotation(
     if degrees:
         # Angle units are checked later, unless the user states them.
         return "rotation-vector-deg", ""
-    if requested.form is None and "rvec" not in joined:
+    if requested.form is None and not re.search(r"rvec|rot\w*vec", joined):
         return "rotation-vector", (
             f"The {whose}'s rotations ({', '.join(names)}) are taken for rotation vectors in "
             f"radians, as the source does not say; --{whose}-form names another form."
