@@ -1,8 +1,8 @@
 """The table of readings: what people mistake about recorded poses, and how it is undone."""
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from itertools import permutations, product
 from typing import Any, Literal
 
@@ -59,12 +59,7 @@ class SideReading(Reading):
             there, none = dict(self.by_place), (np.nan,) * 9
             rows = [there.get(place, none) for place in numbers.places]
             return np.array(rows).reshape(-1, 3, 3)
-        recorded = numbers.rotations
-        if self.written:
-            rotations = ROTATION_FORMS[numbers.reading.rotation].read(recorded)
-            valid = np.isfinite(rotations).all(axis=(1, 2))
-            recorded = np.full((len(rotations), ROTATION_FORMS[self.written].size), np.nan)
-            recorded[valid] = ROTATION_FORMS[self.written].write(rotations[valid])
+        recorded = as_written(numbers, self.written).rotations
         if self.terms:
             recorded = recorded[:, np.abs(self.terms) - 1] * np.sign(self.terms)
         return ROTATION_FORMS[self.rotation].read(self.angle_unit * recorded)
@@ -96,6 +91,17 @@ class SideReading(Reading):
         if self.reading is not None:
             return numbers.read_as(self.reading)
         return PoseNumbers.of_poses(self.poses(numbers), numbers.places)
+
+
+def as_written(numbers: PoseNumbers, form: str) -> PoseNumbers:
+    """The numbers with their rotations in another form, if any; NaN where they give none."""
+    if not form:
+        return numbers
+    rotations = ROTATION_FORMS[numbers.reading.rotation].read(numbers.rotations)
+    valid = np.isfinite(rotations).all(axis=(1, 2))
+    recorded = np.full((len(rotations), ROTATION_FORMS[form].size), np.nan)
+    recorded[valid] = ROTATION_FORMS[form].write(rotations[valid])
+    return replace(numbers, rotations=recorded, reading=replace(numbers.reading, rotation=form))
 
 
 def shifted(by: int, count: int) -> IntArray:
@@ -303,10 +309,10 @@ def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change
     if not by_makers and turned.max(initial=0.0) < _RADIANS_AS_DEGREES_RAD:
         radians = [name.replace("-deg", "-rad") for name in degrees]
         pairs += [*product(radians, degrees), ("rotation-vector", "rotation-vector-deg")]
-    known = [rotations]
+    known, of_form = [rotations], cache(partial(as_written, robot))
     yield from _signed_angles(robot, known, [f"euler-{order}-deg" for order in used])
     for name, written in pairs:
-        tried = SideReading(name, written=written).rotations(robot)
+        tried = SideReading(name).rotations(of_form(written))
         # Other names of the same numbers in another order are the same mistake.
         if not any(np.allclose(tried, other, atol=1e-9, equal_nan=True) for other in known):
             known.append(tried)
@@ -329,8 +335,10 @@ def _signed_angles(
         yield Change(words, "robot", fields, 2)
     for form, (signs, named, cost) in product(forms, _signs(("first", "second", "third"))):
         terms = tuple((np.arange(1, 4) * signs).tolist())
-        tried = SideReading(form, written=form, terms=terms).rotations(robot)
-        if cost > 1 or any(np.allclose(tried, other, atol=1e-9, equal_nan=True) for other in known):
+        if cost > 1:
+            continue
+        tried = SideReading(form, terms=terms).rotations(as_written(robot, form))
+        if any(np.allclose(tried, other, atol=1e-9, equal_nan=True) for other in known):
             continue
         known.append(tried)
         words = f"another sign of the {named} of the robot's {ROTATION_FORMS[form].words}"

@@ -9,7 +9,7 @@ distinguished by the fits.
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import combinations, product
 from typing import TypeAlias
 
@@ -29,6 +29,7 @@ from visioncal.calibration.guess.readings import (
     Change,
     Hypothesis,
     SideReading,
+    as_written,
     changes,
     rewritten,
 )
@@ -387,14 +388,15 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
     of_camera, pairs = recording.camera.rows(rows), upper_pairs(len(rows))
     rows_of = {name: order(len(recording.robot))[rows] for name, order in ROW_ORDERS.items()}
     used = np.unique(np.maximum(np.concatenate([*rows_of.values()]), 0))
-    numbers = recording.robot.rows(used)
+    of_form = cache(partial(as_written, recording.robot.rows(used)))
 
     # Transposed or mirrored rotations turn by the same angles.
     @cache
     def traces(fields: _Rotations) -> FloatArray:
         rotation, written, terms, angle_unit = fields
-        reading = SideReading(rotation, written=written, terms=terms, angle_unit=angle_unit)
-        return _traces(np.append(reading.rotations(numbers), np.full((1, 3, 3), np.nan), axis=0))
+        reading = SideReading(rotation, terms=terms, angle_unit=angle_unit)
+        rotations = reading.rotations(of_form(written))
+        return _traces(np.append(rotations, np.full((1, 3, 3), np.nan), axis=0))
 
     @cache
     def places(order: str) -> tuple[IntArray, IntArray]:
