@@ -122,7 +122,10 @@ def _unexplained_words(away: Rms) -> str:
             "or table by which joint angles became the robot's poses, for a rail or lift that is "
             "in no pose, and for positions in another frame than the rotations."
         )
-    return f"{tried}Look at the worst views, for {sides[0]}; then for {sides[1]}."
+    return (
+        f"{tried}Look at the worst views, for {sides[0]}; then for {sides[1]}, and what holds "
+        "camera and board (a pole that sways, a conveyor, something under the board in some views)."
+    )
 
 
 def _residual(view: ViewResult) -> str:
