@@ -171,6 +171,18 @@ def creeping(cell):
     return showing(cell, looks)
 
 
+def swelling(cell):
+    """Paper that grows by 0.2 % about its first corner, until the end."""
+    points, camera = corner_positions(cell.options.target), cell.options.camera
+    shares = 2e-3 * np.linspace(-1.0, 0.0, len(cell.corners))
+    looks = list[Corners]()
+    for seen, pose, share in zip(cell.corners, cell.cam_from_target, shares, strict=True):
+        marks = points[seen.ids]
+        smaller = project(camera, apply(pose, (1.0 + share) * marks))
+        looks.append(replace(seen, px=seen.px + smaller - project(camera, apply(pose, marks))))
+    return showing(cell, looks)
+
+
 def on_the_way(cell):
     """Poses that are read when the arm is a twelfth of the way to its next stop."""
     there = cell.robot.base_from_flange
@@ -452,6 +464,15 @@ WORLDS: dict[str, World] = {
         words=(r"first row and its last, by (\S+) px",),
         figure=(4.6, 0.7),
         never=frozenset({"wrong_views", "lens_field", "focus", "image_shifted"}),
+    ),
+    "paper that swells": World(
+        replace(FINE, views=24),
+        swelling,
+        status="check",
+        causes=("board_swells",),
+        words=(r"The board grew by (\S+) % during the session",),
+        figure=(0.2, 0.03),
+        never=frozenset({"wrong_views", "arm_errors", "lens_grows", "window"}),
     ),
     # Poses that are not those of the images.
     "poses read on the way": World(

@@ -13,7 +13,7 @@ from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
 from visioncal.fit.linearise import Pair, images_of, linearised, predicted
-from visioncal.fit.score import best_field, best_window, of_effect, of_rows
+from visioncal.fit.score import best_displacement, best_field, of_effect, of_rows
 from visioncal.fit.sizes import most_likely
 from visioncal.fit.unknowns import (
     State,
@@ -29,6 +29,7 @@ from visioncal.model.effects import (
     SIGNIFICANT,
     BaseCreeps,
     BaseSteps,
+    BoardSwells,
     Breathing,
     Effect,
     FocusJitter,
@@ -165,9 +166,11 @@ def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
                 # Tilts of a plane look much like it: beyond, arms' errors would be taken for it.
                 member = starting_at(random_effect(effect), size, _SHOWN * size)
                 yield Candidate(gain, member, effect)
-        if f"window {camera}" not in {known.name for known in fit.unknowns.effects}:
-            pane, size, gain = best_window(fit, pairs, Window.tried(camera))
-            yield Candidate(gain, starting_at(random_effect(pane), size), pane)
+        opened_there = {known.name for known in fit.unknowns.effects}
+        for tried in (Window.tried(camera), (BoardSwells(camera),)):
+            if tried[0].name not in opened_there and images_of(pairs, camera):
+                best, size, gain = best_displacement(fit, pairs, tried)
+                yield Candidate(gain, starting_at(random_effect(best), size), best)
 
 
 def of_distances(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:

@@ -30,7 +30,7 @@ from visioncal.fit.mixed import weights_at
 from visioncal.fit.unknowns import Key, State, Unknowns
 from visioncal.model import Cell, MeasuredPlace, MeasuredPose, Moments, Sighting
 from visioncal.model.boards import SHAPES, shape_basis, shape_count
-from visioncal.model.effects import Rolling, RowMotion, Window
+from visioncal.model.effects import Displacement, Rolling, RowMotion
 from visioncal.vision.camera import project_with_jacobian
 from visioncal.vision.targets import corner_positions
 
@@ -472,8 +472,9 @@ def corner_rows(
         by_own = found.jacobian_intrinsics
         if isinstance(effect, RowMotion):
             by_own = columns["effect", effect.name] = effect.shifts(pair.px)
-        if isinstance(effect, Window):
-            by_own = found.jacobian_point @ effect.moved(apply_each(own, points))
+        if isinstance(effect, Displacement):
+            seen_at = apply_each(own, points)
+            by_own = found.jacobian_point @ effect.moved(seen_at, own[:, :3, 3])
             columns["effect", effect.name] = by_own
         columns_of = effect.columns(pair.moments, pair.distances(poses))
         moved = columns_of @ state.values["effect", effect.name]

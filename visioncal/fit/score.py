@@ -25,7 +25,7 @@ from visioncal.fit.linearise import (
     of_pose_alone,
 )
 from visioncal.fit.mixed import body_with, weights_at
-from visioncal.model.effects import Effect, RowMotion, Window
+from visioncal.model.effects import Displacement, Effect, RowMotion
 from visioncal.vision.camera import project_with_jacobian
 
 # Columns from which on no eigenvectors are worked out.
@@ -225,19 +225,24 @@ def of_rows(fit: Fit, pairs: Sequence[Pair], motion: RowMotion) -> Score:
     return Score(pull.ravel(), np.asarray(block_diag(*information)), fit.of_corners)
 
 
-def best_window(
-    fit: Fit, pairs: Sequence[Pair], windows: Sequence[Window]
-) -> tuple[Window, float, float]:
-    """The likeliest of some panes before one lens, its size, and its log-likelihood ratio."""
-    camera, count, added = windows[0].frame, len(windows), list[Added]()
+def best_displacement(
+    fit: Fit, pairs: Sequence[Pair], tried: Sequence[Displacement]
+) -> tuple[Displacement, float, float]:
+    """The likeliest of one camera's displacements, its size, and its log-likelihood ratio.
+
+    By the first of its values.
+    """
+    camera, count, added = tried[0].frame, len(tried), list[Added]()
     lens = fit.unknowns.camera(fit.linearised, camera)
     for gram, pair, rows in _of_images(fit, images_of(pairs, camera)):
         kept = fit.used[gram.rows]
         shape = pair.basis[pair.ids] @ fit.linearised.values["shape", pair.names[1]]
         points = apply_each(gram.poses[pair.owner], pair.points[pair.ids] + shape)
         slopes = project_with_jacobian(lens, points).jacobian_point
-        moved = np.stack([window.moved(points)[:, :, 0] for window in windows], axis=2)
-        each = slopes @ moved * pair.weights[:, None, None]
+        origins = gram.poses[pair.owner, :3, 3]
+        moved = np.stack([one.moved(points, origins)[:, :, 0] for one in tried], axis=2)
+        shares = tried[0].columns(gram.moments, gram.distances)[pair.owner, 0, 0] * pair.weights
+        each = slopes @ moved * shares[:, None, None]
         by_field = np.stack([np.kron(axis, rows.functions) for axis in np.eye(2)], axis=1)
         full = np.concatenate([rows.head, by_field, rows.residual[:, :, None]], axis=2)
         left, right = (
@@ -250,12 +255,12 @@ def best_window(
     found = score(fit, added, count, fit.of_corners)
     alone = [
         Score(found.pull[[at]], found.information[[at]][:, [at]], found.freedom).best(
-            np.ones(1), *windows[at].bounds[1:]
+            np.ones(1), *tried[at].bounds[1:]
         )
         for at in range(count)
     ]
     best = max(range(count), key=lambda at: alone[at][1])
-    return windows[best], alone[best][0], alone[best][1] - float(np.log(count))
+    return tried[best], alone[best][0], alone[best][1] - float(np.log(count))
 
 
 def _beside_poses(fit: Fit, gram: Gram, local: FloatArray, product: FloatArray) -> Added:

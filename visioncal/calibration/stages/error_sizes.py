@@ -17,7 +17,7 @@ from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
-from visioncal.model.effects import Effect, LensGrows, LensSags, LensSteps, SightSteps, Window
+from visioncal.model.effects import Displacement, Effect, LensGrows, LensSags, LensSteps, SightSteps
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics, project
 from visioncal.vision.targets import corner_positions, first_corners
@@ -35,6 +35,7 @@ _INSTEAD = {
     "lens changes": "the lens was exchanged, or its pictures rectified",
     "lens steps": "the lens changed at once",
     "row motion": "the camera moved while rows of its images were read",
+    "board swells": "the board grew or shrank",
     "window": "it was seen through a tilted pane of glass",
 }
 
@@ -51,11 +52,12 @@ class FoundEffect:
 
 
 @dataclass(frozen=True, eq=False)
-class FoundPane:
-    """A pane of glass before a lens."""
+class Displaced:
+    """Displacements of what a camera sees, of a size that chance does not explain."""
 
-    pane: Window
-    values: FloatArray  # (3,) of it.
+    effect: Displacement
+    columns: FloatArray  # (s, q, c) see `Effect.columns`, at the session's stations.
+    values: FloatArray  # (c,) estimates.
     gain: float  # Twice the gain in log-likelihood.
 
 
@@ -82,7 +84,7 @@ class ErrorSizes:
     # since what is linear at one lens is not so at another.
     zoomed: Mapping[str, Zoom] = field(default_factory=dict)
     opened: tuple[Effect, ...] = ()  # Of frames that move; of measured poses, their steps alone.
-    panes: tuple[FoundPane, ...] = ()  # Through which lenses look.
+    displaced: tuple[Displaced, ...] = ()  # By panes before lenses, and boards that swell.
     rivals: Mapping[str, frozenset[str]] = field(default_factory=dict)  # See `Unknowns.rivals`.
     # Whether boards keep their stated sizes: errors of arms are confounded with them.
     holds_scales: bool = False
@@ -90,19 +92,20 @@ class ErrorSizes:
     def steadied(
         self, camera: str, station: int, corners: Corners, shown: tuple[Camera, FloatArray]
     ) -> Corners:
-        """Corners of an image as a lens shows them that neither grows nor sags, without a pane.
+        """Corners of an image by a lens that neither grows nor sags, without displacements.
 
         Args:
             camera: The camera's frame.
             station: Where the robot stood; -1 where that is not known.
             corners: The corners.
-            shown: About the lens, and (n, 3) where it sees them [m].
+            shown: About the lens, and (n + 1, 3) where it sees the board's origin and them [m].
         """
-        px, (lens_now, seen) = corners.px, shown
-        for at in self.panes:
-            if at.pane.frame == camera:
-                nearer = seen + at.pane.moved(seen) @ at.values
-                px = px + project(lens_now, seen) - project(lens_now, nearer)
+        px, (lens_now, (origin, *_)) = corners.px, shown
+        seen = shown[1][1:]
+        for at in self.displaced:
+            if at.effect.frame == camera:
+                moved = at.effect.moved(seen, origin) @ (at.columns[station] @ at.values)
+                px = px + project(lens_now, seen) - project(lens_now, seen + moved)
         for found in self.grown:
             if found.effect.frame == camera and 0 <= station < len(found.columns):
                 moves, lens = (found.columns[station] @ found.values)[:4], found.effect.lens.matrix
@@ -166,12 +169,8 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
         if abs(zoom.share) > grew.get(name, 0.0):
             zoomed[name], grew[name] = zoom, abs(zoom.share)
     effects = (at for at in fit.unknowns.effects if at.place == "edge" and _size(fit, at.name))
-    panes = (
-        FoundPane(at, fit.state.values["effect", at.name], _gain(fit, at.name))
-        for at in fit.unknowns.effects
-        if isinstance(at, Window) and _size(fit, at.name)
-    )
-    known = tuple(effects), tuple(panes), fit.unknowns.rivals
+    displaced = tuple(_displaced(fit))
+    known = tuple(effects), displaced, fit.unknowns.rivals
     return ErrorSizes(levels, lenses, boards, grown, zoomed, *known, held)
 
 
@@ -313,6 +312,18 @@ def _grown(fit: Fit) -> Iterator[FoundEffect]:
         key: Key = ("effect", effect.name)
         estimate, covariance = fit.state.values[key], fit.covariance(key)
         yield FoundEffect(effect, columns, estimate, covariance, _gain(fit, effect.name))
+
+
+def _displaced(fit: Fit) -> Iterator[Displaced]:
+    """Displacements of what cameras see; where the robot's place is not known, as at the end."""
+    stations, moments = np.array(fit.cell.stations), fit.cell.moments
+    for effect in fit.unknowns.effects:
+        if isinstance(effect, Displacement) and _size(fit, effect.name):
+            known = effect.columns(moments, np.ones(len(moments)))
+            columns = np.tile(known[-1], (stations.max() + 2, 1, 1))
+            columns[stations] = known
+            values = fit.state.values["effect", effect.name]
+            yield Displaced(effect, columns, values, _gain(fit, effect.name))
 
 
 def _changed(fit: Fit) -> Iterator[tuple[Effect, Zoom, float]]:

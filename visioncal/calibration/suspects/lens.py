@@ -22,7 +22,7 @@ from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.estimation.joint import moved_mahalanobis_sq
 from visioncal.estimation.scene import ONLY_CAMERA
 from visioncal.model.effects.effect import SIGNIFICANT
-from visioncal.model.effects.window import nearer
+from visioncal.model.effects.window import Window, nearer
 from visioncal.results.compare import intrinsics_names
 from visioncal.vision.camera import intrinsics, normalise, project, with_intrinsics
 
@@ -266,10 +266,22 @@ def _moving(run: RunState) -> Iterator[Finding]:
 
 
 def _seen_through(run: RunState) -> Iterator[Finding]:
-    """Panes of glass before lenses."""
+    """Panes of glass before lenses, and boards that swell."""
     sizes = run.cell_fit.sizes
-    for found in sizes.panes:
-        camera, (thick_m, normal) = found.pane.frame, found.pane.pane(found.values)
+    for found in sizes.displaced:
+        camera, pane = found.effect.frame, found.effect
+        if not isinstance(pane, Window):
+            percent = 100.0 * float(found.values[0])
+            yield Finding(
+                "board_swells",
+                f"The board {'grew' if percent > 0.0 else 'shrank'} by {figure(abs(percent))} % "
+                "during the session, as paper in the damp. The result is that of its size at the "
+                f"end.{sizes.instead_of(pane.kind)}",
+                Remedy("Print it on aluminium or glass, or let it lie in the room for a day."),
+                mahalanobis_sq=found.gain,
+            ).of("" if camera == ONLY_CAMERA else camera)
+            continue
+        thick_m, normal = pane.pane(found.values)
         shift_mm = 1e3 * thick_m * nearer(np.array([[0.0, 0.0, 1.0]]), normal)[0]
         tilt = f"{np.rad2deg(np.arccos(normal[2])):.0f} deg"
         where = ", ".join(f"{part:.1f}" for part in shift_mm.tolist())
@@ -279,7 +291,7 @@ def _seen_through(run: RunState) -> Iterator[Finding]:
             f"about {figure(1e3 * thick_m)} mm thick, tilted by {tilt}. It was taken out "
             "of the corners, and the result is of the place from which the lens seems to look "
             f"through it, ({where}) mm from where it is, along its own axes. It holds for looks "
-            f"through this pane.{sizes.instead_of(found.pane.kind)}",
+            f"through this pane.{sizes.instead_of(pane.kind)}",
             Remedy(
                 "Take the pane away, or put it square to the line of sight, and record again; or "
                 "leave it as it is, and look with the middle of the image."
@@ -382,4 +394,5 @@ SHIFTED = Suspect(
 )
 MOTION = Suspect("row_motion", _moving, 1e-4, True)
 WINDOW = Suspect("window", _seen_through, 1e-4, True)
+SWELLS = Suspect("board_swells", None, 1e-4, True)
 MODEL = Suspect("lens_model", None, 1e-4, True, hides=("lens_field", "focus"))

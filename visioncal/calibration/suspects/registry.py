@@ -86,6 +86,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     lens.SHIFTED,
     lens.MOTION,
     lens.WINDOW,
+    lens.SWELLS,
     lens.MODEL,
     Suspect("prior", _contradicted, 2.7e-3),
     lens.LENS,

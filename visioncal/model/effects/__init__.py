@@ -12,6 +12,7 @@ from visioncal.model.effects.creep import MountCreeps as MountCreeps
 from visioncal.model.effects.creep import MountSteps as MountSteps
 from visioncal.model.effects.creep import SightSteps as SightSteps
 from visioncal.model.effects.effect import SIGNIFICANT as SIGNIFICANT
+from visioncal.model.effects.effect import Displacement as Displacement
 from visioncal.model.effects.effect import Effect as Effect
 from visioncal.model.effects.effect import Named as Named
 from visioncal.model.effects.effect import Size as Size
@@ -32,6 +33,7 @@ from visioncal.model.effects.springs import Springs as Springs
 from visioncal.model.effects.springs import Weight as Weight
 from visioncal.model.effects.stops_short import MovesOn as MovesOn
 from visioncal.model.effects.stops_short import StopsShort as StopsShort
+from visioncal.model.effects.swells import BoardSwells as BoardSwells
 from visioncal.model.effects.window import Window as Window
 from visioncal.model.effects.zeros import Zeros as Zeros
 

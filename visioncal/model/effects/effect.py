@@ -132,6 +132,22 @@ class Named(ABC):
 
 
 @dataclass(frozen=True, eq=False)
+class Displacement(Effect):
+    """An effect on a camera's images that displaces what it sees, each corner otherwise."""
+
+    place = "corners"
+
+    @abstractmethod
+    def moved(self, points: FloatArray, origins: FloatArray) -> FloatArray:
+        """Displacements (n, 3, c) of points in the camera's frame by as many values [m].
+
+        Args:
+            points: (n, 3) corners [m].
+            origins: (n, 3) or (3,) origins of their boards [m].
+        """
+
+
+@dataclass(frozen=True, eq=False)
 class LensEffect(Effect):
     """An effect on a lens."""
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import Effect, Size
+from visioncal.model.effects.effect import Displacement, Size
 
 # Refractive index of glass and of acrylic.
 _INDEX = 1.5
@@ -17,7 +17,7 @@ _STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Window(Effect):
+class Window(Displacement):
     """A pane's thickness, and that times how its normal is turned, about two axes [m].
 
     Seen through it, points are nearer along its normal by t (1 - cos / sqrt(n^2 - sin^2)), of the
@@ -26,7 +26,7 @@ class Window(Effect):
     through the same pane need it.
     """
 
-    place, kind, bounds, count = "corners", "window", (3e-3, 1e-6, 0.05), 3
+    kind, bounds, count = "window", (3e-3, 1e-6, 0.05), 3
     normal: tuple[float, float, float]  # About the pane's normal, in the camera's frame.
 
     @classmethod
@@ -49,8 +49,9 @@ class Window(Effect):
         normal = self._normals()[0] + values[1:] @ self._tangents() / values[0]
         return float(values[0]), normal / np.linalg.norm(normal)
 
-    def moved(self, points: FloatArray) -> FloatArray:
-        """(n, 3, 3) displacements of (n, 3) points in the camera's frame by the values."""
+    def moved(self, points: FloatArray, origins: FloatArray) -> FloatArray:
+        """See `Displacement`."""
+        del origins
         axis = np.array([[0.0, 0.0, 1.0]])
         still, *turned = (
             nearer(axis, normal) - nearer(points, normal) for normal in self._normals()
