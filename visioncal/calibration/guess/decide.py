@@ -171,8 +171,8 @@ def _with_likeliest_label(best: Candidate) -> Candidate:
         return best
     inliers = np.sort(best.of_rows[best.fit.kept])
     likeliest = max(fitted(best.recording, labels, inliers, 0), key=_plausibility).hypothesis
-    rows = thinned(best.recording.common_rows)
-    return replace(fitted(best.recording, [likeliest], rows, STARTS)[0], labels=labels)
+    rows, share = thinned(best.recording.common_rows), best.fit.share
+    return replace(fitted(best.recording, [likeliest], rows, 3 * STARTS, share)[0], labels=labels)
 
 
 def _plausibility(candidate: Candidate) -> float:

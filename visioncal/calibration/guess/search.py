@@ -127,6 +127,11 @@ class Candidate:
         return EVIDENCE * self.fit.log_likelihood - _CHANGE * cost - impossible
 
     @property
+    def misfit(self) -> float:
+        """RMS distance of the kept rows in the robot's recorded unit, which no reading shrinks."""
+        return self.fit.rms[0] / UNITS_M[self.hypothesis.robot.unit]
+
+    @property
     def board_scale(self) -> float:
         """Factor for the board's sizes, where images were measured; else 1."""
         readings = self.hypothesis, self.recording.declared
@@ -202,9 +207,15 @@ def search_by_half(recording: Recording) -> list[Candidate]:
     The others may be rows apart, or wrong for another reason.
     """
     rows, declared = thinned(recording.common_rows), recording.declared
-    single = _undone(declared, product((None,), changes(declared, recording.is_measured, 0)))
+    every = [*changes(declared, recording.is_measured, 0)]
+    every += rewritten(recording.robot.rows(rows), by_makers=True)
+    single = _undone(declared, product((None,), every))
     tried = [declared, *filter(recording.is_likely, single)]
     first, *others = fitted(recording, tried, rows, 3 * STARTS, HALF_SHARE)
+    classes: dict[Hashable, list[Hypothesis]] = {}
+    for item in others:
+        classes.setdefault(item.hypothesis.chain_class, []).append(item.hypothesis)
+    others = [replace(item, labels=(*classes[item.hypothesis.chain_class],)) for item in others]
     others.sort(key=lambda item: -item.log_posterior)
     return [first, *others]
 
@@ -289,7 +300,7 @@ def _of_another_size(
     The first candidate is the declared reading.
     """
     scaled: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
-    declared = candidates[0]
+    as_stated, declared = dict[Hypothesis, float](), candidates[0]
     for item in candidates:
         if item.fit.rms[1] > _TURNS_AGREE_RAD:
             continue
@@ -303,9 +314,14 @@ def _of_another_size(
         )
         change = Change(f"{whose} {scale:.4g} times as large", "camera", {"scale": scale}, 2)
         scaled[change.of(item.hypothesis)] = (*map(change.of, item.labels),)
+        as_stated[change.of(item.hypothesis)] = min(item.misfit, declared.misfit)
     found = fitted(recording, scaled, rows, STARTS) if scaled else []
-    # Larger distances make any misfit a smaller share of them.
-    return [replace(item, labels=scaled[item.hypothesis]) for item in found if item.fit.closes]
+    # Larger distances make any misfit a smaller share of them, and a fitted number any misfit less.
+    return [
+        replace(item, labels=scaled[item.hypothesis])
+        for item in found
+        if item.fit.closes and CLEAR_RATIO * item.misfit < as_stated[item.hypothesis]
+    ]
 
 
 def _distance_scale(candidate: Candidate) -> float | None:

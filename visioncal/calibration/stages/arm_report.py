@@ -1,5 +1,6 @@
 """A calibrated arm as stops determine it: its parameters, its accuracy, and remarks on both."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from visioncal.calibration.stages import elastic
 from visioncal.calibration.stages.kinematics import SelectedArmLevel
 from visioncal.core.choices import Convention
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding
@@ -15,6 +17,7 @@ from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.identifiability import (
     Identifiability,
     Jacobians,
+    joint_words,
     observability_indices,
     undetermined,
 )
@@ -29,11 +32,19 @@ from visioncal.results.arm import (
     WorkspacePlace,
     WorkspaceSigma,
 )
+from visioncal.robot import Robot
 from visioncal.robot.conversion import convert_table, parallel_axes, table_of
 from visioncal.robot.tables import table_from_document
 
 # Number of postures of a map of the accuracy.
 _PLACES = 200
+# Zeros and eccentricities that are off by more than makers leave [rad], in so many sigmas: what the
+# names of their parameters contain, and words.
+_FAR_RAD, _CLEAR = 2e-3, 10.0
+_FAR_OFF = (
+    ("theta", "Zeros are off", "where they were lost, or the model counts from others"),
+    ("sine", "Encoders or gears run out", "where they sit eccentrically"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +78,29 @@ def report_of(arm: ArmData, levels: SelectedArmLevel, convention: Convention | N
     if model.weights.keys() & set(RIGID):
         result, advice = add_parameters(result, arm, convention)
         result = replace(result, left_out=levels.left_out())
-        notes += [advice] if advice else []
+        notes += [*far_off(result.parameters, model.nominal), *([advice] if advice else [])]
     springs = elastic.elastic_of(arm, levels.fit.errors)
     notes += () if springs is None else elastic.remarks(springs)
     doubts = [*elastic.play_findings(result.backlash)]
     doubts += () if springs is None else elastic.doubts(springs)
     return ArmReport(ArmSections(arm=result, elastic=springs), tuple(notes), tuple(doubts))
+
+
+def far_off(parameters: Sequence[ArmParameter], robot: Robot) -> Iterator[str]:
+    """Names joints whose zero or eccentricity is off by more than makers leave."""
+    for name, words, why in _FAR_OFF:
+        off = dict[str, float]()
+        for at in parameters:
+            # A cosine's name contains that of a sine.
+            if name in at.name and at.sigma and abs(at.change) > max(_FAR_RAD, _CLEAR * at.sigma):
+                off[at.joint] = float(np.hypot(off.get(at.joint, 0.0), at.change))
+        places = map(robot.joint_names.index, off)
+        sizes = [
+            f"{joint_words(place, robot)} by {figure(float(np.rad2deg(size)))} deg"
+            for place, size in zip(places, off.values(), strict=True)
+        ]
+        if sizes:
+            yield f"{words}: {some_of(sizes, most=3)}, as {why}."
 
 
 def add_parameters(

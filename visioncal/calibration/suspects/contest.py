@@ -90,7 +90,9 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
 def _proves(run: RunState, trial: Trial) -> bool:
     """Whether a cure leaves mere noise, and no other cause leaves about as little."""
     (before, after), (problem, fit) = trial.levels, trial.cured
-    is_noise = bool((after < _LIMITS.repeatability * np.array(REPEATABILITY)).all())
+    usual = _LIMITS.repeatability * np.array(REPEATABILITY)
+    # What such arms scatter by anyway needs no cure.
+    is_noise = bool((after < usual).all() and not (before < usual).all())
     is_less = (after < (_LIMITS.scatter_mm[0], _LIMITS.scatter_deg[0])).all()
     if not is_noise and not (is_less and (CLEAR_RATIO * after < before).any()):
         return False

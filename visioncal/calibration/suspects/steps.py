@@ -16,12 +16,19 @@ from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step, with_step
 
 _LIMITS = CalibrationLimits()
+# Prints of one file agree to less, and a print changes its size by as much with the air.
+_OTHER_PRINT = 5e-4
 _THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
 
 
 def _found(run: RunState) -> Iterator[Finding]:
     """The likeliest step or drift, and another that may be the cause instead."""
-    steps, cell = run.assessment.steps, run.cell_fit.cell
+    cell = run.cell_fit.cell
+    steps = [
+        step
+        for step in run.assessment.steps
+        if step.kind != SIZE or abs(float(step.value[0])) > _OTHER_PRINT
+    ]
     # More than a base or an arm drifts by is of another cause that follows the order of the views.
     moved = [pose_difference(np.eye(4), exp(step.value)) for step in steps if step.kind == DRIFT]
     if not steps or any(
