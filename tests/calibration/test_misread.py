@@ -373,6 +373,41 @@ def test_positions_and_rotations_that_two_signs_may_belong_to_are_both_named(tmp
     assert "--positions" in done.refused("close as first read").err
 
 
+def test_of_readings_that_close_half_of_the_rows_the_likelier_cell_is_taken():
+    """A wrong mount looks as inverse poses do; the last rows are those of one row before."""
+    cell = simulate(CellOptions(views=14, mount="eye-to-hand"))
+    robot, seen = cell.robot.base_from_flange, cell.cam_from_target
+    late = np.concatenate([robot[:8], np.roll(robot[8:], 1, axis=0)])
+    best = guessed_of(late, seen).best
+    assert best.hypothesis.changes == ("the camera mounted eye-to-hand",)
+    assert best.fit.agreeing == 8
+
+
+def guessed_of(robot, seen) -> Guess:
+    """The guess of poses that images show, of a camera that is said to be on the flange."""
+    places = (*map(str, range(len(robot))),)
+    numbers = [PoseNumbers.of_poses(side, places) for side in (robot, seen)]
+    return guess_reading(*numbers, "eye-in-hand", is_measured=True)
+
+
+@pytest.mark.parametrize("seed", [0, 3, 4])
+def test_another_size_that_leaves_most_of_a_misfit_is_none(seed):
+    """A tool longer by 150 mm in the later rows, from farther away, looks as a larger board."""
+    rng, count = np.random.default_rng(seed), 22
+    turns = np.column_stack([rng.normal(0.0, [0.25, 0.25, 0.6], (count, 3)), np.zeros((count, 3))])
+    seen = exp(turns) @ compose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    far = np.where(np.arange(count) < 8, 0.7 + 0.1 * (seed == 0), 0.9)
+    seen[:, :3, 3] = rng.normal(0.0, 0.03, (count, 3)) + far[:, None] * [0.0, 0.0, 1.0]
+    base_from_target = exp(np.array([0.1, 0.2, 0.3, 0.5, 0.1, 0.0]))
+    robot = base_from_target @ invert(compose(np.eye(3), np.array([0.02, 0.03, 0.09])) @ seen)
+    robot = robot @ exp(rng.normal(0.0, 1e-4, (count, 6)))
+    robot[8:] = robot[8:] @ compose(np.eye(3), np.array([0.0, 0.0, 0.15]))
+    robot[3, 1, 3] += 0.02
+    guess = guessed_of(robot, seen)
+    assert not guess.stands_out
+    assert not guess.is_open
+
+
 @pytest.mark.parametrize("lost", ["rotations", "poses", "positions"])
 def test_what_was_never_recorded_is_named(lost):
     poses = cell_poses()

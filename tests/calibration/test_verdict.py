@@ -13,6 +13,7 @@ from support.cells import calibrated, pairs_session, reporting, showing
 from support.marks import slow
 from support.sound_findings import SOUND, changed, directions, views
 
+from visioncal.calibration.guess import guess_reading
 from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.calibration.pipeline.judging import findings_of
 from visioncal.calibration.pipeline.result import result_of
@@ -25,6 +26,7 @@ from visioncal.calibration.suspects.judge import in_reading_order, judge
 from visioncal.calibration.suspects.outliers import farthest_by_arms
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD, correcting
 from visioncal.core.codec import read, write
+from visioncal.core.conventions import PoseNumbers
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS, Need, Rejection
@@ -388,14 +390,23 @@ def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:
     assert "wrong_views" in found
 
 
-def test_angles_in_an_order_that_no_reading_brings_back_are_named() -> None:
-    cell = simulate(CellOptions(views=16))
+@pytest.mark.parametrize("orders", [("xyz", "ZYZ"), ("ZYZ", "ZYX"), ("ZYZ", "xyz")])
+def test_angles_taken_for_another_makers_are_brought_back_row_by_row(orders: tuple[str, str]):
+    """Of the two triples of angles of a rotation, some rows had the one that writing gives."""
+    cell, (order, taken) = simulate(CellOptions(views=16)), orders
     poses = cell.robot.base_from_flange
-    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("xyz")
-    misread = compose(Rotation.from_euler("ZYZ", angles).as_matrix(), poses[:, :3, 3])
-    verdict = calibrate(session_of(cell, misread)).verdict
-    assert ids(verdict)[:1] == ["misread_poses"]
-    assert "must turn by the same angle" in verdict.top[0]
+    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler(order)
+    misread = compose(Rotation.from_euler(taken, angles).as_matrix(), poses[:, :3, 3])
+    cause = calibrate(session_of(cell, misread)).verdict.causes[0]
+    assert cause.kind == "misread_poses"
+    assert f"as Euler angles {order}" in cause.words
+    assert f"taken for Euler angles {taken}" in cause.words
+    assert "convert SESSION FIXED --guess --yes" in cause.do.command
+    rows = tuple(map(str, range(len(poses))))
+    numbers = [PoseNumbers.of_poses(side, rows) for side in (misread, cell.cam_from_target)]
+    best = guess_reading(*numbers, cell.options.mount).best.hypothesis
+    # As precise as the turns of twelve digits are.
+    np.testing.assert_allclose(best.robot.poses(numbers[0]), poses, atol=1e-7)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

@@ -26,6 +26,7 @@ from visioncal.calibration.guess.search import (
 )
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import counted, figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, rotation_angle
@@ -43,6 +44,8 @@ NO_READING = "No reading that was tried stands out"
 POSE_OPTIONS = "--robot-form, --robot-unit, --robot-inverse, or --robot-columns in the right order"
 # Poses of two readings that differ by less than this share of the residuals are the same.
 _SAME = 0.3
+# Turns of two readings that differ by less, as a share, are alike.
+_ALIKE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +146,7 @@ def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
     if (
         beaten <= declared.log_posterior
         or best.fit.score > _MOST_SCORE
+        or not _brings_nearer(best, declared)
         or _turns_about_one_axis(best)
         or any(other.log_posterior > beaten and not _are_same(best, other) for other in others)
         or beaten <= EVIDENCE * _by_other_rows(best)
@@ -150,6 +154,13 @@ def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
         return tried, declared
     chosen = _with_likeliest_label(best)
     return [chosen if item is best else item for item in tried], chosen
+
+
+def _brings_nearer(item: Candidate, declared: Candidate) -> bool:
+    """Whether places agree clearly better, where turns are the same: units alone shrink figures."""
+    if declared.fit.closes or not np.isclose(item.fit.rms[1], declared.fit.rms[1], rtol=_ALIKE):
+        return True
+    return CLEAR_RATIO * item.misfit < declared.misfit
 
 
 def _by_other_rows(best: Candidate) -> float:
@@ -284,7 +295,8 @@ def _alike(declared: Candidate, ranked: Sequence[Candidate]) -> list[Candidate]:
     """
     if declared.fit.closes or _turns_about_one_axis(declared):
         return []
-    rivals = [item for item in ranked if item is not declared and item.fit.closes]
+    others = (item for item in ranked if item is not declared and item.fit.closes)
+    rivals = [item for item in others if _brings_nearer(item, declared)]
     most = max((item.log_posterior for item in rivals), default=np.inf)
     alike = list[Candidate]()
     for item in rivals:

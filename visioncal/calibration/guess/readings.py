@@ -28,6 +28,8 @@ class SideReading(Reading):
     # Where the recorded rotations came from misreading others: the form in which those were
     # misread. Writing the rotations in it gets them back, and they are read as `rotation`.
     written: str = ""
+    # Whether they were the other ones of the two angles of a rotation, which writing does not give.
+    folded: bool = False
     # Signed places, from 1, of the numbers of a rotation; empty for as they are written.
     terms: tuple[int, ...] = ()
     angle_unit: float = 1.0  # Factor of the angles, beside the unit of their form.
@@ -60,6 +62,8 @@ class SideReading(Reading):
             rows = [there.get(place, none) for place in numbers.places]
             return np.array(rows).reshape(-1, 3, 3)
         recorded = as_written(numbers, self.written).rotations
+        if self.folded:
+            recorded = _other_angles(recorded, self.written)
         if self.terms:
             recorded = recorded[:, np.abs(self.terms) - 1] * np.sign(self.terms)
         return ROTATION_FORMS[self.rotation].read(self.angle_unit * recorded)
@@ -67,7 +71,8 @@ class SideReading(Reading):
     @property
     def of_rotations(self) -> tuple[object, ...]:
         """The same for readings that have the same `rotations` of the same numbers."""
-        return self.rotation, self.written, self.terms, self.angle_unit, self.by_place
+        written = self.written, self.folded
+        return self.rotation, written, self.terms, self.angle_unit, self.by_place
 
     def poses(self, numbers: PoseNumbers, rotations: FloatArray | None = None) -> FloatArray:
         """(n, 4, 4) transforms [m]; NaN in rows without a pose.
@@ -322,7 +327,18 @@ def rewritten(robot: PoseNumbers, *, by_makers: bool = False) -> Iterator[Change
             )
             if {name, written} == {"euler-ZYX-deg", "euler-xyz-deg"}:
                 words += ", or the reverse (A, B, C of KUKA and W, P, R of FANUC)"
-            yield Change(words, "robot", {"rotation": name, "written": written}, 2)
+            for folded in (False, True) if by_makers else (False,):
+                fields = {"rotation": name, "written": written, "folded": folded}
+                yield Change(words, "robot", fields, 2)
+
+
+def _other_angles(angles: FloatArray, form: str) -> FloatArray:
+    """The other (n, 3) Euler angles, in a form of these, of the same rotations."""
+    _, order, unit = form.split("-")
+    half = 180.0 if unit == "deg" else np.pi
+    is_proper = order[0].lower() == order[2].lower()
+    other = angles * [1.0, -1.0, 1.0] + [half, 0.0 if is_proper else half, half]
+    return np.asarray(other)
 
 
 def _signed_angles(

@@ -22,6 +22,7 @@ from visioncal.calibration.guess.fit import (
     STARTS,
     Fit,
     distance_rows,
+    distances,
     robust_fits,
 )
 from visioncal.calibration.guess.readings import (
@@ -217,7 +218,33 @@ def search_by_half(recording: Recording) -> list[Candidate]:
         classes.setdefault(item.hypothesis.chain_class, []).append(item.hypothesis)
     others = [replace(item, labels=(*classes[item.hypothesis.chain_class],)) for item in others]
     others.sort(key=lambda item: -item.log_posterior)
-    return [first, *others]
+    whole = _row_by_row(recording, others[0], rows) if others else None
+    return [first, *([] if whole is None else [whole]), *others]
+
+
+def _row_by_row(recording: Recording, best: Candidate, rows: IntArray) -> Candidate | None:
+    """The reading in which angles that were taken for others are of either kind, row by row.
+
+    Of the two triples of angles of a rotation, each row has the one that the camera confirms. None
+    where that closes no chain.
+    """
+    robot = best.hypothesis.robot
+    if not robot.written.startswith("euler") or not best.fit.closes:
+        return None
+    both = [replace(robot, folded=folded) for folded in (False, True)]
+    every = recording.common_rows
+    numbers = recording.robot.rows(every)
+    tried = [replace(best.hypothesis, robot=side) for side in both]
+    chained, seen = chains(recording, tried, every)
+    lever, edges = best.fit.lever, (best.fit.x, best.fit.z)
+    pairs = zip(chained, seen, strict=True)
+    away = np.array([distances(*sides, lever, edges).residuals for sides in pairs])
+    rotations = np.array([side.rotations(numbers) for side in both])
+    chosen = rotations[np.nan_to_num(away, nan=np.inf).argmin(axis=0), np.arange(len(every))]
+    by_place = tuple(zip(numbers.places, map(tuple, chosen.reshape(-1, 9).tolist()), strict=True))
+    side = replace(recording.declared.robot, by_place=by_place)
+    (whole,) = fitted(recording, [replace(best.hypothesis, robot=side)], rows, STARTS)
+    return whole if whole.fit.closes else None
 
 
 def search(recording: Recording) -> list[Candidate]:
