@@ -11,45 +11,34 @@ right.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 
-from visioncal.calibration.guess.fit import CLOSING_SCORE, mounting_fits, robust_fits
+from visioncal.calibration.guess.fit import CLOSING_SCORE
 from visioncal.calibration.guess.readings import ROW_ORDERS, shifted
 from visioncal.calibration.guess.search import CLEAR, EVIDENCE
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import estimate_lenses, locate_targets
 from visioncal.calibration.stages.clocks import waits_for_clock
+from visioncal.calibration.suspects.record import LEAST, Edges, Record, evidence
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
 from visioncal.core.number_format import counted, ranges, some_of, view_words
 from visioncal.core.transforms import apply, compose, exp, invert, rotation_angle
-from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Rejection
+from visioncal.core.types import FloatArray, IntArray, Mask, Rejection
 from visioncal.core.verdict import Finding, mending, or_alone
 from visioncal.estimation.chain import robot_part
 from visioncal.vision.camera import turned_back
-from visioncal.vision.targets import corner_positions, rotation_transforms
 
 _SHIFTS = (0, 1, -1, 2, -2, 3, -3)
-# Share of the rows that a fit keeps, and its random starts: half of the rows may be wrong, and a
-# few lose their partner.
-_KEPT, _STARTS = 0.45, 40
-# Least standard deviation by axis, without unit: digits of a table.
-_LEAST = 5e-4
-# Log-density of a wrong view's pose, over two radians and two distances by axis, with the prior
-# probability of wrong views; the prior of a mistake of the record; the probability that a robot
-# reports one pose twice to the last digit though it moved.
-_WRONG, _WIDTH = float(np.log(0.05)), 3.0 * float(np.log(2.0))
+# The prior of a mistake of the record; the probability that a robot reports one pose twice to the
+# last digit though it moved.
 _MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
-# Neighbouring rows by which a fit starts, too: those of one end of the session may be right alone.
-_WINDOW = 7
 # A turn of a board differs by less from a quarter or half one, and one of a picture whose lens has
-# its centre off the middle [rad]; copies of poses by less.
-_NEAR_RAD, _NEAR_TURN_RAD, _SAME = 0.1, 0.3, 1e-9
+# its centre off the middle [rad].
+_NEAR_RAD, _NEAR_TURN_RAD = 0.1, 0.3
 # Of so few views, one that is wrong bends the fit of all.
 _FEW = 7
 # Views are alike within so many medians; log-ratios of squares count as one so clear at most.
@@ -60,135 +49,6 @@ _CLIPPED = -2.0 * float(np.log(_UNEVEN)), 2.0 * float(np.log(_UNEVEN))
 _FARTHEST_M, _NEAREST_M = 20.0, 0.01
 # A camera is in its place within this [m].
 _IN_PLACE_M = 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class _Record:
-    """The poses of one robot and what one camera saw of one board, by row of the session.
-
-    Or an instrument of its probe, which it sees as a fixed camera a board.
-    """
-
-    views: IntArray  # (n,) numbers of the session's rows.
-    robot: FloatArray  # (n, 4, 4) the robot's part of the chain; NaN where unknown.
-    mount: Mount
-    rows: IntArray  # (m,) the rows that show the board.
-    camera: FloatArray  # (m, c, 4, 4) `cam_from_target` with all rivals.
-    marks: FloatArray  # (k, 3) corners of the board [m]; empty of several and of unknown ones.
-    is_numbered: bool  # Whether the camera's poses are of corners, which have numbers.
-    shows: str  # The name of what is beside a row's pose: its image or its reading.
-    are_places: bool  # Whether only the places of a point were read, whose rotations mean nothing.
-
-    @classmethod
-    def of(cls, run: RunState) -> Self:
-        """The record of a run after the stage `pnp`, of one robot and one camera."""
-        seen, views = run.poses_of_one_board, [view.number for view in run.session.views]
-        robot = np.full((len(views), 4, 4), np.nan)
-        rows, camera, session = [], list[FloatArray](), run.session
-        turns = {name: rotation_transforms(board) for name, board in session.boards.items()}
-        excluded = run.held_back | run.spared.keys()
-        for at, view in enumerate(views):
-            if view in run.base_from_flange:
-                robot[at] = run.base_from_flange[view]
-            if view in seen and view not in excluded:
-                own = turns.get(session.board_of(session.views[at]), np.eye(4)[None])
-                rows.append(at)
-                camera.append((seen[view].cam_from_target[:, None] @ own).reshape(-1, 4, 4))
-        most = max(map(len, camera), default=0)
-        padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
-        read = run.readings
-        mount: Mount = run.mount or "eye-in-hand"
-        mount = mount if read is None else "eye-to-hand"
-        known, shown = robot_part(robot, mount), np.array(rows, dtype=int)
-        marks = corner_positions(*session.boards.values()) if len(turns) == 1 else np.zeros((0, 3))
-        is_numbered = bool(run.corners) and len(marks) > 0
-        shows, are_places = ("image", False) if read is None else ("reading", not read.are_poses)
-        of_rows = np.array(views), known, mount, shown, np.array(padded), marks, is_numbered
-        return cls(*of_rows, shows, are_places)
-
-    def paired(self, order: IntArray) -> IntArray:
-        """(m,) the robot's row of each view that shows the board; -1 where it has no pose."""
-        at = order[self.rows]
-        return np.where((at >= 0) & np.isfinite(self.robot[at, 0, 0]), at, -1)
-
-    @cached_property
-    def copies(self) -> Mask:
-        """(m,) views in whose row the robot's pose before is there once more."""
-        return _same_as_before(self.robot)[self.rows]
-
-    @cached_property
-    def lingering(self) -> Mask:
-        """(m,) views in which the pose of the target before is there once more."""
-        return _same_as_before(self.camera[:, 0])
-
-
-def _same_as_before(poses: FloatArray) -> Mask:
-    """(n,) mask of (n, 4, 4) poses that are the one before."""
-    return np.append(False, np.abs(np.diff(poses, axis=0)).max(axis=(1, 2)) < _SAME)
-
-
-@dataclass(frozen=True, eq=False)
-class _Edges:
-    """Both edges by some pairing of the rows, and what they make of a record."""
-
-    record: _Record
-    x: FloatArray
-    z: FloatArray
-    lever: float
-
-    @classmethod
-    def by(
-        cls, record: _Record, pairs: IntArray, among: Mask, starts: int = _STARTS
-    ) -> Self | None:
-        """The edges that most of some paired rows agree on; None with too few."""
-        some = np.flatnonzero(among & (pairs >= 0))
-        if len(some) < FEWEST_COMPARED:
-            return None
-        robot, seen = record.robot[pairs[some]][None], record.camera[some, 0]
-        if record.are_places:
-            # Of a reading, the chain is that of the point on the flange.
-            fit = mounting_fits(invert(robot), seen[:, :3, 3], starts, _KEPT, _WINDOW)[0]
-            return cls(record, fit.z, fit.x, fit.lever)
-        fit = robust_fits(robot, seen[None], starts, share=_KEPT)[0]
-        return cls(record, fit.x, fit.z, fit.lever)
-
-    def turned(self, pairs: IntArray) -> FloatArray:
-        """(m, 4, 4) each view's target in the common one, by the nearest of its rivals."""
-        robot = self.record.robot[pairs][:, None]
-        placed = invert(self.z) @ robot @ self.x @ self.record.camera
-        away = np.linalg.norm(self.squares(placed), axis=-1)
-        return np.asarray(placed[np.arange(len(pairs)), away.argmin(axis=1)])
-
-    def squares(self, turned: FloatArray) -> FloatArray:
-        """(..., 2) squared distances and angles without unit; (..., 1) distances of places."""
-        shift = np.linalg.norm(turned[..., :3, 3], axis=-1) / self.lever
-        if self.record.are_places:
-            return np.asarray(shift[..., None] ** 2)
-        return np.stack([shift, rotation_angle(turned)], axis=-1) ** 2
-
-    def of(self, pairs: IntArray) -> FloatArray:
-        """(m, 2) squares of a pairing, (m, 1) of places; infinite where a view has no pose."""
-        return np.where(pairs[:, None] < 0, np.inf, self.squares(self.turned(pairs)))
-
-
-def _evidence(squares: FloatArray) -> tuple[FloatArray, Mask]:
-    """Log marginal likelihoods of (k, m, 2) squares, and the (k, m) views that agree.
-
-    The noise of positions and of rotations is integrated over (a Student distribution); the number
-    of agreeing views is the likeliest, and both edges take six directions of each. Of (k, m, 1)
-    squares of places alone they take nine.
-    """
-    count, sides = squares.shape[1:]
-    order = np.argsort(squares.sum(axis=2), axis=1, kind="stable")
-    sums = np.cumsum(np.take_along_axis(squares, order[..., None], 1) + 3.0 * _LEAST**2, axis=1)
-    agreeing = np.arange(FEWEST_COMPARED, count + 1)
-    freedom = 3.0 * agreeing - (6.0 if sides == 2 else 9.0)
-    by_level = gammaln(0.5 * freedom) - 0.5 * freedom * np.log(np.pi)
-    logs = sides * by_level - 0.5 * freedom * np.log(sums[:, agreeing - 1]).sum(axis=2)
-    logs += (_WRONG - sides * _WIDTH) * (count - agreeing)
-    best = logs.argmax(axis=1)
-    agrees = np.argsort(order, axis=1) < agreeing[best][:, None]
-    return logs[np.arange(len(logs)), best], agrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,26 +79,26 @@ def likeliest(run: RunState) -> Undoing | None:
     """
     if run.mount is None or run.misread or waits_for_clock(run.session):
         return None
-    record = _Record.of(run)
+    record = Record.of(run)
     if len(record.rows) < FEWEST_COMPARED:
         return None
     own = record.paired(np.arange(len(record.views)))
     fresh = ~record.copies & ~record.lingering
-    declared = _Edges.by(record, own, fresh)
+    declared = Edges.by(record, own, fresh)
     if declared is None:
         return None
     squares = declared.of(own)
-    agrees = _evidence(squares[None])[1]
+    agrees = evidence(squares[None])[1]
     # Turns that agree do not let a few places that are off count as wrong.
-    is_even = (squares < _UNEVEN**2 * (np.median(squares, axis=0) + _LEAST**2)).all()
+    is_even = (squares < _UNEVEN**2 * (np.median(squares, axis=0) + LEAST**2)).all()
     if agrees.all() and is_even and squares.mean() < CLOSING_SCORE**2:
         return None
     pairs = {by: record.paired(shifted(by, len(record.views))) for by in _SHIFTS}
     every = [declared]
-    every += filter(None, (_Edges.by(record, pairs[by], fresh) for by in _SHIFTS[1:]))
-    best = max(every, key=lambda edges: float(_evidence(edges.of(own)[None])[0][0]))
+    every += filter(None, (Edges.by(record, pairs[by], fresh) for by in _SHIFTS[1:]))
+    best = max(every, key=lambda edges: float(evidence(edges.of(own)[None])[0][0]))
     apart = best.of(own)
-    (base,), (agrees,) = _evidence(apart[None])
+    (base,), (agrees,) = evidence(apart[None])
     rivals = [*_copied(record, apart, own, agrees), *_shifted(record, every, pairs, float(base))]
     if record.shows == "image":
         rivals += [
@@ -253,7 +113,7 @@ def likeliest(run: RunState) -> Undoing | None:
     return found if found is not None and found.odds > CLEAR else None
 
 
-def _copied(record: _Record, apart: FloatArray, own: IntArray, agrees: Mask) -> Iterator[Undoing]:
+def _copied(record: Record, apart: FloatArray, own: IntArray, agrees: Mask) -> Iterator[Undoing]:
     """Poses of the robot, or of the target, that are there once more though the other moved."""
     closes = apart[agrees].mean() < CLOSING_SCORE**2
     for copies, pose, but in (
@@ -290,7 +150,7 @@ def _copied(record: _Record, apart: FloatArray, own: IntArray, agrees: Mask) -> 
 
 
 def _flipped(
-    record: _Record, edges: _Edges, own: IntArray, apart: FloatArray, base: float
+    record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
 ) -> Iterator[Undoing]:
     """Views of a flat board with the other one of the two poses that its image nearly fits.
 
@@ -306,10 +166,10 @@ def _flipped(
         # One view in a few bends the fit.
         camera = record.camera.copy()
         camera[at] = other[at]
-        alone = _Edges.by(replace(record, camera=camera), own, own >= 0)
+        alone = Edges.by(replace(record, camera=camera), own, own >= 0)
         if alone is not None:
             squares = alone.of(own)
-            (log,), (agrees,) = _evidence(squares[None])
+            (log,), (agrees,) = evidence(squares[None])
             gain = EVIDENCE * float(log - base) + _MISTAKE - float(np.log(len(own)))
             if gain > odds and squares[agrees].mean() < CLOSING_SCORE**2:
                 odds, wrong = gain, np.arange(len(own)) == at
@@ -336,7 +196,7 @@ def _flipped(
 
 
 def _turned_pictures(
-    run: RunState, record: _Record, edges: _Edges, own: IntArray, apart: FloatArray, base: float
+    run: RunState, record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
 ) -> Iterator[Undoing]:
     """Views whose picture is turned: the camera is, about the line of sight."""
     for degrees in (180, 90, 270):
@@ -375,7 +235,7 @@ def _turned_pictures(
 
 
 def _by_pixels(
-    run: RunState, record: _Record, own: IntArray, wrong: Mask, quarters: int, base: float
+    run: RunState, record: Record, own: IntArray, wrong: Mask, quarters: int, base: float
 ) -> float:
     """Log odds that (m,) some views' pictures are turned: with these turned back, and a lens anew.
 
@@ -397,13 +257,13 @@ def _by_pixels(
         run = locate_targets(estimate_lenses(run))
     except VisioncalError:
         return -np.inf
-    mended = _Record.of(run)
+    mended = Record.of(run)
     pairs = mended.paired(np.arange(len(mended.views)))
-    fitted = _Edges.by(mended, pairs, ~mended.copies & ~mended.lingering)
+    fitted = Edges.by(mended, pairs, ~mended.copies & ~mended.lingering)
     if fitted is None or len(pairs) < len(own):
         return -np.inf
     squares = fitted.of(pairs)
-    (log,), (agrees,) = _evidence(squares[None])
+    (log,), (agrees,) = evidence(squares[None])
     is_close = squares[agrees].mean() < CLOSING_SCORE**2
     is_close &= bool(np.sum(agrees & wrong) > 0.6 * np.sum(wrong))
     return EVIDENCE * float(log - base) + 2.0 * _MISTAKE if is_close else -np.inf
@@ -415,11 +275,11 @@ def _chosen(own: IntArray, apart: FloatArray, other: FloatArray, base: float) ->
     Any number of them is as likely, and any choice: they are those that it helps most.
     """
     there, here = (np.where(own < 0, 1.0, at.sum(axis=1)) for at in (other, apart))
-    order = np.argsort((there + _LEAST**2) / (here + _LEAST**2), kind="stable")
+    order = np.argsort((there + LEAST**2) / (here + LEAST**2), kind="stable")
     number = np.arange(1, len(own) + 1)
     some = np.argsort(order) < number[:, None]
     squares = np.where(some[..., None], other, apart)
-    logs, agrees = _evidence(squares)
+    logs, agrees = evidence(squares)
     choices = gammaln(len(own) + 2) - gammaln(number + 1) - gammaln(len(own) - number + 1)
     odds = EVIDENCE * (logs - base) + _MISTAKE - choices
     at = int(odds.argmax())
@@ -428,7 +288,7 @@ def _chosen(own: IntArray, apart: FloatArray, other: FloatArray, base: float) ->
 
 
 def _signed(
-    record: _Record, edges: _Edges, own: IntArray, apart: FloatArray, base: float
+    record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
 ) -> Iterator[Undoing]:
     """Views whose position lost the sign of one axis."""
     for axis, name in enumerate("xyz"):
@@ -454,7 +314,7 @@ def _signed(
         )
 
 
-def _mixed_units(record: _Record, own: IntArray, base: float) -> Iterator[Undoing]:
+def _mixed_units(record: Record, own: IntArray, base: float) -> Iterator[Undoing]:
     """Views whose position is in millimetres where the others' are in metres, or the reverse.
 
     The sizes of the positions, or of one axis, tell the rows of either unit, however many they are.
@@ -489,21 +349,21 @@ def _mixed_units(record: _Record, own: IntArray, base: float) -> Iterator[Undoin
         )
 
 
-def _of_changed(record: _Record, own: IntArray, wrong: Mask, flanges: FloatArray) -> float | None:
+def _of_changed(record: Record, own: IntArray, wrong: Mask, flanges: FloatArray) -> float | None:
     """Log evidence of other poses of the robot in (n,) some rows; None where most disagree."""
     rows = wrong[own] & (own >= 0)
     if np.sum(rows) < 1 or np.sum(~rows & (own >= 0)) < 1:
         return None
-    edges = _Edges.by(replace(record, robot=robot_part(flanges, record.mount)), own, own >= 0)
+    edges = Edges.by(replace(record, robot=robot_part(flanges, record.mount)), own, own >= 0)
     if edges is None:
         return None
     squares = edges.of(own)
-    (log,), (agrees,) = _evidence(squares[None])
+    (log,), (agrees,) = evidence(squares[None])
     is_close = squares[agrees].mean() < CLOSING_SCORE**2
     return float(log) if is_close and np.sum(agrees & rows) > 0.6 * np.sum(rows) else None
 
 
-def _mixed_angles(record: _Record, own: IntArray, base: float) -> Iterator[Undoing]:
+def _mixed_angles(record: Record, own: IntArray, base: float) -> Iterator[Undoing]:
     """Views whose angles are in radians where the others' are in degrees.
 
     Read as degrees, they are of a robot that hardly turns.
@@ -546,7 +406,7 @@ def _mixed_angles(record: _Record, own: IntArray, base: float) -> Iterator[Undoi
 
 
 def _turned(
-    record: _Record, edges: _Edges, own: IntArray, apart: FloatArray, base: float
+    record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
 ) -> Iterator[Undoing]:
     """Boards that were read as if they were turned in their plane, or some squares on in it."""
     known = np.flatnonzero(own >= 0)
@@ -566,12 +426,12 @@ def _turned(
             continue
         squares = apart.copy()
         squares[near] = edges.squares(invert(whole) @ turned[near])
-        (there,), (agrees,) = _evidence(squares[None])
+        (there,), (agrees,) = evidence(squares[None])
         wrong = near[agrees[near]]
         if not len(wrong) or squares[agrees].mean() > CLOSING_SCORE**2:
             continue
         # The middle is known by these views themselves, in two directions of their six.
-        noise = float(np.sqrt(squares[agrees, 0].mean() / 3.0 + _LEAST**2))
+        noise = float(np.sqrt(squares[agrees, 0].mean() / 3.0 + LEAST**2))
         odds = EVIDENCE * (float(there - base) - 2.0 * float(np.log(2.0 / noise)))
         odds += _MISTAKE - float(np.log(4.0))
         views = tuple(record.views[record.rows[wrong]].tolist())
@@ -596,7 +456,7 @@ def _turned(
         )
 
 
-def _is_reading(record: _Record, turn: FloatArray, lever: float) -> bool:
+def _is_reading(record: Record, turn: FloatArray, lever: float) -> bool:
     """Whether a board may be read so: where its corners were numbered, they are others of its own.
 
     Else its own middle is in the picture. What turns about another place is another frame.
@@ -627,7 +487,7 @@ def _squares_on(marks: FloatArray, shifts: FloatArray) -> tuple[Mask, FloatArray
 
 
 def _shifted(
-    record: _Record, every: list[_Edges], pairs: dict[int, IntArray], base: float
+    record: Record, every: list[Edges], pairs: dict[int, IntArray], base: float
 ) -> Iterator[Undoing]:
     """The likeliest rows at an end of the record, or amid it, in which images and poses are apart.
 
@@ -646,7 +506,7 @@ def _shifted(
             mixed = np.where(sides[..., None], squares[by], squares[0])
             # Amid the record, a pose is of one image.
             mixed[-1, amid & ~np.isin(pairs[by], record.rows[amid])] = np.inf
-            logs, agrees = _evidence(mixed)
+            logs, agrees = evidence(mixed)
             # Both ends are a free choice.
             logs[-1] -= float(np.log(count)) / EVIDENCE
             at = int(logs.argmax())
@@ -655,7 +515,7 @@ def _shifted(
         # Other orders of the rows are readings of the whole recording.
         for order in orders:
             rival = edges.of(order)
-            found.append((float(_evidence(rival[None])[0][0]), 0, behind[0], behind[0], False))
+            found.append((float(evidence(rival[None])[0][0]), 0, behind[0], behind[0], False))
     log, by, side, agrees, closes = max(found, key=lambda item: item[0])
     partnered = side & (pairs[by] >= 0)
     if not by or not closes or np.sum(agrees & partnered) < max(2.0, 0.6 * partnered.sum()):
@@ -688,7 +548,7 @@ def _shifted(
     )
 
 
-def _apart_amid(record: _Record, own: FloatArray, other: FloatArray, by: int) -> Mask:
+def _apart_amid(record: Record, own: FloatArray, other: FloatArray, by: int) -> Mask:
     """(m,) the run of views, and so many whose pose these have, that other poses explain best.
 
     Args:
@@ -698,7 +558,7 @@ def _apart_amid(record: _Record, own: FloatArray, other: FloatArray, by: int) ->
         by: By how many rows.
     """
     here, there = (np.where(np.isfinite(at), at, 1.0).sum(axis=1) for at in (own, other))
-    gains = np.log((here + _LEAST**2) / (there + _LEAST**2))
+    gains = np.log((here + LEAST**2) / (there + LEAST**2))
     # A view that neither explains ends the run.
     sums = np.append(0.0, np.cumsum(np.clip(gains, *_CLIPPED) - 1.0))
     last = int(np.argmax(sums - np.minimum.accumulate(sums)))
