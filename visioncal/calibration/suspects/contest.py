@@ -91,7 +91,7 @@ def _proves(run: RunState, trial: Trial) -> bool:
     """Whether a cure leaves mere noise, and no other cause leaves about as little."""
     (before, after), (problem, fit) = trial.levels, trial.cured
     usual = _LIMITS.repeatability * np.array(REPEATABILITY)
-    # What such arms scatter by anyway needs no cure.
+    # Scatter that such arms have anyway needs no cure.
     is_noise = bool((after < usual).all() and not (before < usual).all())
     is_less = (after < (_LIMITS.scatter_mm[0], _LIMITS.scatter_deg[0])).all()
     if not is_noise and not (is_less and (CLEAR_RATIO * after < before).any()):
