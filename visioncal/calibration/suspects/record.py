@@ -12,6 +12,7 @@ from scipy.special import gammaln
 
 from visioncal.calibration.guess.fit import mounting_fits, robust_fits
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.readings import places_of_one_point
 from visioncal.core.limits import FEWEST_COMPARED
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount
@@ -50,21 +51,25 @@ class Record:
     @classmethod
     def of(cls, run: RunState) -> Self:
         """The record of a run after the stage `pnp`, of one robot and one camera."""
-        seen, views = run.poses_of_one_board, [view.number for view in run.session.views]
+        seen, session, read = run.poses_of_one_board, run.session, run.readings
+        every = session.views
+        if read is not None and len(read.names) > 1:
+            # Rows of several points repeat the pose of their stop.
+            every = tuple(view for view in every if view.number in places_of_one_point(read))
+        views = [view.number for view in every]
         robot = np.full((len(views), 4, 4), np.nan)
-        rows, camera, session = [], list[FloatArray](), run.session
+        rows, camera = [], list[FloatArray]()
         turns = {name: rotation_transforms(board) for name, board in session.boards.items()}
         excluded = run.held_back | run.spared.keys()
         for at, view in enumerate(views):
             if view in run.base_from_flange:
                 robot[at] = run.base_from_flange[view]
             if view in seen and view not in excluded:
-                own = turns.get(session.board_of(session.views[at]), np.eye(4)[None])
+                own = turns.get(session.board_of(every[at]), np.eye(4)[None])
                 rows.append(at)
                 camera.append((seen[view].cam_from_target[:, None] @ own).reshape(-1, 4, 4))
         most = max(map(len, camera), default=0)
         padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
-        read = run.readings
         mount: Mount = run.mount or "eye-in-hand"
         mount = mount if read is None else "eye-to-hand"
         known, shown = robot_part(robot, mount), np.array(rows, dtype=int)

@@ -99,7 +99,10 @@ def likeliest(run: RunState) -> Undoing | None:
     best = max(every, key=lambda edges: float(evidence(edges.of(own)[None])[0][0]))
     apart = best.of(own)
     (base,), (agrees,) = evidence(apart[None])
-    rivals = [*_copied(record, apart, own, agrees), *_shifted(record, every, pairs, float(base))]
+    rivals = [*_copied(record, apart, own, agrees)]
+    if len(record.views) == len(run.session.views):
+        # Shifted are all rows, of one point as of others.
+        rivals += _shifted(record, every, pairs, float(base))
     if record.shows == "image":
         rivals += [
             *_flipped(record, best, own, apart, float(base)),
