@@ -210,9 +210,10 @@ def _trimmed(squares: FloatArray, kept: int) -> tuple[FloatArray, IntArray]:
 
 def _random_sets(count: int, starts: int, size: int) -> list[IntArray]:
     """(starts, size) random rows of `count`, if any; empty where all rows are as few."""
+    if not starts or count <= size:
+        return []
     rng = np.random.default_rng(0)
-    sets = [rng.choice(count, size, replace=False) for _ in range(starts if count > size else 0)]
-    return [np.array(sets)] if sets else []
+    return [np.array([rng.choice(count, size, replace=False) for _ in range(starts)])]
 
 
 def _least_trimmed(

@@ -27,6 +27,8 @@ def guess_from_camera_poses(
 ) -> Guess:
     """Tries every plausible reading of a session's poses, with the camera's by each image alone.
 
+    An instrument sees its probe on the flange as a fixed camera does a board.
+
     Args:
         run: The run, with the camera's poses.
         robot: The robot's original numbers, one row a view; those of the session where None.
@@ -49,10 +51,14 @@ def guess_from_camera_poses(
     return guess_reading(
         robot,
         _camera_numbers(run, robot) if camera is None else camera,
-        run.session.mount if knows_mount else None,
+        _seen_as(run.session.mount) if knows_mount else None,
         chain=joint_poses,
         is_measured=bool(run.corners),
     )
+
+
+def _seen_as(mount: Mount) -> Mount:
+    return "eye-to-hand" if mount == "instrument" else mount
 
 
 def alike_turning(

@@ -269,35 +269,41 @@ def _seen_through(run: RunState) -> Iterator[Finding]:
     """Panes of glass before lenses, and boards that swell."""
     sizes = run.cell_fit.sizes
     for found in sizes.displaced:
-        camera, pane = found.effect.frame, found.effect
-        if not isinstance(pane, Window):
-            percent = 100.0 * float(found.values[0])
-            yield Finding(
-                "board_swells",
-                f"The board {'grew' if percent > 0.0 else 'shrank'} by {figure(abs(percent))} % "
-                "during the session, as paper in the damp. The result is that of its size at the "
-                f"end.{sizes.instead_of(pane.kind)}",
-                Remedy("Print it on aluminium or glass, or let it lie in the room for a day."),
-                mahalanobis_sq=found.gain,
-            ).of("" if camera == ONLY_CAMERA else camera)
-            continue
-        thick_m, normal = pane.pane(found.values)
-        shift_mm = 1e3 * thick_m * nearer(np.array([[0.0, 0.0, 1.0]]), normal)[0]
-        tilt = f"{np.rad2deg(np.arccos(normal[2])):.0f} deg"
-        where = ", ".join(f"{part:.1f}" for part in shift_mm.tolist())
-        yield Finding(
-            "window",
-            "The camera looks through a tilted pane of glass, as of a housing or a mirror's front: "
-            f"about {figure(1e3 * thick_m)} mm thick, tilted by {tilt}. It was taken out "
-            "of the corners, and the result is of the place from which the lens seems to look "
-            f"through it, ({where}) mm from where it is, along its own axes. It holds for looks "
-            f"through this pane.{sizes.instead_of(pane.kind)}",
-            Remedy(
-                "Take the pane away, or put it square to the line of sight, and record again; or "
-                "leave it as it is, and look with the middle of the image."
-            ),
-            mahalanobis_sq=found.gain,
-        ).of("" if camera == ONLY_CAMERA else camera)
+        camera, effect = found.effect.frame, found.effect
+        finding = (
+            _pane(effect, found.values) if isinstance(effect, Window) else _swelling(found.values)
+        )
+        words = f"{finding.words}{sizes.instead_of(effect.kind)}"
+        finding = replace(finding, words=words, mahalanobis_sq=found.gain)
+        yield finding.of("" if camera == ONLY_CAMERA else camera)
+
+
+def _swelling(values: FloatArray) -> Finding:
+    percent = 100.0 * float(values[0])
+    return Finding(
+        "board_swells",
+        f"The board {'grew' if percent > 0.0 else 'shrank'} by {figure(abs(percent))} % "
+        "during the session, as paper in the damp. The result is that of its size at the end.",
+        Remedy("Print it on aluminium or glass, or let it lie in the room for a day."),
+    )
+
+
+def _pane(window: Window, values: FloatArray) -> Finding:
+    thick_m, normal = window.pane(values)
+    shift_mm = 1e3 * thick_m * nearer(np.array([[0.0, 0.0, 1.0]]), normal)[0]
+    tilt = f"{np.rad2deg(np.arccos(normal[2])):.0f} deg"
+    where = ", ".join(f"{part:.1f}" for part in shift_mm.tolist())
+    return Finding(
+        "window",
+        "The camera looks through a tilted pane of glass, as of a housing or a mirror's front: "
+        f"about {figure(1e3 * thick_m)} mm thick, tilted by {tilt}. It was taken out of the "
+        "corners, and the result is of the place from which the lens seems to look through it, "
+        f"({where}) mm from where it is, along its own axes. It holds for looks through this pane.",
+        Remedy(
+            "Take the pane away, or put it square to the line of sight, and record again; or "
+            "leave it as it is, and look with the middle of the image."
+        ),
+    )
 
 
 def _zoomed(run: RunState, of: str, zoom: Zoom, gain: float) -> Finding:

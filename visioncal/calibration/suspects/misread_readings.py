@@ -4,17 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from visioncal.calibration.guess import guess_reading
 from visioncal.calibration.guess.fit import STARTS, mounting_fits
 from visioncal.calibration.guess.search import thinned
-from visioncal.calibration.pipeline.guess_inputs import chain_poses, numbers_in
+from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses, numbers_in
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.readings import places_of_one_point
-from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
-from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION, POSE
+from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION
 
 # Mirroring another axis is equivalent, up to half turns of the instrument's frame.
 _MIRROR = np.array([1.0, 1.0, -1.0])
@@ -58,14 +56,9 @@ def misread_readings(run: RunState) -> Iterator[Finding]:
 
 def _misread_probe(run: RunState) -> Iterator[Finding]:
     """The finding on another reading of a probe's poses."""
-    session, matched = run.timed, run.reported.matched
-    probe = numbers_in(session, (*INSTRUMENT_POSITION, *INSTRUMENT_QUATERNION))
-    joints = chain_poses(session, None if matched is None else matched.robot)
-    robot = numbers_in(session, POSE)
-    if joints is not None and not robot.present.any():
-        robot = PoseNumbers.of_poses(joints, robot.places)
+    probe = numbers_in(run.timed, (*INSTRUMENT_POSITION, *INSTRUMENT_QUATERNION))
     try:
-        guess = guess_reading(robot, probe, "eye-to-hand", chain=joints)
+        guess = guess_from_camera_poses(run, camera=probe)
     except VisioncalError:
         # Too little to guess from; the calibration's own error says so.
         return

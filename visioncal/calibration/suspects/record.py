@@ -55,7 +55,8 @@ class Record:
         every = session.views
         if read is not None and len(read.names) > 1:
             # Rows of several points repeat the pose of their stop.
-            every = tuple(view for view in every if view.number in places_of_one_point(read))
+            of_point = places_of_one_point(read)
+            every = tuple(view for view in every if view.number in of_point)
         views = [view.number for view in every]
         robot = np.full((len(views), 4, 4), np.nan)
         rows, camera = [], list[FloatArray]()
