@@ -92,6 +92,13 @@ def test_a_real_session_of_images_is_not_accused(real_data, name, views, said):
     assert said in guess.sentence
 
 
+def test_a_real_lens_that_departs_from_its_model_is_no_pane_of_negative_thickness(real_data):
+    """A pane of -7.6 mm explained its field, and doubled what its arm errs by."""
+    found = visioncal.calibrate(real_data / "sessions/kuka_checkerboard_in_hand").verdict
+    assert found.causes[0].kind == "arm_errors"
+    assert "window" not in {finding.kind for finding in found.findings}
+
+
 @pytest.mark.parametrize("stops", [30, slow(40)])
 def test_two_cameras_of_one_arm_agree_within_a_bounded_search(real_data, monkeypatch, stops):
     # Cameras 1 and 3 of four, whose lenses are not as stated; rows 25 and 26 are exchanged.

@@ -15,6 +15,7 @@ from support.cells import pairs_session
 from support.commands import visioncal as typed
 from support.following import follow
 from support.marks import crossed, slow
+from support.refusals import raised
 from support.whole_cells import OPTIONS, recorded
 
 import visioncal
@@ -22,13 +23,13 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
-from visioncal.core.errors import DegenerateError
+from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import ranges
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.verdict import GUESS_AND_CALIBRATE
 from visioncal.interchange.formats.mending import shift_views, turn_boards
 from visioncal.results import Calibration
-from visioncal.session import Session
+from visioncal.session import MemoryImages, Session
 from visioncal.simulation import simulate
 from visioncal.vision.targets import corner_positions, load_target
 
@@ -489,6 +490,14 @@ def test_turned_pictures_are_turned_back_by_the_printed_command(
     assert sum(view.used for view in mended.views) == len(robot)
     for name, edge in sound.edges.items():
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=1e-6)
+
+
+def test_views_without_pictures_are_not_said_to_be_turned_back():
+    rows = [["0", "2.0", "0.1", "0.2"], ["1", "2.1", "0.1", "0.2"]]
+    columns, images = ["view", "meas_x_m", "meas_y_m", "meas_z_m"], MemoryImages({})
+    read = Session.assemble({"schema": 1, "name": "read"}, columns, rows, images)
+    words = "Views 0-1 have neither pictures nor corners or poses of the target"
+    raised(DataError, words, turn_boards, read, [0, 1], (180.0,))
 
 
 @pytest.mark.parametrize(

@@ -253,8 +253,10 @@ def best_displacement(
         inner, taken = left.reshape(-1, count), gram if kept.all() else gram.take(kept)
         added.append(_beside_poses(fit, taken, local, weight * inner.T @ inner))
     found = score(fit, added, count, fit.of_corners)
+    # The thickness of a pane is positive.
+    pull = np.where(found.pull > 0.0, found.pull, 0.0) if tried[0].is_positive else found.pull
     alone = [
-        Score(found.pull[[at]], found.information[[at]][:, [at]], found.freedom).best(
+        Score(pull[[at]], found.information[[at]][:, [at]], found.freedom).best(
             np.ones(1), *tried[at].bounds[1:]
         )
         for at in range(count)

@@ -192,6 +192,13 @@ def _turn_pictures(session: Session, chosen: Sequence[int], degrees: float) -> S
         )
     quarters, note = round(degrees / 90.0), f"turned back by {degrees:g} deg"
     corners, rows = session.corner_table, [view for view in session.views if view.number in chosen]
+    if corners is None and "cft_qw" not in session.columns and not any(at.image for at in rows):
+        raise DataError(
+            f"Views {ranges(chosen)} have neither pictures nor corners or poses of the target, "
+            "which could be turned back.",
+            culprits=["--turned"],
+            next_step="Name views that have.",
+        )
     if corners is not None:
         px = corners.px.copy()
         for view in (view for view in rows if view.has_corners):

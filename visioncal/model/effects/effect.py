@@ -136,6 +136,7 @@ class Displacement(Effect):
     """An effect on a camera's images that displaces what it sees, each corner otherwise."""
 
     place = "corners"
+    is_positive: ClassVar = False  # Whether its first value cannot be negative.
 
     @abstractmethod
     def moved(self, points: FloatArray, origins: FloatArray) -> FloatArray:

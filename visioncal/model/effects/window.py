@@ -26,7 +26,7 @@ class Window(Displacement):
     through the same pane need it.
     """
 
-    kind, bounds, count = "window", (3e-3, 1e-6, 0.05), 3
+    kind, bounds, count, is_positive = "window", (3e-3, 1e-6, 0.05), 3, True
     normal: tuple[float, float, float]  # About the pane's normal, in the camera's frame.
 
     @classmethod
