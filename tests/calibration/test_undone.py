@@ -495,7 +495,8 @@ def test_turned_pictures_are_turned_back_by_the_printed_command(
 def test_views_without_pictures_are_not_said_to_be_turned_back():
     rows = [["0", "2.0", "0.1", "0.2"], ["1", "2.1", "0.1", "0.2"]]
     columns, images = ["view", "meas_x_m", "meas_y_m", "meas_z_m"], MemoryImages({})
-    read = Session.assemble({"schema": 1, "name": "read"}, columns, rows, images)
+    document = {"schema": 1, "name": "read", "mount": "eye-to-hand"}
+    read = Session.assemble(document, columns, rows, images)
     words = "Views 0-1 have neither pictures nor corners or poses of the target"
     raised(DataError, words, turn_boards, read, [0, 1], (180.0,))
 
