@@ -11,12 +11,14 @@ import pytest
 import tomli_w
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from support.cells import pairs_session
 from support.commands import Done, visioncal
 from support.edited import rewritten
 from support.following import follow
 from support.fuzz.broken_sessions import BROKEN, SMALL, edit, sound_session
 from support.marks import slow
 
+from visioncal import Calibration, Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, cell_session, simulate
 
@@ -143,14 +145,43 @@ def test_a_board_of_markers_where_another_kind_is_declared_is_followed_to_a_resu
     assert "seen.toml" in (sound / "session.toml").read_text("utf-8")
 
 
-def test_a_board_that_visioncal_ships_is_corrected_in_a_file_of_the_user_s(place):
-    options = CellOptions(views=20, seed=3, board_scale=1.01, pixel_sigma_px=0.05)
-    cell_session(simulate(options), "cell", seen="corners").save(place / "cell")
-    assert 'target = "charuco_9x6_30mm"' in (place / "cell/session.toml").read_text("utf-8")
+@pytest.mark.parametrize("seen", ["corners", "poses"])
+def test_a_board_of_another_size_is_scaled_in_a_copy(place, seen):
+    cell = simulate(CellOptions(views=20, seed=3, board_scale=1.01, pixel_sigma_px=0.05))
+    if seen == "corners":
+        cell_session(cell, "cell", seen=seen).save(place / "cell")
+    else:
+        # As a program measures them that was told the stated size.
+        poses = cell.cam_from_target.copy()
+        poses[:, :3, 3] /= 1.01
+        pairs_session("eye-in-hand", cell.robot.base_from_flange, poses).save(place / "cell")
     followed = follow("calibrate", "cell", "-o", "out")
-    assert "1 % larger than stated" in followed.runs[0].said
+    assert "--board-scale" in followed.done[0]
     assert followed.last.good().said.startswith("good")
-    assert "square_m = 0.0303" in (place / "cell/charuco_9x6_30mm.toml").read_text("utf-8")
+    found = Calibration.load(place / "out/calibration.json").transforms["flange_from_cam"]
+    away = found.as_matrix() - cell.transforms["flange_from_cam"]
+    # 1 % of the distance would be 4 mm.
+    assert np.linalg.norm(away[:3, 3]) < 3e-4
+
+
+def test_one_of_several_boards_is_scaled_by_its_name(place):
+    session = cell_session(simulate(CellOptions(views=6)), "cell", seen="corners")
+    document = {**session.document, "targets": {"left": {"target": "charuco_9x6_30mm"}}}
+    document["targets"]["right"] = {"target": "aprilgrid_6x4_32mm"}
+    del document["target"]
+    row = [[*(view.cell(at) for at in session.columns), "left"] for view in session.views]
+    two = session.with_content(
+        document=document,
+        columns=(*session.columns, "target"),
+        cells=row,
+        target_document=None,
+    )
+    two.save(place / "cell")
+    refused = visioncal("convert", "cell", "copy", "--board-scale", "1.01").refused().said
+    assert "Name one of left, right" in refused
+    visioncal("convert", "cell", "copy", "--board-scale", "right:1.01").good()
+    left, right = Session.load(place / "copy").boards.values()
+    assert (left.square_m, right.square_m) == pytest.approx((0.03, 1.01 * 0.032))
 
 
 def test_a_size_that_poses_gave_is_known_no_better_than_so(place):

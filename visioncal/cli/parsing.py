@@ -72,6 +72,14 @@ def turn_in(words: str, option: str) -> tuple[tuple[int, ...], tuple[float, ...]
     return views_in(views, option), numbers_in(turn, option, parts)
 
 
+def scale_in(words: str, option: str) -> tuple[str, float]:
+    """Parses a board's true over its stated size, written as 1.01, or left:1.01 of several."""
+    name, _, factor = words.rpartition(":")
+    (scale,) = numbers_in(factor, option, "factor")
+    _check(0.0 < scale < 1e3, words, option, "a factor above 0, as 1.01 or left:1.01")
+    return name, scale
+
+
 def places_in(
     words: str, option: str
 ) -> tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]]:

@@ -21,7 +21,7 @@ from visioncal.cli.options import (
     session_argument,
     yes_flag,
 )
-from visioncal.cli.parsing import names_in, pairs_in, places_in, shift_in, turn_in
+from visioncal.cli.parsing import names_in, pairs_in, places_in, scale_in, shift_in, turn_in
 from visioncal.core.choices import (
     PLAN_SPEED,
     POSE_FORMS,
@@ -410,6 +410,11 @@ class ConvertOptions(RobotPoseOptions):
     positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = _doubt(
         "Views whose positions are made of other columns: 0,4-6:x,-y,z+rail_m.",
         parse=places_in,
+    )
+    board_scale: tuple[str, float] | None = _doubt(
+        "True over stated size of the board: 1.01, or, of several, left:1.01. Poses that were "
+        "measured by it are scaled along.",
+        parse=scale_in,
     )
     by_joints: bool = _doubt(
         "Take the poses of the joint angles, not the reported ones.", "--by-joints", default=False

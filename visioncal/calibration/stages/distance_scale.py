@@ -1,12 +1,14 @@
 """Scale error of poses that another program measured, by the robot's motion."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from visioncal.calibration.guess.fit import distance_rows
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Finding, Remedy
+from visioncal.core.verdict import Finding, Remedy, mending
 
 
 def distance_scale(
@@ -40,6 +42,14 @@ def distance_scale(
     return other_size(scale - 1.0, variance)
 
 
+def scaling(first: str, factor: float, board: str = "") -> Remedy:
+    """Advice to scale a board, of several by its name, after a measurement that comes first."""
+    option = f"--board-scale {f'{board}:' * bool(board)}{factor:.5g}"
+    do = mending(f"the board is {factor:.5g} times as large", option)
+    words = f"{first}{do.words[0].lower()}{do.words[1:-1]}; else check the arm."
+    return replace(do, words=words)
+
+
 def other_size(share: float, variance: float, beside: str = "") -> Finding:
     """The finding on a board that is larger by a share of some variance, with words beside it."""
     short, size = ("short", "larger") if share > 0.0 else ("long", "smaller")
@@ -48,9 +58,6 @@ def other_size(share: float, variance: float, beside: str = "") -> Finding:
         "board_size",
         f"By the robot's motion the board is {percent} {size} than the size by which a program "
         f"measured its poses: all distances in them (cft_) are too {short}.{beside}",
-        Remedy(
-            "Measure the board with a caliper, and measure the poses again with its true size; or "
-            f"multiply cft_x_m, cft_y_m and cft_z_m by {1.0 + share:.5g}."
-        ),
+        scaling("Measure the board with a caliper. If the robot is right, ", 1.0 + share),
         mahalanobis_sq=share**2 / max(variance, np.finfo(float).tiny),
     )

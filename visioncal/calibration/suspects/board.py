@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.distance_scale import distance_scale, other_size
+from visioncal.calibration.stages.distance_scale import distance_scale, other_size, scaling
 from visioncal.calibration.stages.other_board import board_correction
 from visioncal.calibration.suspects.lens import has_changed
 from visioncal.calibration.suspects.suspect import Suspect
@@ -15,7 +15,7 @@ from visioncal.core.number_format import counted, figure, ranges
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import invert
 from visioncal.core.types import Corners, FloatArray, Target
-from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
+from visioncal.core.verdict import NOTE, Finding, Remedy
 from visioncal.estimation.appearance import ASPECT, BOARD_NAMES, SCALE, SHEAR, shaped_corners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import (
@@ -25,7 +25,6 @@ from visioncal.estimation.joint import (
     size_of_measured,
 )
 from visioncal.estimation.unknowns import BOARD, LENS
-from visioncal.session import Session
 from visioncal.session.frames import frame_name
 from visioncal.vision.boards import kind_of
 from visioncal.vision.targets import corner_positions
@@ -57,12 +56,12 @@ def _found(run: RunState) -> Iterator[Finding]:
                 measured = scale_by_stated_arms(fitted, stated, frame) or measured
             yield from _point_findings(target, fitted.values(board))
             if measured.is_another and abs(measured.scale) >= _SAME_SIZE:
-                yield scale_finding(f"target {target.name}", target, measured, measured)
+                yield scale_finding(f"target {target.name}", target, measured, measured, name)
             continue
         if measured.is_another and SCALE in fitted.unknowns.values_of(board, moved=True):
             scale, sigma = float(fitted.values(board)[SCALE]), float(fitted.sigmas(board)[SCALE])
             written = replace(measured, scale=scale, sigma=sigma)
-            found = scale_finding(called, target, measured, written, (run.session, name))
+            found = scale_finding(called, target, measured, written, name)
             yield _stretched(found, fitted, board, called)
         yield from _shape_findings(fitted, name, target, called)
 
@@ -133,12 +132,12 @@ def scale_finding(
     target: Target,
     measured: MeasuredScale,
     written: MeasuredScale,
-    own: tuple[Session | None, str] = (None, ""),
+    name: str = "",
 ) -> Finding:
     """Finding on a board or rig of another size; a note where its stated sigma allows it.
 
     `measured` is the scale by the robot's motion, `written` that of the result, with its total
-    sigma; `own` is the session that declares it, and its name there.
+    sigma; `name` is its name in the session, empty of the only one.
     """
     # Errors that last from stop to stop count in the total alone.
     measured = replace(measured, sigma=max(measured.sigma, written.sigma))
@@ -153,11 +152,7 @@ def scale_finding(
         return Finding(NOTE, f"{allowed} The result goes by both.")
     if target.is_rig:
         words = f"{size}. The result goes by the table of its points."
-        do = (
-            "Measure the distance of two points that are far apart. If the robot is right, "
-            f"multiply the table's x_m, y_m and z_m by {1 + written.scale:.5g}; else check the arm."
-        )
-        command = ""
+        first = "Measure the distance of two points that are far apart."
     else:
         kind, side = kind_of(target), 1e3 * target.square_m
         found = side * (1 + written.scale)
@@ -166,14 +161,11 @@ def scale_finding(
             f"{share}). The result takes the robot's scale; if the board is right, the arm's model "
             "is off by as much."
         )
-        write, command = board_correction(*own, f"{kind.size_key} = {1e-3 * found:.4g}")
-        do = (
-            f"Measure the board over its whole width. If the robot is right, {write}; else check "
-            "the arm."
-        )
+        first = "Measure the board over its whole width."
     total = measured.sigma**2 + measured.stated_sigma**2
     square = measured.scale**2 / total
-    return Finding("board_size", words, Remedy(do, command or CALIBRATE), mahalanobis_sq=square)
+    do = scaling(f"{first} If the robot is right, ", 1 + written.scale, name)
+    return Finding("board_size", words, do, mahalanobis_sq=square)
 
 
 def _stretched(found: Finding, fitted: Fit, board: tuple[str, str], called: str) -> Finding:

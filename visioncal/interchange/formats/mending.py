@@ -22,7 +22,7 @@ from visioncal.session.columns import (
     POSE,
     pose_row,
 )
-from visioncal.session.kinds import name_of
+from visioncal.session.kinds import declared_targets, name_of
 from visioncal.vision.camera import turned_back
 from visioncal.vision.targets import corner_positions
 
@@ -255,6 +255,61 @@ def write_positions(
     sums_of = ("".join(f"{factor:+g} {name} " for factor, name in axis).strip() for axis in axes)
     note = f"the positions of views {ranges(chosen)} are {', '.join(sums_of)}"
     return _with_cells(session, cells, note)
+
+
+def scaled_board(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
+    """The content of a target's `.toml`, and of its table, with all lengths times a factor."""
+    found = dict(document)
+    for name, value in document.items():
+        if isinstance(value, Mapping):
+            found[name] = scaled_board(value, factor)
+        elif name.endswith("_m") and not isinstance(value, str):
+            found[name] = (factor * np.asarray(value, float)).tolist()
+    return found
+
+
+def scale_board(session: Session, name: str, factor: float) -> Session:
+    """Multiplies all lengths of a board, and the distances of poses that were measured by it.
+
+    Args:
+        session: A session.
+        name: The board's name; empty for the only one.
+        factor: True over stated size.
+
+    Raises:
+        DataError: There is no such board, and no measured pose.
+    """
+    stated = declared_targets(session.declaration)
+    only = name or (next(iter(stated)) if len(stated) == 1 else "")
+    poses = numbers_in(session, MEASURED_CAM_POSE).poses()
+    is_measured = not stated and not name and np.isfinite(poses).any()
+    if only not in stated and not is_measured:
+        raise DataError(
+            f"Session {session.name!r} needs a board {name or 'or measured poses'} to scale.",
+            culprits=["--board-scale"],
+            next_step=f"Name one of {some_of([*stated])}, as {next(iter(stated))}:1.01."
+            if stated
+            else "Declare it as target in session.toml.",
+        )
+    shown = [at.number for at in session.views if session.board_of(at) in ("", only)]
+    poses[:, :3, 3] *= factor
+    note = f"the {f'board {only}'.strip()} is {factor:g} times as large as was stated"
+    document, boards = {**session.document}, session.target_document
+    if boards is not None and stated:
+        file = f"target_{only}.toml" if only else "target.toml"
+        if only:
+            tables = document["targets"]
+            document["targets"] = {**tables, only: {**tables[only], "target": file}}
+        else:
+            document["target"] = file
+        is_one = len(stated) == 1
+        scaled = scaled_board(boards if is_one else boards[only], factor)
+        boards = scaled if is_one else {**boards, only: scaled}
+    return session.with_content(
+        document=noting(session, document, [note]),
+        cells=[[row[at] for at in session.columns] for row in _with_poses(session, shown, poses)],
+        target_document=boards,
+    )
 
 
 def without_reported_poses(session: Session) -> Session:

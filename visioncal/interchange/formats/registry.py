@@ -22,6 +22,7 @@ from visioncal.interchange.formats.industrial import EASY_HANDEYE, HAND_EYE, KIN
 from visioncal.interchange.formats.lerobot import LEROBOT
 from visioncal.interchange.formats.mending import (
     exchange_views,
+    scale_board,
     shift_views,
     turn_boards,
     without_reported_poses,
@@ -78,6 +79,7 @@ def convert(
     shift: tuple[tuple[int, ...], int] | None = None,
     turned: tuple[tuple[int, ...], tuple[float, ...]] | None = None,
     positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = None,
+    board_scale: tuple[str, float] | None = None,
     mends_images: bool = False,
     by_joints: bool = False,
 ) -> Session:
@@ -100,6 +102,7 @@ def convert(
             about which point of the board [mm] (x, y). With an angle alone, pictures are turned.
         positions: Views whose positions are sums of columns, and these sums by axis: pairs of a
             factor and a column's name.
+        board_scale: A board's name, empty for the only one, and its true over its stated size.
         mends_images: Whether images are mirrored, turned and scaled back: see `mend_images`.
         by_joints: Whether the robot's poses are those of its joint angles, not the reported ones.
 
@@ -151,6 +154,7 @@ def convert(
         (shift_views, shift),
         (turn_boards, turned),
         (write_positions, positions),
+        (scale_board, board_scale),
     )
     for mend, asked in mends:
         session = session if asked is None else mend(session, *asked)

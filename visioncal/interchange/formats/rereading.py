@@ -45,7 +45,7 @@ from visioncal.interchange.formats.assemble import (
 )
 from visioncal.interchange.formats.fields import fields_of_records
 from visioncal.interchange.formats.foreign import ForeignRecording, Side, rows_of
-from visioncal.interchange.formats.mending import noting
+from visioncal.interchange.formats.mending import noting, scaled_board
 from visioncal.interchange.formats.poses import makers_of, pose_names
 from visioncal.session import Session, Stream
 from visioncal.session.columns import (
@@ -64,7 +64,6 @@ _MOVE = (
 )
 # The beginning of the reason where the robot's rotations do not differ, of whatever unit.
 _STILL, _SAME = "the robot does not turn: its rotations are the same", 1e-3
-_LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 # Sigma of a board's size, as a share of it, that the distances of some poses gave: nobody measured
 # it, and the fit finds it better.
 _BY_POSES = 0.01
@@ -477,7 +476,7 @@ def load_for_rereading(path: Path) -> DoubtfulSession:
     side = next((side for side in sides if isinstance(side, int | float)), 0.0)
     if not LARGEST_M < side < 1e3 * LARGEST_M:
         return DoubtfulSession(Session.load(path, table=plain), robot, makers=makers)
-    session = Session.load(path, target_document=_scaled(stated, 1e-3), table=plain)
+    session = Session.load(path, target_document=scaled_board(stated, 1e-3), table=plain)
     note = f"{name} cannot be in metres: {side:g} is read as {side:g} mm."
     session = replace(session, warnings=(note, *session.warnings))
     return DoubtfulSession(session, robot, makers=makers)
@@ -642,15 +641,8 @@ def _replace_cells(
 
 def _rescaled(target: Mapping[str, Any], candidate: Candidate) -> Mapping[str, Any]:
     """The board in another unit, or of another size, which then is no better known than so."""
-    scaled = _scaled(target, candidate.board_scale)
+    scaled = scaled_board(target, candidate.board_scale)
     size = scaled.get("square_m", scaled.get("size_m"))
     if candidate.hypothesis.camera.scale == 1.0 or not isinstance(size, float):
         return scaled
     return {**scaled, "square_sigma_m": _BY_POSES * size}
-
-
-def _scaled(target: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
-    return {
-        name: factor * value if name in _LENGTHS and isinstance(value, int | float) else value
-        for name, value in target.items()
-    }
