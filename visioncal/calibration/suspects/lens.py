@@ -37,8 +37,9 @@ _MOST_CREEP = 0.03
 _CROPPED_PX, _EXPLAINED = 10.0, 0.1
 # Boards whose corners are those of single squares.
 _LONE = ("gridboard", "marker")
-# Another model of a lens leaves so much less: more than an even field does.
-_BETTER = 1.1
+# Another model of a lens leaves so much less: more than an even field does; and so much less that
+# it is the lens, however small both are: where corners end, the models part by far more.
+_BETTER, _FAR_BETTER = 1.1, 2.0
 _ONE_LENS = "Keep one lens, and one setting of the driver that rectifies pictures"
 _NEW_LENS = mending(
     "the lens is estimated from these views (or calibrate the camera anew, and state its matrix "
@@ -362,7 +363,8 @@ def _of_fisheye(run: RunState, name: str, of: str) -> Finding | None:
         taken_px, fisheye_px = taken.sigma_px, fisheye.sigma_px
         gained_px = np.sqrt(max(taken_px**2 - fisheye_px**2, 0.0))
         px = np.concatenate([seen.px for seen in corners.values()])
-        is_better = fisheye_px * _BETTER <= taken_px and gained_px >= _LEAST_MOVE_PX
+        is_clear = gained_px >= _LEAST_MOVE_PX or fisheye_px * _FAR_BETTER <= taken_px
+        is_better = fisheye_px * _BETTER <= taken_px and is_clear
         if is_better and _bends(fisheye.camera, px):
             return Finding(
                 "lens_model",
