@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.following import follow
 from support.samples import made_up
+from support.urdf_arm import URDF, of_urdf
 
 from visioncal.calibration.stages import detect
 from visioncal.core.documents import tables
@@ -1535,6 +1536,29 @@ def test_a_board_of_other_counts_is_named_before_the_form_is_asked_for(tmp_path)
     said = ("--target", "checkerboard_11x8_35mm", "--mount", "eye-in-hand")
     done = visioncal("convert", FIELD / "checkerboard-miscounted", tmp_path / "out", *said)
     assert "Euler angles" in done.good().err
+
+
+@pytest.mark.parametrize("others", [(), ("second.urdf",), ("renamed",)])
+def test_the_only_urdf_beside_a_table_gives_its_arm_by_the_names_of_its_joints(tmp_path, others):
+    arm, names = (
+        of_urdf(),
+        [f"cam_{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")],
+    )
+    rng, joints = np.random.default_rng(3), [*arm.joint_names]
+    header = [f"{name}_moved" for name in joints] if "renamed" in others else joints
+    rows = rng.uniform(-1.0, 1.0, (9, len(joints) + 7)).round(6)
+    rows[:, -4:] /= np.linalg.norm(rows[:, -4:], axis=1, keepdims=True)
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    write(tmp_path / "in/log.csv", "\n".join([",".join([*header, *names]), *lines]))
+    for name in ("arm.urdf", *(name for name in others if name.endswith(".urdf"))):
+        write(tmp_path / "in" / name, URDF)
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    if others:
+        done.refused("Which of these are the robot's poses is not known")
+        return
+    assert "are the joints of arm.urdf, to its flange" in done.good().err
+    view = Session.load(tmp_path / "out").views[0]
+    assert view.joints_rad == pytest.approx(rows[0, : len(joints)])
 
 
 def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypatch):

@@ -79,9 +79,7 @@ def with_user_options(foreign: ForeignRecording, requested: ImportOptions) -> Fo
     foreign = replace(foreign, form=stated.name if stated and stated.models else "")
     if requested.tip is not None and requested.robot_model is None:
         raise DataError("--tip needs the robot that it is of; name it with --robot-model.")
-    if requested.robot_model is not None:
-        tip = {} if requested.tip is None else {"tip": requested.tip}
-        foreign = replace(foreign, arm={"model": requested.robot_model} | tip)
+    foreign = replace(foreign, arm=requested.arm or foreign.arm)
     lens, lenses, notes = dict(foreign.lens or {}), foreign.lenses, foreign.notes
     is_of_one = requested.intrinsics not in (None, "estimate") or requested.resolution is not None
     if lenses and is_of_one:

@@ -1,6 +1,6 @@
 """Tables, JSON and .npz with a row a view; lines of a pendant; a second file of camera poses."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 
@@ -86,7 +86,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     for rank, fields, asked in readings:
         try:
             for more, foreign in _recordings(fields, asked, images, instead):
-                all_notes = (*foreign.notes, *notes)
+                all_notes = (*foreign.notes, *notes, *_arm_note(asked, requested))
                 found.append(
                     (rank + more, replace(foreign, lens=foreign.lens or lens, notes=all_notes))
                 )
@@ -104,6 +104,16 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
             first, doubt=unknown(source, requested, [each for _, each, _ in readings[:1]])
         )
     return replace(first, rivals=tuple((at - rank, other) for at, other in others))
+
+
+def _arm_note(asked: ImportOptions, requested: ImportOptions) -> Iterator[str]:
+    """A note on the robot whose description stands beside the rows, where the user names none."""
+    if asked.robot_model and not requested.robot_model:
+        file, tip = Path(asked.robot_model).name, asked.tip or "flange"
+        yield (
+            f"{', '.join(asked.joints)} are the joints of {file}, to its {tip}; --robot-model "
+            "and --tip name another."
+        )
 
 
 def _files_apart(
@@ -201,6 +211,7 @@ def _recordings(
         images=pairing.images,
         corners=() if px is None else tuple(row if np.isfinite(row).all() else None for row in px),
         lens={"model": "points"} if points else None,
+        arm=requested.arm,
         joints_rad=joints,
         stamps_s=in_seconds(fields.column(stamps)[:, 0]) if stamps else None,
         form=fields.form,

@@ -81,6 +81,13 @@ class ImportOptions:
     # Called during long reading.
     progress: Progress | None = field(default=None, compare=False, repr=False)
 
+    @property
+    def arm(self) -> dict[str, str] | None:
+        """The fields of `[robot]` in session.toml; None where no robot is named."""
+        if self.robot_model is None:
+            return None
+        return {"model": self.robot_model} | ({} if self.tip is None else {"tip": self.tip})
+
     def with_poses(self, robot: PoseImportOptions, camera: PoseImportOptions) -> Self:
         """These options over what a source states of its poses."""
         return replace(self, robot=self.robot.over(robot), camera=self.camera.over(camera))
@@ -123,7 +130,7 @@ class ForeignRecording:
     instrument: Mapping[str, Any] | None = None
     # The robot's description, where the source holds it; see `Robot.from_document`.
     robot_document: Mapping[str, Any] | None = None
-    # The fields of `[robot]` in session.toml, where the user names a robot.
+    # The fields of `[robot]` in session.toml, where the user or a URDF beside names a robot.
     arm: Mapping[str, Any] | None = None
     views: tuple[int, ...] = ()  # (n,) the rows' numbers in the source; 0, 1, ... where empty.
     # The robot's poses, where they are not those of the rows but a stream beside them.

@@ -6,6 +6,7 @@
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -201,8 +202,7 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
     for fields in [each for each in rows if _has(each, given)] or rows:
         # A robot's program beside a table has the same poses once more.
         later = 4 * bool(fields.form) + 2 * (len(rows) > 1 and not _NAMED.search(fields.name))
-        by_count = () if requested.joints or joint_names(fields, ()) else _joints(fields, requested)
-        asked = replace(requested, joints=requested.joints or by_count)
+        asked = _with_joints(fields, requested)
         joints = asked.joints or joint_names(fields, ())
         is_given = bool(requested.robot.names or requested.joints) or not _has(fields, given)
         camera = () if is_given else pose_names(fields, requested.camera.names, "camera", joints)
@@ -227,13 +227,19 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
     return sorted(found, key=lambda item: item[0])[:_MOST_READINGS]
 
 
-def _joints(fields: Fields, requested: ImportOptions) -> tuple[str, ...]:
-    """Columns called as the joints of the user's robot; else the only ones that are as many."""
+def _with_joints(fields: Fields, requested: ImportOptions) -> ImportOptions:
+    """Options with the columns of joint angles that no usual name shows.
+
+    They are called as the joints of the user's robot or of the only URDF beside the rows; else they
+    are the only ones that are as many as the robot's.
+    """
+    if requested.joints or joint_names(fields, ()):
+        return requested
     if requested.robot_model is None:
-        return ()
+        return _of_urdf(fields, requested)
     robot = Robot.from_document(read_robot_document(requested.robot_model))
     if called := joint_names(fields, (), robot.joint_names):
-        return called
+        return replace(requested, joints=called)
     count = robot.joint_count
     # Columns called x, y, z, or named by the user, are a pose.
     poses = pose_names(fields, requested.robot.names, "robot", (), by_shape=False)
@@ -243,7 +249,24 @@ def _joints(fields: Fields, requested: ImportOptions) -> tuple[str, ...]:
         for names in column_groups(fields).values()
         if len(names) == count and places.isdisjoint(names)
     ]
-    return groups[0] if len(groups) == 1 else ()
+    return replace(requested, joints=groups[0]) if len(groups) == 1 else requested
+
+
+def _of_urdf(fields: Fields, requested: ImportOptions) -> ImportOptions:
+    """Options with the only URDF beside the rows, where columns are called as its joints.
+
+    The angles are of the link at its end, unless it has a flange or the user names a tip.
+    """
+    files = sorted(fields.folder.glob("*.urdf"))
+    urdf = read_robot_document(str(files[0]))["urdf"] if len(files) == 1 else ""
+    ends = {*re.findall(r"<link\s+name=\"([^\"]+)\"", urdf)}
+    ends -= {*re.findall(r"<parent\s+link=\"([^\"]+)\"", urdf)}
+    for tip in (requested.tip, *ends) if len(ends) == 1 else ():
+        with suppress(DataError):
+            robot = Robot.from_document(read_robot_document(str(files[0]), tip=tip))
+            if called := joint_names(fields, (), robot.joint_names):
+                return replace(requested, joints=called, robot_model=str(files[0]), tip=tip)
+    return requested
 
 
 def _has(fields: Fields, given: Sequence[str]) -> bool:
