@@ -386,6 +386,25 @@ def test_rows_amid_the_table_that_are_apart_are_one_command(tmp_path, monkeypatc
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
 
 
+@pytest.mark.parametrize(("lost", "whose"), [((10, 17), "image"), slow((8, 20), "pose")])
+def test_rows_that_two_losses_leave_apart_are_mended_one_after_the_other(
+    tmp_path, monkeypatch, lost, whose
+):
+    monkeypatch.chdir(tmp_path)
+    # No half of the rows is right, and none is apart by one number of rows.
+    robot, boards = poses_of(MOUNTS[0], 26)
+    kept, whole = np.delete(np.arange(26), lost), np.arange(24)
+    rows = (robot[whole], boards[kept]) if whose == "image" else (robot[kept], boards[whole])
+    pairs_session(MOUNTS[0], *rows).save(tmp_path / "cell")
+    cause, mended = followed("cell")
+    assert cause.kind == "shifted_rows"
+    # A row at each end of a run that is apart has no partner left.
+    assert sum(view.used for view in mended.views) >= 24 - 4
+    sound = visioncal.calibrate(pairs_session(MOUNTS[0], robot, boards))
+    for name, edge in sound.edges.items():
+        np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
+
+
 def test_a_whole_table_two_rows_apart_is_named():
     session = pairs_session(MOUNTS[1], *shifted(*poses_of(MOUNTS[1]), 0, 2))
     cause = visioncal.calibrate(session).verdict.causes[0]

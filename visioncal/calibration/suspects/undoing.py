@@ -96,6 +96,9 @@ def likeliest(run: RunState) -> Undoing | None:
     pairs = {by: record.paired(shifted(by, len(record.views))) for by in _SHIFTS}
     every = [declared]
     every += filter(None, (Edges.by(record, pairs[by], fresh) for by in _SHIFTS[1:]))
+    # Two losses may leave no half of all rows right, and yet most of one end's.
+    halves = np.arange(len(own)) < 0.5 * len(own)
+    every += filter(None, (Edges.by(record, own, fresh & half) for half in (halves, ~halves)))
     best = max(every, key=lambda edges: float(evidence(edges.of(own)[None])[0][0]))
     apart = best.of(own)
     (base,), (agrees,) = evidence(apart[None])
@@ -500,28 +503,34 @@ def _shifted(
     behind = np.arange(count) >= np.arange(count)[:, None]
     ends = np.concatenate([behind, ~behind[FEWEST_VIEWS:]])
     orders = [record.paired(order(len(record.views))) for order in ROW_ORDERS.values()]
-    found = []
+    found = list[tuple[float, int, Mask]]()
     for edges in every:
         squares = {by: edges.of(pairs[by]) for by in _SHIFTS}
         for by in _SHIFTS[1:]:
             amid = _apart_amid(record, squares[0], squares[by], by)
-            sides = np.concatenate([ends, amid[None]])
+            sides = np.concatenate([ends, amid])
             mixed = np.where(sides[..., None], squares[by], squares[0])
-            # Amid the record, a pose is of one image.
-            mixed[-1, amid & ~np.isin(pairs[by], record.rows[amid])] = np.inf
+            # A pose is of one image: those of rows that stay are their own.
+            first = record.rows[sides.argmax(axis=1), None]
+            last = record.rows[-1 - sides[:, ::-1].argmax(axis=1), None]
+            partnered = sides & (pairs[by] >= first) & (pairs[by] <= last)
+            mixed[sides & ~partnered] = np.inf
             logs, agrees = evidence(mixed)
             # Both ends are a free choice.
-            logs[-1] -= float(np.log(count)) / EVIDENCE
-            at = int(logs.argmax())
-            closes = mixed[at][agrees[at]].mean() < CLOSING_SCORE**2
-            found.append((float(logs[at]), by, sides[at], agrees[at], closes))
+            logs[len(ends) :] -= float(np.log(count)) / EVIDENCE
+            # Of several runs that are apart, one at a time explains its own views.
+            explained = np.sum(agrees & partnered, axis=1)
+            explains = explained >= np.maximum(2.0, 0.6 * partnered.sum(axis=1))
+            # A view that no run explains is in none.
+            at = int(np.where(explains, logs - LEAST * sides.sum(axis=1), -np.inf).argmax())
+            if explains[at] and mixed[at][agrees[at]].mean() < CLOSING_SCORE**2:
+                found.append((float(logs[at]), by, sides[at]))
         # Other orders of the rows are readings of the whole recording.
         for order in orders:
             rival = edges.of(order)
-            found.append((float(evidence(rival[None])[0][0]), 0, behind[0], behind[0], False))
-    log, by, side, agrees, closes = max(found, key=lambda item: item[0])
-    partnered = side & (pairs[by] >= 0)
-    if not by or not closes or np.sum(agrees & partnered) < max(2.0, 0.6 * partnered.sum()):
+            found.append((float(evidence(rival[None])[0][0]), 0, behind[0]))
+    log, by, side = max(found, key=lambda item: item[0])
+    if not by:
         return
     # One row, in all views, is a reading of the whole recording, which is tried of images.
     if side.all() and abs(by) == 1 and record.shows == "image":
@@ -552,7 +561,7 @@ def _shifted(
 
 
 def _apart_amid(record: Record, own: FloatArray, other: FloatArray, by: int) -> Mask:
-    """(m,) the run of views, and so many whose pose these have, that other poses explain best.
+    """(2, m) the run of views that other poses explain best, and with those whose pose these have.
 
     Args:
         record: The record.
@@ -567,6 +576,6 @@ def _apart_amid(record: Record, own: FloatArray, other: FloatArray, by: int) -> 
     last = int(np.argmax(sums - np.minimum.accumulate(sums)))
     rows = record.rows[int(np.argmin(sums[: last + 1])) : last]
     if not len(rows):
-        return np.zeros(len(own), dtype=bool)
-    first, end = int(rows[0]) + min(by, 0), int(rows[-1]) + max(by, 0)
-    return (record.rows >= first) & (record.rows <= end)
+        return np.zeros((2, len(own)), dtype=bool)
+    first, last = rows[0] + np.array([[0], [min(by, 0)]]), rows[-1] + np.array([[0], [max(by, 0)]])
+    return np.asarray((record.rows >= first) & (record.rows <= last))
