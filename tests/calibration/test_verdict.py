@@ -390,6 +390,22 @@ def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:
     assert "wrong_views" in found
 
 
+def test_all_views_of_one_end_are_off_by_no_chance_whatever_each_is_off_by():
+    """As where the zero of a joint is lost, which moves each flange by its own posture."""
+    cell, rng = simulate(CellOptions(views=20)), np.random.default_rng(1)
+    flange, amid = cell.robot.base_from_flange.copy(), cell.robot.base_from_flange.copy()
+    off = exp(rng.normal(0.0, [0.006] * 3 + [0.003] * 3, (8, 6)))
+    flange[12:] = flange[12:] @ off
+    cause = calibrate(session_of(cell, flange)).verdict.causes[0]
+    assert cause.kind == "something_moved"
+    assert "from view 12 on, the camera, the target or a frame of the controller" in cause.words
+    # Picks come after it.
+    assert cause.do.command.endswith("--views 12-19")
+    some = np.arange(1, 17, 2)
+    amid[some] = amid[some] @ off
+    assert "something_moved" not in ids(calibrate(session_of(cell, amid)).verdict)
+
+
 @pytest.mark.parametrize("orders", [("xyz", "ZYZ"), ("ZYZ", "ZYX"), ("ZYZ", "xyz")])
 def test_angles_taken_for_another_makers_are_brought_back_row_by_row(orders: tuple[str, str]):
     """Of the two triples of angles of a rotation, some rows had the one that writing gives."""

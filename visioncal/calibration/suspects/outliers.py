@@ -1,5 +1,6 @@
 """Messages on outliers and moved frames: exchanged or wrong observations, by cause."""
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CAL
 # Views among many outliers of one end that agree by chance, one of so many; what a step that few
 # times exceeds the noise leaves of these, and poses that are wrong apart never do.
 _BY_CHANCE, _AT_END = 4, 0.6
+# Probability below which outliers that are all views of one end are so by no chance.
+_ONE_END = 1e-3
 _WRONG = "its pose or its reading is wrong, or something had moved"
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
@@ -173,7 +176,12 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
     if cell_fit.cell.mount == "instrument":
         words = "Leave the instrument where it stands and one probe in one nest, and record again"
     most = _AT_END if len(run) > FEWEST_VIEWS else 1.0 / CLEAR_RATIO
-    if len(run) >= FEWEST_VIEWS and (change := _common_change(inliers, run, most)) is not None:
+    change = _common_change(inliers, run, most) if len(run) >= FEWEST_VIEWS else None
+    if len(run) == np.sum(~is_used) == (at if run is before else len(order) - at):
+        # All views of one end and no others: by another pose of each, that is hardly chance.
+        by_chance = 2.0 * len(order) / math.comb(len(order), len(run))
+        change = change or (("", np.eye(4)) if by_chance < _ONE_END else None)
+    if change is not None:
         # Picks come after the session.
         later = [rows[row].view for row in np.sort(order[at:]).tolist()]
         when = f"{'before' if run is before else 'from'} view {rows[int(order[at])].view}"
@@ -199,7 +207,9 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
 def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str, str]:
     """The frame that moved from some view on, and by how much, in words."""
     if not frame:
-        return "the camera, the target or a frame of the controller", ""
+        known = any(arm.matched is not None for arm in cell_fit.arms.values())
+        joint = ", or the zero of a joint," if known else ""
+        return f"the camera, the target or a frame of the controller{joint}", ""
     thing, edge = ("camera" if frame.startswith("cam") else "target"), cell_fit.fit.frames[frame]
     on_flange = (cell_fit.cell.mount == "eye-in-hand") == (thing == "camera")
     if cell_fit.cell.mount == "instrument":
