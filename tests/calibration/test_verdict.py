@@ -473,6 +473,21 @@ def test_a_tool_that_was_active_is_asked_for(mount, tool_mm, where) -> None:
         assert finding.words in " ".join(verdict.top)
 
 
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_poses_of_the_camera_in_place_of_the_robots_are_named(mount: str) -> None:
+    cell = simulate(CellOptions(views=14, mount=mount))
+    seen = cell.cam_from_target.copy()
+    # Another program has a longer lens, and the board's first corner at its other end.
+    seen[:, 2, 3] *= 1.01
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turned[:2, 3] = 0.24, 0.15
+    seen = seen @ turned
+    poses = invert(seen) if mount == MOUNTS[0] else seen
+    verdict = calibrate(pairs_session(mount, poses, cell.cam_from_target)).verdict
+    assert (verdict.status, ids(verdict)[:1]) == ("check", ["camera_poses"])
+    assert "with the poses that the robot reported" in verdict.next_steps[0].words
+
+
 def test_a_camera_behind_its_flange_where_no_bracket_has_it_is_a_doubt() -> None:
     cell, tool = simulate(CellOptions(views=14)), np.eye(4)
     tool[2, 3] = 0.17

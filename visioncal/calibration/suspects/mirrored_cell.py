@@ -1,20 +1,24 @@
-"""A cell the other way round, which fits the views as well, and what is carried where none is."""
+"""A cell the other way round, one without a robot, and what is carried where none is."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.suspects.suspect import Suspect
+from visioncal.calibration.suspects.misread_poses import BY_CHAIN
+from visioncal.calibration.suspects.suspect import CHAIN, FACT, SOURCES, Suspect
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure
-from visioncal.core.types import MOUNTS
+from visioncal.core.types import MOUNTS, FloatArray
 from visioncal.core.verdict import Finding, Remedy
 
 # A part on a flange may be so far from it [m], also where the poses are in the board's frame;
 # seldom so far, or a camera so far behind the flange: more than the length of one beside the wrist;
 # farther behind than the last link is long, no bracket has it.
 _NEAR_M, _FAR_M, _BEHIND_M, _FAR_BEHIND_M = 0.3, 0.5, 0.05, 0.08
+# Another program's lens shifts a camera by some hundredths of its distance [m], and turns it less
+# than so: no camera is so near a flange, its axes parallel, and a board so flat in a base at once.
+_SAME_M, _PARALLEL = 0.02, np.cos(np.radians(2.0))
 
 
 def _found(run: RunState) -> Iterator[Finding]:
@@ -24,9 +28,22 @@ def _found(run: RunState) -> Iterator[Finding]:
     matched = run.reported.matched
     if matched is not None and matched.joints_rad:
         return
+    edges = [*run.assessment.last_edges.items()][:2]
+    if _is_of_camera(*(edge.matrix for _, edge in edges)):
+        yield Finding(
+            "camera_poses",
+            "The robot's poses are those of the camera over the board, or of the board before the "
+            "camera: by them, the camera is in its place and the board in its own, and no "
+            "robot is anywhere. Another program found them in the same images.",
+            Remedy(
+                "Convert the recording again, with the poses that the robot reported; these say "
+                "nothing of it."
+            ),
+            until_mm=0.0,
+        )
+        return
     camera, target = (
-        (name, float(np.linalg.norm(edge.transform.translation)))
-        for name, edge in [*run.assessment.last_edges.items()][:2]
+        (name, float(np.linalg.norm(edge.transform.translation))) for name, edge in edges
     )
     in_hand = run.mount == MOUNTS[0]
     (carried, carried_m), (placed, placed_m) = (camera, target) if in_hand else (target, camera)
@@ -70,5 +87,14 @@ def _found(run: RunState) -> Iterator[Finding]:
         )
 
 
+def _is_of_camera(camera: FloatArray, target: FloatArray) -> bool:
+    """Whether (4, 4) poses are the identity, and the board's own frame but for its first corner."""
+    turned = np.abs(target[:3, :3])
+    is_parallel = min(*camera.diagonal()[:3], turned[2, 2], turned[:2, :2].max()) > _PARALLEL
+    return bool(is_parallel and max(np.abs(camera[:3, 3]).max(), abs(target[2, 3])) < _SAME_M)
+
+
+# A result by such poses is of nothing else.
+CAMERA_POSES = Suspect("camera_poses", None, FACT, hides=(CHAIN, *BY_CHAIN), inflates=SOURCES)
 MIRRORED_CELL = Suspect("mirrored_cell", _found, 1e-2)
 TOOL_ACTIVE = Suspect("tool_active", chance=1e-2)

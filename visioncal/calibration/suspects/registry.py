@@ -95,6 +95,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     board.PRINT,
     *growing.GROWING,
     mirrored_cell.MIRRORED_CELL,
+    mirrored_cell.CAMERA_POSES,
     rounded_poses.ROUNDED_POSES,
     turned_views.TURNED_VIEWS,
     late_poses.LATE_POSES,
