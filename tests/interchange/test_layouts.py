@@ -25,7 +25,7 @@ from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptio
 from visioncal.interchange.formats.poses import pose_names, poses_from
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.registry import read_foreign
-from visioncal.interchange.formats.sources import describe
+from visioncal.interchange.formats.sources import describe, proposed
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 from visioncal.session import Session
@@ -1000,6 +1000,30 @@ def named_with_clouds(folder):
     table_of(folder)
 
 
+def axis_first(folder):
+    """Names that begin with the axis, sorted by these."""
+    keys = ["x_pos", "y_pos", "z_pos", "x_rot", "y_rot", "z_rot", "w_rot"]
+    rows = {
+        str(at): dict(sorted(zip(keys, map(float, seven(pose)), strict=True)))
+        for at, pose in enumerate(world()[0])
+    }
+    write(folder / "world_to_tip.json", json.dumps({"world_to_tip": rows}))
+    shoot(folder, "{}.png")
+
+
+def two_of_a_day(folder):
+    """Pictures of another recording, fewer and in a folder of their own, beside."""
+    np.savetxt(folder_of(folder) / "poses_7-30.csv", vectors(), fmt="%.12f", delimiter=",")
+    shoot(folder / "2025_7-30", "{}.png")
+    for at in range(5):
+        shoot_one(folder / f"2025_8-15/{at}.png", at)
+
+
+def folder_of(folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 LAYOUTS: Mapping[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
@@ -1021,7 +1045,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         job, within_braces, elements, nested_elements, sections,
         headings_in_turn, lines_of_lost_pictures, lines_of_few_pictures, letters_of_a_lost_picture,
         letters_of_a_picture_too_many, lines_before_the_first_picture, urscript_with_a_start,
-        named_with_depth, named_with_clouds,
+        named_with_depth, named_with_clouds, axis_first, two_of_a_day,
     )
 }  # fmt: skip
 
@@ -1434,6 +1458,43 @@ def test_files_that_are_each_a_recording_are_named_at_once(tmp_path, monkeypatch
     listed = describe(tmp_path / "my runs").words()
     assert "9 kinds not read" in listed
     assert listed.count("code/") == 3
+
+
+@pytest.mark.parametrize("is_listed", [False, True])
+def test_files_of_a_recording_each_that_differ_in_numbers_are_named(tmp_path, is_listed):
+    poses, _, session = world()
+    for name, count in (("run_1", 6), ("run_2", 9)):
+        rows = vectors()[:count]
+        if is_listed:
+            seen = (view.cam_from_target().as_matrix() for view in session.views)
+            records = [
+                {"id": at, "robot_coords": row.tolist(), "board_pose": pose.tolist()}
+                for at, (row, pose) in enumerate(zip(rows, seen, strict=False))
+            ]
+            write(tmp_path / f"in/{name}.json", json.dumps(records))
+        else:
+            (tmp_path / "in").mkdir(exist_ok=True)
+            np.savetxt(tmp_path / f"in/{name}.csv", rows, fmt="%.12f", delimiter=",")
+            shoot(tmp_path / "in", "{}.png")
+    board = () if is_listed else ("--target", session.document["target"])
+    followed = follow(
+        "convert", tmp_path / "in", tmp_path / "out", "--mount", session.mount, *board
+    )
+    assert "2 files that are each a recording: run_1" in followed.runs[0].refused().err
+    assert len(followed.runs) == 2
+    read = Session.load(tmp_path / "out")
+    found = np.array([view.base_from_flange().as_matrix() for view in read.views])
+    np.testing.assert_allclose(found, poses, atol=1e-9)
+
+
+def test_a_result_of_one_pose_is_no_recording_beside_rows(tmp_path):
+    np.savetxt(folder_of(tmp_path) / "hand_angle.txt", vectors(1.0), delimiter=", ")
+    results = {f"T_my{at}": world()[0][at].tolist() for at in (1, 2)}
+    for ending in ("json", "yaml"):
+        write(tmp_path / f"T_cam2base.{ending}", results)
+    (rank, rows, _), (later, *_) = proposed(describe(tmp_path), ImportOptions())
+    assert len(rows) == len(world()[0])
+    assert rank < later
 
 
 def test_joints_of_a_gripper_and_settings_of_each_row_are_none_of_the_arm(tmp_path):

@@ -147,6 +147,21 @@ def test_corners_of_another_program_are_the_session_s(tmp_path, is_of_opencv):
         np.testing.assert_allclose(session.corners[view.number].px, points, atol=1e-6)
 
 
+def test_rotations_stand_first_in_rows_of_which_some_are_missing(tmp_path):
+    poses, seen, mount = world()
+    for name, side, first in (("gripper2base", poses, 1), ("target2cam", seen, 1)):
+        places, turns = halves(side)
+        rows = np.column_stack([np.arange(first, first + len(side)), turns, 1e3 * places])
+        np.savetxt(tmp_path / f"{name}.csv", rows, fmt="%d" + ", %.12f" * 6)
+    # Files of a tracker, of more views than were seen.
+    for at in range(25):
+        write(tmp_path / f"vicon/aa{at + 1}.csv", "1,2,3\n" * (4 + at))
+    visioncal("convert", tmp_path, tmp_path / "out", "--mount", mount).good()
+    read = Session.load(tmp_path / "out")
+    found = np.array([view.base_from_flange().as_matrix() for view in read.views])
+    np.testing.assert_allclose(found, poses, atol=1e-9)
+
+
 def test_a_command_names_two_sides_of_as_many_rows(tmp_path):
     """Beside a lens of its own pictures, whose vectors are more than the robot's poses."""
     poses, seen, mount = world()

@@ -192,7 +192,8 @@ def _below_titles(rows: list[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tu
     """
     widths = [len(cells) for _, cells in rows]
     filled = [sum(map(bool, cells)) * (len(cells) == widths[-1]) for _, cells in rows]
-    above = next(at for at, count in enumerate(filled) if 2 * count > max(filled))
+    fullest = max(filled)
+    above = next(at for at, count in enumerate(filled) if 2 * count > fullest)
     # Without a header, rows of few cells may be rows all the same.
     is_header = not any(map(is_number, rows[above][1])) or widths[-1] not in widths[:above]
     is_title = is_header and len(rows) > above + 2 and len({*widths[above:]}) == 1

@@ -31,7 +31,10 @@ from visioncal.interchange.formats.reading import ENDINGS
 from visioncal.session.images import CLOUD_ENDINGS, IMAGE_ENDINGS
 
 # Endings of texts with numbers that are none of a recording.
-_NO_DATA = (".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg")
+_NO_DATA = (
+    *(".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg"),
+    *(".ply", ".pcd"),
+)
 # Folders below a source that are looked through, and the most files in all; a source of more files
 # than a recording in folders has, such as a disk, is looked through less deep.
 _DEPTH, _FEW_FILES, _LESS_DEEP, _MOST_FILES = 8, 5_000, 3, 100_000
@@ -204,10 +207,17 @@ def _series(source: Path, files: Sequence[Path], ending: str) -> Iterator[FileGr
     last = max(differing, default=0)
     for file, run in zip(files, runs, strict=True):
         parts["".join(run[:last])][file] = run[last]
+    folders: dict[Path, list[Path]] = defaultdict(list)
+    for file in files:
+        folders[file.parent].append(file)
     first, *others = parts.values()
     if others and len(first) > 1 and all({*first.values()} == {*each.values()} for each in others):
         for part in parts.values():
             yield from _series(source, [*part], ending)
+    elif not numbers and len(folders) > 1 and min(map(len, folders.values())) > 2:
+        # Of another number each, as several recordings have them.
+        for of_folder in folders.values():
+            yield from _series(source, of_folder, ending)
     else:
         yield FileGroup(label, tuple(files), numbers)
 
@@ -353,14 +363,17 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
         is_named = re.search("rgb|colou?r", group.label, re.IGNORECASE) is not None
         # Drawings of another program, and pictures of some of the rows alone, come last.
         is_grey = group.image is not None and group.image.words.endswith("grey")
+        left_over = int((found.rows < 0).sum())
+        # Numbers that differ by a constant are no surer than as many of both.
+        is_guess = bool(left_over) and found in steps.get(group.label, [])[:1]
         extra = (
-            int((found.rows < 0).sum()),
+            left_over,
             HOW.index(found.how),
             not is_named,
             is_grey,
             -len(group.files),
         )
-        return group.is_depth, drawn, found.how == HOW[-1], *extra
+        return group.is_depth, drawn, found.how == HOW[-1] or is_guess, *extra
 
     ranked = sorted(matches, key=rank)
     if not ranked:

@@ -67,6 +67,7 @@ _NO_POSE = re.compile(
     r"joint|axis|axes|angles|wrench|speed|force|torque|twist|vel|accel|effort|corner|intrins"
 )
 _ASKED_FOR = {"d", "des", "desired", "cmd", "commanded", "goal", "initial", "init", "ref", "guess"}
+_AXIS_FIRST = re.compile(r"(?<![^ .])([wxyz])_([a-z]+)$", re.IGNORECASE)
 # Columns among which poses are looked for by their numbers alone.
 _MOST_COLUMNS = 40
 # Columns that count or time rows.
@@ -312,7 +313,8 @@ def _by_prefix(fields: Fields, taken: Collection[str]) -> dict[str, dict[str, st
     texts = {name: None for name, cells in fields.texts.items() if any(cells)}
     # An exact name goes before one in another case or with a unit.
     for name in sorted({**columns, **texts}, key=lambda name: without_unit(name)[0] != name):
-        plain = without_unit(name)[0]
+        # `x_pos` is `pos_x`.
+        plain = _AXIS_FIRST.sub(r"\2_\1", without_unit(name)[0])
         last = re.split("[ _.]", plain)[-1]
         prefix = plain.removesuffix(last)
         # The same numbers as an array.
@@ -519,8 +521,9 @@ def _split(
 
 def _is_rotation_first(flat: FloatArray) -> bool:
     """Whether of (n, 6) numbers the last three are no rotation, in any unit, and the first are."""
-    turns, places = (np.abs(half[np.isfinite(half)]) for half in (flat[:, :3], flat[:, 3:]))
-    return bool(turns.max(initial=0.0) <= 2.0 * np.pi and (places > 360.0).sum() > len(flat) / 2)
+    filled = np.abs(flat[np.isfinite(flat).all(axis=1)])
+    turns, places = filled[:, :3], filled[:, 3:]
+    return bool(turns.max(initial=0.0) <= 2.0 * np.pi and (places > 360.0).sum() > len(filled) / 2)
 
 
 def _by_rows(requested: PoseImportOptions, count: int) -> PoseImportOptions:

@@ -136,7 +136,10 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     if is_known or foreign.mount is None:
         return foreign
     _check_sides(foreign)
-    readings = [(0, foreign), *foreign.rivals]
+    # Other images make no difference where the stored poses of the target are used.
+    by_images = foreign.camera is None or foreign.target is not None
+    rivals = (each for each in foreign.rivals if by_images or each[1].robot is not foreign.robot)
+    readings = [(0, foreign), *rivals]
     other_orders = [(rank, each) for rank, item in readings for each in _reordered(item)]
     why, fault = "too few rows have a pose and what the camera saw", None
     searches = dict[Path, Searched]()
@@ -452,6 +455,8 @@ def _unsaid(
         words = f"{why}. No calibration is determined so, and no form of these rotations"
     elif why.startswith(NO_READING):
         step = "Look whether these rows are those of these images or poses of the target. Else say"
+        if foreign.images and foreign.target is None:
+            step = f"Name the board that the images show with --target: it tells more. {step}"
     elif fault is not None:
         words = f"{re.sub('^session .*?: ', '', why)}. Beside that, {unsaid}"
         step = f"{fault.next_step} Else say".strip()

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from visioncal.calibration.guess import FEWEST_ROWS
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import FloatArray
@@ -63,6 +64,7 @@ class Part:
     fault: DataError | None = None  # Why they cannot be read.
     # Fields of `[camera]` by where they stand.
     lenses: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    kin: str = ""  # Label of files that are each a recording like this one; empty of others.
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +150,15 @@ def describe(path: Path, form: str | None = None) -> Source:
     Reads all of what may hold numbers, and the first image of each kind.
     """
     parts = [_part(group, form) for group in groups_in(path)]
+    # Names of a list's records are no view's.
+    if not any(
+        not re.search(r"\.[0-9]+\.", name)
+        for part in parts
+        for fields in part.rows
+        for item in possible_poses(fields)
+        for name in item.names
+    ):
+        parts = [each for part in parts for each in _one_by_one(part, path, form)]
     single = {part.group.files[0].stem: part for part in parts if len(part.group.files) == 1}
     arrays = {name: _array(part.rows[0]) for name, part in single.items() if part.rows}
     for place, lens in lenses_in({k: v for k, v in arrays.items() if v is not None}, path.name):
@@ -155,6 +166,22 @@ def describe(path: Path, form: str | None = None) -> Source:
         of_lens = [single[name] for name in arrays if name in LENS_KEYS]
         parts = [replace(part, lenses={place: lens}) if part in of_lens else part for part in parts]
     return Source(path, tuple(parts))
+
+
+def _one_by_one(part: Part, source: Path, form: str | None) -> list[Part]:
+    """Files whose names differ in numbers, each by itself, where each has rows of poses."""
+    files = part.group.files if part.group.is_data else ()
+    if not 1 < len(files) <= _MOST_READINGS:
+        return [part]
+    groups = (FileGroup(file.relative_to(source).as_posix(), (file,)) for file in files)
+    each = [replace(_part(group, form), kin=part.group.label) for group in groups]
+    are_whole = all(any(map(_is_whole, one.rows)) for one in each)
+    return each if are_whole else [part]
+
+
+def _is_whole(fields: Fields) -> bool:
+    """Whether rows are enough, and their fields are such, that they may be a recording's."""
+    return len(fields) >= FEWEST_ROWS and bool(possible_poses(fields))
 
 
 def _array(fields: Fields) -> FloatArray | None:
@@ -202,6 +229,8 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
     for fields in [each for each in rows if _has(each, given)] or rows:
         # A robot's program beside a table has the same poses once more.
         later = 4 * bool(fields.form) + 2 * (len(rows) > 1 and not _NAMED.search(fields.name))
+        # A result of another program has a row or two.
+        later += 8 * (len(fields) < FEWEST_ROWS)
         asked = _with_joints(fields, requested)
         joints = asked.joints or joint_names(fields, ())
         is_given = bool(requested.robot.names or requested.joints) or not _has(fields, given)
@@ -309,13 +338,17 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
 def several_recordings(source: Source, requested: ImportOptions) -> DataError | None:
     """The error of a folder with several files that are each a whole recording; None of others.
 
-    Each has the same fields, with poses of both sides: rows of one are none of another's.
+    Each has the same fields, with poses of both sides, or their names differ in numbers alone:
+    rows of one are none of another's.
     """
     alike: dict[tuple[str, ...], list[tuple[Path, int]]] = {}
     for part in source.parts:
         for fields in part.rows if len(part.group.files) == 1 else ():
-            if sum(item.is_named for item in possible_poses(fields)) > 1:
-                own = alike.setdefault(tuple(sorted(fields.numbers)), [])
+            both = sum(item.is_named for item in possible_poses(fields)) > 1
+            if _is_whole(fields) if part.kin else both:
+                own = alike.setdefault(
+                    (part.kin,) if part.kin else tuple(sorted(fields.numbers)), []
+                )
                 own.append((part.group.files[0], len(fields)))
     found = max(alike.values(), key=len, default=[])
     if len(found) < 2:
