@@ -241,12 +241,12 @@ def bending(size_m):
 
 
 def tilting(size_rad_m):
-    """The base tilts in proportion to the horizontal reach."""
+    """The base tilts with the moment of what hangs at the flange, by its stand's stiffness."""
 
     def moved(poses, rng):
-        about = size_rad_m * np.array([*_unit(rng), 0.0])
-        reach = np.hypot(poses[:, 0, 3], poses[:, 1, 3])
-        return np.array([pose(far * about, np.zeros(3)) for far in reach]) @ poses
+        stiff = rng.uniform(0.5, 1.0, 2)
+        turns = size_rad_m * np.pad(poses[:, [1, 0], 3] * [-1.0, 1.0] * stiff, ((0, 0), (0, 1)))
+        return np.array([pose(turn, np.zeros(3)) for turn in turns]) @ poses
 
     return moved
 

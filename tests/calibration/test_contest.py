@@ -250,3 +250,14 @@ def test_words_say_whether_rivals_are_left():
     proven = replace(first, by_limit=False, without_it="It leaves nothing.")
     said = "Most likely (90 %): The lens. It leaves nothing."
     assert Verdict("bad", (proven, other)).top[0] == said
+
+
+def test_errors_of_an_arm_explain_what_the_cure_of_a_lens_leaves():
+    """The stated lens is another camera's; it was refined, and the arm errs as arms do."""
+    cell = simulate(replace(FINE, views=24, seed=4, dh_sigma_m=1e-4, dh_sigma_rad=1e-4))
+    for off, first in ((0.0, "arm_errors"), (15.0, "lens")):
+        ((name, lens),) = cell.stated.items()
+        other = replace(lens, matrix=lens.matrix + off)
+        found = calibrated(replace(cell, stated={name: other}), joints=False).verdict
+        assert found.causes[0].kind == first
+        assert "arm_errors" in {finding.kind for finding in found.findings}

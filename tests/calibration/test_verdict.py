@@ -124,6 +124,13 @@ def test_what_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
     assert ids(judge(replace(changed(SOUND), warnings=(FIELD,)))) == ["lens_field"]
 
 
+def test_errors_of_an_arm_are_as_likely_as_what_another_cure_leaves() -> None:
+    refined = replace(HELD_LENS, mahalanobis_sq=0.0)
+    for left, first in ((1.0, "arm_errors"), (1e-3, "lens")):
+        found = changed(SOUND, warnings=(replace(POSTURE, explains=left), refined))
+        assert ids(judge(found))[0] == first
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [

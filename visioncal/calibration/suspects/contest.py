@@ -15,7 +15,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.likely_steps import likely_steps
 from visioncal.calibration.stages.pose_errors import find_pose_errors
 from visioncal.calibration.stages.random_effects import KINDS
-from visioncal.calibration.suspects.suspect import STEPS
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, STEPS
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits, CheckLimits
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import exp
@@ -28,8 +28,9 @@ from visioncal.estimation.problem_parts import State
 from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.steps import FRAME, with_step
-from visioncal.estimation.unknowns import BOARD, SIZE
+from visioncal.estimation.unknowns import BOARD, LENS, SIZE
 from visioncal.robot.model import REPEATABILITY
+from visioncal.vision.camera import intrinsics
 
 _LIMITS = CalibrationLimits()
 _CREEPS = ("base_creeps", "mount_creeps")
@@ -52,13 +53,22 @@ class Trial:
 
 
 def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
-    """Findings with what their cures leave: whether that proves them, and how much they explain."""
+    """Findings with what their cures leave: whether that proves them, and how much they explain.
+
+    Errors of arms follow the posture beside all that the fit has: of a misfit that a cure there
+    clearly removes, they explain what it leaves.
+    """
+    by_arms, rest = list[Finding](), 1.0
     is_stepped = False
     for finding in found:
+        if finding.kind == ARM_ERRORS:
+            by_arms.append(finding)
+            continue
         if is_stepped and finding.kind in _CREEPS:
             # A frame that was moved at once looks as if it crept.
             continue
-        if finding.kind not in _TRIALS or not finding.until_mm:
+        is_held = finding.kind == LENS and finding.mahalanobis_sq
+        if finding.kind not in _TRIALS or not finding.until_mm or is_held:
             yield finding
             continue
         trial = _TRIALS[finding.kind](run, finding.kind)
@@ -66,6 +76,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         # Turns count by what they move at a typical distance.
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
         share = max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0)
+        if trial.is_in_fit and CLEAR_RATIO**2 * left[1] < left[0]:
+            rest = min(rest, 1.0 - share)
         is_proven, instead = bool(finding.mahalanobis_sq) and _proves(run, trial), ""
         if finding.kind in KINDS:
             # The fit here knows of a lens what the one likelihood of all corners found, which is no
@@ -85,6 +97,7 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
             # Without evidence of its own, or where most remains, it stands for what it removes.
             explains=1.0 if finding.mahalanobis_sq and share > 0.5 else share,
         )
+    yield from (replace(finding, explains=rest) for finding in by_arms)
 
 
 def _proves(run: RunState, trial: Trial) -> bool:
@@ -164,8 +177,22 @@ def _of_board(run: RunState, kind: str) -> Trial:
     return _held(run, np.concatenate(columns))
 
 
+def _of_lens(run: RunState, _: str) -> Trial:
+    """Of stated lenses that were refined."""
+    fit, optics = run.assessment.fit, run.assessment.fit.camera_parameters
+    columns, stated = np.zeros(0, int), np.zeros(0)
+    for lens in fit.unknowns.all_of(LENS):
+        scene = optics.problems[lens.name].scene
+        if not scene.estimated:
+            columns = np.append(columns, fit.unknowns.columns(lens))
+            given = intrinsics(scene.camera)[fit.unknowns.values_of(lens)]
+            stated = np.append(stated, given)
+    return _held(run, columns, stated)
+
+
 _TRIALS: Mapping[str, Callable[[RunState, str], Trial]] = {
     **dict.fromkeys(STEPS, _of_step),
     **dict.fromkeys(KINDS, _of_growth),
+    LENS: _of_lens,
     **dict.fromkeys(("board_size", "board_shape"), _of_board),
 }

@@ -207,7 +207,8 @@ def _log_odds(doubt: Finding, misfit_mm: float = 0.0) -> float:
         log_chance = min(np.log(2.0) + float(log_ndtr(-np.sqrt(doubt.mahalanobis_sq))), log_chance)
     log_chance = max(log_chance, np.finfo(float).min)
     log_odds = float(-1.0 - log_chance - np.log(-log_chance))
-    share = min(1.0, doubt.explains, (doubt.up_to_mm / misfit_mm) ** 2) if misfit_mm else 1.0
+    share = doubt.explains if misfit_mm or doubt.kind == ARM_ERRORS else 1.0
+    share = min(share, (doubt.up_to_mm / misfit_mm) ** 2) if misfit_mm else share
     return log_odds if share == 1.0 else float(logit(share * expit(log_odds)))
 
 

@@ -27,6 +27,10 @@ from visioncal.model.effects.links import Links as Links
 from visioncal.model.effects.play import Play as Play
 from visioncal.model.effects.posture import BaseTilts as BaseTilts
 from visioncal.model.effects.posture import BracketBends as BracketBends
+from visioncal.model.effects.posture import Stretches as Stretches
+from visioncal.model.effects.posture import XStretches as XStretches
+from visioncal.model.effects.posture import YStretches as YStretches
+from visioncal.model.effects.posture import ZStretches as ZStretches
 from visioncal.model.effects.rolling import Rolling as Rolling
 from visioncal.model.effects.rolling import RowMotion as RowMotion
 from visioncal.model.effects.springs import Springs as Springs
@@ -40,6 +44,9 @@ from visioncal.model.effects.zeros import Zeros as Zeros
 # From these follow the trial in every cell, the columns of the fit, covariance, budget and finding.
 NAMED: tuple[type[Named], ...] = (
     BaseTilts,
+    XStretches,
+    YStretches,
+    ZStretches,
     BaseCreeps,
     MountCreeps,
     BracketBends,

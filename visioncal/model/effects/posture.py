@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -80,18 +81,18 @@ def twists_of_frames(poses: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class BaseTilts(PostureEffect, Named):
-    """Tilts of the base about its x and y [rad/m], in proportion to the horizontal reach.
+    """Tilts of the base about its x and y [rad/m] with the flange's x, and with its y.
 
-    Its stand, or the floor, gives way.
+    Its stand, or the floor, gives way under the moment of the arm's weight.
     """
 
-    kind, bounds, count, most = "base tilts", (1e-2, 1e-7, 0.1), 2, 5e-3
+    kind, bounds, count, most = "base tilts", (1e-2, 1e-7, 0.1), 4, 5e-3
     do = "Tighten the base's screws, and stiffen what it stands on, or keep to one reach."
 
     @classmethod
     def says(cls, values: FloatArray) -> str:
         """See `Named`."""
-        size = figure(1e3 * float(np.linalg.norm(values)))
+        size = figure(1e3 * float(np.linalg.norm(values.reshape(2, 2), ord=2)))
         return (
             f"The base tilts as the arm reaches out, by {size} mrad for each metre. The result "
             "counts it; the robot's own poses do not."
@@ -99,8 +100,58 @@ class BaseTilts(PostureEffect, Named):
 
     def raw(self, poses: FloatArray) -> FloatArray:
         """See `PostureEffect`."""
-        reach = np.hypot(poses[:, 0, 3], poses[:, 1, 3])
-        return np.asarray(adjoint(invert(poses))[:, :, :2] * reach[:, None, None])
+        turns = adjoint(invert(poses))[:, :, :2]
+        return np.concatenate([turns * poses[:, axis, 3, None, None] for axis in (0, 1)], axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretches(PostureEffect, Named):
+    """The share by which a robot goes farther along an axis of its base than it reports.
+
+    As of a linear axis of another scale than its controller has.
+    """
+
+    bounds, count, most = (1e-2, 1e-6, 0.1), 1, 2e-2
+    axis: ClassVar[int]
+    do = (
+        "Measure a long way along that axis, and correct its scale in the controller; then record "
+        "again."
+    )
+
+    @classmethod
+    def says(cls, values: FloatArray) -> str:
+        """See `Named`."""
+        (share,) = values.tolist()
+        way = "farther" if share > 0.0 else "less far"
+        return (
+            f"The robot goes {figure(100 * abs(share))} % {way} along its base's "
+            f"{'xyz'[cls.axis]} than it reports, as where a linear axis has another scale. The "
+            "result counts it; the robot's own poses do not."
+        )
+
+    def raw(self, poses: FloatArray) -> FloatArray:
+        """See `PostureEffect`."""
+        found = np.zeros((len(poses), 6, 1))
+        found[:, 3:, 0] = poses[:, self.axis, :3] * poses[:, self.axis, 3:]
+        return found
+
+
+class XStretches(Stretches):
+    """Along its base's x."""
+
+    kind, axis = "x stretches", 0
+
+
+class YStretches(Stretches):
+    """Along its base's y."""
+
+    kind, axis = "y stretches", 1
+
+
+class ZStretches(Stretches):
+    """Along its base's z."""
+
+    kind, axis = "z stretches", 2
 
 
 @dataclass(frozen=True, eq=False)
