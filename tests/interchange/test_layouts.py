@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -1485,6 +1486,28 @@ def test_files_of_a_recording_each_that_differ_in_numbers_are_named(tmp_path, is
     read = Session.load(tmp_path / "out")
     found = np.array([view.base_from_flange().as_matrix() for view in read.views])
     np.testing.assert_allclose(found, poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("ending", ["toml", "yaml"])
+def test_a_board_that_a_file_beside_describes_need_not_be_named(tmp_path, ending):
+    poses, _, session = world()
+    table_of(folder_of(tmp_path / "in"))
+    shoot(tmp_path / "in", "color_{:03d}.png")
+    board = target_document(session.target)
+    settings = {
+        "num_X": board["columns"],
+        "num_Y": board["rows"],
+        "len_squares": board["square_m"],
+        "len_markers": board["marker_m"],
+        "markers_dictionary": board["dictionary"],
+    }
+    text = tomli_w.dumps(board) if ending == "toml" else json.dumps(settings)
+    write(tmp_path / f"in/board.{ending}", text)
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", session.mount).good()
+    assert f"The board is that of board.{ending}" in done.err
+    read = Session.load(tmp_path / "out")
+    assert replace(read.target, name="") == replace(session.target, name="")
+    assert len(read.views) == len(poses)
 
 
 def test_a_result_of_one_pose_is_no_recording_beside_rows(tmp_path):

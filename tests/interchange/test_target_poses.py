@@ -137,7 +137,7 @@ def test_corners_of_another_program_are_the_session_s(tmp_path, is_of_opencv):
         done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said)
         done.refused("the corners do not say for which size", "--resolution")
         lacking = visioncal("convert", tmp_path / "in", tmp_path / "out", *said[:2])
-        lacking.refused("has corners, but what target they show is not known", "--target")
+        lacking.refused("there are corners, but what target they show is not known", "--target")
         said += ["--resolution", "640,400"]
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
     assert "Found by the corners" in done.err

@@ -246,8 +246,8 @@ def lacks_target(foreign: ForeignRecording) -> bool:
 def unknown_target(foreign: ForeignRecording, culprit: str, then: str = "") -> DataError:
     """The error of images of which nothing says what they show, and what `then` follows."""
     return DataError(
-        f"{foreign.name} has {'images' if foreign.images else 'corners'}, but what target they "
-        "show is not known.",
+        f"{foreign.name}: there are {'images' if foreign.images else 'corners'}, but what target "
+        "they show is not known.",
         culprits=[culprit],
         next_step=f"Say {_TARGET}{then}",
     )

@@ -79,6 +79,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     is_beside = path.is_file() and requested.target and not requested.images
     images = images_of(path.parent) if is_beside else source.images
     lens, notes = (None, ()) if requested.intrinsics else source.lens()
+    board = (None, ()) if requested.target else source.board()
     found: list[tuple[int, ForeignRecording]] = []
     faults: list[DataError] = []
     readings = proposed(source, requested)
@@ -86,10 +87,11 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     for rank, fields, asked in readings:
         try:
             for more, foreign in _recordings(fields, asked, images, instead):
-                all_notes = (*foreign.notes, *notes, *_arm_note(asked, requested))
-                found.append(
-                    (rank + more, replace(foreign, lens=foreign.lens or lens, notes=all_notes))
-                )
+                target, of_board = board if foreign.images else (None, ())
+                all_notes = (*foreign.notes, *notes, *of_board, *_arm_note(asked, requested))
+                lens_of = foreign.lens or lens
+                whole = replace(foreign, lens=lens_of, target=target, notes=all_notes)
+                found.append((rank + more, whole))
         except DataError as error:
             faults.append(error)
     if not found:

@@ -28,7 +28,11 @@ from visioncal.interchange.formats.fields import (
 )
 from visioncal.interchange.formats.file_search import FileGroup, groups_in
 from visioncal.interchange.formats.foreign import ImportOptions
-from visioncal.interchange.formats.intrinsics import LENS_KEYS, lenses_in
+from visioncal.interchange.formats.intrinsics import (
+    LENS_KEYS,
+    lenses_in,
+    read_target_description,
+)
 from visioncal.interchange.formats.joints import joint_names
 from visioncal.interchange.formats.poses import (
     PoseFields,
@@ -48,6 +52,8 @@ from visioncal.interchange.formats.reading import (
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 
+# Files that describe boards, and the most bytes of one.
+_OF_BOARDS, _MOST_OF_BOARD = (".toml", ".yaml", ".yml"), 10_000
 # Files without poses that are listed one by one.
 _LISTED = 6
 # Readings of one source that are tested, and names of rows that are a robot's.
@@ -90,6 +96,18 @@ class Source:
             return found[place], (f"The intrinsics are those of {place}.",)
         note = f"Several intrinsics are left aside: {some_of([*found])}; --intrinsics names a file."
         return None, (note,) * bool(found)
+
+    def board(self) -> tuple[Mapping[str, Any] | None, tuple[str, ...]]:
+        """The only board that a file beside describes, and where it is from; None without."""
+        found: dict[str, Mapping[str, Any]] = {}
+        for file in (part.group.files[0] for part in self.parts if part.group.is_data):
+            if file.suffix in _OF_BOARDS and file.stat().st_size < _MOST_OF_BOARD:
+                with suppress(DataError):
+                    found[file.name] = read_target_description(str(file))
+        if len(found) != 1:
+            return None, ()
+        name, board = found.popitem()
+        return board, (f"The board is that of {name}; --target says another.",)
 
     def words(self) -> str:
         """The text form: a line a kind of file, and one each for its fields."""
