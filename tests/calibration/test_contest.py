@@ -13,6 +13,7 @@ from support.refusals import raised
 from support.sound_findings import SOUND, changed, directions
 
 import visioncal
+from visioncal.calibration.pipeline.judging import findings_of
 from visioncal.calibration.suspects.judge import judge
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert
@@ -98,10 +99,15 @@ def lifted(cell):
 
 
 def test_a_cause_is_sure_where_its_cure_leaves_noise():
-    cause = calibrated(lifted(simulate(FINE))).verdict.causes[0]
+    known = calibrated(lifted(simulate(FINE)))
+    cause = known.verdict.causes[0]
     assert cause.kind == "moved_at_once"
     assert not cause.by_limit
     assert "Applied and refitted, it leaves noise of" in cause.without_it
+    # Beside another step about as likely, which its sentence names, it is the likeliest.
+    (step,) = known.assessment.steps
+    both = replace(known.assessment, steps=(step, step))
+    assert judge(findings_of(replace(known, assessment_or_none=both))).causes[0].by_limit
 
 
 def test_a_small_step_of_an_arm_without_joints_may_be_its_other_posture():

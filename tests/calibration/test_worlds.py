@@ -103,6 +103,13 @@ def stretched(cell):
     return reporting(cell, base_from_flange=poses)
 
 
+def skewed(cell):
+    """Linear axes that meet at 89.9 deg: y leans towards x."""
+    poses = cell.robot.base_from_flange.copy()
+    poses[:, 0, 3] -= 2e-3 * poses[:, 1, 3]
+    return reporting(cell, base_from_flange=poses)
+
+
 def crept(cell):
     """To where it is at the end."""
     return moved_base(cell, -np.pad((time_of(cell) - 0.5) * CREEP_M, ((0, 0), (3, 0))))
@@ -628,6 +635,7 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
     [
         (tilted, "base_tilts", TILT_RAD_M),
         (stretched, "y_stretches", np.array([3e-3])),
+        (skewed, "axes_skew", np.array([2e-3, 0.0, 0.0])),
         (crept, "base_creeps", np.pad(-CREEP_M, (3, 0))),
         (turned_beside, "base_creeps", None),
         (bent_bracket, "bracket_bends", None),
@@ -653,7 +661,7 @@ def test_what_grows_is_named_recovered_and_in_the_budget(change, kind, true):
     values = fit.values((kind, name)) + known.cell_fit.sizes.steadied_by(kind, name)
     assert np.all(np.abs(values - true) < 4.0 * fit.sigmas((kind, name)))
     # The mean of what follows the posture is a base that stands otherwise.
-    if kind not in ("base_tilts", "y_stretches"):
+    if kind not in ("base_tilts", "y_stretches", "axes_skew"):
         assert np.all(np.abs(error_of(cell, known)) < 4.5 * np.sqrt(np.diag(fit.whole))[:12])
 
 

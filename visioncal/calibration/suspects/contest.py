@@ -87,7 +87,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
             instead = sizes.instead_of(kind)
         if finding.kind in STEPS:
             is_stepped |= is_proven
-            is_proven &= not _may_be_of_arm(run)
+            # Others about as likely are named with it.
+            is_proven &= not _may_be_of_arm(run) and len(run.assessment.steps) == 1
         yield replace(
             finding,
             words=finding.words + instead,

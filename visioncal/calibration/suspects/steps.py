@@ -73,7 +73,7 @@ def _words(step: Step, run: RunState) -> str:
         return (
             f"The offset of {joint} steps: {when}, it reads {'+' if first < 0.0 else '-'}"
             f"{figure(changed_deg)} deg (sigma {figure(sigma_deg)}) from what it read before, as "
-            "where an encoder slipped or a zero was lost"
+            "where an encoder slipped, a zero was lost, or another load bends it"
         )
     # A program whose poses are given may go over to another lens, or another origin.
     source = ", or what measures its poses was set otherwise"

@@ -25,6 +25,7 @@ from visioncal.model.effects.lens_steps import LensChanges as LensChanges
 from visioncal.model.effects.lens_steps import LensSteps as LensSteps
 from visioncal.model.effects.links import Links as Links
 from visioncal.model.effects.play import Play as Play
+from visioncal.model.effects.posture import AxesSkew as AxesSkew
 from visioncal.model.effects.posture import BaseTilts as BaseTilts
 from visioncal.model.effects.posture import BracketBends as BracketBends
 from visioncal.model.effects.posture import Stretches as Stretches
@@ -47,6 +48,7 @@ NAMED: tuple[type[Named], ...] = (
     XStretches,
     YStretches,
     ZStretches,
+    AxesSkew,
     BaseCreeps,
     MountCreeps,
     BracketBends,

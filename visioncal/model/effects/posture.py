@@ -112,7 +112,8 @@ class Stretches(PostureEffect, Named):
     """
 
     bounds, count, most = (1e-2, 1e-6, 0.1), 1, 2e-2
-    axis: ClassVar[int]
+    # Along which axis the flange goes by a share of its place along another, or along the same.
+    shares: ClassVar[tuple[tuple[int, int], ...]]
     do = (
         "Measure a long way along that axis, and correct its scale in the controller; then record "
         "again."
@@ -122,36 +123,57 @@ class Stretches(PostureEffect, Named):
     def says(cls, values: FloatArray) -> str:
         """See `Named`."""
         (share,) = values.tolist()
-        way = "farther" if share > 0.0 else "less far"
+        way, axis = "farther" if share > 0.0 else "less far", "xyz"[cls.shares[0][0]]
         return (
-            f"The robot goes {figure(100 * abs(share))} % {way} along its base's "
-            f"{'xyz'[cls.axis]} than it reports, as where a linear axis has another scale. The "
-            "result counts it; the robot's own poses do not."
+            f"The robot goes {figure(100 * abs(share))} % {way} along its base's {axis} than it "
+            "reports, as where a linear axis has another scale. The result counts it; the robot's "
+            "own poses do not."
         )
 
     def raw(self, poses: FloatArray) -> FloatArray:
         """See `PostureEffect`."""
-        found = np.zeros((len(poses), 6, 1))
-        found[:, 3:, 0] = poses[:, self.axis, :3] * poses[:, self.axis, 3:]
+        found = np.zeros((len(poses), 6, self.count))
+        for column, (axis, by) in enumerate(self.shares):
+            found[:, 3:, column] = poses[:, axis, :3] * poses[:, by, 3:]
         return found
 
 
 class XStretches(Stretches):
     """Along its base's x."""
 
-    kind, axis = "x stretches", 0
+    kind, shares = "x stretches", ((0, 0),)
 
 
 class YStretches(Stretches):
     """Along its base's y."""
 
-    kind, axis = "y stretches", 1
+    kind, shares = "y stretches", ((1, 1),)
 
 
 class ZStretches(Stretches):
     """Along its base's z."""
 
-    kind, axis = "z stretches", 2
+    kind, shares = "z stretches", ((2, 2),)
+
+
+class AxesSkew(Stretches):
+    """Linear axes that are not square to each other."""
+
+    kind, count, shares = "axes skew", 3, ((0, 1), (0, 2), (1, 2))
+    do = "Measure the axes with a square, and correct them in the controller; then record again."
+
+    @classmethod
+    def says(cls, values: FloatArray) -> str:
+        """See `Named`."""
+        angles = 90.0 - np.rad2deg(values)
+        pairs = ("x and y", "x and z", "y and z")
+        meet = ", ".join(
+            f"{pair} meet at {at:.3f} deg" for pair, at in zip(pairs, angles, strict=True)
+        )
+        return (
+            f"The robot's linear axes are not square: {meet}. The result counts it; the robot's "
+            "own poses do not."
+        )
 
 
 @dataclass(frozen=True, eq=False)
