@@ -26,7 +26,8 @@ from visioncal.vision.targets import corner_positions
 
 # An arm without joint angles may look like a step of a frame.
 OTHER_POSTURE = (
-    ", or the arm went over to another posture (shoulder, elbow or wrist) with its errors"
+    ", or the arm went over to another posture (shoulder, elbow or wrist) with its errors, or "
+    "another load bends it"
 )
 
 
