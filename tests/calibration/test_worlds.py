@@ -186,16 +186,33 @@ def creeping(cell):
     return showing(cell, looks)
 
 
+def with_marks(cell, marked):
+    """Looks at a board whose (k, 3) marks are elsewhere, by look and where they are drawn."""
+    points, camera = corner_positions(cell.options.target), cell.options.camera
+    looks = list[Corners]()
+    for at, (seen, pose) in enumerate(zip(cell.corners, cell.cam_from_target, strict=True)):
+        ends = (apply(pose, each[seen.ids]) for each in (marked(at, points), points))
+        there, drawn = (project(camera, end) for end in ends)
+        looks.append(replace(seen, px=seen.px + there - drawn))
+    return showing(cell, looks)
+
+
 def swelling(cell):
     """Paper that grows by 0.2 % about its first corner, until the end."""
-    points, camera = corner_positions(cell.options.target), cell.options.camera
     shares = 2e-3 * np.linspace(-1.0, 0.0, len(cell.corners))
-    looks = list[Corners]()
-    for seen, pose, share in zip(cell.corners, cell.cam_from_target, shares, strict=True):
-        marks = points[seen.ids]
-        smaller = project(camera, apply(pose, (1.0 + share) * marks))
-        looks.append(replace(seen, px=seen.px + smaller - project(camera, apply(pose, marks))))
-    return showing(cell, looks)
+    return with_marks(cell, lambda at, points: (1.0 + shares[at]) * points)
+
+
+def sagging(cell):
+    """A board on a flange whose ends along x hang by 0.5 mm below its middle where it is level."""
+    normals = cell.robot.base_from_flange[:, 2, :3] @ cell.transforms["flange_from_target"][:3, 2]
+
+    def marked(at, points):
+        x = points[:, 0] - np.mean(points[:, 0])
+        down = -5e-4 * normals[at] * (x / np.max(np.abs(x))) ** 2
+        return points + np.outer(down, [0.0, 0.0, 1.0])
+
+    return with_marks(cell, marked)
 
 
 def on_the_way(cell):
@@ -488,6 +505,14 @@ WORLDS: dict[str, World] = {
         words=(r"The board grew by (\S+) % during the session",),
         figure=(0.2, 0.03),
         never=frozenset({"wrong_views", "arm_errors", "lens_grows", "window"}),
+    ),
+    "board that sags on the flange": World(
+        replace(FINE, mount="eye-to-hand", views=24, state_intrinsics=False),
+        sagging,
+        causes=("board_sags",),
+        words=(r"otherwise than upright, by (\S+) mm between",),
+        figure=(0.5, 0.1),
+        never=frozenset({"wrong_views", "row_motion", "focus", "lens_field", "arm_errors"}),
     ),
     # Poses that are not those of the images.
     "poses read on the way": World(

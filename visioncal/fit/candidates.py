@@ -29,6 +29,7 @@ from visioncal.model.effects import (
     SIGNIFICANT,
     BaseCreeps,
     BaseSteps,
+    BoardSags,
     BoardSwells,
     Breathing,
     Effect,
@@ -47,6 +48,7 @@ from visioncal.model.effects import (
     Weight,
     Window,
 )
+from visioncal.vision.targets import corner_positions
 
 # Log-likelihood ratio by which a rival is as good as ruled out.
 _RULED_OUT = float(np.log(CheckLimits.ruled_out))
@@ -167,10 +169,21 @@ def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
                 member = starting_at(random_effect(effect), size, _SHOWN * size)
                 yield Candidate(gain, member, effect)
         opened_there = {known.name for known in fit.unknowns.effects}
-        for tried in (Window.tried(camera), (BoardSwells(camera),)):
+        displacements = (Window.tried(camera), (BoardSwells(camera),), *_sags(fit, pairs, camera))
+        for tried in displacements:
             if tried[0].name not in opened_there and images_of(pairs, camera):
                 best, size, gain = best_displacement(fit, pairs, tried)
                 yield Candidate(gain, starting_at(random_effect(best), size), best)
+
+
+def _sags(fit: Fit, pairs: Sequence[Pair], camera: str) -> Iterator[tuple[BoardSags, ...]]:
+    """Those of the only board that a camera sees, where a flange carries it."""
+    boards = {pair.names[1] for pair in images_of(pairs, camera)}
+    for board in boards if len(boards) == 1 else ():
+        flange, edges = fit.cell.tree.branches[board].parent, fit.linearised.values
+        if flange in fit.cell.arms and ("edge", board) in edges:
+            points = corner_positions(fit.cell.boards[board])
+            yield BoardSags.tried(camera, flange, edges["edge", board][:3, 2], points)
 
 
 def of_distances(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:

@@ -474,7 +474,7 @@ def corner_rows(
             by_own = columns["effect", effect.name] = effect.shifts(pair.px)
         if isinstance(effect, Displacement):
             seen_at = apply_each(own, points)
-            by_own = found.jacobian_point @ effect.moved(seen_at, own[:, :3, 3])
+            by_own = found.jacobian_point @ effect.moved(seen_at, own)
             columns["effect", effect.name] = by_own
         columns_of = effect.columns(pair.moments, pair.distances(poses))
         moved = columns_of @ state.values["effect", effect.name]

@@ -237,10 +237,10 @@ def best_displacement(
     for gram, pair, rows in _of_images(fit, images_of(pairs, camera)):
         kept = fit.used[gram.rows]
         shape = pair.basis[pair.ids] @ fit.linearised.values["shape", pair.names[1]]
-        points = apply_each(gram.poses[pair.owner], pair.points[pair.ids] + shape)
+        poses = gram.poses[pair.owner]
+        points = apply_each(poses, pair.points[pair.ids] + shape)
         slopes = project_with_jacobian(lens, points).jacobian_point
-        origins = gram.poses[pair.owner, :3, 3]
-        moved = np.stack([one.moved(points, origins)[:, :, 0] for one in tried], axis=2)
+        moved = np.stack([one.moved(points, poses)[:, :, 0] for one in tried], axis=2)
         shares = tried[0].columns(gram.moments, gram.distances)[pair.owner, 0, 0] * pair.weights
         each = slopes @ moved * shares[:, None, None]
         by_field = np.stack([np.kron(axis, rows.functions) for axis in np.eye(2)], axis=1)

@@ -147,8 +147,8 @@ class CellFit:
             marks = np.concatenate([corner_positions(target) for target in scene.targets])
             for view in views[frame]:
                 if view.corners is not None:
-                    points = np.vstack([np.zeros(3), marks[view.corners.ids]])
-                    shown = scene.camera, apply(view.cam_from_target[0], points)
+                    pose = view.cam_from_target[0]
+                    shown = scene.camera, pose, apply(pose, marks[view.corners.ids])
                     station = stop_of.get(view.view, -1)
                     corners[view.view] = sizes.steadied(frame, station, view.corners, shown)
             problem, levels = CornerProblem.of(scene, corners, shares), sizes.levels.get(frame)

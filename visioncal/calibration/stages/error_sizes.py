@@ -35,6 +35,7 @@ _INSTEAD = {
     "lens changes": "the lens was exchanged, or its pictures rectified",
     "lens steps": "the lens changed at once",
     "row motion": "the camera moved while rows of its images were read",
+    "board sags": "the board bends with its weight",
     "board swells": "the board grew or shrank",
     "window": "it was seen through a tilted pane of glass",
 }
@@ -90,7 +91,11 @@ class ErrorSizes:
     holds_scales: bool = False
 
     def steadied(
-        self, camera: str, station: int, corners: Corners, shown: tuple[Camera, FloatArray]
+        self,
+        camera: str,
+        station: int,
+        corners: Corners,
+        shown: tuple[Camera, FloatArray, FloatArray],
     ) -> Corners:
         """Corners of an image by a lens that neither grows nor sags, without displacements.
 
@@ -98,13 +103,12 @@ class ErrorSizes:
             camera: The camera's frame.
             station: Where the robot stood; -1 where that is not known.
             corners: The corners.
-            shown: About the lens, and (n + 1, 3) where it sees the board's origin and them [m].
+            shown: About the lens, (4, 4) where it sees the board, and (n, 3) where them [m].
         """
-        px, (lens_now, (origin, *_)) = corners.px, shown
-        seen = shown[1][1:]
+        px, (lens_now, pose, seen) = corners.px, shown
         for at in self.displaced:
             if at.effect.frame == camera:
-                moved = at.effect.moved(seen, origin) @ (at.columns[station] @ at.values)
+                moved = at.effect.moved(seen, pose) @ (at.columns[station] @ at.values)
                 px = px + project(lens_now, seen) - project(lens_now, seen + moved)
         for found in self.grown:
             if found.effect.frame == camera and 0 <= station < len(found.columns):

@@ -21,10 +21,12 @@ from visioncal.estimation.fit import Fit
 from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.estimation.joint import moved_mahalanobis_sq
 from visioncal.estimation.scene import ONLY_CAMERA
+from visioncal.model.effects.board_sags import BoardSags
 from visioncal.model.effects.effect import SIGNIFICANT
 from visioncal.model.effects.window import Window, nearer
 from visioncal.results.compare import intrinsics_names
 from visioncal.vision.camera import intrinsics, normalise, project, with_intrinsics
+from visioncal.vision.targets import corner_positions
 
 # Changes of intrinsics or corners below this show in no image, and in no pick [px].
 _LEAST_MOVE_PX = 0.1
@@ -271,9 +273,12 @@ def _seen_through(run: RunState) -> Iterator[Finding]:
     sizes = run.cell_fit.sizes
     for found in sizes.displaced:
         camera, effect = found.effect.frame, found.effect
-        finding = (
-            _pane(effect, found.values) if isinstance(effect, Window) else _swelling(found.values)
-        )
+        if isinstance(effect, Window):
+            finding = _pane(effect, found.values)
+        elif isinstance(effect, BoardSags):
+            finding = _sagging(run, effect, found.values)
+        else:
+            finding = _swelling(found.values)
         words = f"{finding.words}{sizes.instead_of(effect.kind)}"
         finding = replace(finding, words=words, mahalanobis_sq=found.gain)
         yield finding.of("" if camera == ONLY_CAMERA else camera)
@@ -286,6 +291,23 @@ def _swelling(values: FloatArray) -> Finding:
         f"The board {'grew' if percent > 0.0 else 'shrank'} by {figure(abs(percent))} % "
         "during the session, as paper in the damp. The result is that of its size at the end.",
         Remedy("Print it on aluminium or glass, or let it lie in the room for a day."),
+    )
+
+
+def _sagging(run: RunState, sags: BoardSags, values: FloatArray) -> Finding:
+    points = np.vstack([corner_positions(board) for board in run.session.boards.values()])
+    bent, plane = sags.bent(points) @ values, np.column_stack([np.ones(len(points)), points[:, :2]])
+    bow = bent - plane @ np.linalg.lstsq(plane, bent, rcond=None)[0]
+    return Finding(
+        "board_sags",
+        "The board bends with its weight as the robot turns it: level it is bowed otherwise than "
+        f"upright, by {figure(1e3 * float(np.ptp(bow)))} mm between its highest and its lowest "
+        "corner. It was taken out of the corners, and the result is that of the board as it is "
+        "upright.",
+        Remedy(
+            "Glue the board to a stiff plate (aluminium or glass of 5 mm or more), or lay it down "
+            "and put the camera on the flange; or hold it upright in all views."
+        ),
     )
 
 
@@ -403,4 +425,5 @@ SHIFTED = Suspect(
 MOTION = Suspect("row_motion", _moving, 1e-4, True)
 WINDOW = Suspect("window", _seen_through, 1e-4, True)
 SWELLS = Suspect("board_swells", None, 1e-4, True)
+SAGS = Suspect("board_sags", None, 1e-4, True)
 MODEL = Suspect("lens_model", None, 1e-4, True, hides=("lens_field", "focus"))

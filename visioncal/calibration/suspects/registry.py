@@ -87,6 +87,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     lens.MOTION,
     lens.WINDOW,
     lens.SWELLS,
+    lens.SAGS,
     lens.MODEL,
     Suspect("prior", _contradicted, 2.7e-3),
     lens.LENS,

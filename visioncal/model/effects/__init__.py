@@ -3,6 +3,7 @@
 Those that a finding names are in `NAMED`, too.
 """
 
+from visioncal.model.effects.board_sags import BoardSags as BoardSags
 from visioncal.model.effects.breathing import Breathing as Breathing
 from visioncal.model.effects.clock import Clock as Clock
 from visioncal.model.effects.creep import BaseCreeps as BaseCreeps

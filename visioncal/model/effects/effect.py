@@ -139,12 +139,12 @@ class Displacement(Effect):
     is_positive: ClassVar = False  # Whether its first value cannot be negative.
 
     @abstractmethod
-    def moved(self, points: FloatArray, origins: FloatArray) -> FloatArray:
+    def moved(self, points: FloatArray, poses: FloatArray) -> FloatArray:
         """Displacements (n, 3, c) of points in the camera's frame by as many values [m].
 
         Args:
             points: (n, 3) corners [m].
-            origins: (n, 3) or (3,) origins of their boards [m].
+            poses: (n, 4, 4) or (4, 4) `cam_from_board` of their boards.
         """
 
 

@@ -28,9 +28,9 @@ class BoardSwells(Displacement):
         """See `Effect`."""
         return replace(super().size, limit=_RARER)
 
-    def moved(self, points: FloatArray, origins: FloatArray) -> FloatArray:
+    def moved(self, points: FloatArray, poses: FloatArray) -> FloatArray:
         """See `Displacement`."""
-        return np.asarray((origins - points)[:, :, None])
+        return np.asarray((poses[..., :3, 3] - points)[:, :, None])
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`: (k, 1, 1) shares of the growth that are still to come."""

@@ -49,9 +49,9 @@ class Window(Displacement):
         normal = self._normals()[0] + values[1:] @ self._tangents() / values[0]
         return float(values[0]), normal / np.linalg.norm(normal)
 
-    def moved(self, points: FloatArray, origins: FloatArray) -> FloatArray:
+    def moved(self, points: FloatArray, poses: FloatArray) -> FloatArray:
         """See `Displacement`."""
-        del origins
+        del poses
         axis = np.array([[0.0, 0.0, 1.0]])
         still, *turned = (
             nearer(axis, normal) - nearer(points, normal) for normal in self._normals()

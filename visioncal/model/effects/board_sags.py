@@ -1,0 +1,50 @@
+"""A board on a flange that bends with its weight, by the attitude in which it is held."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.types import FloatArray
+from visioncal.model.arm import Moments
+from visioncal.model.effects.effect import Displacement
+
+
+@dataclass(frozen=True, eq=False)
+class BoardSags(Displacement):
+    """Curvatures of a board that gravity pulls along its normal: along a line, across, twist [1/m].
+
+    A thin plate bends in proportion to the load across it. It is taken to be held at its middle;
+    held elsewhere, its pose gives way, too, as that of any load on a bracket.
+    """
+
+    kind, bounds, count = "board sags", (0.1, 1e-6, 2.0), 3
+    flange: str
+    normal: tuple[float, float, float]  # Of the board, in the flange's frame.
+    middle: tuple[float, float]  # Of the board, in its plane [m].
+    along: float  # The line's angle from the board's x [rad].
+
+    @classmethod
+    def tried(
+        cls, camera: str, flange: str, normal: FloatArray, points: FloatArray
+    ) -> "tuple[BoardSags, ...]":
+        """Those of some lines, of a board with (n, 3) points."""
+        (x, y, z), (u, v, _) = normal.tolist(), points.mean(axis=0).tolist()
+        return tuple(cls(camera, flange, (x, y, z), (u, v), at * np.pi / 4.0) for at in range(4))
+
+    def moved(self, points: FloatArray, poses: FloatArray) -> FloatArray:
+        """See `Displacement`."""
+        turns, origins = poses[..., :3, :3], poses[..., :3, 3]
+        on_board = (np.swapaxes(turns, -1, -2) @ (points - origins)[:, :, None])[:, :, 0]
+        return np.asarray(turns[..., 2, None] * self.bent(on_board)[:, None, :])
+
+    def bent(self, on_board: FloatArray) -> FloatArray:
+        """(n, 3) heights of (n, 3) points of the board by each curvature of one [m]."""
+        cosine, sine = np.cos(self.along), np.sin(self.along)
+        u, v = np.array([[cosine, sine], [-sine, cosine]]) @ (on_board[:, :2] - self.middle).T
+        return np.stack([0.5 * u**2, 0.5 * v**2, u * v], axis=1)
+
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """See `Effect`: (k, 3, 3) shares of gravity along the normal; none where it is unknown."""
+        del distances
+        down = -moments.poses[self.flange][:, 2, :3] @ np.array(self.normal)
+        return np.asarray(np.nan_to_num(down)[:, None, None] * np.eye(3))
