@@ -58,6 +58,8 @@ _STEPS, _ZOOMS = 12, 60
 # between their first row and their last [px]: below, other errors of images look so; and its size
 # at most, over that which each image shows by itself.
 _MOVING, _LEAST_PX, _SHOWN = 120, 0.1, 3.0
+# Corners of a board that bends with its weight, at least: a tag is too small, and says too little.
+_BENDING = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +183,8 @@ def _sags(fit: Fit, pairs: Sequence[Pair], camera: str) -> Iterator[tuple[BoardS
     boards = {pair.names[1] for pair in images_of(pairs, camera)}
     for board in boards if len(boards) == 1 else ():
         flange, edges = fit.cell.tree.branches[board].parent, fit.linearised.values
-        if flange in fit.cell.arms and ("edge", board) in edges:
-            points = corner_positions(fit.cell.boards[board])
+        points = corner_positions(fit.cell.boards[board])
+        if flange in fit.cell.arms and ("edge", board) in edges and len(points) >= _BENDING:
             yield BoardSags.tried(camera, flange, edges["edge", board][:3, 2], points)
 
 
