@@ -110,6 +110,13 @@ def skewed(cell):
     return reporting(cell, base_from_flange=poses)
 
 
+def grown(cell):
+    """An arm that warms up, to its length at the end: it is 0.1 % shorter at the start."""
+    poses = cell.robot.base_from_flange.copy()
+    poses[:, :3, 3] *= 1.0 + 1e-3 * (0.5 - time_of(cell))
+    return reporting(cell, base_from_flange=poses)
+
+
 def crept(cell):
     """To where it is at the end."""
     return moved_base(cell, -np.pad((time_of(cell) - 0.5) * CREEP_M, ((0, 0), (3, 0))))
@@ -661,6 +668,7 @@ def test_what_a_world_does_is_named_and_its_sigmas_hold(name):
         (tilted, "base_tilts", TILT_RAD_M),
         (stretched, "y_stretches", np.array([3e-3])),
         (skewed, "axes_skew", np.array([2e-3, 0.0, 0.0])),
+        (grown, "arm_grows", np.array([1e-3])),
         (crept, "base_creeps", np.pad(-CREEP_M, (3, 0))),
         (turned_beside, "base_creeps", None),
         (bent_bracket, "bracket_bends", None),

@@ -32,13 +32,13 @@ from visioncal.model.effects import (
     BoardSags,
     BoardSwells,
     Breathing,
+    Creeps,
     Effect,
     FocusJitter,
     FrameCreeps,
     Heat,
     LensChanges,
     LensSteps,
-    MountCreeps,
     MountSteps,
     Play,
     RowMotion,
@@ -247,7 +247,7 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
         # one that differs from stop to stop does not last.
         lasting = [one[0] for one in found if one[0].typical is one[0]]
         clear = [one[0] for one in found if one[0] in lasting and 4.0 * one[2] >= SIGNIFICANT]
-        if any(isinstance(one, BaseCreeps | MountCreeps) for one in clear):
+        if any(isinstance(one, Creeps) for one in clear):
             creeps = [(one[2], one[0].about_m) for one in found if isinstance(one[0], BaseCreeps)]
             _, place = max(creeps, default=(0.0, ()))
             clear += [one for one in steps(fit, flange, place) if one.name not in known]

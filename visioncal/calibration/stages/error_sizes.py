@@ -24,6 +24,7 @@ from visioncal.vision.targets import corner_positions, first_corners
 
 # Effects in words.
 _INSTEAD = {
+    "arm grows": "the arm warmed up or cooled",
     "base creeps": "the base, or what stands in it, crept",
     "mount creeps": "what the flange carries crept",
     "frame creeps": "a camera or target crept",

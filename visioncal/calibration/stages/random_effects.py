@@ -29,9 +29,9 @@ from visioncal.model import Moments
 from visioncal.model.arm import even_progress
 from visioncal.model.effects import (
     NAMED,
-    BaseCreeps,
     BaseSteps,
     BaseTilts,
+    Creeps,
     MountCreeps,
     MountSteps,
     Named,
@@ -93,14 +93,14 @@ def random_effects(
             or any(isinstance(at, kind) for at in opened)
         ]
         if any(isinstance(at, SightSteps) for at in sizes.opened):
-            kinds = [kind for kind in kinds if not issubclass(kind, BaseCreeps | MountCreeps)]
+            kinds = [kind for kind in kinds if not issubclass(kind, Creeps)]
         creeps = [at for at in opened if not isinstance(at, BaseSteps | MountSteps)]
         tried = _of_flange(problem, robot, stops, kinds, creeps)
         chosen, value = _with_sizes(inliers, tried, nuisance)
         step = next((at for at in opened if isinstance(at, BaseSteps | MountSteps)), None)
         if step is not None:
             # A frame that moved at once looks as if it crept; the search for steps comes later.
-            kinds = [kind for kind in kinds if not issubclass(kind, BaseCreeps | MountCreeps)]
+            kinds = [kind for kind in kinds if not issubclass(kind, Creeps)]
             others = _of_flange(problem, robot, stops, kinds, [step])
             instead, least = _with_sizes(inliers, others, nuisance)
             if value - least > _BY_CHANCE:

@@ -88,7 +88,7 @@ def _words(step: Step, run: RunState) -> str:
     if step.kind == DRIFT:
         return (
             "Residuals drift with time: from the first stop to the last, base or target moved by "
-            f"{moved}"
+            f"{moved}, or the arm grew as it warmed up"
         )
     mount, far_mm = run.mount, pose_difference(np.eye(4), exp(step.value))[0]
     on_flange = (mount == "eye-in-hand") == step.of.startswith("cam")

@@ -6,8 +6,10 @@ Those that a finding names are in `NAMED`, too.
 from visioncal.model.effects.board_sags import BoardSags as BoardSags
 from visioncal.model.effects.breathing import Breathing as Breathing
 from visioncal.model.effects.clock import Clock as Clock
+from visioncal.model.effects.creep import ArmGrows as ArmGrows
 from visioncal.model.effects.creep import BaseCreeps as BaseCreeps
 from visioncal.model.effects.creep import BaseSteps as BaseSteps
+from visioncal.model.effects.creep import Creeps as Creeps
 from visioncal.model.effects.creep import FrameCreeps as FrameCreeps
 from visioncal.model.effects.creep import MountCreeps as MountCreeps
 from visioncal.model.effects.creep import MountSteps as MountSteps
@@ -52,6 +54,7 @@ NAMED: tuple[type[Named], ...] = (
     AxesSkew,
     BaseCreeps,
     MountCreeps,
+    ArmGrows,
     BracketBends,
     LensGrows,
     LensSags,

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from visioncal.core.number_format import mm_and_deg
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
@@ -65,7 +65,7 @@ class _OfMount(_Moves):
 
 
 @dataclass(frozen=True, eq=False)
-class _Creep(_Moves, Named):
+class Creeps(_Moves, Named):
     """Motion all over the session."""
 
     most = 3e-3
@@ -91,7 +91,7 @@ class _Creep(_Moves, Named):
 
 
 @dataclass(frozen=True, eq=False)
-class BaseCreeps(_Creep, _OfBase):
+class BaseCreeps(Creeps, _OfBase):
     """A base, or what stands in it, that creeps."""
 
     kind, what = "base creeps", "The base, or what stands in it,"
@@ -108,7 +108,7 @@ class BaseCreeps(_Creep, _OfBase):
 
 
 @dataclass(frozen=True, eq=False)
-class MountCreeps(_Creep, _OfMount):
+class MountCreeps(Creeps, _OfMount):
     """Creep of all that the flange carries."""
 
     kind, what = "mount creeps", "The load on the flange"
@@ -116,7 +116,31 @@ class MountCreeps(_Creep, _OfMount):
 
 
 @dataclass(frozen=True, eq=False)
-class FrameCreeps(_Creep, _OfMount):
+class ArmGrows(Creeps):
+    """Share by which the flange is farther from the base's origin, of an arm that warms up."""
+
+    kind, what, bounds, count = "arm grows", "The arm", (1e-3, 1e-7, 0.02), 1
+    do = "Let the arm warm up at its work for half an hour, and record again."
+
+    @classmethod
+    def says(cls, values: FloatArray) -> str:
+        """See `Named`."""
+        way, percent = "grew" if values[0] > 0.0 else "shrank", figure(100.0 * abs(values[0]))
+        return (
+            f"The arm {way} by {percent} % of its length during the session, as one that warms up "
+            "or cools. The result is that of its end."
+        )
+
+    def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
+        """See `Effect`."""
+        del distances
+        out = np.zeros((len(moments), 6, 1))
+        out[:, 3:, 0] = -invert(moments.poses[self.frame])[:, :3, 3]
+        return np.asarray(-out * self.left(moments))
+
+
+@dataclass(frozen=True, eq=False)
+class FrameCreeps(Creeps, _OfMount):
     """Creep of one of several cameras or targets that share a base or a flange."""
 
     kind, what = "frame creeps", "A camera or target"
