@@ -22,7 +22,7 @@ from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalEr
 from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
-from visioncal.core.verdict import Finding, Remedy
+from visioncal.core.verdict import Finding, mending
 from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
@@ -35,6 +35,13 @@ T = TypeVar("T", bound=Observed)
 # Stated intrinsics belong to another camera where estimated ones fit clearly better, and either
 # a focal length differs by more than any focusing [share] or the stated ones fit badly.
 _OTHER_FOCAL = 0.1
+# Shares by which matrices of one lens differ, for images of two sizes.
+_SAME_RATIO = 0.03
+NEW_LENS = mending(
+    "the lens is estimated from these views (or calibrate the camera anew, and state its matrix "
+    "and distortion)",
+    "--intrinsics estimate",
+)
 # Travel during an exposure from which on it matters when the robot's pose was read [m].
 _TRAVEL_M = 2e-4
 
@@ -284,12 +291,13 @@ def _other_lens(
         f"estimated of these images by {figure(poses.sigma_px)} px. The estimated one was taken: "
         f"fx, fy, cx, cy = {', '.join(f'{value:.1f}' for value in lens.camera.matrix)} px."
     )
-    do = (
-        "In session.toml, delete matrix and distortion, or give those of this camera: matrix is "
-        "fx, fy, cx, cy in pixels."
-    )
+    ratios = stated.matrix / lens.camera.matrix
+    if np.ptp(ratios) < _SAME_RATIO * ratios.mean():
+        width, height = (round(ratios.mean() * side, -1) for side in look.resolution)
+        words += f" Those stated are all {figure(ratios.mean())} times as large, as of images of "
+        words += f"about {width:.0f} x {height:.0f} px."
     result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
-    return result, poses, Finding("other_lens", words, Remedy(do))
+    return result, poses, Finding("other_lens", words, NEW_LENS)
 
 
 @contextmanager

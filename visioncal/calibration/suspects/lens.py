@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.cameras import NEW_LENS
 from visioncal.calibration.stages.error_sizes import Zoom
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
 from visioncal.core.errors import VisioncalError
@@ -15,7 +16,7 @@ from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray
-from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy, mending
+from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation import unknowns
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.intrinsics import estimate_intrinsics
@@ -43,11 +44,6 @@ _LONE = ("gridboard", "marker")
 # it is the lens, however small both are: where corners end, the models part by far more.
 _BETTER, _FAR_BETTER = 1.1, 2.0
 _ONE_LENS = "Keep one lens, and one setting of the driver that rectifies pictures"
-_NEW_LENS = mending(
-    "the lens is estimated from these views (or calibrate the camera anew, and state its matrix "
-    "and distortion)",
-    "--intrinsics estimate",
-)
 
 
 _FREE_LENS = Remedy(
@@ -113,7 +109,7 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
         if is_wrong and moved_px > _LEAST_MOVE_PX:
             words = f"The given intrinsics do not fit these images and were refined: {moved}"
             words += _misread(stated, refined, stack.px, moved_px)
-            yield Finding("lens", words, _NEW_LENS)
+            yield Finding("lens", words, NEW_LENS)
         else:
             allowed = "within what is stated, or no more than images or a board's size explain"
             yield Finding(NOTE, f"The given intrinsics were refined {allowed}: {moved}")
