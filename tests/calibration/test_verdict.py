@@ -388,6 +388,16 @@ def test_a_step_by_a_few_times_the_noise_is_named_though_a_view_agrees_by_chance
     assert cause.do.command.endswith("--views 10-19")
 
 
+def test_a_row_that_was_not_filled_in_is_said_to_be() -> None:
+    cell = simulate(CellOptions(views=20))
+    flange = cell.robot.base_from_flange.copy()
+    flange[7] = np.eye(4)
+    result = calibrate(session_of(cell, flange))
+    (view,) = (view for view in result.views if not view.used)
+    assert view.view == 7
+    assert "the robot's pose in its row is all zeros" in view.reason
+
+
 def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:
     cell, rng = simulate(CellOptions(views=20)), np.random.default_rng(1)
     flange = cell.robot.base_from_flange.copy()

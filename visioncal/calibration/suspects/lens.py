@@ -35,6 +35,8 @@ _LEAST_MOVE_PX = 0.1
 _SHIFTED_PX = 3.0
 # Share of the focal length by which no zoom creeps unseen: a board that curls looks so.
 _MOST_CREEP = 0.03
+# Share of the focal length by which distortion that changed alone may seem to change it, too.
+_ALONE = 3e-3
 # A part of a picture begins farther from its corner than any centre is wrong [px]; what is left of
 # the move where stated intrinsics were misread.
 _CROPPED_PX, _EXPLAINED = 10.0, 0.1
@@ -338,8 +340,11 @@ def _zoomed(run: RunState, of: str, zoom: Zoom, gain: float) -> Finding:
         words = f"{of} changed at once, as where it was zoomed, refocused or hit: {first}, "
         words += f"its focal length is {share}."
         if zoom.kind == "lens changes":
-            words = f"{of} changed at once: {first}, its distortion is another one, as where "
-            words += "pictures are rectified in one part alone, or another lens was put on."
+            is_longer = abs(zoom.share) > _ALONE
+            words = f"{of} changed at once: {first}, its distortion is another one"
+            words += f" and its focal length {share}" * is_longer
+            words += f", as where {'it was zoomed or refocused, ' * is_longer}pictures are "
+            words += "rectified in one part alone, or another lens was put on."
             do = cell.or_separately(_ONE_LENS, zoom.station)
         elif np.hypot(*zoom.shift_px) > _SHIFTED_PX and not instead:
             return _shifted(of, zoom, f"{first}, ", do, gain)

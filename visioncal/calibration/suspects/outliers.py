@@ -388,8 +388,10 @@ def _cause(
             f"it fits stop {stops[other.station]}, and view {other.view} fits stop "
             f"{stops[own.station]}: these two rows are exchanged"
         )
-    cause = _WRONG
-    of_stop = cell_fit.inlier_fit.problem.observations.stops
+    cause, problem = _WRONG, cell_fit.inlier_fit.problem
+    of_stop = problem.observations.stops
+    if any(np.array_equal(poses[of_stop[at]], np.eye(4)) for poses in problem.poses.values()):
+        return "the robot's pose in its row is all zeros, as of a row that was not filled in"
     mates = np.flatnonzero((of_stop == of_stop[at]) & cell_fit.inlier_fit.used)
     if len(mates):
         cause = f"view {rows[mates[0]].view} of the same stop agrees: its reading is wrong"

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 
 from visioncal.calibration.guess.fit import CLOSING_SCORE
@@ -23,6 +22,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import estimate_lenses, locate_targets
 from visioncal.calibration.stages.clocks import waits_for_clock
 from visioncal.calibration.suspects.record import LEAST, Edges, Record, evidence
+from visioncal.core.conventions import ROTATION_FORMS
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
 from visioncal.core.number_format import counted, ranges, some_of, view_words
@@ -379,13 +379,13 @@ def _mixed_angles(record: Record, own: IntArray, base: float) -> Iterator[Undoin
     wrong = angles < np.deg2rad(np.pi * np.sqrt(3.0))
     if not wrong.any() or wrong[own].all():
         return
-    read = Rotation.from_matrix(flanges[wrong, :3, :3])
     turned = flanges.copy()
-    for order in ("", "ZYX", "xyz", "ZYZ", "XYZ"):
-        right = Rotation.from_rotvec(np.rad2deg(read.as_rotvec()))
-        if order:
-            right = Rotation.from_euler(order, np.rad2deg(read.as_euler(order)))
-        turned[wrong, :3, :3] = right.as_matrix()
+    for form in (
+        "rotation-vector",
+        *(f"euler-{each}-rad" for each in ("ZYX", "xyz", "ZYZ", "XYZ")),
+    ):
+        numbers = ROTATION_FORMS[f"{form.removesuffix('-rad')}-deg"].write(flanges[wrong, :3, :3])
+        turned[wrong, :3, :3] = ROTATION_FORMS[form].read(numbers)
         log = _of_changed(record, own, wrong, turned)
         if log is None:
             continue
