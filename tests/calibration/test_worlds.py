@@ -373,6 +373,14 @@ WORLDS: dict[str, World] = {
         never=frozenset({"moved_slowly", "weak_motion", "place", "calibration"}),
         of=NONE,
     ),
+    "lifted in the last views": World(
+        replace(FINE, views=30),
+        lambda cell: moved_base(cell, (time_of(cell) > 0.3) * 1e-3 * np.eye(6)[5]),
+        joints=True,
+        causes=("something_moved",),
+        words=("from view 24 on, the target.* or another load bends the arm",),
+        of=NONE,
+    ),
     "stops err in groups": World(
         replace(FINE, views=30), in_groups, seed=1, words=("last from stop to stop",), slack=2.0
     ),

@@ -186,7 +186,10 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         later = [rows[row].view for row in np.sort(order[at:]).tolist()]
         when = f"{'before' if run is before else 'from'} view {rows[int(order[at])].view}"
         when += " on" * (run is after)
-        do = or_alone(f"{words}; or calibrate the {len(later)} views from there on alone.", later)
+        words += f"; or calibrate the {len(later)} views from there on alone"
+        if pose_difference(np.eye(4), change[1])[0] > _ARM_ERRS[0]:
+            words += ": their result is for the tool and the base frame that were active there"
+        do = or_alone(f"{words}.", later)
     else:
         # Views here and there, as of every second row.
         run, when = order[~is_used], "in all of these"
@@ -200,6 +203,8 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
     outliers = np.sort(run).tolist()
     if cell_fit.may_be_of_arms(change[1]):
         how += OTHER_POSTURE
+    elif change[0] and np.less(pose_difference(np.eye(4), change[1]), _ARM_ERRS).all():
+        how += ", or another load bends the arm"
     words = f"{{views}} were left out: {when}, {what} was another one{how}."
     yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
 
