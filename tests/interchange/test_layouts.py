@@ -1622,7 +1622,7 @@ def test_a_board_of_other_counts_is_named_before_the_form_is_asked_for(tmp_path)
     assert "Euler angles" in done.good().err
 
 
-@pytest.mark.parametrize("others", [(), ("second.urdf",), ("renamed",)])
+@pytest.mark.parametrize("others", [(), ("second.urdf",), ("renamed",), ("broken",), ("linked",)])
 def test_the_only_urdf_beside_a_table_gives_its_arm_by_the_names_of_its_joints(tmp_path, others):
     arm, names = (
         of_urdf(),
@@ -1635,7 +1635,10 @@ def test_the_only_urdf_beside_a_table_gives_its_arm_by_the_names_of_its_joints(t
     lines = [",".join(map(repr, row)) for row in rows.tolist()]
     write(tmp_path / "in/log.csv", "\n".join([",".join([*header, *names]), *lines]))
     for name in ("arm.urdf", *(name for name in others if name.endswith(".urdf"))):
-        write(tmp_path / "in" / name, URDF)
+        write(tmp_path / "in" / name, URDF.partition("<joint")[0] if "broken" in others else URDF)
+    if "linked" in others:
+        (tmp_path / "in/arm.urdf").rename(tmp_path / "arm.urdf")
+        (tmp_path / "in/arm.urdf").symlink_to(tmp_path / "arm.urdf")
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
     if others:
         done.refused("Which of these are the robot's poses is not known")

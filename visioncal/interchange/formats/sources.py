@@ -304,10 +304,13 @@ def _of_urdf(fields: Fields, requested: ImportOptions) -> ImportOptions:
 
     The angles are of the link at its end, unless it has a flange or the user names a tip.
     """
-    files = sorted(fields.folder.glob("*.urdf"))
-    urdf = read_robot_document(str(files[0]))["urdf"] if len(files) == 1 else ""
-    ends = {*re.findall(r"<link\s+name=\"([^\"]+)\"", urdf)}
-    ends -= {*re.findall(r"<parent\s+link=\"([^\"]+)\"", urdf)}
+    # Links may lead out of a stranger's folder.
+    files = [file for file in fields.folder.glob("*.urdf") if not file.is_symlink()]
+    ends = set[str]()
+    with suppress(DataError):
+        urdf = read_robot_document(str(files[0]))["urdf"] if len(files) == 1 else ""
+        ends = {*re.findall(r"<link\s+name=\"([^\"]+)\"", urdf)}
+        ends -= {*re.findall(r"<parent\s+link=\"([^\"]+)\"", urdf)}
     for tip in (requested.tip, *ends) if len(ends) == 1 else ():
         with suppress(DataError):
             robot = Robot.from_document(read_robot_document(str(files[0]), tip=tip))
