@@ -161,7 +161,7 @@ def test_a_rig_that_is_larger_than_its_table_is_named_with_its_size():
         return calibrate(replace(session, target=replace(CUBE, points_m=points))).verdict
 
     (found,) = (cause for cause in sized(1.0 / 1.01).causes if cause.kind == "board_size")
-    (advised,) = re.findall(r"multiply the table's x_m, y_m and z_m by ([0-9.]+)", found.do.words)
+    (advised,) = re.findall(r"--board-scale ([0-9.]+)", found.do.command)
     # The sentence has a sigma of 0.1 %, by residuals that are the size's own doing.
     assert float(advised) == pytest.approx(1.01, abs=3e-3)
     mended = sized(float(advised) / 1.01)
