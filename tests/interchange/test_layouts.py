@@ -1646,6 +1646,10 @@ def test_the_only_urdf_beside_a_table_gives_its_arm_by_the_names_of_its_joints(t
     assert "are the joints of arm.urdf, to its flange" in done.good().err
     view = Session.load(tmp_path / "out").views[0]
     assert view.joints_rad == pytest.approx(rows[0, : len(joints)])
+    # The note says that --tip names another, which needs no robot by name then.
+    said = ("--mount", "eye-in-hand", "--tip", "d")
+    visioncal("convert", tmp_path / "in", tmp_path / "other", *said).good()
+    assert 'tip = "d"' in (tmp_path / "other/session.toml").read_text()
 
 
 def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypatch):

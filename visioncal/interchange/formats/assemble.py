@@ -77,7 +77,7 @@ def with_user_options(foreign: ForeignRecording, requested: ImportOptions) -> Fo
     stated = POSE_FORMS.get(requested.robot.form or foreign.form)
     # Forms of libraries are no controller's.
     foreign = replace(foreign, form=stated.name if stated and stated.models else "")
-    if requested.tip is not None and requested.robot_model is None:
+    if requested.tip is not None and not (requested.robot_model or foreign.arm):
         raise DataError("--tip needs the robot that it is of; name it with --robot-model.")
     foreign = replace(foreign, arm=requested.arm or foreign.arm)
     lens, lenses, notes = dict(foreign.lens or {}), foreign.lenses, foreign.notes

@@ -111,10 +111,9 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
 def _arm_note(asked: ImportOptions, requested: ImportOptions) -> Iterator[str]:
     """A note on the robot whose description stands beside the rows, where the user names none."""
     if asked.robot_model and not requested.robot_model:
-        file, tip = Path(asked.robot_model).name, asked.tip or "flange"
         yield (
-            f"{', '.join(asked.joints)} are the joints of {file}, to its {tip}; --robot-model "
-            "and --tip name another."
+            f"{', '.join(asked.joints)} are the joints of {Path(asked.robot_model).name}, to its "
+            f"{asked.tip}; --robot-model and --tip name another."
         )
 
 

@@ -456,7 +456,8 @@ def _unsaid(
     elif why.startswith(NO_READING):
         step = "Look whether these rows are those of these images or poses of the target. Else say"
         if foreign.images and foreign.target is None:
-            step = f"Name the board that the images show with --target: it tells more. {step}"
+            board = "Name the board that the images show with --target: its corners determine more."
+            step = f"{board} {step}"
     elif fault is not None:
         words = f"{re.sub('^session .*?: ', '', why)}. Beside that, {unsaid}"
         step = f"{fault.next_step} Else say".strip()

@@ -306,16 +306,18 @@ def _of_urdf(fields: Fields, requested: ImportOptions) -> ImportOptions:
     """
     # Links may lead out of a stranger's folder.
     files = [file for file in fields.folder.glob("*.urdf") if not file.is_symlink()]
-    ends = set[str]()
+    if len(files) != 1:
+        return requested
+    ends, robot_file = set[str](), str(files[0])
     with suppress(DataError):
-        urdf = read_robot_document(str(files[0]))["urdf"] if len(files) == 1 else ""
+        urdf = read_robot_document(robot_file)["urdf"]
         ends = {*re.findall(r"<link\s+name=\"([^\"]+)\"", urdf)}
         ends -= {*re.findall(r"<parent\s+link=\"([^\"]+)\"", urdf)}
     for tip in (requested.tip, *ends) if len(ends) == 1 else ():
         with suppress(DataError):
-            robot = Robot.from_document(read_robot_document(str(files[0]), tip=tip))
+            robot = Robot.from_document(read_robot_document(robot_file, tip=tip))
             if called := joint_names(fields, (), robot.joint_names):
-                return replace(requested, joints=called, robot_model=str(files[0]), tip=tip)
+                return replace(requested, joints=called, robot_model=robot_file, tip=robot.tip)
     return requested
 
 
