@@ -29,11 +29,12 @@ from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.steps import FRAME, with_step
 from visioncal.estimation.unknowns import BOARD, LENS, SIZE
+from visioncal.model.effects import Creeps
 from visioncal.robot.model import REPEATABILITY
 from visioncal.vision.camera import intrinsics
 
 _LIMITS = CalibrationLimits()
-_CREEPS = ("base_creeps", "mount_creeps")
+_CREEPS = [name for name, kind in KINDS.items() if issubclass(kind, Creeps)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -134,9 +134,9 @@ class ArmGrows(Creeps):
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""
         del distances
-        out = np.zeros((len(moments), 6, 1))
-        out[:, 3:, 0] = -invert(moments.poses[self.frame])[:, :3, 3]
-        return np.asarray(-out * self.left(moments))
+        inwards = np.zeros((len(moments), 6, 1))
+        inwards[:, 3:, 0] = invert(moments.poses[self.frame])[:, :3, 3]
+        return np.asarray(inwards * self.left(moments))
 
 
 @dataclass(frozen=True, eq=False)
