@@ -27,7 +27,6 @@ from visioncal.model.effects.effect import SIGNIFICANT
 from visioncal.model.effects.window import Window, nearer
 from visioncal.results.compare import intrinsics_names
 from visioncal.vision.camera import intrinsics, normalise, project, with_intrinsics
-from visioncal.vision.targets import corner_positions
 
 # Changes of intrinsics or corners below this show in no image, and in no pick [px].
 _LEAST_MOVE_PX = 0.1
@@ -274,7 +273,7 @@ def _seen_through(run: RunState) -> Iterator[Finding]:
         if isinstance(effect, Window):
             finding = _pane(effect, found.values)
         elif isinstance(effect, BoardSags):
-            finding = _sagging(run, effect, found.values)
+            finding = _sagging(effect, found.values)
         else:
             finding = _swelling(found.values)
         words = f"{finding.words}{sizes.instead_of(effect.kind)}"
@@ -292,14 +291,11 @@ def _swelling(values: FloatArray) -> Finding:
     )
 
 
-def _sagging(run: RunState, sags: BoardSags, values: FloatArray) -> Finding:
-    points = np.vstack([corner_positions(board) for board in run.session.boards.values()])
-    bent, plane = sags.bent(points) @ values, np.column_stack([np.ones(len(points)), points[:, :2]])
-    bow = bent - plane @ np.linalg.lstsq(plane, bent, rcond=None)[0]
+def _sagging(sags: BoardSags, values: FloatArray) -> Finding:
     return Finding(
         "board_sags",
         "The board bends with its weight as the robot turns it: level it is bowed otherwise than "
-        f"upright, by {figure(1e3 * float(np.ptp(bow)))} mm between its highest and its lowest "
+        f"upright, by {figure(1e3 * sags.bow_m(values))} mm between its highest and its lowest "
         "corner. It was taken out of the corners, and the result is that of the board as it is "
         "upright.",
         Remedy(

@@ -19,17 +19,22 @@ class BoardSags(Displacement):
 
     kind, bounds, count = "board sags", (0.1, 1e-6, 2.0), 3
     flange: str
-    normal: tuple[float, float, float]  # Of the board, in the flange's frame.
-    middle: tuple[float, float]  # Of the board, in its plane [m].
+    normal: FloatArray  # (3,) of the board, in the flange's frame.
+    marks: FloatArray  # (n, 3) corners of the board [m].
     along: float  # The line's angle from the board's x [rad].
 
     @classmethod
     def tried(
-        cls, camera: str, flange: str, normal: FloatArray, points: FloatArray
+        cls, camera: str, flange: str, normal: FloatArray, marks: FloatArray
     ) -> "tuple[BoardSags, ...]":
-        """Those of some lines, of a board with (n, 3) points."""
-        (x, y, z), (u, v, _) = normal.tolist(), points.mean(axis=0).tolist()
-        return tuple(cls(camera, flange, (x, y, z), (u, v), at * np.pi / 4.0) for at in range(4))
+        """Those of some lines, of a board with (n, 3) corners."""
+        return tuple(cls(camera, flange, normal, marks, at * np.pi / 4.0) for at in range(4))
+
+    def bow_m(self, values: FloatArray) -> float:
+        """Heights of the corners where the board lies level, by (3,) values, from end to end."""
+        bent = self.bent(self.marks) @ values
+        plane = np.column_stack([np.ones(len(bent)), self.marks[:, :2]])
+        return float(np.ptp(bent - plane @ np.linalg.lstsq(plane, bent, rcond=None)[0]))
 
     def moved(self, points: FloatArray, poses: FloatArray) -> FloatArray:
         """See `Displacement`."""
@@ -40,11 +45,12 @@ class BoardSags(Displacement):
     def bent(self, on_board: FloatArray) -> FloatArray:
         """(n, 3) heights of (n, 3) points of the board by each curvature of one [m]."""
         cosine, sine = np.cos(self.along), np.sin(self.along)
-        u, v = np.array([[cosine, sine], [-sine, cosine]]) @ (on_board[:, :2] - self.middle).T
+        about = (on_board - self.marks.mean(axis=0))[:, :2]
+        u, v = np.array([[cosine, sine], [-sine, cosine]]) @ about.T
         return np.stack([0.5 * u**2, 0.5 * v**2, u * v], axis=1)
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`: (k, 3, 3) shares of gravity along the normal; none where it is unknown."""
         del distances
-        down = -moments.poses[self.flange][:, 2, :3] @ np.array(self.normal)
+        down = -moments.poses[self.flange][:, 2, :3] @ self.normal
         return np.asarray(np.nan_to_num(down)[:, None, None] * np.eye(3))
