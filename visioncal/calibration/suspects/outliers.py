@@ -395,7 +395,13 @@ def _cause(
         )
     cause, problem = _WRONG, cell_fit.inlier_fit.problem
     of_stop = problem.observations.stops
-    if any(np.array_equal(poses[of_stop[at]], np.eye(4)) for poses in problem.poses.values()):
+    by_joints = {name for name, arm in cell_fit.arms.items() if arm.matched is not None}
+    reported = (
+        problem.poses[name][of_stop[at]]
+        for name, flange in problem.tree.flanges.items()
+        if name not in by_joints and problem.observations_through(flange)[at]
+    )
+    if any(np.array_equal(pose, np.eye(4)) for pose in reported):
         return "the robot's pose in its row is all zeros, as of a row that was not filled in"
     mates = np.flatnonzero((of_stop == of_stop[at]) & cell_fit.inlier_fit.used)
     if len(mates):
