@@ -120,6 +120,7 @@ class ArmGrows(Creeps):
     """Share by which the flange is farther from the base's origin, of an arm that warms up."""
 
     kind, what, bounds, count = "arm grows", "The arm", (1e-3, 1e-7, 0.02), 1
+    most = 1e-3  # Aluminium grows by so much in 43 K, and steel in 90.
     do = "Let the arm warm up at its work for half an hour, and record again."
 
     @classmethod

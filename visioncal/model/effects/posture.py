@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -13,7 +13,11 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import Effect, Named, Stood
+from visioncal.model.effects.effect import SIGNIFICANT, Effect, Named, Size, Stood
+
+# Likelihood ratio of linear axes that are off: arms of revolute joints that err otherwise by their
+# posture are a hundred times as frequent.
+_RARER = SIGNIFICANT + 2.0 * float(np.log(100.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +122,11 @@ class Stretches(PostureEffect, Named):
         "Measure a long way along that axis, and correct its scale in the controller; then record "
         "again."
     )
+
+    @property
+    def size(self) -> Size:
+        """See `Effect`."""
+        return replace(super().size, limit=_RARER)
 
     @classmethod
     def says(cls, values: FloatArray) -> str:
