@@ -151,7 +151,7 @@ def test_a_board_of_another_size_is_scaled_in_a_copy(place, seen):
     if seen == "corners":
         cell_session(cell, "cell", seen=seen).save(place / "cell")
     else:
-        # As a program measures them that was told the stated size.
+        # As a program measures them that goes by the stated size.
         poses = cell.cam_from_target.copy()
         poses[:, :3, 3] /= 1.01
         pairs_session("eye-in-hand", cell.robot.base_from_flange, poses).save(place / "cell")
@@ -179,6 +179,9 @@ def test_one_of_several_boards_is_scaled_by_its_name(place):
     two.save(place / "cell")
     refused = visioncal("convert", "cell", "copy", "--board-scale", "1.01").refused().said
     assert "Name one of left, right" in refused
+    session.save(place / "one")
+    refused = visioncal("convert", "one", "copy", "--board-scale", "left:1.01").refused().said
+    assert "Give the factor alone, as 1.01." in refused
     visioncal("convert", "cell", "copy", "--board-scale", "right:1.01").good()
     left, right = Session.load(place / "copy").boards.values()
     assert (left.square_m, right.square_m) == pytest.approx((0.03, 1.01 * 0.032))

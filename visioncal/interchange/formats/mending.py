@@ -284,12 +284,16 @@ def scale_board(session: Session, name: str, factor: float) -> Session:
     poses = numbers_in(session, MEASURED_CAM_POSE).poses()
     is_measured = not stated and not name and np.isfinite(poses).any()
     if only not in stated and not is_measured:
+        step = "Declare it as target in session.toml."
+        if stated:
+            # The only board has no name.
+            first = next(iter(stated))
+            step = f"Name one of {some_of([*stated])}, as {first}:1.01."
+            step = step if first else "Give the factor alone, as 1.01."
         raise DataError(
             f"Session {session.name!r} needs a board {name or 'or measured poses'} to scale.",
             culprits=["--board-scale"],
-            next_step=f"Name one of {some_of([*stated])}, as {next(iter(stated))}:1.01."
-            if stated
-            else "Declare it as target in session.toml.",
+            next_step=step,
         )
     shown = [at.number for at in session.views if session.board_of(at) in ("", only)]
     poses[:, :3, 3] *= factor
