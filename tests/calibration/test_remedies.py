@@ -67,10 +67,10 @@ def poses_from(order: Callable[[int], list[int]]) -> Callable[[Path], None]:
     return rows_of(changed)
 
 
-def exchanged(count: int) -> list[int]:
-    rows = [*range(count)]
-    rows[3], rows[11] = rows[11], rows[3]
-    return rows
+def exchanged(*views: int) -> Callable[[Path], None]:
+    """Each of some rows has the pose of the one after it among them, and the last the first's."""
+    after = dict(zip(views, [*views[1:], views[0]], strict=True))
+    return poses_from(lambda count: [after.get(row, row) for row in range(count)])
 
 
 def moved_lens(document: dict) -> None:
@@ -114,8 +114,9 @@ def read_late(place: np.ndarray, turn: Rotation) -> tuple[np.ndarray, np.ndarray
 
 
 FAULTS = {
-    "two rows exchanged": Fault(
-        "exchanged_views", poses_from(exchanged), command="--exchange 3,11"
+    "two rows exchanged": Fault("exchanged_views", exchanged(3, 11), command="--exchange 3,11"),
+    "four rows exchanged in turn": Fault(
+        "exchanged_views", exchanged(3, 6, 13, 10), command="--exchange 3,10,3,13,3,6"
     ),
     "rows two apart from one on": Fault(
         "shifted_rows",
@@ -147,7 +148,7 @@ FAULTS = {
     ),
 }
 QUICK = (
-    "two rows exchanged",
+    "four rows exchanged in turn",
     "quaternions that begin with w",
     "poses of another instant than the joints",
 )

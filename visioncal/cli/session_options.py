@@ -397,7 +397,7 @@ class ConvertOptions(RobotPoseOptions):
         "Mirror left-handed poses.", "--mirror-poses", default=False, needs="guess"
     )
     exchange: tuple[int, ...] | None = _doubt(
-        "Pairs of views whose images are exchanged: 8,17, or 8,17,9,16.", parse=pairs_in
+        "Pairs of views whose images are exchanged, one after the other: 8,17,9,16.", parse=pairs_in
     )
     shift: tuple[tuple[int, ...], int] | None = _doubt(
         "Views whose poses stand so many rows later: 12-24:2.", parse=shift_in

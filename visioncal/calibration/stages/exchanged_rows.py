@@ -1,4 +1,4 @@
-"""Search for other stops that outliers fit, and for pairs of exchanged rows."""
+"""Search for other stops that outliers fit, and for rows that are exchanged."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -73,13 +73,26 @@ def _at_stops(
 
 
 def exchanged(problem: Problem, fitting: Mapping[int, Sequence[int]]) -> dict[int, int]:
-    """Pairs of observations that each fit the other's stop, by the result of `other_stops`."""
-    seen, pairs = problem.observations, {}
+    """Observations that fit each other's stops: to each, the one whose stop it fits.
+
+    Two that each fit the other's, or circles of more, by the stop that each fits best; `fitting` is
+    the result of `other_stops`.
+    """
+    seen, partners = problem.observations, dict[int, int]()
     frames = [
         (observer.partition("@")[0], observed.partition("@")[0])
         for observer, observed in zip(seen.observers, seen.observed, strict=True)
     ]
     for a, b in combinations(sorted(fitting), 2):
         if frames[a] == frames[b] and seen.stops[b] in fitting[a] and seen.stops[a] in fitting[b]:
-            pairs[a], pairs[b] = b, a
-    return pairs
+            partners[a], partners[b] = b, a
+    left = sorted(fitting.keys() - partners.keys())
+    own = {(frames[at], int(seen.stops[at])): at for at in left}
+    following = {at: own.get((frames[at], fitting[at][0])) for at in left}
+    for first in left:
+        circle = [first]
+        while (after := following[circle[-1]]) is not None and after not in circle:
+            circle.append(after)
+        if after == first and first not in partners:
+            partners |= zip(circle, [*circle[1:], first], strict=True)
+    return partners

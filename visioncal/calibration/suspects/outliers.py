@@ -12,7 +12,7 @@ from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
-from visioncal.core.number_format import figure, mm_and_deg, some_of, view_words
+from visioncal.core.number_format import figure, listed, mm_and_deg, some_of, view_words
 from visioncal.core.transforms import (
     apply,
     compose,
@@ -301,9 +301,10 @@ def _step_of(
 
 
 def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
-    """Poses of one robot that are exchanged, and pairs of views that fit each other's pose."""
+    """Poses of one robot that are exchanged, and views that fit each other's poses."""
     rows, problem, used = cell_fit.cell.rows, cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
-    pairs = [pair for pair in sorted(mutual.items()) if pair[0] < pair[1]]
+    yield from _exchanged_in_turn(cell_fit, mutual)
+    pairs = [(a, b) for a, b in sorted(mutual.items()) if a < b and mutual[b] == a]
     for robot, flange in problem.tree.flanges.items() if cell_fit.cell.mount is None else ():
         by_robot = np.flatnonzero(problem.observations_through(flange)).tolist()
         through = [pair for pair in pairs if pair[0] in by_robot]
@@ -340,6 +341,29 @@ def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFau
     typed = ",".join(f"{first},{second}" for first, second in views)
     do = mending(f"their {shown}s are exchanged", f"--exchange {typed}")
     yield _fault(cell_fit, EXCHANGED, [row for pair in pairs for row in pair], words, do)
+
+
+def _exchanged_in_turn(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
+    """More than two views, of which each fits the pose of the next."""
+    rows, shown, left = cell_fit.cell.rows, _shown(cell_fit), sorted(mutual)
+    words, typed, exchanged_rows = list[str](), list[str](), list[int]()
+    while left:
+        circle = [left[0]]
+        while (after := mutual[circle[-1]]) != circle[0]:
+            circle.append(after)
+        left = [at for at in left if at not in circle]
+        if len(circle) > 2:
+            first, *others = (rows[at].view for at in circle)
+            words.append(" to ".join(map(str, (first, *others, first))))
+            typed += [f"{first},{other}" for other in others]
+            exchanged_rows += circle
+    if words:
+        text = (
+            f"{{views}} are exchanged in turn ({listed(words)}): the {shown} of each fits the pose "
+            "in the next one's row. They were left out."
+        )
+        do = mending(f"their {shown}s are exchanged", f"--exchange {','.join(typed)}")
+        yield _fault(cell_fit, EXCHANGED, sorted(exchanged_rows), text, do)
 
 
 def _shown(cell_fit: CellFit) -> str:
@@ -389,6 +413,8 @@ def _cause(
     rows, stops = cell_fit.cell.rows, cell_fit.cell.stops
     if at in mutual:
         own, other = rows[at], rows[mutual[at]]
+        if mutual[mutual[at]] != at:
+            return f"it fits stop {stops[other.station]}, of view {other.view}"
         return (
             f"it fits stop {stops[other.station]}, and view {other.view} fits stop "
             f"{stops[own.station]}: these two rows are exchanged"

@@ -47,36 +47,39 @@ def exchange_views(session: Session, *views: int) -> Session:
 
     Args:
         session: A session.
-        views: Numbers of views: the first with the second, the third with the fourth, and so on.
+        views: Numbers of views: the first with the second, then the third with the fourth, and so
+            on.
 
     Raises:
-        DataError: There are no such views, or one is in two pairs.
+        DataError: There are no such views, or a pair is there twice.
     """
     cells = {
         view.number: {name: view.cell(name) for name in session.columns} for view in session.views
     }
-    partners = dict[int, int]()
+    owners, pairs = {number: number for number in cells}, set[frozenset[int]]()
     for first, second in zip(views[::2], views[1::2], strict=True):
         first_cells, second_cells = cells.get(first, {}), cells.get(second, {})
         differing = [
             name for name in _MUST_AGREE if first_cells.get(name, "") != second_cells.get(name, "")
         ]
-        if twice := sorted({first, second} & partners.keys()):
-            words = f"view {twice[0]} must be in one pair, and is in two."
-            raise DataError(f"Views {first} and {second}: {words}", culprits=["--exchange"])
+        if {first, second} in pairs:
+            words = f"Views {first} and {second} must be exchanged once, and are twice."
+            raise DataError(words, culprits=["--exchange"])
         if first == second or differing or not (first_cells and second_cells):
             raise DataError(
                 f"Views {first} and {second} of session {session.name!r} are not two views that "
                 f"see the same{': another ' * bool(differing)}{' and '.join(differing)}.",
                 culprits=["--exchange"],
             )
-        partners |= {first: second, second: first}
+        pairs.add(frozenset({first, second}))
+        owners[first], owners[second] = owners[second], owners[first]
         for name in {*_OBSERVED} & {*session.columns}:
             first_cells[name], second_cells[name] = second_cells[name], first_cells[name]
     corners = session.corner_table
     if corners is not None:
-        owners = [partners.get(view, view) for view in corners.views.tolist()]
-        corners = replace(corners, views=np.array(owners, dtype=corners.views.dtype))
+        now = {before: view for view, before in owners.items()}
+        moved = [now.get(view, view) for view in corners.views.tolist()]
+        corners = replace(corners, views=np.array(moved, dtype=corners.views.dtype))
     named = ", ".join(
         f"{first} and {second}" for first, second in zip(views[::2], views[1::2], strict=True)
     )
