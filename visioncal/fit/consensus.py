@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import product
 from typing import Self
 
@@ -199,14 +200,20 @@ def between_arms(
     return (middle[best, 0], float(medians[best])) if medians[best] < AGREE_M else None
 
 
+@lru_cache(maxsize=64)
+def _drawn(counts: tuple[int, ...]) -> tuple[IntArray, ...]:
+    """Triples of views with so many candidates: often those with few, of fewer combinations."""
+    rng, weights = np.random.default_rng(0), 1.0 / np.array(counts) ** 2
+    shares = weights / weights.sum()
+    return tuple(
+        rng.choice(len(counts), FEWEST_VIEWS, replace=False, p=shares) for _ in range(_TRIPLES)
+    )
+
+
 def _triples(candidates: Candidates) -> tuple[IntArray, IntArray]:
     """(s, 3) views and picks to solve from, with all combinations of each triple's candidates."""
-    rng = np.random.default_rng(0)
-    # Views with few candidates first: they need the fewest combinations.
-    counts = candidates.valid.sum(axis=1)
-    weights, rows, picks = 1.0 / counts**2, [], []
-    for _ in range(_TRIPLES):
-        triple = rng.choice(len(candidates), FEWEST_VIEWS, replace=False, p=weights / weights.sum())
+    counts, rows, picks = candidates.valid.sum(axis=1).tolist(), [], []
+    for triple in _drawn(tuple(counts)):
         options = [list(range(counts[at])) for at in triple]
         # A turn of the target in all views alike changes its frame and is no other solution.
         options[0] = [at for at in options[0] if candidates.turns[triple[0], at] == 0]

@@ -1,13 +1,14 @@
 """Depth pictures of a simulated cell: a sensor whose depth is false, noisy, and has holes."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, Image, Image16
+from visioncal.core.types import Camera, FloatArray, Image, Image16
 from visioncal.simulation.boards import outline_m
 from visioncal.simulation.optics import rays
 from visioncal.simulation.render import RenderScene
@@ -47,9 +48,7 @@ def depth_picture(
     if scene.board.bow_m:
         raise DataError("simulation: depth is that of a flat board; leave bow_m out.")
     width, height = scene.camera.camera.resolution
-    px = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
-    directions = rays(scene.camera.camera, px)
-    directions = directions / directions[..., 2:]
+    px, directions = _seen(scene.camera.camera)
     pose = scene.sights[index].cam_from_target
     outline = outline_m(scene.board, margin_m(scene.board.target))
     low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]
@@ -83,6 +82,15 @@ def depth_picture(
     blobs = cv2.resize(rng.random((height // 12 + 2, width // 12 + 2)), (width, height))
     measured[blobs < np.quantile(blobs, options.holes)] = 0.0
     return np.clip(np.rint(measured / options.unit_m), 0, 65535).astype(np.uint16), image
+
+
+@lru_cache(maxsize=1)
+def _seen(camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """(h, w, 2) pixels of a camera's images and (h, w, 3) their rays of unit depth."""
+    width, height = camera.resolution
+    px = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+    directions = rays(camera, px)
+    return px, directions / directions[..., 2:]
 
 
 def _plane(pose: FloatArray, directions: FloatArray, z_m: float) -> tuple[FloatArray, FloatArray]:

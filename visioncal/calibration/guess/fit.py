@@ -136,7 +136,8 @@ class Fit:
     def _estimate(self) -> tuple[FloatArray, FloatArray]:
         """Standard deviations (2,) by axis of position and rotation, and each view's weight."""
         sigma, squares = np.full(2, _MOST_SIGMA), self._squares
-        weights = np.where(np.isin(np.arange(len(self.angle)), self.kept), 1.0, 0.0)
+        weights = np.zeros(len(self.angle))
+        weights[self.kept] = 1.0
         for _ in range(5 if self.is_readable else 0):
             # Three equations a view each, less the six unknowns of the edges.
             freedom = max(3.0 * weights.sum() - 6.0, 3.0)
@@ -153,8 +154,12 @@ class Fit:
     def _densities(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n,) log densities of inlier and outlier views, each times its prior probability."""
         inlier = -3.0 * np.log(sigma).sum() - 0.5 * (self._squares.T / sigma**2).sum(axis=1)
-        outlier = -3.0 * np.log1p(self._squares).sum(axis=0)
-        return inlier + np.log1p(-_OUTLIER_PRIOR), outlier + np.log(_OUTLIER_PRIOR)
+        return inlier + np.log1p(-_OUTLIER_PRIOR), self._outlier
+
+    @cached_property
+    def _outlier(self) -> FloatArray:
+        """(n,) log densities of outlier views, which no noise changes."""
+        return np.asarray(np.log(_OUTLIER_PRIOR) - 3.0 * np.log1p(self._squares).sum(axis=0))
 
 
 def is_about_one_axis(rotations: FloatArray) -> bool:
@@ -182,14 +187,15 @@ def robust_fits(
     kept = _kept_count(count, share)
     lever = np.maximum(np.median(np.linalg.norm(camera[..., :3, 3], axis=2), axis=1), 1e-12)
 
-    def solved(rows: IntArray) -> _Solved:
-        sides = (np.take_along_axis(side[:, None], rows[..., None, None], 2) for side in parts)
-        edges = SOLVERS["park"](*sides)
-        shift, angle = _away(robot[:, None], camera[:, None], (edges.x, edges.z))
-        squares = (shift / lever[:, None, None]) ** 2 + angle**2
+    def solved(some: IntArray, rows: IntArray) -> _Solved:
+        sides = robot[some, None], camera[some, None]
+        edges = SOLVERS["park"](
+            *(np.take_along_axis(side, rows[..., None, None], 2) for side in sides)
+        )
+        shift, angle = _away(*sides, (edges.x, edges.z))
+        squares = (shift / lever[some, None, None]) ** 2 + angle**2
         return np.stack([edges.x, edges.z], axis=2), *_trimmed(squares, kept)
 
-    parts = robot, camera
     best = _least_trimmed(solved, len(robot), count, _random_sets(count, starts, _SUBSET))
     away = zip(*_away(robot, camera, (best[:, 0], best[:, 1])), lever.tolist(), strict=True)
     return [
@@ -217,31 +223,37 @@ def _random_sets(count: int, starts: int, size: int) -> list[IntArray]:
 
 
 def _least_trimmed(
-    solved: Callable[[IntArray], _Solved], readings: int, count: int, sets: Sequence[IntArray]
+    solved: Callable[[IntArray, IntArray], _Solved],
+    readings: int,
+    count: int,
+    sets: Sequence[IntArray],
 ) -> FloatArray:
     """(k, 2, 4, 4) edges of the least trimmed squares that were found.
 
     Args:
-        solved: Solves by (k, s, m) rows.
-        readings: Number k of readings.
+        solved: Solves some (k,) of the readings by (k, s, m) rows.
+        readings: Number of readings.
         count: Number of rows.
         sets: (s, m) rows to start from, besides all.
     """
-    edges, sums, nearest = solved(np.broadcast_to(np.arange(count), (readings, 1, count)))
+    every = np.arange(readings)
+    edges, sums, nearest = solved(every, np.broadcast_to(np.arange(count), (readings, 1, count)))
     for rows in sets:
-        more = solved(np.broadcast_to(rows, (readings, *rows.shape)))
+        more = solved(every, np.broadcast_to(rows, (readings, *rows.shape)))
         edges, sums = np.hstack([edges, more[0]]), np.hstack([sums, more[1]])
         nearest = np.hstack([nearest, more[2]])
     if sets:
-        followed = np.arange(readings)[:, None], np.argsort(sums, axis=1)[:, :_FOLLOWED]
+        followed = every[:, None], np.argsort(sums, axis=1)[:, :_FOLLOWED]
         edges, sums, nearest = edges[followed], sums[followed], nearest[followed]
+    falls = np.ones(sums.shape, dtype=bool)
     for _ in range(6 if sets else 2):
-        trial, lower, rows = solved(nearest)
-        falls = lower < sums
-        if not falls.any():
+        # Rows whose sum did not fall have the same solution again.
+        trial, lower, rows = solved(np.nonzero(falls)[0], nearest[falls][:, None])
+        falls[falls] = less = lower[:, 0] < sums[falls]
+        if not less.any():
             break
-        edges[falls], sums[falls], nearest[falls] = trial[falls], lower[falls], rows[falls]
-    return np.asarray(edges[np.arange(readings), sums.argmin(axis=1)])
+        edges[falls], sums[falls], nearest[falls] = trial[less, 0], lower[less, 0], rows[less, 0]
+    return np.asarray(edges[every, sums.argmin(axis=1)])
 
 
 def mounting_fits(
@@ -268,9 +280,10 @@ def mounting_fits(
     kept = _kept_count(count, share)
     lever = max(float(np.median(np.linalg.norm(read - np.median(read, axis=0), axis=1))), 1e-12)
 
-    def solved(rows: IntArray) -> _Solved:
-        edges = _mounted(np.take_along_axis(flanges[:, None], rows[..., None, None], 2), read[rows])
-        squares = (_missed(flanges[:, None], read, edges) / lever) ** 2
+    def solved(some: IntArray, rows: IntArray) -> _Solved:
+        each = flanges[some, None]
+        edges = _mounted(np.take_along_axis(each, rows[..., None, None], 2), read[rows])
+        squares = (_missed(each, read, edges) / lever) ** 2
         return edges, *_trimmed(squares, kept)
 
     sets = _random_sets(count, starts, _PLACES_SUBSET)
