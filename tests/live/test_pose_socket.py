@@ -15,6 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.live_cell import fake_devices, fake_plan
+from support.marks import slow
 from support.refusals import raised
 
 from visioncal.cli import live_cell
@@ -197,7 +198,7 @@ MISHAPS = (
 )
 
 
-@pytest.mark.parametrize("first_seed", range(0, 500, 100))
+@pytest.mark.parametrize("first_seed", [0, *map(slow, range(100, 500, 100))])
 def test_after_500_broken_conversations_each_view_has_its_pose(first_seed, monkeypatch):
     monkeypatch.setattr(pose_socket, "_SLICE_S", 0.0)
     for seed in range(first_seed, first_seed + 100):

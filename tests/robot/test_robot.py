@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.marks import slow
 from support.readers import rx, ry, rz, transform
 from support.refusals import raised
 from support.slopes import jacobian, twists
@@ -212,7 +213,11 @@ def test_arms_stand_at_zero_as_their_makers_draw_them(name):
     np.testing.assert_allclose(1e3 * flange[:3, 3], _AT_ZERO[name], atol=0.06)
 
 
-@pytest.mark.parametrize("robot", [*robots(), other(load_robot("ur5e")), other(of_urdf())])
+@pytest.mark.parametrize(
+    "robot",
+    [*robots()[::4], other(load_robot("ur5e")), other(of_urdf())]
+    + [slow(robot) for at, robot in enumerate(robots()) if at % 4],
+)
 def test_jacobians_are_the_jacobian_of_the_forward_kinematics(robot):
     q, count = some_joints(robot), robot.joint_count
     turning = np.where(robot.chain.prismatic[:, None], [1, 1, 0, 0], 1).ravel()
