@@ -121,6 +121,7 @@ def two_folders(folder):
             "\n".join(" ".join(map(repr, r)) for r in pose.tolist()),
         )
     shoot(folder / "rgb", "frame_{:03d}_corners.png")
+    shoot(folder / "DrawChessboard", "frame_{:03d}.png")
 
 
 def calls_of_numpy(folder):
@@ -1078,7 +1079,7 @@ def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
         assert "The depth #.png (9 files) is of the same images" in done.err
         assert "Left aside, as rows differ in their shape: joints" in done.err
     if make is two_folders:
-        assert "Left out of the images: rgb/frame_#_corners.png (9 files)" in done.err
+        assert "frame_#.png (9 files), rgb/frame_#_corners.png (9 files)" in done.err
     if make in (named_with_depth, named_with_clouds):
         for at, view in zip(shown, session.views, strict=True):
             depth = read_depth(session.images.read(view.depth), view.depth, (640, 400))

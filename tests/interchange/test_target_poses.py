@@ -2,17 +2,21 @@
 
 import json
 import shlex
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import scipy.io
 from scipy.io.matlab import MatlabOpaque
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
+from support.fuzz.mistakes import numbers
 from support.samples import made_up
 
+from visioncal.calibration.guess.search import Recording, turns_alike
 from visioncal.core.errors import DataError
 from visioncal.interchange.formats import rereading
 from visioncal.interchange.formats.reading import read_fields
@@ -193,6 +197,49 @@ def test_no_field_is_proposed_for_both_sides(tmp_path):
     refused = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
     command = shlex.split(refused.refused("--robot-key").err.splitlines()[-1])
     assert command[-2:] == ["--robot-key", "v0,v1,v2,v3,v4,v5,v6"]
+
+
+def test_a_sensor_beside_a_camera_is_the_arm_s(tmp_path):
+    """As of an electromagnetic tracker: both words are a camera's."""
+    rows = []
+    for pair in zip(*world()[:2], strict=True):
+        sides = zip(("camera", "sensor"), pair[::-1], strict=True)
+        rows.append(
+            {
+                name: {
+                    "position": pose[:3, 3].tolist(),
+                    "orientation": Rotation.from_matrix(pose[:3, :3]).as_quat().tolist(),
+                }
+                for name, pose in sides
+            }
+        )
+    write(tmp_path / "in.json", rows)
+    refused = visioncal("convert", tmp_path / "in.json", tmp_path / "out", "--mount", world()[2])
+    command = shlex.split(refused.refused("--robot-key").err.splitlines()[-1])
+    assert command[-4:] == [
+        "--robot-key", "sensor.position,sensor.orientation",
+        "--camera-key", "camera.position,camera.orientation",
+    ]  # fmt: skip
+
+
+def test_pictures_of_a_page_are_none_of_rows_that_have_both_sides(tmp_path):
+    counted_rows(tmp_path / "in")
+    for at in (14, 17, 21):
+        write(tmp_path / f"in/docs/page_{at}.png", "")
+        cv2.imwrite(str(tmp_path / f"in/docs/page_{at}.png"), np.full((40, 60), at, np.uint8))
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", world()[2]).good()
+    assert "The images are left aside" in done.err
+    assert len(Session.load(tmp_path / "out").views) == 9
+
+
+def test_other_motions_are_known_by_their_turns_before_any_fit():
+    """Of many tables, or fields, those that turn otherwise under any reading need no search."""
+    poses, seen, mount = world()
+    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("zyx", degrees=True)
+    robot = replace(numbers(poses, "rotation-vector"), rotations=angles)
+    assert turns_alike(Recording(robot, numbers(seen), mount, is_measured=True))
+    other = replace(robot, rotations=np.random.default_rng(0).uniform(-90.0, 90.0, (9, 3)))
+    assert not turns_alike(Recording(other, numbers(seen), mount, is_measured=True))
 
 
 def test_what_keeps_images_from_telling_a_form_comes_before_the_form(tmp_path, monkeypatch):

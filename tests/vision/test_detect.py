@@ -493,6 +493,28 @@ def test_a_checkerboard_cut_within_its_outermost_squares_is_found(surround):
     assert min(away) < 0.2
 
 
+def test_outlines_of_squares_are_looked_for_in_a_small_copy(monkeypatch):
+    """In the noise of a whole image of many pixels the search takes most of a minute."""
+    sizes, search = list[int](), cv2.findChessboardCorners
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", lambda *_, **__: (False, None))
+    monkeypatch.setattr(
+        cv2,
+        "findChessboardCorners",
+        lambda image, *args, **options: (
+            sizes.append(max(image.shape)) or search(image, *args, **options)
+        ),
+    )
+    image = np.full((1500, 2000), 235, dtype=np.uint8)
+    squares = 210 * (np.indices((5, 7)).sum(axis=0) % 2) + 20
+    image[300:1200, 400:1660] = np.kron(squares, np.ones((180, 180)))
+    board = checkerboard_of(6, 4)
+    found = kind_of(board).search(cv2.GaussianBlur(image, (0, 0), 1.0), board)
+    rows, columns = np.indices((4, 6))
+    true = np.stack([579.5 + 180 * columns, 479.5 + 180 * rows], axis=-1).reshape(-1, 2)
+    assert min(np.abs(found.px - order).max() for order in (true, true[::-1])) < 1.5
+    assert max(sizes) <= 1500
+
+
 @pytest.mark.parametrize("turns", range(4))
 def test_a_grid_of_circles_leaves_no_row_of_the_plate_over(turns):
     """Of 7 x 11 circles, 5 x 14 are a grid, too: of seven rows the last is left over."""

@@ -236,6 +236,15 @@ def test_a_checkerboard_of_another_count_is_named(tmp_path, monkeypatch):
     assert "checkerboard" not in followed.last.said
 
 
+def test_a_checkerboard_whose_white_is_overexposed_is_named():
+    """Light blooms over the corners, where dark squares meet."""
+    squares = 480.0 * (np.indices((7, 9)).sum(axis=0) % 2) + 20.0
+    image = np.full((480, 640), 500.0)
+    image[80:430, 80:530] = np.kron(squares, np.ones((50, 50)))
+    shown = np.clip(cv2.GaussianBlur(image, (0, 0), 1.5), 0.0, 255.0).astype(np.uint8)
+    assert "checkerboard of 8 x 6 inner corners" in board_words(identify(shown).board)
+
+
 @pytest.mark.parametrize("seed", [3, *map(slow, range(4, 8))])
 def test_dots_that_a_projector_throws_on_a_checkerboard_are_no_marks(seed):
     """As of a depth camera: a dot of 2 px in a quarter of all places, brighter on white."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.guess.readings import SideReading
-from visioncal.calibration.guess.search import in_one_turn
+from visioncal.calibration.guess.search import Recording, in_one_turn, turns_alike
 from visioncal.calibration.guess.unwrapping import in_one_place
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -55,6 +55,12 @@ def guess_from_camera_poses(
         chain=joint_poses,
         is_measured=bool(run.corners),
     )
+
+
+def may_agree(run: RunState, robot: PoseNumbers) -> bool:
+    """Whether the robot's numbers turn as the boards in a run's images do, under any reading."""
+    camera, mount = _camera_numbers(run, robot), _seen_as(run.session.mount)
+    return turns_alike(Recording(robot, camera, mount, is_measured=bool(run.corners)))
 
 
 def _seen_as(mount: Mount) -> Mount:

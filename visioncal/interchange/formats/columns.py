@@ -196,7 +196,7 @@ def _recordings(
     if stamps.isdecimal():
         notes.append(f"Column {stamps} is taken for times, as the source does not say.")
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
-    pairing, image_name = _images(fields, requested.image, found, instead, used)
+    pairing, image_name = _images(fields, requested, found, instead, used, bool(names["camera"]))
     used.add(image_name)
     corner_name, px = ("", None) if pairing.images else corners_in(fields)
     used.add(corner_name)
@@ -327,12 +327,14 @@ def view_numbers(fields: Fields) -> tuple[int, ...]:
 
 def _images(
     fields: Fields,
-    column: str | None,
+    requested: ImportOptions,
     found: Sequence[FileGroup],
     asked: Sequence[FileGroup] | None,
     taken: Collection[str],
+    has_camera_poses: bool,
 ) -> tuple[Pairing, str]:
     """Pairs the rows with images, and names the field that names them."""
+    column = requested.image
     every = found if asked is None else asked
     groups = [group for group in every if group.is_images]
     name = fields.find(column) if column else _image_name(fields, groups, taken)
@@ -341,7 +343,13 @@ def _images(
         named = None if asked is None else groups
         pairing = Pairing(images_named(cells, fields.folder, groups, named))
         return with_depth(pairing, every), name
-    return with_depth(paired(fields, groups), every) if groups else Pairing(()), ""
+    try:
+        return with_depth(paired(fields, groups), every) if groups else Pairing(()), ""
+    except DataError as error:
+        # Pictures of a page are no views', where poses of the target say what these saw.
+        if asked is not None or requested.target or not has_camera_poses:
+            raise
+        return Pairing((), (f"The images are left aside: {error.message}",)), ""
 
 
 def _with_folders(fields: Fields, name: str, groups: Sequence[FileGroup]) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ _FEWEST_PAIRED = 8
 _NO_IMAGE = ("", "n/a", "none", "null", "nan")
 # Words of pictures that a program drew: they are no camera's where there are others.
 _DRAWN = re.compile(
-    r"result|overlay|detect|corner|annot|drawn|debug|visual|vis(?![a-z])|axes|axis|mask|plot|"
+    r"result|overlay|detect|corner|annot|draw|debug|visual|vis(?![a-z])|axes|axis|mask|plot|"
     r"preview|thumb|reproj|heat|undist|rectif",
     re.IGNORECASE,
 )

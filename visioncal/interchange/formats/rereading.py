@@ -21,6 +21,7 @@ from visioncal.calibration.guess import (
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
+    may_agree,
     numbers_in,
 )
 from visioncal.calibration.pipeline.run_state import RunState
@@ -159,6 +160,9 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
             break
         fault = None
         searches |= seen.searches
+        # More rows make no other motion of what turns otherwise.
+        readings = [*readings[:1], *filter(seen.may_agree, readings[1:])]
+        other_orders = [*filter(seen.may_agree, other_orders)]
         is_last = most == _TESTED[-1] or seen.count < most
         for tried in (readings, other_orders):
             found, reason = _tested(tried, seen, is_last=is_last)
@@ -303,6 +307,11 @@ class _Seen:
             images.files[view.image]: found[view.number] for view in views if view.number in found
         }
 
+    def may_agree(self, reading: tuple[int, ForeignRecording]) -> bool:
+        """Whether the robot's rows of a reading, with its rank, turn as the boards do."""
+        robot = None if self.run is None else self._robot(reading[1])
+        return self.run is None or robot is None or may_agree(self.run, robot)
+
     def guess(self, foreign: ForeignRecording) -> Guess:
         """Tries the readings of one recording's poses; raises VisioncalError."""
         item = with_observations_only(replace(foreign, rivals=()))
@@ -314,16 +323,20 @@ class _Seen:
             rows = np.flatnonzero(here)
             rows = rows[evenly(len(rows), self.count)]
             return DoubtfulSession.of(rows_of(item, rows)).guess(self.progress)
-        row = {image: at for at, image in enumerate(item.images)}
+        knows_mount = foreign.mount is not None
+        return guess_from_camera_poses(self.run, self._robot(item), knows_mount=knows_mount)
+
+    def _robot(self, foreign: ForeignRecording) -> PoseNumbers:
+        """The robot's numbers of what was seen; NaN where a recording has none."""
+        row = {image: at for at, image in enumerate(foreign.images)}
         rows = np.array([row.get(image, -1) for image in self.images] or self.rows)
-        robot = item.robot
+        robot = foreign.robot
         if not robot.present.any():
-            chain = chain_poses(assemble(item))
+            chain = chain_poses(assemble(foreign))
             robot = robot if chain is None else PoseNumbers.of_poses(chain, robot.places)
         robot = robot.rows(np.maximum(rows, 0))
         robot.positions[rows < 0] = np.nan
-        knows_mount = foreign.mount is not None
-        return guess_from_camera_poses(self.run, robot, None, knows_mount=knows_mount)
+        return robot
 
 
 def _applied(

@@ -330,7 +330,13 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
     """The error of a source whose poses are not known, with a command that reads it."""
     possible = [(fields, item) for fields in rows for item in possible_poses(fields)]
     possible.sort(
-        key=lambda of: (of[1].is_seen, of[1].sides != ["robot"], bool(of[1].sides)),
+        key=lambda of: (
+            of[1].is_seen,
+            of[1].sides != ["robot"],
+            bool(of[1].sides),
+            # Another side's word, as of a tracker's sensor, may be the arm's.
+            not {"camera", "cam"}.isdisjoint(of[1].words),
+        ),
     )
     step, options = "", list[str]()
     if possible:

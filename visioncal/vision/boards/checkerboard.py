@@ -9,6 +9,7 @@ import numpy as np
 from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.board import Board
+from visioncal.vision.boards.imaging import shrunk
 from visioncal.vision.boards.kind import (
     COUNTS,
     DEFAULT_RELATIVE_SIGMA,
@@ -30,6 +31,11 @@ _FEWEST = ((4, 4), (3, 3))
 # Shares of a square at which its grey levels are compared, and their range in units of contrast
 # from which on it is not plain: light and noise leave a tenth. What is averaged there.
 _INSIDE, _MARKS, _DOTS = (0.25, 0.4, 0.6, 0.75), 0.4, 0.25
+# Share of the way from a corner to the middle of a dark square; usual circles end before.
+_TIP = 0.2
+# Longer side of the copy in which outlines of squares are looked for: among the noise of more
+# pixels their search takes most of a minute [px].
+_OUTLINES_PX = 1500
 
 
 class Checkerboard(Board):
@@ -125,6 +131,8 @@ class Checkerboard(Board):
             board = Target("board", self.name, columns, rows, 1.0, DEFAULT_RELATIVE_SIGMA)
             # A second look, as this search takes parts of some boards for the whole.
             seen = self.search(image, board, quick=True)
+            if found and isinstance(seen, NotFound):
+                seen = self.search(image, board)
             if isinstance(seen, DetectedCorners):
                 px = seen.px.reshape(rows, columns, 2)
                 outside = _extended(px).reshape(-1, 2)
@@ -146,9 +154,11 @@ def _grids(image: Image, size: tuple[int, int], *, quick: bool) -> Iterator[Floa
         return
     # By the outlines of squares, some boards are found whose corners the other search loses.
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    found, px = cv2.findChessboardCorners(image, size, flags=flags)
+    by = -(-max(image.shape) // _OUTLINES_PX)
+    found, px = cv2.findChessboardCorners(shrunk(image, by) if by > 1 else image, size, flags=flags)
     if found:
-        yield px.reshape(rows, columns, 2).astype(np.float64)
+        # From pixel centres of the small image to those of the large one.
+        yield by * px.reshape(rows, columns, 2).astype(np.float64) + (by - 1) / 2
 
 
 def square_corners(target: Target, inset: int) -> FloatArray:
@@ -198,10 +208,14 @@ def _extended(grid: FloatArray, share: float = 1.0) -> FloatArray:
 def _has_tips(image: Image, grid: FloatArray) -> bool:
     """Whether squares meet at the corners of a (rows, columns, 2) grid, as circles do not.
 
-    Of squares, a corner is half way from dark to light under any even blur.
+    Near its corner a dark square is still dark, where overexposed light blooms over the corner.
     """
-    dark, light = np.percentile(_levels(image, grid), [25, 75])
-    return bool(np.median(_at(image, grid)) < light - (light - dark) / 4)
+    middles = (grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4
+    levels = _at(image, middles)
+    dark, light = np.percentile(levels, [25, 75])
+    corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]])
+    near = _at(image, corners + _TIP * (middles - corners))[:, levels < (dark + light) / 2]
+    return bool(near.size and np.median(near) < (dark + light) / 2)
 
 
 def _has_marks(image: Image, grid: FloatArray) -> bool:
