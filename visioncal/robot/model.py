@@ -303,7 +303,27 @@ class Robot:
         functions: FloatArray | None = None,
         harmonics: FloatArray | None = None,
     ) -> "Robot":
-        """Builds the robot with a changed geometry.
+        """Builds the robot with a changed geometry; arguments as of `chain_with`.
+
+        Returns:
+            The robot, with a self-contained document that recreates it exactly.
+
+        Raises:
+            DataError: As of `chain_with`, or a ratio is not positive.
+        """
+        chain = self.chain_with(placements, functions, harmonics)
+        document = chain_document(self.name, self.tip, chain)
+        for row, known in zip(document["joint"], self.document.get("joint", ()), strict=False):
+            row |= {key: known[key] for key in BODY_KEYS if key in known}
+        return Robot.from_document(self.weighted(document))
+
+    def chain_with(
+        self,
+        placements: FloatArray | None = None,
+        functions: FloatArray | None = None,
+        harmonics: FloatArray | None = None,
+    ) -> Chain:
+        """The chain with a changed geometry.
 
         Args:
             placements: (n + 1, 6) twists (rotation [rad], translation [m]); each placement is
@@ -313,12 +333,8 @@ class Robot:
             harmonics: (n, k, 2) additions to each joint's sine and cosine [rad] of the orders from
                 2 on. None leaves them.
 
-        Returns:
-            The robot, with a self-contained document that recreates it exactly.
-
         Raises:
-            DataError: A shape is wrong, a ratio is not positive, or a prismatic joint has
-                eccentricity.
+            DataError: A shape is wrong, or a prismatic joint has eccentricity.
         """
         chain = self.chain
         if placements is not None:
@@ -342,10 +358,7 @@ class Robot:
                     for array in (known, harmonics)
                 )
             chain = replace(chain, harmonics=harmonics if known is None else known + harmonics)
-        document = chain_document(self.name, self.tip, chain)
-        for row, known in zip(document["joint"], self.document.get("joint", ()), strict=False):
-            row |= {key: known[key] for key in BODY_KEYS if key in known}
-        return Robot.from_document(self.weighted(document))
+        return chain
 
     def weighted(self, document: Mapping[str, Any]) -> dict[str, Any]:
         """Adds this arm's masses, inertias, drive limits and `ARM_KEYS` to a description."""
