@@ -310,12 +310,12 @@ def test_without_depth_nothing_of_it_is_loaded():
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
-def test_picks_by_depth_are_within_their_radius(mount):
+@pytest.mark.parametrize(("mount", "count"), [slow("eye-in-hand", 300), ("eye-to-hand", 100)])
+def test_picks_by_depth_are_within_their_radius(mount, count):
     cell, _, result = calibrated(1, mount, FALSE, 12)
-    error, raw, radius = picks(cell, result, FALSE, np.random.default_rng(2), 300).T
-    # 95 %, where 300 scatter by 1.3 % and one calibration's errors are common to all.
-    assert 0.89 < np.mean(error < radius) < 0.995
+    error, raw, radius = picks(cell, result, FALSE, np.random.default_rng(2), count).T
+    # 95 %, where 100 scatter by 2.2 % and one calibration's errors are common to all.
+    assert 0.88 < np.mean(error < radius) < 0.995
     assert np.linalg.norm(error) < 0.4 * np.linalg.norm(raw)
 
 

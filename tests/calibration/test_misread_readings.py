@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.marks import crossed, slow
 from support.refusals import raised
 
 from visioncal.calibration.run import calibrate
@@ -83,7 +84,7 @@ def test_readings_in_another_form_are_named_instead_of_the_arm(options, change, 
     assert "arm_errors" not in {found.kind for found in verdict.findings}
 
 
-@pytest.mark.parametrize(("options", "first"), [(POINT, 0), (POINT, 15), (PROBE, 12)])
+@pytest.mark.parametrize(("options", "first"), [(POINT, 0), slow(POINT, 15), (PROBE, 12)])
 def test_readings_one_row_apart_are_named_and_shifted_back(options, first):
     shop, poses = read(options)
     sound = calibrate(session_of(shop))
@@ -116,17 +117,16 @@ def stale(poses):
     return poses[np.where(np.isin(np.arange(len(poses)), [7, 20]), -1, 0) + np.arange(len(poses))]
 
 
-@pytest.mark.parametrize(
-    ("change", "kind", "words"),
-    [
-        (moved, "something_moved", r"from view 18 on, the instrument .* was another one"),
-        (in_another_nest, "something_moved", r"in all of these, the probe .*: the probe by 50 mm"),
-        (stale, "copied_poses", r"Views 7, 20 have the reading of the row before once more"),
-    ],
-)
-@pytest.mark.parametrize("options", [POINT, PROBE], ids=["point", "probe"])
-def test_groups_of_readings_that_agree_with_one_change_are_named(options, change, kind, words):
-    shop, poses = read(options)
+CHANGES = [
+    (moved, "something_moved", r"from view 18 on, the instrument .* was another one"),
+    (in_another_nest, "something_moved", r"in all of these, the probe .*: the probe by 50 mm"),
+    (stale, "copied_poses", r"Views 7, 20 have the reading of the row before once more"),
+]
+
+
+@pytest.mark.parametrize(("named", "options"), crossed(CHANGES, [POINT, PROBE]))
+def test_groups_of_readings_that_agree_with_one_change_are_named(options, named):
+    (change, kind, words), (shop, poses) = named, read(options)
     verdict = calibrate(of_rows(shop, change(poses))).verdict
     assert verdict.causes[0].kind == kind
     assert re.search(words, verdict.causes[0].words)

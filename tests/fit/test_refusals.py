@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.marks import seeds
 from support.refusals import raised
 from support.small_cells import TABLE, made
 from support.whole_cells import OPTIONS, recorded
@@ -77,11 +78,12 @@ def test_cells_of_which_a_part_is_tied_to_nothing_are_refused():
         raised(DegenerateError, "determined", solve, cell.only(range(count)))
 
 
-def test_a_lens_that_starts_far_off_ends_in_no_traceback(monkeypatch):
+@pytest.mark.parametrize("draws", seeds(1, 4))
+def test_a_lens_that_starts_far_off_ends_in_no_traceback(monkeypatch, draws):
     """As found where views of few corners mislead the closed form of focal lengths."""
     refused = list[str]()
     for focal in (60.0, 350.0, 3e4):
-        for seed in range(4):
+        for seed in draws:
             small = made(seed, stops=12, given=False)
             wild = Camera("brown", TABLE.size, np.array([focal, focal, 900.0, 200.0]), np.zeros(5))
             monkeypatch.setattr(
@@ -105,8 +107,9 @@ def test_every_view_is_in_the_cell_or_said_to_be_absent():
     assert "in one row of the target" in cell.absent[3]
 
 
-def test_a_lens_is_found_beside_views_of_one_row():
-    for seed in range(6):
+@pytest.mark.parametrize("draws", seeds(2, 6))
+def test_a_lens_is_found_beside_views_of_one_row(draws):
+    for seed in draws:
         small = made(seed, stops=24, given=False)
         own = list(small.cell.sightings)
         for at in range(0, 24, 2):

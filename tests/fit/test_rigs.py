@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from support.marks import seeds
 from support.small_cells import PX, ROBOT_RAD, made
 from support.whole_cells import FLOOR, OPTIONS, PLATE, recorded
 
@@ -89,9 +90,10 @@ def ring(seed):
     )
 
 
-def test_all_edges_of_a_rig_err_as_their_joint_covariance_says():
-    squares, count = [], 6
-    for seed in range(count):
+@pytest.mark.parametrize("draws", seeds(2, 6))
+def test_all_edges_of_a_rig_err_as_their_joint_covariance_says(draws):
+    squares, count = [], len(draws)
+    for seed in draws:
         simulated = simulate(ring(seed))
         session = recorded(simulated)
         fit = solve(read_cell(session, session.corners)).fit

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.marks import seeds
 from support.small_cells import PX, TABLE, made, pose
 from support.whole_cells import OPTIONS, recorded
 from test_measured import is_fair
@@ -38,9 +39,10 @@ def with_prior(small, *prior):
     return small.cell.with_sightings([*small.cell.sightings, *more])
 
 
-def test_a_prior_is_worth_what_it_says():
+@pytest.mark.parametrize("draws", seeds(4, 12))
+def test_a_prior_is_worth_what_it_says(draws):
     squares, gains, sigma = [], [], 5e-5
-    for seed in range(12):
+    for seed in draws:
         small = made(seed)
         place = small.edges["cam"][:3, 3] + sigma * np.random.default_rng(seed).normal(size=3)
         solved = solve(with_prior(small, place, sigma))
@@ -150,10 +152,11 @@ def off_lens(rng, sigma_px, **changes):
     return TABLE.model_copy(update={"matrix": matrix, "matrix_sigma_px": sigma_px, **changes})
 
 
+@pytest.mark.parametrize("draws", seeds(4, 12))
 @pytest.mark.parametrize("mode", ["hold", "refine", "auto"])
-def test_a_stated_lens_is_as_sure_as_its_sigma(mode):
+def test_a_stated_lens_is_as_sure_as_its_sigma(mode, draws):
     squares, sigma = [], 2.0
-    for seed in range(12):
+    for seed in draws:
         small = made(seed, 14)
         table = off_lens(np.random.default_rng(seed), sigma, intrinsics=mode)
         fit = solve(replace(small.cell, cameras={"cam": table})).fit
@@ -246,10 +249,11 @@ def test_a_stated_lens_leaves_without_its_field_as_matrix_and_distortion_explain
             assert left(other) > left(alone)
 
 
+@pytest.mark.parametrize("draws", seeds(3, 8))
 @pytest.mark.parametrize("stops", [5, 14])
-def test_the_axis_of_a_given_lens_with_wrong_decentring_is_as_sure_as_is_said(stops):
+def test_the_axis_of_a_given_lens_with_wrong_decentring_is_as_sure_as_is_said(stops, draws):
     squares = []
-    for seed in range(8):
+    for seed in draws:
         # Five views leave distortion no parameters of its own: a field shows that it is wrong.
         small, off = made(seed, stops), np.array(TABLE.distortion)
         off[2:4] += [1.6e-3, -1.2e-3]
