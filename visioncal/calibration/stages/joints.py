@@ -38,6 +38,8 @@ class MatchedJoints:
     joints_rad: Mapping[int, FloatArray] = field(default_factory=dict)
     # (4, 4) the poses' frame in the model's flange.
     flange_from_reported: FloatArray = field(default_factory=lambda: np.eye(4))
+    # (n,) by view, where poses and angles disagree, which leaves none that belong to it [rad].
+    disagreeing_rad: Mapping[int, FloatArray] = field(default_factory=dict)
     misread: str = ""  # The fault of the angles or the model, and the fix; empty for none.
     # The fault of the angles, unless the pose has one, by view.
     contradicting: Mapping[int, str] = field(default_factory=dict)
@@ -98,7 +100,8 @@ def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
             "the poses. The joint angles were not used."
         )
         step = "Check [robot] model and tip, and whether the base frame is the controller's."
-        return MatchedJoints(robot, warnings=(Finding("other_arm", words, Remedy(step)),))
+        doubt = Finding("other_arm", words, Remedy(step))
+        return MatchedJoints(robot, disagreeing_rad=joints, warnings=(doubt,))
     if is_outlier.any():
         reasons = {
             view: f"its joint angles lead {_words(residual)} away from its pose"

@@ -21,11 +21,12 @@ def _found(run: RunState) -> Iterator[Finding]:
     if run.mount not in MOUNTS or matched is None or matched.misread:
         return
     seen, reported = run.poses_of_one_board, run.base_from_flange
-    views = [view for view in run.used if view in seen and view in matched.joints_rad]
+    joints_rad = matched.joints_rad or matched.disagreeing_rad
+    views = [view for view in run.used if view in seen and view in joints_rad]
     if len(views) <= FEWEST_COMPARED:
         return
     camera = np.array([seen[view].cam_from_target[0] for view in views])
-    by_joints = [matched.pose(matched.joints_rad[view]) for view in views]
+    by_joints = [matched.pose(joints_rad[view]) for view in views]
     poses = robot_part(np.array([[reported[view] for view in views], by_joints]), run.mount)
     # Of an arm that cannot tilt, the same poses close by chance to any length along its axes.
     if np.abs(poses[1] - poses[0]).max() < _SAME:
@@ -51,6 +52,6 @@ LATE_POSES = Suspect(
     _found,
     1e-6,
     of_chain=True,
-    hides=(UNEXPLAINED, ARM_ERRORS, "stops_short"),
+    hides=(UNEXPLAINED, ARM_ERRORS, "stops_short", "other_arm", "wrong_views", "something_moved"),
     inflates=("robot_noise", "robot_noise_of_pick", "calibration", ARM_ERRORS),
 )
