@@ -331,7 +331,7 @@ def test_a_held_distortion_that_does_not_fit_is_named_and_freed_by_what_is_advis
     (cause, *_) = held.verdict.causes
     assert cause.kind == "lens"
     assert "the distortion, k1, k2, p1, p2, k3, would move corners by up to" in cause.words
-    assert cause.do.words.startswith('In session.toml, write intrinsics = "refine"')
+    assert cause.do.command.startswith("visioncal convert SESSION FIXED --intrinsics estimate && ")
     freed = calibrated(cell, session=with_camera(cell, distortion=[0.0] * 5, **REFINE))
     # Chi-square of 12 over 12: beyond in one case of a thousand.
     assert mahalanobis_sq(cell, freed) < 2.74

@@ -79,7 +79,11 @@ def moved_lens(document: dict) -> None:
 
 
 def without_distortion(document: dict) -> None:
-    document["camera"]["distortion"] = [0.0] * 5
+    document["camera"] |= {"distortion": [0.0] * 5}
+
+
+def held_without_distortion(document: dict) -> None:
+    document["camera"] |= {"distortion": [0.0] * 5, "intrinsics": "hold"}
 
 
 def turned_off(document: dict) -> None:
@@ -143,6 +147,9 @@ FAULTS = {
     "a lens of another camera": Fault("lens", document_of(moved_lens), command="calibrate"),
     "a lens without its distortion": Fault(
         "lens", document_of(without_distortion), command="--intrinsics estimate"
+    ),
+    "a held lens without its distortion": Fault(
+        "lens", document_of(held_without_distortion), command="--intrinsics estimate"
     ),
     "a camera that was pushed for the last views": Fault(
         "something_moved", seen=pushed, options=replace(SOUND, views=32), command="--views 20-31"

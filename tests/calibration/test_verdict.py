@@ -124,6 +124,16 @@ def test_what_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
     assert ids(judge(replace(changed(SOUND), warnings=(FIELD,)))) == ["lens_field"]
 
 
+def test_a_held_lens_explains_a_misfit_that_it_is_large_enough_for() -> None:
+    """No step then says that nothing explains it."""
+    found = changed(SOUND, noise_mm=1.0)
+    for up_to_mm, is_explained in ((2.0 * found.held_out.mm, True), (0.1, False)):
+        warnings = (replace(HELD_LENS, up_to_mm=up_to_mm),)
+        verdict = judge(replace(found, warnings=warnings))
+        (unexplained,) = (one for one in verdict.findings if one.kind == "unexplained")
+        assert (unexplained.do is None) == is_explained
+
+
 def test_errors_of_an_arm_are_as_likely_as_what_another_cure_leaves() -> None:
     refined = replace(HELD_LENS, mahalanobis_sq=0.0)
     for left, first in ((1.0, "arm_errors"), (1e-3, "lens")):

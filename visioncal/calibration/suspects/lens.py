@@ -10,7 +10,7 @@ from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import NEW_LENS
 from visioncal.calibration.stages.error_sizes import Zoom
-from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure
@@ -45,12 +45,6 @@ _LONE = ("gridboard", "marker")
 # it is the lens, however small both are: where corners end, the models part by far more.
 _BETTER, _FAR_BETTER = 1.1, 2.0
 _ONE_LENS = "Keep one lens, and one setting of the driver that rectifies pictures"
-
-
-_FREE_LENS = Remedy(
-    'In session.toml, write intrinsics = "refine" in [camera], or calibrate the camera anew.',
-    CALIBRATE,
-)
 
 
 def _stated(run: RunState) -> Iterator[Finding]:
@@ -131,8 +125,12 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
                 "lens",
                 f"The given intrinsics do not fit these images: free, {would}. But intrinsics = "
                 '"hold" keeps them; what this does to the result counts in its sigmas.',
-                _FREE_LENS,
+                NEW_LENS,
                 mahalanobis_sq=squared,
+                up_to_mm=1e3
+                * mean_distance_m(fitted, camera)
+                * moved_px
+                / float(np.mean(held.matrix[:2])),
             )
 
 
@@ -151,8 +149,9 @@ def _misread(stated: Camera, refined: Camera, px: FloatArray, moved_px: float) -
         words = "They are in the order k1, k2, k3, p1, p2, and OpenCV's is k1, k2, p1, p2, k3: "
         words += f"write distortion = [{', '.join(f'{value:.6g}' for value in other)}]."
         ways[words] = replace(stated, distortion=other)
-    if np.abs(moves).max() > _CROPPED_PX:
-        right, below = (-moves).round().tolist()
+    right, below = (-moves).round().tolist()
+    # A part begins within the picture.
+    if max(right, below) > _CROPPED_PX and min(right, below) >= 0.0:
         words = (
             f"The pictures are a part of this lens's, which begins {right:g} px to the right and "
             f"{below:g} px below: subtract these from the centre in matrix."
@@ -408,15 +407,22 @@ def _bends(lens: Camera, px: FloatArray) -> bool:
 
 # A held lens that the corners contradict looks like a board of another size or shape, and, by the
 # views' postures, like arm errors; the lens is tested beside all three.
-LENS = Suspect("lens", _stated, 1e-4, True, ("board_size", "board_shape", ARM_ERRORS))
+LENS = Suspect(
+    "lens",
+    _stated,
+    1e-4,
+    True,
+    ("board_size", "board_shape", ARM_ERRORS, "wrong_views", "corner_noise", UNEXPLAINED),
+)
 FIELD = Suspect("lens_field", _beyond, 1e-4, True)
-FOCUS = Suspect("focus", None, 1e-4, True)
+# A look is off by what the focus changes, however well the robot repeats.
+FOCUS = Suspect("focus", None, 1e-4, True, inflates=("robot_noise",))
 SHIFTED = Suspect(
     "image_shifted",
     None,
     1e-4,
     True,
-    ("moved_at_once", "something_moved", "place", ARM_ERRORS),
+    ("moved_at_once", "something_moved", "place", ARM_ERRORS, UNEXPLAINED),
     INFLATED,
 )
 MOTION = Suspect("row_motion", _moving, 1e-4, True)

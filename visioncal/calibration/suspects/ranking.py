@@ -164,8 +164,8 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
     for finding in doubts:
         if SUSPECTS[finding.kind].chance:
             first.setdefault(finding.kind, finding)
-    hidden = {*_hidden({doubt.kind: doubt for doubt in reversed(doubts)})}
     misfit_mm = left_out_mm if UNEXPLAINED in first else 0.0
+    hidden = {*_hidden({doubt.kind: doubt for doubt in reversed(doubts)}, misfit_mm)}
     log_odds = {
         name: 0.0 if name in hidden else _log_odds(finding, misfit_mm)
         for name, finding in first.items()
@@ -187,9 +187,11 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
     return [weighed(doubt) for doubt in doubts]
 
 
-def _hidden(first: Mapping[str, Finding]) -> Iterator[str]:
-    """Kinds of findings that are mere effects of another finding."""
+def _hidden(first: Mapping[str, Finding], misfit_mm: float) -> Iterator[str]:
+    """Kinds of findings that are mere effects of another, which can be as large as a misfit."""
     for name, finding in first.items():
+        if finding.up_to_mm < misfit_mm:
+            continue
         if name == "lens" and not finding.mahalanobis_sq:
             # It was refined with the rest.
             continue
