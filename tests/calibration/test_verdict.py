@@ -134,6 +134,15 @@ def test_a_held_lens_explains_a_misfit_that_it_is_large_enough_for() -> None:
         assert (unexplained.do is None) == is_explained
 
 
+def test_effects_of_a_cause_are_no_causes_and_have_no_steps_of_their_own() -> None:
+    wrong = Finding("wrong_views", "View 3 was left out.", Remedy("Delete its row."), (3,))
+    short = Finding("stops_short", "The arm stood short.", mahalanobis_sq=300.0)
+    alone, beside = (judge(changed(SOUND, warnings=some)) for some in ((wrong,), (short, wrong)))
+    assert ids(alone) == ["wrong_views"]
+    assert ids(beside) == ["stops_short"]
+    assert next(one for one in beside.findings if one.kind == "wrong_views").do is None
+
+
 def test_errors_of_an_arm_are_as_likely_as_what_another_cure_leaves() -> None:
     refined = replace(HELD_LENS, mahalanobis_sq=0.0)
     for left, first in ((1.0, "arm_errors"), (1e-3, "lens")):

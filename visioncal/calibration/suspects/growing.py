@@ -37,7 +37,7 @@ def _suspect(kind: str) -> Suspect:
     effect, own = KINDS[kind], ("robot_noise", "robot_noise_of_pick", UNEXPLAINED)
     inflated: tuple[str, ...] = () if issubclass(effect, LensEffect) else own
     inflated += ("calibration",) if issubclass(effect, BracketBends) else ()
-    return Suspect(kind, partial(_found, kind), 1e-4, True, inflates=inflated)
+    return Suspect(kind, partial(_found, kind), 1e-4, True, effect.hides, inflated)
 
 
 GROWING = tuple(map(_suspect, KINDS))

@@ -174,7 +174,7 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
     def weighed(finding: Finding) -> Finding:
         name, of_chain = finding.kind, SUSPECTS[finding.kind].of_chain
         found = replace(finding, do=None) if name in hidden else finding
-        if first.get(name) is not finding:
+        if first.get(name) is not finding or (name in hidden and not of_chain):
             return found
         rivals = [rival for rival in log_odds if of_chain and SUSPECTS[rival].of_chain] or [name]
         among = [log_odds[rival] for rival in rivals]

@@ -112,6 +112,7 @@ class Named(ABC):
     # Size, a standard deviation of its values, beyond which what else looks like it is likelier.
     most: ClassVar[float]
     do: ClassVar[str]  # Advice.
+    hides: ClassVar[tuple[str, ...]] = ()  # Kinds of findings that are mere effects of it.
 
     @classmethod
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:

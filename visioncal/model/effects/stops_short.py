@@ -26,6 +26,8 @@ class _AlongMotion(Effect, Named):
     """
 
     count, bounds, most = 6, (1e-2, 1e-6, 0.1), 5e-2
+    # After the largest motions it is no multiple of these.
+    hides = ("wrong_views",)
     poses: FloatArray  # (s, 4, 4) `base_from_flange` at the cell's stops; NaN where unknown.
 
     @classmethod
