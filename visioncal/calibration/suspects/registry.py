@@ -126,7 +126,9 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("joint_play", None, 1e-6, hides=("wrong_views",)),
     # The frames are by the poses, which a wrong model does not change.
     Suspect("other_arm", None, REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
-    *map(Suspect, ("contradicting_joints", "base_link", "tool_frame", "level", "load", "clock")),
+    # A result in another frame than the flange's, beside sigmas beyond their limits.
+    Suspect("tool_frame", chance=REMARK),
+    *map(Suspect, ("contradicting_joints", "base_link", "level", "load", "clock")),
     # The remainder of a clock's jump looks like motion.
     Suspect("clock_changed", None, 1e-4, True, ("moved_slowly", *STEPS, ARM_ERRORS)),
     # The size of errors.
