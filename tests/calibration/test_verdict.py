@@ -352,6 +352,18 @@ def test_the_arm_is_among_the_causes_of_a_view_that_is_off_by_what_arms_err_by(o
     assert farthest_by_arms([servo]) == pytest.approx((12.0, 3.0))
 
 
+def test_a_view_just_beyond_the_limit_of_outliers_is_no_mistake():
+    cell = simulate(CellOptions(views=20))
+    flanges = cell.robot.base_from_flange.copy()
+    # The limit is 0.23 mm.
+    flanges[7, 0, 3] += 3e-4
+    found = calibrate(session_of(cell, flanges))
+    assert [view.view for view in found.views if not view.used] == [7]
+    assert found.verdict.status == "good"
+    words = "View 7 was left out: off by what arms err by now and then."
+    assert words in [finding.words for finding in found.verdict.findings]
+
+
 @pytest.mark.parametrize(
     ("step_mm", "step_deg", "noise_mm", "words"),
     [

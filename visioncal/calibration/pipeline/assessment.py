@@ -61,6 +61,9 @@ class FitAssessment:
     held_out: HeldOutResiduals  # Residuals of observations that were left out of the fit in turn.
     moved: tuple[Moved, ...]  # Frames that moved, in the order of time.
     faults: tuple[PoseFault, ...]  # Wrong poses and images that explain outliers.
+    strays: frozenset[
+        int
+    ]  # Views left out that are off by no more than an arm's errors now and then.
     views: tuple[ViewResult, ...]  # Result of each observation.
     # Estimated standard deviations, by frame or robot and by name.
     sigmas: Mapping[str, Mapping[str, float]]
@@ -170,7 +173,7 @@ def assess_fit(
     beside = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)
     fit = replace(with_lasting_errors(fit, cell_fit.arms) if is_fit else fit, beside=beside)
     held_out = left_out(cell_fit)
-    (faults, reasons), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
+    (faults, reasons, strays), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
     return FitAssessment(
         cell_fit,
         fit,
@@ -179,6 +182,7 @@ def assess_fit(
         held_out,
         movements(cell_fit),
         faults,
+        strays,
         _views(observed, cell, cell_fit, held_out, reasons),
         _sigmas(cell_fit),
     )

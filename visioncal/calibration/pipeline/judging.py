@@ -20,7 +20,7 @@ from visioncal.calibration.suspects.registry import found_in
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.core.conventions import controller_form
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import mm_and_deg, some_of
+from visioncal.core.number_format import mm_and_deg, some_of, view_words
 from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import stops_of
@@ -63,12 +63,12 @@ def findings_of(run: RunState) -> Findings:
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {run.cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     return Findings(
-        _pairs(connected, explained, answer, alone=run.mount is not None),
+        _pairs(connected, explained | answer.strays, answer, alone=run.mount is not None),
         _sensors(connected, run),
         _arms(run),
         _worst(run),
         (*contested(run, found_in(run)), *run.warnings),
-        run.notes,
+        (*run.notes, *_stray_words(answer)),
         run.session.need,
         predict_picks(_pick_inputs(run, explained), run.session.need),
         run.session.corrects_targets,
@@ -105,6 +105,13 @@ def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
         middle_jacobians(fit, run.session),
         _strays(answer, explained),
     )
+
+
+def _stray_words(answer: FitAssessment) -> Iterator[str]:
+    """Remark on views that an arm's ordinary errors put off."""
+    if views := sorted(answer.strays):
+        were = "was" if len(views) == 1 else "were"
+        yield f"V{view_words(views)[1:]} {were} left out: off by what arms err by now and then."
 
 
 def _strays(answer: FitAssessment, explained: Collection[int]) -> dict[str, FloatArray]:

@@ -43,6 +43,9 @@ _BY_CHANCE, _AT_END = 4, 0.6
 # Probability below which outliers that are all views of one end are so by no chance.
 _ONE_END = 1e-3
 _WRONG = "its pose or its reading is wrong, or something had moved"
+# An arm's errors have longer tails than noise: views within so many times the limit of outliers, at
+# most one to so many that agree, are no mistakes where arms err by as much.
+_TAIL, _STRAY_SHARE = 1.5, 10
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
 
@@ -130,14 +133,16 @@ def crept_findings(cell_fit: CellFit) -> Iterator[Finding]:
         )
 
 
-def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[int, str]]:
-    """Faults that explain outliers, and the reason why each view is left out.
+def explained_outliers(
+    cell_fit: CellFit,
+) -> tuple[tuple[PoseFault, ...], dict[int, str], frozenset[int]]:
+    """Faults that explain outliers, the reason why each view is left out, and mere strays.
 
     Exchanged or wrong poses, and what moved; else the stops that a view fits instead of its own.
     """
     outliers, agreed = np.flatnonzero(~cell_fit.inlier_fit.used), cell_fit.inlier_fit
     if not len(outliers):
-        return (), {}
+        return (), {}, frozenset()
     turns = {
         frame_name("target", name): rotation_transforms(target)
         for name, target in cell_fit.cell.session.boards.items()
@@ -149,7 +154,7 @@ def explained_outliers(cell_fit: CellFit) -> tuple[tuple[PoseFault, ...], dict[i
         faults += _moved_run(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     causes = {at: _cause(cell_fit, at, fitting, mutual) for at in outliers.tolist()} | clauses
-    return tuple(faults), _reasons(cell_fit, causes)
+    return tuple(faults), *_reasons(cell_fit, causes)
 
 
 def _fault(
@@ -378,14 +383,15 @@ def farthest_by_arms(robots: Iterable[Robot]) -> tuple[float, float]:
     return mm, deg
 
 
-def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
-    """Why outliers are left out, by view, given the likely cause of each."""
+def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> tuple[dict[int, str], frozenset[int]]:
+    """Why outliers are left out, by view, given the likely cause of each; and mere strays."""
     inliers, alone = cell_fit.inlier_fit, cell_fit.cell.mount is not None
     directions = np.maximum(inliers.distances.directions, 1)
     distance = np.sqrt(inliers.distances.squares / directions)
     limit = np.sqrt(inliers.distances.limit / directions)
     off_m, off_rad = pose_residuals(inliers.problem, inliers.fit.state)
-    reasons, known = dict[int, str](), (arm.matched for arm in cell_fit.arms.values())
+    strays, reasons = set[int](), dict[int, str]()
+    known = (arm.matched for arm in cell_fit.arms.values())
     robots = [matched.robot for matched in known if matched is not None]
     most_mm, most_deg = farthest_by_arms(robots)
     for at, cause in causes.items():
@@ -399,11 +405,14 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> dict[int, str]:
         if distance[at] > limit[at]:
             beyond = f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"
         target = f"the {row.seen.partition('_')[0]}" if alone else row.seen.partition("@")[0]
+        if may_err and distance[at] < _TAIL * limit[at]:
+            strays.add(row.view)
         reasons[row.view] = (
             f"disagrees with the other views: it places {target} {figure(mm)} mm{turned} away, "
             f"{beyond}; {cause}{', or the arm errs so there' if may_err else ''}"
         )
-    return reasons
+    are_few = _STRAY_SHARE * len(strays) <= inliers.used.sum()
+    return reasons, frozenset(strays if are_few else ())
 
 
 def _cause(
