@@ -161,6 +161,9 @@ FAULTS = {
     "poses read on the way": Fault(
         "late_poses", read_late(8e-3, 2e-2), command="--by-joints", has_joints=True
     ),
+    "poses read early on the way": Fault(
+        "late_poses", read_late(2e-2, 7e-2), command="--by-joints", has_joints=True
+    ),
 }
 QUICK = (
     "four rows exchanged in turn",

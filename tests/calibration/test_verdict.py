@@ -164,6 +164,14 @@ def test_another_size_is_said_by_what_the_targets_file_calls_it(name, said) -> N
     assert "--board-scale left:1.0047 " in found.do.command
 
 
+def test_a_result_that_goes_far_from_the_stated_size_says_so() -> None:
+    """However unsure the robot alone is of that."""
+    target, measured = load_target("charuco_9x6_30mm"), MeasuredScale(4.7e-3, 1.7e-3, 3e-4)
+    for scale, kind in ((4.6e-3, "board_size"), (7e-4, "note")):
+        written = replace(measured, scale=scale, sigma=8e-4)
+        assert scale_finding("board", target, measured, written).kind == kind
+
+
 @pytest.mark.parametrize(("repeatability", "is_doubt"), [((0.1, 0.01), True), ((5.0, 1.5), False)])
 def test_noise_is_plausible_by_the_kind_of_arm(repeatability, is_doubt) -> None:
     arm = replace(
@@ -259,7 +267,7 @@ def test_the_cause_its_cost_and_what_to_do_come_first() -> None:
     assert Verdict.of("good", "Fine.").top == ("Fine.",)
 
 
-def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
+def test_findings_are_kept_and_name_the_session(tmp_path: Path, monkeypatch) -> None:
     verdict = judge(changed(SOUND, warnings=(EXCHANGED,), stops=8))
     document = json.loads(json.dumps(write(VerdictForm, verdict)))
     assert read(VerdictForm, document, "verdict").verdict("verdict") == verdict
@@ -278,6 +286,9 @@ def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     # An apostrophe of a sentence is no quotation.
     assert with_paths("Look at the camera's driver.", folder) == "Look at the camera's driver."
     assert with_paths(GUESS, folder) == f"visioncal convert {folder} {folder}-fixed --guess --yes"
+    # A copy of the folder in which somebody stands is beside it.
+    monkeypatch.chdir(tmp_path)
+    assert with_paths(GUESS, ".").split()[2:4] == [".", f"../{tmp_path.name}-fixed"]
     some = ("--need-mm", "0.5", "--views", "1-9")
     of_others = with_paths("visioncal calibrate SESSION -o NEW --views 2-5", "s", "out", need=some)
     assert of_others == "visioncal calibrate s -o out-new --need-mm 0.5 --views 2-5"

@@ -273,6 +273,9 @@ def with_paths(
     A corrected copy of the session has the first free name after so many as `copy`.
     """
     folder, result = Path(session), Path(out or "out")
+    if folder.name in ("", ".."):
+        # A copy of the current folder stands beside it, not within.
+        folder = folder / ".." / folder.resolve().name
     name = f"{folder.with_suffix('') if folder.is_file() else folder}-fixed"
     names = (name, *(f"{name}-{index}" for index in range(2, 100)))
     free = [word for word in names if not Path(word).exists()]

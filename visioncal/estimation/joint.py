@@ -167,6 +167,11 @@ class MeasuredScale:
         """Whether it differs by more than both uncertainties combined explain."""
         return abs(self.scale) > CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
+    @property
+    def leaves_stated(self) -> bool:
+        """Whether a result with it goes far from what is stated, as one that takes it for wrong."""
+        return abs(self.scale) > CONTRADICTION * max(self.sigma, self.stated_sigma)
+
 
 def measured_scale(
     model: FrameModel, fitted: Fit, frame: str, name: str, target: Target

@@ -58,11 +58,12 @@ def _found(run: RunState) -> Iterator[Finding]:
             if measured.is_another and abs(measured.scale) >= _SAME_SIZE:
                 yield scale_finding(f"target {target.name}", target, measured, measured, name)
             continue
-        if measured.is_another and SCALE in fitted.unknowns.values_of(board, moved=True):
+        if SCALE in fitted.unknowns.values_of(board, moved=True):
             scale, sigma = float(fitted.values(board)[SCALE]), float(fitted.sigmas(board)[SCALE])
             written = replace(measured, scale=scale, sigma=sigma)
-            found = scale_finding(called, target, measured, written, name)
-            yield _stretched(found, fitted, board, called)
+            if measured.is_another or written.leaves_stated:
+                found = scale_finding(called, target, measured, written, name)
+                yield _stretched(found, fitted, board, called)
         yield from _shape_findings(fitted, name, target, called)
 
 
@@ -147,7 +148,7 @@ def scale_finding(
         f"{'larger' if written.scale > 0 else 'smaller'} than stated (sigma "
         f"{figure(100 * written.sigma)} %)"
     )
-    if not measured.contradicts:
+    if not (measured.contradicts or written.leaves_stated):
         allowed = f"{size}, which does not contradict the stated size (to within {share})."
         return Finding(NOTE, f"{allowed} The result goes by both.")
     if target.is_rig:

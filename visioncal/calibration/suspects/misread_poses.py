@@ -17,6 +17,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.corner_numbers import are_from_behind
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
+from visioncal.calibration.suspects.late_poses import by_joints
 from visioncal.calibration.suspects.misread_readings import misread_readings
 from visioncal.calibration.suspects.missing_axis import missing_axes
 from visioncal.calibration.suspects.other_rows import of_other_rows
@@ -193,6 +194,9 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
         yield Finding("misread_poses", still, _LOG_ANEW)
     if np.quantile(away, PAIRS_SHARE) < _ALIKE_RAD:
         yield from missing_axes(run, views, both)
+    if np.median(away) > _ALIKE_RAD and (other := [*by_joints(run)]):
+        yield from other
+        return
     alike = float(np.mean(away < _ALIKE_RAD))
     if np.median(away) > _ALIKE_RAD and (late := _on_the_way(robot, by_camera, kept)) is not None:
         yield late

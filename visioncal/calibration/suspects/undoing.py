@@ -32,7 +32,8 @@ from visioncal.core.verdict import Finding, mending, or_alone
 from visioncal.estimation.chain import robot_part
 from visioncal.vision.camera import turned_back
 
-_SHIFTS = (0, 1, -1, 2, -2, 3, -3)
+# Rows that images and poses are apart, from none on: some lost or doubled pictures.
+_SHIFTS = (0, *(sign * by for by in range(1, 7) for sign in (1, -1)))
 # The prior of a mistake of the record; the probability that a robot reports one pose twice to the
 # last digit though it moved.
 _MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
