@@ -114,6 +114,7 @@ def stems_with_depth(folder):
 
 
 def two_folders(folder):
+    folder = folder / "Debug"
     shoot(folder / "rgb", "frame_{:03d}.png")
     for at, pose in enumerate(world()[0]):
         write(
@@ -1079,7 +1080,7 @@ def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
         assert "The depth #.png (9 files) is of the same images" in done.err
         assert "Left aside, as rows differ in their shape: joints" in done.err
     if make is two_folders:
-        assert "frame_#.png (9 files), rgb/frame_#_corners.png (9 files)" in done.err
+        assert "frame_#.png (9 files), Debug/rgb/frame_#_corners.png (9 files)" in done.err
     if make in (named_with_depth, named_with_clouds):
         for at, view in zip(shown, session.views, strict=True):
             depth = read_depth(session.images.read(view.depth), view.depth, (640, 400))

@@ -199,6 +199,17 @@ def test_no_field_is_proposed_for_both_sides(tmp_path):
     assert command[-2:] == ["--robot-key", "v0,v1,v2,v3,v4,v5,v6"]
 
 
+def test_pairs_of_matrices_in_one_array_are_named_apart(tmp_path):
+    poses, seen, mount = world()
+    write(tmp_path / "in.json", {"transform set": np.stack([poses, seen], axis=1).tolist()})
+    refused = visioncal("convert", tmp_path / "in.json", tmp_path / "out", "--mount", mount)
+    command = shlex.split(refused.refused("--robot-key").err.splitlines()[-1])
+    assert command[-3::2] == ["transform set.0", "transform set.1"]
+    visioncal(*command[1:]).good()
+    last = Session.load(tmp_path / "out").views[-1]
+    np.testing.assert_allclose(last.base_from_flange().as_matrix(), poses[-1], atol=1e-9)
+
+
 def test_a_sensor_beside_a_camera_is_the_arm_s(tmp_path):
     """As of an electromagnetic tracker: both words are a camera's."""
     rows = []

@@ -203,6 +203,10 @@ def fields_of_records(
         else:
             empty = np.full(shape, np.nan)
             array = np.array([empty if value is None else value for value in values], float)
+            if shape == (2, 4, 4):
+                # Both sides of a pair of matrices in one array.
+                numbers |= {f"{key}.{at}": array[:, at] for at in (0, 1)}
+                continue
             numbers[key] = _without_counts(array)
             if not shape:
                 # As cells of a table: whole numbers without a decimal point.

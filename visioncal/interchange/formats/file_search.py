@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
+from os.path import commonpath
 from pathlib import Path
 
 import cv2
@@ -357,9 +358,12 @@ def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
             found = found or next(iter(steps[group.label]), None)
         matches += [(group, found)] if found else []
 
+    # A folder of all of them says nothing of one, as `bin/Debug`.
+    shared = len(commonpath([group.label for group in groups]))
+
     def rank(item: tuple[FileGroup, Match]) -> tuple[object, ...]:
         group, found = item
-        drawn = _DRAWN.search(group.label) is not None
+        drawn = _DRAWN.search(group.label, shared) is not None
         is_named = re.search("rgb|colou?r", group.label, re.IGNORECASE) is not None
         # Drawings of another program, and pictures of some of the rows alone, come last.
         is_grey = group.image is not None and group.image.words.endswith("grey")
