@@ -170,8 +170,6 @@ class FakeCamera:
         self._print = cv2.copyMakeBorder(
             board.generateImage(size), *(_PX_A_SQUARE // 2,) * 4, cv2.BORDER_CONSTANT, value=255
         )
-        # An arm at rest is seen again and again.
-        self._warp = self._still = np.zeros(0)
         width, height = self.lens.resolution
         # Fresh noise is a part of a larger picture of it, which is quicker than drawing it anew.
         self._rng = np.random.default_rng(3)
@@ -209,13 +207,10 @@ class FakeCamera:
         board_from_px = np.array([[scale, 0, -edge], [0, scale, -edge], [0, 0, 1.0]])
         board_from_px[:2, 2] += 0.5 * scale
         warp = matrix_3x3(self.lens) @ pose[:3, [0, 1, 3]] @ board_from_px
-        if not np.array_equal(warp, self._warp):
-            flags = cv2.INTER_AREA
-            size = self.lens.resolution
-            seen = cv2.warpPerspective(self._print, warp, size, flags=flags, borderValue=120)
-            self._warp = warp
-            self._still = cv2.GaussianBlur(seen, (0, 0), 0.7).astype(np.float32)
-        return self._still
+        flags = cv2.INTER_AREA
+        size = self.lens.resolution
+        seen = cv2.warpPerspective(self._print, warp, size, flags=flags, borderValue=120)
+        return cv2.GaussianBlur(seen, (0, 0), 0.7).astype(np.float32)
 
     def close(self) -> None:
         """Nothing is open."""
