@@ -240,11 +240,16 @@ def test_numbers_that_do_not_lie_as_drawn_are_refused_or_left_out_by_name():
         assert f"Write {stated} in the board's .toml" in caught.next_step
     _, session = seen(CHARUCO)
     table = session.corner_table
-    by_column = table.points % 5 * 8 + table.points // 5
-    everywhere = replace(session, corner_table=replace(table, points=by_column))
-    caught = raised(DataError, "do not lie as its drawing numbers them", detect, everywhere)
-    assert "Compare columns, rows and the order" in caught.next_step
-    points = np.where(table.views == 2, by_column, table.points)
+    shuffled = table.points % 5 * 8 + table.points // 5
+    by_column = table.points % 8 * 5 + table.points // 8
+    for points, advice in (
+        (shuffled, "Compare columns, rows and the order"),
+        (by_column, "Number them row by row"),
+    ):
+        everywhere = replace(session, corner_table=replace(table, points=points))
+        caught = raised(DataError, "do not lie as its drawing numbers them", detect, everywhere)
+        assert advice in caught.next_step
+    points = np.where(table.views == 2, shuffled, table.points)
     (rejection,) = detect(replace(session, corner_table=replace(table, points=points))).rejections
     assert rejection.view == 2
     assert "do not lie as the target's drawing numbers them" in rejection.reason

@@ -122,12 +122,17 @@ def _misnumbered(session: Session, name: str, views: Sequence[Corners]) -> list[
             )
         )
     if is_other:
+        by_columns = points[np.lexsort((points[:, 1], points[:, 0])), :2]
+        likely = "the drawing is of another board, or the numbers are of another order"
+        next_step = "Compare columns, rows and the order of the points with the detector's."
+        if all(_residual(by_columns[at.ids], at.px) < _LIKE for at in views):
+            likely = "they are numbered column by column"
+            next_step = "Number them row by row, from corner 0 at the upper left."
         raise DataError(
             f"target {target.name!r}: in {len(wrong)} of {len(views)} views the corners of "
-            "corners.csv do not lie as its drawing numbers them: the drawing is of another board, "
-            "or the numbers are of another order.",
+            f"corners.csv do not lie as its drawing numbers them: {likely}.",
             culprits=[f"view {view}" for view in wrong],
-            next_step="Compare columns, rows and the order of the points with the detector's.",
+            next_step=next_step,
         )
     return wrong
 
@@ -138,9 +143,13 @@ def _counts(target: Target, views: Sequence[Corners]) -> dict[str, object]:
         return {}
     largest, some = max(int(at.ids.max()) for at in views), views[:: len(views) // 3 + 1]
     for columns, rows in product(range(2, _MOST_COUNT), repeat=2):
-        points = corner_positions(replace(target, columns=columns, rows=rows))[:, :2]
+        other = replace(target, columns=columns, rows=rows)
+        points = corner_positions(other)[:, :2]
         enough = largest < len(points) <= largest + len(points) // rows
-        if enough and all(_residual(points[at.ids], at.px) < _LIKE for at in some):
+        if not enough or any(_residual(points[at.ids], at.px) >= _LIKE for at in some):
+            continue
+        # Numbers that run column by column are those of no board that is seen from the front.
+        if not are_from_behind([(at, other) for at in some]):
             return {"columns": columns, "rows": rows}
     return {}
 
