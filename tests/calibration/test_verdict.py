@@ -23,6 +23,7 @@ from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.board import scale_finding
 from visioncal.calibration.suspects.judge import in_reading_order, judge
+from visioncal.calibration.suspects.lens import pane_finding
 from visioncal.calibration.suspects.outliers import farthest_by_arms
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD, correcting
 from visioncal.core.codec import read, write
@@ -46,6 +47,7 @@ from visioncal.core.verdict import (
 from visioncal.estimation.arm import ArmErrors, pose_basis
 from visioncal.estimation.joint import MeasuredScale
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
+from visioncal.model.effects import Window
 from visioncal.present.report.content import need_facts
 from visioncal.results import Calibration, Rms, to_document
 from visioncal.results.parts import VerdictForm
@@ -162,6 +164,13 @@ def test_another_size_is_said_by_what_the_targets_file_calls_it(name, said) -> N
     found = scale_finding("board", load_target(name), MEASURED, MEASURED, "left")
     assert said in found.words
     assert "--board-scale left:1.0047 " in found.do.command
+
+
+@pytest.mark.parametrize(("tilt_deg", "kind"), [(60.0, "window"), (103.0, "lens_field")])
+def test_a_pane_through_which_no_camera_looks_is_of_the_lens(tilt_deg: float, kind: str) -> None:
+    tilt = np.deg2rad(tilt_deg)
+    pane = Window("cam", (float(np.sin(tilt)), 0.0, float(np.cos(tilt))))
+    assert pane_finding(pane, np.array([2e-3, 0.0, 0.0])).kind == kind
 
 
 def test_a_result_that_goes_far_from_the_stated_size_says_so() -> None:

@@ -44,6 +44,10 @@ _LONE = ("gridboard", "marker")
 # Another model of a lens leaves so much less: more than an even field does; and so much less that
 # it is the lens, however small both are: where corners end, the models part by far more.
 _BETTER, _FAR_BETTER = 1.1, 2.0
+# Cosine of the steepest tilt of a pane to the sight: through it little light comes beyond.
+_STEEPEST = float(np.cos(np.deg2rad(75.0)))
+_OTHER_MODEL = "Give matrix and distortion of a model that fits the lens, or keep to the middle of "
+_OTHER_MODEL += "the image."
 _ONE_LENS = "Keep one lens, and one setting of the driver that rectifies pictures"
 
 
@@ -203,8 +207,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             focal_px = float(np.mean(optics.camera(name).matrix[:2]))
             words = "corners of one part of the image are off alike, by "
             words = f"{of} departs from its model: {words}{figure(field_px)} px."
-            advice = "Give matrix and distortion of a model that fits the lens, or keep to the "
-            advice += "middle of the image."
+            advice = _OTHER_MODEL
             if any(board.kind in _LONE for board in run.session.boards.values()):
                 words += " Or else the corners of lone tags were found off: blur and light shift "
                 words += "them, unlike those where squares meet."
@@ -270,7 +273,7 @@ def _seen_through(run: RunState) -> Iterator[Finding]:
     for found in sizes.displaced:
         camera, effect = found.effect.frame, found.effect
         if isinstance(effect, Window):
-            finding = _pane(effect, found.values)
+            finding = pane_finding(effect, found.values)
         elif isinstance(effect, BoardSags):
             finding = _sagging(effect, found.values)
         else:
@@ -304,8 +307,16 @@ def _sagging(sags: BoardSags, values: FloatArray) -> Finding:
     )
 
 
-def _pane(window: Window, values: FloatArray) -> Finding:
+def pane_finding(window: Window, values: FloatArray) -> Finding:
+    """Finding on a pane by its (3,) values; on the lens, of one that is tilted as no pane is."""
     thick_m, normal = window.pane(values)
+    if normal[2] < _STEEPEST:
+        return Finding(
+            "lens_field",
+            "The lens departs from its model, on one side of the image otherwise than on the "
+            "other. It was taken out of the corners, and the result belongs to this lens.",
+            Remedy(_OTHER_MODEL),
+        )
     shift_mm = 1e3 * thick_m * nearer(np.array([[0.0, 0.0, 1.0]]), normal)[0]
     tilt = f"{np.rad2deg(np.arccos(normal[2])):.0f} deg"
     where = ", ".join(f"{part:.1f}" for part in shift_mm.tolist())
