@@ -583,6 +583,25 @@ def test_rows_in_reverse_order_are_mended_by_one_command(tmp_path, monkeypatch):
     assert "Views 23 and 14 must be exchanged once" in again.refused("--exchange").err
 
 
+def test_rows_exchanged_among_stops_that_are_alike_have_one_partner_each():
+    """Each of two pairs of rows fits those of the other, as where a programme ran twice."""
+    rng, count = np.random.default_rng(3), 12
+    x, z = exp(np.array([[0.3, -0.1, 1.5, 0.03, -0.05, 0.02], [0, 3, 0, 0.3, 0, 0.1]]))
+    cam = exp(rng.uniform(-1, 1, (count, 6)) * [0.6, 0.6, 1.5, 0.05, 0.05, 0.05])
+    cam[:, 2, 3] += 0.3
+    cam = np.concatenate([cam, cam])
+    noise = [exp(rng.normal(0, [2e-3] * 3 + [1e-3] * 3, (2 * count, 6))) for _ in range(2)]
+    order = np.arange(2 * count)
+    order[[2, 7, 14, 19]] = order[[7, 2, 19, 14]]
+    robot = z @ invert(cam) @ invert(x) @ noise[0]
+    session = pairs_session(MOUNTS[0], robot, (cam @ noise[1])[order])
+    cause = visioncal.calibrate(session).verdict.causes[0]
+    assert cause.kind == "exchanged_views"
+    assert sorted(cause.views) == [2, 7, 14, 19]
+    pairs = np.reshape([int(view) for view in cause.do.command.split()[5].split(",")], (2, 2))
+    assert (np.sort(pairs % count, axis=1) == [2, 7]).all()
+
+
 def test_views_that_a_symmetric_board_lets_read_turned_are_said_and_turned_back(
     tmp_path, monkeypatch
 ):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
-from support.cells import calibrated, pairs_session, reporting, showing
+from support.cells import calibrated, cell_session, pairs_session, reporting, showing
 from support.marks import slow
 from support.sound_findings import SOUND, changed, directions, views
 
@@ -29,7 +29,7 @@ from visioncal.calibration.suspects.ranking import MEASURE_BOARD, correcting
 from visioncal.core.codec import read, write
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import MOUNTS, Need, Rejection
 from visioncal.core.verdict import (
     CALIBRATE,
@@ -55,7 +55,8 @@ from visioncal.robot import load_robot
 from visioncal.robot.conversion import with_base
 from visioncal.robot.files import read_robot_document
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, SimulatedCell, simulate
+from visioncal.session.columns import POSE
+from visioncal.simulation import CAMERAS, CellOptions, SimulatedCell, simulate
 from visioncal.vision.targets import load_target
 
 EXCHANGED = Finding(
@@ -610,6 +611,34 @@ def without_arm_errors(known: RunState) -> RunState:
     beside = {name: part for name, part in answer.fit.beside.items() if name != "arm"}
     changed = replace(answer, fit=replace(answer.fit, beside=beside))
     return replace(known, assessment_or_none=changed, cell_fit_or_none=replace(solved, arms=arms))
+
+
+def test_a_wrong_length_of_an_arm_and_a_board_of_another_size_both_stay_possible() -> None:
+    """The fit takes the board for 0.23 % larger, since one length of many is off by 3 mm."""
+    target = replace(CellOptions().target, square_sigma_m=1e-5)
+    options = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1, target=target, seed=1)
+    options = replace(options, robot="generic-6r-1800", views=32, mount=MOUNTS[1])
+    cell = simulate(replace(options, dh_sigma_m=8e-5, dh_sigma_rad=1e-4))
+    session, robot = cell_session(cell, "cell", seen="corners"), load_robot(options.robot).document
+    first, second, *rest = robot["joint"]
+    joints = [first, {**second, "a_m": second["a_m"] + 3e-3}, *rest]
+    columns = [name for name in session.columns if name not in POSE]
+    known = calibrate(
+        Session.assemble(
+            session.document,
+            columns,
+            [[view.cell(name) for name in columns] for view in session.views],
+            session.images,
+            target_document=session.target_document,
+            robot_document={**robot, "joint": joints},
+            corners=session.corner_table,
+        )
+    )
+    assert ids(known.verdict)[0] == "board_size"
+    edge = known.edges["base_from_cam"]
+    away = log(invert(edge.matrix) @ cell.transforms["base_from_cam"])
+    assert np.linalg.norm(away[3:]) > 3e-3
+    assert away @ np.linalg.solve(edge.covariance, away) < chi2_limit(1e-3, 6)
 
 
 def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm() -> None:

@@ -36,6 +36,8 @@ FOLLOWS = 2.0
 # The prior assumes arm link errors of equal size; the few that mimic a board's scale may be larger
 # by this factor.
 UNEVEN_LINKS = 2.0
+# Source of uncertainty: a board that a fit takes for far from stated, where the arm may be, too.
+BOARD_OR_ARM = "board or arm"
 
 
 class FrameModel(Protocol):
@@ -171,6 +173,37 @@ class MeasuredScale:
     def leaves_stated(self) -> bool:
         """Whether a result with it goes far from what is stated, as one that takes it for wrong."""
         return abs(self.scale) > CONTRADICTION * max(self.sigma, self.stated_sigma)
+
+
+def estimated_scale(fitted: Fit, name: str, target: Target) -> MeasuredScale | None:
+    """Scale of a board in a fit, by its name in the session; None where the fit does not move it.
+
+    Its sigma is without `BOARD_OR_ARM`.
+    """
+    board = BOARD, name
+    if target.is_rig or SCALE not in fitted.unknowns.values_of(board, moved=True):
+        return None
+    beside = {source: part for source, part in fitted.beside.items() if source != BOARD_OR_ARM}
+    sigma = float(replace(fitted, beside=beside).sigmas(board)[SCALE])
+    stated = float(stated_board_sigma(target)[SCALE])
+    return MeasuredScale(float(fitted.values(board)[SCALE]), sigma, stated)
+
+
+def between_boards_and_arm(fitted: Fit, targets: Mapping[str, Target]) -> FloatArray:
+    """(p, p) covariance of a fit with boards far from stated, which an arm's lengths may be, too.
+
+    An arm that is longer by a share looks like a board that is larger, and neither is known to be
+    right: the fit with the board as stated is as good. `targets` are by their names in the session.
+    """
+    total = np.zeros((fitted.problem.size,) * 2)
+    for name, target in targets.items():
+        scale, board = estimated_scale(fitted, name, target), (BOARD, name)
+        if scale is not None and scale.leaves_stated:
+            columns = fitted.unknowns.columns(board)
+            (at,) = columns[fitted.unknowns.values_of(board) == SCALE]
+            step = scale.scale * fitted.by_noise[:, at] / fitted.by_noise[at, at]
+            total += np.outer(step, step)
+    return total
 
 
 def measured_scale(

@@ -37,6 +37,7 @@ from visioncal.estimation.chain import scatter
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import noise_intervals
+from visioncal.estimation.joint import BOARD_OR_ARM, between_boards_and_arm
 from visioncal.estimation.moves import Creep, creep_effects
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
@@ -61,9 +62,8 @@ class FitAssessment:
     held_out: HeldOutResiduals  # Residuals of observations that were left out of the fit in turn.
     moved: tuple[Moved, ...]  # Frames that moved, in the order of time.
     faults: tuple[PoseFault, ...]  # Wrong poses and images that explain outliers.
-    strays: frozenset[
-        int
-    ]  # Views left out that are off by no more than an arm's errors now and then.
+    # Views left out that are off by no more than an arm's errors now and then.
+    strays: frozenset[int]
     views: tuple[ViewResult, ...]  # Result of each observation.
     # Estimated standard deviations, by frame or robot and by name.
     sigmas: Mapping[str, Mapping[str, float]]
@@ -171,6 +171,8 @@ def assess_fit(
         arms = with_errors_beside_step(cell_fit.arms, fit, steps)
         cell_fit = replace(cell_fit, arms=arms)
     beside = covariance_from_other_sources(fit, cell_fit.arms, steps, is_fit=is_fit)
+    if cell_fit.has_links and (between := between_boards_and_arm(fit, cell.session.boards)).any():
+        beside[BOARD_OR_ARM] = between
     fit = replace(with_lasting_errors(fit, cell_fit.arms) if is_fit else fit, beside=beside)
     held_out = left_out(cell_fit)
     (faults, reasons, strays), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)

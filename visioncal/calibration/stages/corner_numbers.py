@@ -148,8 +148,9 @@ def _counts(target: Target, views: Sequence[Corners]) -> dict[str, object]:
         enough = largest < len(points) <= largest + len(points) // rows
         if not enough or any(_residual(points[at.ids], at.px) >= _LIKE for at in some):
             continue
+        is_transposed = (columns, rows) == (target.rows, target.columns)
         # Numbers that run column by column are those of no board that is seen from the front.
-        if not are_from_behind([(at, other) for at in some]):
+        if not is_transposed or not are_from_behind([(at, other) for at in some]):
             return {"columns": columns, "rows": rows}
     return {}
 

@@ -83,11 +83,16 @@ def exchanged(problem: Problem, fitting: Mapping[int, Sequence[int]]) -> dict[in
         (observer.partition("@")[0], observed.partition("@")[0])
         for observer, observed in zip(seen.observers, seen.observed, strict=True)
     ]
+    stops, mutual = seen.stops.tolist(), list[tuple[int, int, int]]()
     for a, b in combinations(sorted(fitting), 2):
-        if frames[a] == frames[b] and seen.stops[b] in fitting[a] and seen.stops[a] in fitting[b]:
-            partners[a], partners[b] = b, a
+        if frames[a] == frames[b] and stops[b] in fitting[a] and stops[a] in fitting[b]:
+            mutual.append((fitting[a].index(stops[b]) + fitting[b].index(stops[a]), a, b))
+    # Where stops are alike, an observation fits several: each has one partner, the best first.
+    for _, a, b in sorted(mutual):
+        if not {a, b} & partners.keys():
+            partners |= {a: b, b: a}
     left = sorted(fitting.keys() - partners.keys())
-    own = {(frames[at], int(seen.stops[at])): at for at in left}
+    own = {(frames[at], stops[at]): at for at in left}
     following = {at: own.get((frames[at], fitting[at][0])) for at in left}
     for first in left:
         circle = [first]

@@ -20,6 +20,7 @@ from visioncal.estimation.appearance import ASPECT, BOARD_NAMES, SCALE, SHEAR, s
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.joint import (
     MeasuredScale,
+    estimated_scale,
     measured_scale,
     scale_by_stated_arms,
     size_of_measured,
@@ -58,12 +59,10 @@ def _found(run: RunState) -> Iterator[Finding]:
             if measured.is_another and abs(measured.scale) >= _SAME_SIZE:
                 yield scale_finding(f"target {target.name}", target, measured, measured, name)
             continue
-        if SCALE in fitted.unknowns.values_of(board, moved=True):
-            scale, sigma = float(fitted.values(board)[SCALE]), float(fitted.sigmas(board)[SCALE])
-            written = replace(measured, scale=scale, sigma=sigma)
-            if measured.is_another or written.leaves_stated:
-                found = scale_finding(called, target, measured, written, name)
-                yield _stretched(found, fitted, board, called)
+        written = estimated_scale(fitted, name, target)
+        if written is not None and (measured.is_another or written.leaves_stated):
+            found = scale_finding(called, target, measured, written, name)
+            yield _stretched(found, fitted, board, called)
         yield from _shape_findings(fitted, name, target, called)
 
 
@@ -276,5 +275,5 @@ def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
 
 
 PRINT = Suspect("print_size", _of_prints, is_doubt=False)
-SIZE = Suspect("board_size", _found, 2.7e-3, True)
+SIZE = Suspect("board_size", _found, 2.7e-3, True, inflates=("unmeasured_board",))
 SHAPE = Suspect("board_shape", None, 1e-4, True)

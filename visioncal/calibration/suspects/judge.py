@@ -137,15 +137,17 @@ def _good_for(worst: Picks, good_for_mm: float, status: VerdictStatus) -> Findin
     sensor = "instrument" if is_read else "camera"
     corrected = "" if worst.uncorrected is None else ", with corrected targets"
     limit, alone = (figure(rounded_up(mm)) for mm in (good_for_mm, worst.good_for_mm))
-    doubtless = ""
+    without_doubts = ""
     if alone != limit:
         # The doubts decide, not the predicted picks.
-        doubtless = ": beside these, the doubts are small. Without the doubts, 95 % of picks would "
-        doubtless += f"land within {alone} mm"
+        without_doubts = (
+            ": beside these, the doubts are small. Without the doubts, 95 % of picks would "
+        )
+        without_doubts += f"land within {alone} mm"
     return Finding(
         "good_for",
         f"It {verb} good for tasks of {limit} mm and more {where} {figure(worst.distance_m)} m "
-        f"from the {sensor}{corrected}{doubtless}.",
+        f"from the {sensor}{corrected}{without_doubts}.",
     )
 
 

@@ -18,11 +18,11 @@ _SAME = 1e-6
 
 
 def by_joints(run: RunState) -> Iterator[Finding]:
-    """The finding that the images agree with the joint angles alone, unless it is known."""
+    """The finding that the images agree with the joint angles alone; none of misread poses."""
     matched = run.reported.matched
     if run.mount not in MOUNTS or matched is None or matched.misread:
         return
-    if any(one.kind == _KIND for one in run.misread or ()):
+    if run.misread:
         return
     seen, reported = run.poses_of_one_board, run.base_from_flange
     joints_rad = matched.joints_rad or matched.disagreeing_rad

@@ -44,10 +44,15 @@ _LONE = ("gridboard", "marker")
 # Another model of a lens leaves so much less: more than an even field does; and so much less that
 # it is the lens, however small both are: where corners end, the models part by far more.
 _BETTER, _FAR_BETTER = 1.1, 2.0
-# Cosine of the steepest tilt of a pane to the sight: through it little light comes beyond.
+# Cosine of the steepest tilt of a pane to the sight: beyond it, little light comes through.
 _STEEPEST = float(np.cos(np.deg2rad(75.0)))
 _OTHER_MODEL = "Give matrix and distortion of a model that fits the lens, or keep to the middle of "
 _OTHER_MODEL += "the image."
+# Of several cameras, the command would drop what is stated of the others, too.
+_FREE_LENS = Remedy(
+    'In session.toml, write intrinsics = "refine" in its table of [cameras], or calibrate it anew.',
+    CALIBRATE,
+)
 _ONE_LENS = "Keep one lens, and one setting of the driver that rectifies pictures"
 
 
@@ -129,7 +134,7 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
                 "lens",
                 f"The given intrinsics do not fit these images: free, {would}. But intrinsics = "
                 '"hold" keeps them; what this does to the result counts in its sigmas.',
-                NEW_LENS,
+                NEW_LENS if camera == ONLY_CAMERA else _FREE_LENS,
                 mahalanobis_sq=squared,
                 up_to_mm=1e3
                 * mean_distance_m(fitted, camera)
@@ -154,8 +159,9 @@ def _misread(stated: Camera, refined: Camera, px: FloatArray, moved_px: float) -
         words += f"write distortion = [{', '.join(f'{value:.6g}' for value in other)}]."
         ways[words] = replace(stated, distortion=other)
     right, below = (-moves).round().tolist()
-    # A part begins within the picture.
-    if max(right, below) > _CROPPED_PX and min(right, below) >= 0.0:
+    # A part begins within the picture, and no centre is known to the pixel.
+    if max(right, below) > _CROPPED_PX and min(right, below) > -_CROPPED_PX:
+        right, below = max(right, 0.0) + 0.0, max(below, 0.0) + 0.0
         words = (
             f"The pictures are a part of this lens's, which begins {right:g} px to the right and "
             f"{below:g} px below: subtract these from the centre in matrix."
@@ -423,7 +429,7 @@ LENS = Suspect(
     _stated,
     1e-4,
     True,
-    ("board_size", "board_shape", ARM_ERRORS, "wrong_views", "corner_noise", UNEXPLAINED),
+    ("board_size", "board_shape", ARM_ERRORS, "corner_noise", UNEXPLAINED),
 )
 FIELD = Suspect("lens_field", _beyond, 1e-4, True)
 # A look is off by what the focus changes, however well the robot repeats.

@@ -348,7 +348,7 @@ def _both_sides(
 BY_CHAIN = (
     *(*STEPS, ARM_ERRORS, "prior"),
     *("board_size", "board_shape", "lens", "lens_field", "corner_noise", "tool_frame"),
-    *("carried_away", "tool_active"),
+    *("carried_away", "tool_active", "late_poses"),
 )
 MISREAD_POSES, MISREAD_READINGS = (
     Suspect(kind, None, 1e-3, True, (CHAIN, *BY_CHAIN), SOURCES)

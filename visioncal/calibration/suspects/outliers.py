@@ -354,7 +354,7 @@ def _exchanged_in_turn(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator
     words, typed, exchanged_rows = list[str](), list[str](), list[int]()
     while left:
         circle = [left[0]]
-        while (after := mutual[circle[-1]]) != circle[0]:
+        while (after := mutual[circle[-1]]) not in circle:
             circle.append(after)
         left = [at for at in left if at not in circle]
         if len(circle) > 2:
@@ -411,8 +411,11 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> tuple[dict[int, st
             f"disagrees with the other views: it places {target} {figure(mm)} mm{turned} away, "
             f"{beyond}; {cause}{', or the arm errs so there' if may_err else ''}"
         )
-    are_few = _STRAY_SHARE * len(strays) <= inliers.used.sum()
-    return reasons, frozenset(strays if are_few else ())
+    rows = cell_fit.cell.rows
+    used = Counter(row.seer for row, one in zip(rows, inliers.used.tolist(), strict=True) if one)
+    astray = Counter(row.seer for row in rows if row.view in strays)
+    few = {seer for seer, count in astray.items() if _STRAY_SHARE * count <= used[seer]}
+    return reasons, frozenset(row.view for row in rows if row.view in strays and row.seer in few)
 
 
 def _cause(

@@ -35,8 +35,8 @@ from visioncal.robot.model import REPEATABILITY
 
 # Probability from which on a mistake precedes sigmas beyond their limits.
 _LIKELIER = 0.5
-# Kinds of errors that are in the fit, where no test of their own says more.
-_ACCOUNTED = ("board_shape", "lens")
+# Kinds of errors that are in the fit, or inflate no sigma, where no test of their own says more.
+_ACCOUNTED = ("board_shape", "lens", "tool_frame")
 # Removing a source with a smaller share of the variance would reduce a pick's error by under 5 %.
 _LEAST_SHARE = 0.1
 

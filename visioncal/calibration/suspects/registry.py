@@ -126,7 +126,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("joint_play", None, 1e-6, hides=("wrong_views",)),
     # The frames are by the poses, which a wrong model does not change.
     Suspect("other_arm", None, REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
-    # A result in another frame than the flange's, beside sigmas beyond their limits.
+    # It precedes sigmas beyond their limits, which have less to say where the frame is another.
     Suspect("tool_frame", chance=REMARK),
     *map(Suspect, ("contradicting_joints", "base_link", "level", "load", "clock")),
     # The remainder of a clock's jump looks like motion.

@@ -34,6 +34,8 @@ from visioncal.vision.camera import turned_back
 
 # Rows that images and poses are apart, from none on: some lost or doubled pictures.
 _SHIFTS = (0, *(sign * by for by in range(1, 7) for sign in (1, -1)))
+# Of more views, fewer rows apart are tried: each takes as long as the fit.
+_MANY, _FEW_APART = 200, 3
 # The prior of a mistake of the record; the probability that a robot reports one pose twice to the
 # last digit though it moved.
 _MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
@@ -94,9 +96,10 @@ def likeliest(run: RunState) -> Undoing | None:
     is_even = (squares < _UNEVEN**2 * (np.median(squares, axis=0) + LEAST**2)).all()
     if agrees.all() and is_even and squares.mean() < CLOSING_SCORE**2:
         return None
-    pairs = {by: record.paired(shifted(by, len(record.views))) for by in _SHIFTS}
+    shifts = _SHIFTS if len(record.views) <= _MANY else _SHIFTS[: 1 + 2 * _FEW_APART]
+    pairs = {by: record.paired(shifted(by, len(record.views))) for by in shifts}
     every = [declared]
-    every += filter(None, (Edges.by(record, pairs[by], fresh) for by in _SHIFTS[1:]))
+    every += filter(None, (Edges.by(record, pairs[by], fresh) for by in shifts[1:]))
     # Two losses may leave no half of all rows right, and yet most of one end's.
     halves = np.arange(len(own)) < 0.5 * len(own)
     every += filter(None, (Edges.by(record, own, fresh & half) for half in (halves, ~halves)))
@@ -506,8 +509,8 @@ def _shifted(
     orders = [record.paired(order(len(record.views))) for order in ROW_ORDERS.values()]
     found = list[tuple[float, int, Mask]]()
     for edges in every:
-        squares = {by: edges.of(pairs[by]) for by in _SHIFTS}
-        for by in _SHIFTS[1:]:
+        squares = {by: edges.of(pair) for by, pair in pairs.items()}
+        for by in [*pairs][1:]:
             amid = _apart_amid(record, squares[0], squares[by], by)
             sides = np.concatenate([ends, amid])
             mixed = np.where(sides[..., None], squares[by], squares[0])
