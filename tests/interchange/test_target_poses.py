@@ -18,6 +18,7 @@ from support.samples import made_up
 
 from visioncal.calibration.guess.search import Recording, turns_alike
 from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert
 from visioncal.interchange.formats import rereading
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.sources import describe
@@ -241,6 +242,69 @@ def test_pictures_of_a_page_are_none_of_rows_that_have_both_sides(tmp_path):
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", world()[2]).good()
     assert "The images are left aside" in done.err
     assert len(Session.load(tmp_path / "out").views) == 9
+
+
+def test_images_of_two_cameras_are_asked_for_though_rows_have_both_sides(tmp_path):
+    counted_rows(tmp_path / "in")
+    for at in range(9):
+        for side in ("left", "right"):
+            write(tmp_path / f"in/{side}/{at}.png", "")
+            cv2.imwrite(str(tmp_path / f"in/{side}/{at}.png"), np.full((40, 60), at, np.uint8))
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", world()[2])
+    done.refused("Each row has several images", "--images")
+
+
+def turning(count):
+    """Poses of a robot that turns far, and of the target in its camera, as `world`."""
+    rng = np.random.default_rng(1)
+    seen = np.tile(np.eye(4), (count, 1, 1))
+    angles = rng.uniform(-1.0, 1.0, (count, 3)) * (80.0, 35.0, 35.0)
+    seen[:, :3, :3] = Rotation.from_euler("zyx", angles, degrees=True).as_matrix()
+    seen[:, :3, 3] = rng.uniform((-0.1, -0.1, 0.5), (0.0, 0.0, 0.7), (count, 3))
+    target, camera = exp(np.array([[3.0, 0.1, 0.2, 0.5, 0.1, 0.05], [0.1, 0.2, 0.3, 0, 0, 0.1]]))
+    return target @ invert(seen) @ invert(camera), seen
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_angles_come_first_where_some_rows_have_no_corners(fails, tmp_path, monkeypatch):
+    """Rows are compared with those that have corners; an error of one reading ends nothing."""
+
+    def faulty(*_):
+        raise DataError("a fault of one reading")
+
+    if fails:
+        monkeypatch.setattr(rereading, "may_agree", faulty)
+    poses, seen = turning(12)
+    grid = np.stack(np.meshgrid(np.arange(13), np.arange(10)), axis=-1).reshape(-1, 2)
+    points = np.hstack([0.015 * grid, np.zeros((130, 1)), np.ones((130, 1))])
+    lens = np.array([[520.0, 0, 320], [0, 520, 200], [0, 0, 1]])
+    shown = np.einsum("ij,njk,mk->nmi", lens, seen[:, :3], points)
+    px = shown[..., :2] / shown[..., 2:]
+    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("xyz", degrees=True)
+    rows = np.hstack([angles, 1e3 * poses[:, :3, 3]]).tolist()
+    corners = [None if at in (0, 2) else each.tolist() for at, each in enumerate(px)]
+    pairs = zip(rows, corners, strict=True)
+    write(tmp_path / "in.json", [{"pose": pose, "corners": each} for pose, each in pairs])
+    options = ["--mount", "eye-in-hand", "--target", "checkerboard_13x10_15mm"]
+    options += ["--resolution", "640,400", "--robot-key", "pose"]
+    visioncal("convert", tmp_path / "in.json", tmp_path / "out", *options).good()
+    views = Session.load(tmp_path / "out").views
+    found = [view.base_from_flange().as_matrix() for view in views]
+    np.testing.assert_allclose(found, np.delete(poses, (0, 2), axis=0), atol=1e-6)
+
+
+def test_readings_that_a_search_finds_are_no_other_motion():
+    """With half of the rows apart, after whole turns were lost, and by too few rows."""
+    poses, seen = turning(12)
+    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX", degrees=True)
+    apart = replace(numbers(poses, "rotation-vector"), rotations=angles[:, ::-1])
+    apart = apart.rows(np.array([*range(6), 7, 8, 9, 10, 11, 6]))
+    lost = poses.copy()
+    lost[:, :3, :3] = Rotation.from_euler("ZYX", angles).as_matrix()
+    few = numbers(poses[::-1])
+    few.positions[3:] = np.nan
+    for robot in (apart, numbers(lost), few):
+        assert turns_alike(Recording(robot, numbers(seen), "eye-in-hand", is_measured=True))
 
 
 def test_other_motions_are_known_by_their_turns_before_any_fit():

@@ -22,7 +22,7 @@ from visioncal.calibration.stages.detect import detect, unshown_rows
 from visioncal.cli.target import to_toml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
-from visioncal.core.types import Camera, Target
+from visioncal.core.types import Camera, Image, Target
 from visioncal.session import MemoryImages, Session, View
 from visioncal.simulation import BOARDS, CellOptions, prepare_scene, project, render, simulate
 from visioncal.simulation.render import light_on
@@ -493,18 +493,22 @@ def test_a_checkerboard_cut_within_its_outermost_squares_is_found(surround):
     assert min(away) < 0.2
 
 
-def test_outlines_of_squares_are_looked_for_in_a_small_copy(monkeypatch):
-    """In the noise of a whole image of many pixels the search takes most of a minute."""
-    sizes, search = list[int](), cv2.findChessboardCorners
+@pytest.fixture
+def outlined(monkeypatch):
+    """Images in which outlines of squares are looked for; the other search finds nothing."""
+    images, search = list[Image](), cv2.findChessboardCorners
     monkeypatch.setattr(cv2, "findChessboardCornersSB", lambda *_, **__: (False, None))
     monkeypatch.setattr(
         cv2,
         "findChessboardCorners",
-        lambda image, *args, **options: (
-            sizes.append(max(image.shape)) or search(image, *args, **options)
-        ),
+        lambda image, *args, **options: images.append(image) or search(image, *args, **options),
     )
-    image = np.full((1500, 2000), 235, dtype=np.uint8)
+    return images
+
+
+def test_outlines_of_squares_are_looked_for_in_a_small_copy(outlined):
+    """In the noise of a whole image of many pixels the search takes most of a minute."""
+    image = np.full((1500, 2400), 235, dtype=np.uint8)
     squares = 210 * (np.indices((5, 7)).sum(axis=0) % 2) + 20
     image[300:1200, 400:1660] = np.kron(squares, np.ones((180, 180)))
     board = checkerboard_of(6, 4)
@@ -512,7 +516,20 @@ def test_outlines_of_squares_are_looked_for_in_a_small_copy(monkeypatch):
     rows, columns = np.indices((4, 6))
     true = np.stack([579.5 + 180 * columns, 479.5 + 180 * rows], axis=-1).reshape(-1, 2)
     assert min(np.abs(found.px - order).max() for order in (true, true[::-1])) < 1.5
-    assert max(sizes) <= 1500
+    assert max(image.shape[1] for image in outlined) <= 1500
+
+
+def test_outlines_of_small_squares_are_looked_for_in_the_whole_image(outlined):
+    """As of 16 px in 1920 x 1080, among less noise than the image has."""
+    rng = np.random.default_rng(0)
+    squares = 200.0 * (np.indices((7, 9)).sum(axis=0) % 2) + 20.0
+    image = np.full((1080, 1920), 220.0)
+    image[500:612, 900:1044] = np.kron(squares, np.ones((16, 16)))
+    image = cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(0.0, 3.0, image.shape)
+    image = np.clip(image, 0.0, 255.0).astype(np.uint8)
+    board = checkerboard_of(8, 6)
+    assert isinstance(kind_of(board).search(image, board), DetectedCorners)
+    assert np.std(outlined[0][:400]) < 0.5 * np.std(image[:400])
 
 
 @pytest.mark.parametrize("turns", range(4))

@@ -72,7 +72,7 @@ class Fit:
     def kept(self) -> IntArray:
         """The rows with the smallest residuals, smallest first."""
         return np.argsort(self.residuals, kind="stable")[
-            : _kept_count(len(self.residuals), self.share)
+            : kept_count(len(self.residuals), self.share)
         ]
 
     @cached_property
@@ -184,7 +184,7 @@ def robust_fits(
         share: Share of the views that must agree.
     """
     count = robot.shape[1]
-    kept = _kept_count(count, share)
+    kept = kept_count(count, share)
     lever = np.maximum(np.median(np.linalg.norm(camera[..., :3, 3], axis=2), axis=1), 1e-12)
 
     def solved(some: IntArray, rows: IntArray) -> _Solved:
@@ -277,7 +277,7 @@ def mounting_fits(
         window: Number of neighbouring views from which it starts, too; 0 for none.
     """
     count = len(read)
-    kept = _kept_count(count, share)
+    kept = kept_count(count, share)
     lever = max(float(np.median(np.linalg.norm(read - np.median(read, axis=0), axis=1))), 1e-12)
 
     def solved(some: IntArray, rows: IntArray) -> _Solved:
@@ -341,7 +341,7 @@ def distances(
     return Fit(*edges, *_away(robot, camera, edges), lever)
 
 
-def _kept_count(rows: int, share: float = KEPT_SHARE) -> int:
+def kept_count(rows: int, share: float = KEPT_SHARE) -> int:
     """Number of rows that a fit of this many keeps."""
     return max(int(np.ceil(share * rows)), min(rows, FEWEST_COMPARED))
 

@@ -23,6 +23,7 @@ from visioncal.calibration.guess.fit import (
     Fit,
     distance_rows,
     distances,
+    kept_count,
     robust_fits,
 )
 from visioncal.calibration.guess.readings import (
@@ -302,20 +303,27 @@ def search(recording: Recording) -> list[Candidate]:
 
 
 def turns_alike(recording: Recording) -> bool:
-    """Whether robot and camera turn alike under a reading with at most two mistakes.
+    """Whether robot and camera may turn alike under a reading of `search` or `search_by_half`.
 
-    Where they do not, no fit closes the chain, which `search` takes ten times as long to find.
+    Where they do not, none of these closes the chain, which takes ten times as long to find. Too
+    few rows rule nothing out.
     """
     rows, declared = thinned(recording.common_rows), recording.declared
     if len(rows) < FEWEST_ROWS:
-        return False
+        return True
     plain = changes(declared, recording.is_measured, len(recording.robot))
     turning = [each for each in plain if not _TURNING.isdisjoint(each.fields)]
-    pairs = [*product((None, *turning), rewritten(recording.robot.rows(rows)))]
-    pairs += [*product((None,), turning), *combinations(turning, 2)]
-    mismatch = _mismatch(recording, rows)
-    tried = (declared, *_undone(declared, pairs))
-    return any(mismatch(reading) < _TURNS_AGREE_RAD for reading in tried)
+    some = recording.robot.rows(rows)
+    pairs = [*product((None, *turning), rewritten(some)), *product((None,), turning)]
+    pairs += [*combinations(turning, 2)]
+    single = [*product((None,), (*turning, *rewritten(some, by_makers=True)))]
+    for changed, by_half in ((pairs, False), (single, True)):
+        mismatch = _mismatch(recording, rows, by_half=by_half)
+        tried = (declared, *_undone(declared, changed))
+        if any(mismatch(reading) < _TURNS_AGREE_RAD for reading in tried):
+            return True
+    # Rotations that lost whole turns are found by the positions.
+    return any(_unwrapped(recording, keep_turns=False))
 
 
 def _unwrapped(recording: Recording, *, keep_turns: bool) -> Iterator[Change]:
@@ -445,8 +453,14 @@ def _near(tried: Sequence[Hypothesis], scores: Sequence[float]) -> list[Hypothes
     return [tried[at] for _, at in sorted(near)[:_HANDED_ON]]
 
 
-def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], float]:
-    """Low quantile of the differences [rad] by which robot and camera turn under a reading."""
+def _mismatch(
+    recording: Recording, rows: IntArray, *, by_half: bool = False
+) -> Callable[[Hypothesis], float]:
+    """Low quantile of the differences [rad] by which robot and camera turn under a reading.
+
+    `by_half`, the least by which as many rows as `search_by_half` needs agree with as many: a low
+    quantile of all pairs would be small in other motions, too.
+    """
     of_camera, pairs = recording.camera.rows(rows), upper_pairs(len(rows))
     rows_of = {name: order(len(recording.robot))[rows] for name, order in ROW_ORDERS.items()}
     used = np.unique(np.maximum(np.concatenate([*rows_of.values()]), 0))
@@ -478,7 +492,13 @@ def _mismatch(recording: Recording, rows: IntArray) -> Callable[[Hypothesis], fl
     @cache
     def away(fields: _Rotations, order: str, of_camera: str) -> float:
         difference = np.abs(by_robot(fields, order) - by_camera(of_camera))
-        rank = int(PAIRS_SHARE * len(difference))
+        if by_half:
+            square = np.zeros((len(rows), len(rows)))
+            square[pairs] = difference
+            rank = kept_count(len(rows), HALF_SHARE) - 1
+            difference = np.partition(square + square.T, rank, axis=1)[:, rank]
+        else:
+            rank = int(PAIRS_SHARE * len(difference))
         # NaN is the largest.
         found = float(np.partition(difference, rank)[rank])
         return np.inf if np.isnan(found) else found

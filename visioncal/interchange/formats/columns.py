@@ -24,6 +24,7 @@ from visioncal.interchange.formats.fields import (
 from visioncal.interchange.formats.file_search import (
     FileGroup,
     Pairing,
+    UnpairedError,
     groups_in,
     image_groups,
     images_named,
@@ -345,7 +346,7 @@ def _images(
         return with_depth(pairing, every), name
     try:
         return with_depth(paired(fields, groups), every) if groups else Pairing(()), ""
-    except DataError as error:
+    except UnpairedError as error:
         # Pictures of a page are no views', where poses of the target say what these saw.
         if asked is not None or requested.target or not has_camera_poses:
             raise

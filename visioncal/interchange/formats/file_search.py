@@ -343,11 +343,15 @@ class Pairing:
     depths: tuple[Path | None, ...] = ()  # (n,) the depth of each row likewise; empty without any.
 
 
+class UnpairedError(DataError):
+    """Neither names nor numbers of images say which row each belongs to."""
+
+
 def paired(fields: Fields, groups: Sequence[FileGroup]) -> Pairing:
     """Pairs rows with one kind of image: by equal names or numbers, else in natural order.
 
     Where one side has more, numbers may differ by a constant, which the images determine if several
-    fit. Raises DataError where nothing fits, or several kinds do.
+    fit. Raises UnpairedError where nothing fits, and DataError where several kinds do.
     """
     matches, steps = list[tuple[FileGroup, Match]](), dict[str, list[Match]]()
     for group in groups:
@@ -467,10 +471,10 @@ def _one_over(fields: Fields, group: FileGroup) -> Iterator[Match]:
         yield Match(HOW[3], every if files > rows else np.insert(np.arange(files), left, -1))
 
 
-def _unpaired(fields: Fields, group: FileGroup) -> DataError:
+def _unpaired(fields: Fields, group: FileGroup) -> UnpairedError:
     """The error where nothing says which image is a row's."""
     first, last = group.files[0], group.files[-1]
-    return DataError(
+    return UnpairedError(
         f"{first.parent} has {counted(len(group.files), 'image')} ({first.name} ... {last.name}), "
         f"but there are {len(fields)} poses ({fields.places[0]} ... {fields.places[-1]}), and "
         "neither names nor numbers say which belong together.",

@@ -160,7 +160,7 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
             break
         fault = None
         searches |= seen.searches
-        # More rows make no other motion of what turns otherwise.
+        # Rows that turn otherwise are another motion's, whatever more rows add.
         readings = [*readings[:1], *filter(seen.may_agree, readings[1:])]
         other_orders = [*filter(seen.may_agree, other_orders)]
         is_last = most == _TESTED[-1] or seen.count < most
@@ -308,9 +308,13 @@ class _Seen:
         }
 
     def may_agree(self, reading: tuple[int, ForeignRecording]) -> bool:
-        """Whether the robot's rows of a reading, with its rank, turn as the boards do."""
-        robot = None if self.run is None else self._robot(reading[1])
-        return self.run is None or robot is None or may_agree(self.run, robot)
+        """Whether the robot's rows of a reading, with its rank, may turn as the boards do."""
+        try:
+            item = with_observations_only(replace(reading[1], rivals=()))
+            return self.run is None or may_agree(self.run, self._robot(item))
+        except VisioncalError:
+            # Its test says why.
+            return True
 
     def guess(self, foreign: ForeignRecording) -> Guess:
         """Tries the readings of one recording's poses; raises VisioncalError."""

@@ -33,9 +33,10 @@ _FEWEST = ((4, 4), (3, 3))
 _INSIDE, _MARKS, _DOTS = (0.25, 0.4, 0.6, 0.75), 0.4, 0.25
 # Share of the way from a corner to the middle of a dark square; usual circles end before.
 _TIP = 0.2
-# Longer side of the copy in which outlines of squares are looked for: among the noise of more
-# pixels their search takes most of a minute [px].
-_OUTLINES_PX = 1500
+# About the longer side of the image in which outlines of squares are looked for: among the noise of
+# more pixels their search takes most of a minute. A smaller copy loses small squares, so that up to
+# half as many more pixels a side are kept and smoothed by some [px].
+_OUTLINES_PX, _SMOOTHED_PX = 1500, 1.0
 
 
 class Checkerboard(Board):
@@ -154,8 +155,12 @@ def _grids(image: Image, size: tuple[int, int], *, quick: bool) -> Iterator[Floa
         return
     # By the outlines of squares, some boards are found whose corners the other search loses.
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    by = -(-max(image.shape) // _OUTLINES_PX)
-    found, px = cv2.findChessboardCorners(shrunk(image, by) if by > 1 else image, size, flags=flags)
+    by = max(1, round(max(image.shape) / _OUTLINES_PX))
+    if by > 1:
+        image = shrunk(image, by)
+    elif max(image.shape) > _OUTLINES_PX:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTHED_PX), np.uint8)
+    found, px = cv2.findChessboardCorners(image, size, flags=flags)
     if found:
         # From pixel centres of the small image to those of the large one.
         yield by * px.reshape(rows, columns, 2).astype(np.float64) + (by - 1) / 2
