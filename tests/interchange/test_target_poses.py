@@ -116,15 +116,20 @@ def test_poses_of_the_target_come_in_as_programs_store_them(make, tmp_path):
         np.testing.assert_allclose(view.cam_from_target().as_matrix(), board, atol=1e-9)
 
 
-@pytest.mark.parametrize("is_of_opencv", [True, False])
-def test_corners_of_another_program_are_the_session_s(tmp_path, is_of_opencv):
-    """One file a view beside a table that names them, or the points of OpenCV's calibration."""
-    poses, seen, mount = world()
+def corners_px(seen):
+    """(n, 130, 2) corners of checkerboard_13x10_15mm in images of 640 x 400 px."""
     grid = np.stack(np.meshgrid(np.arange(13), np.arange(10)), axis=-1).reshape(-1, 2)
     points = np.hstack([0.015 * grid, np.zeros((130, 1)), np.ones((130, 1))])
     lens = np.array([[520.0, 0, 320], [0, 520, 200], [0, 0, 1]])
     shown = np.einsum("ij,njk,mk->nmi", lens, seen[:, :3], points)
-    px = shown[..., :2] / shown[..., 2:]
+    return shown[..., :2] / shown[..., 2:]
+
+
+@pytest.mark.parametrize("is_of_opencv", [True, False])
+def test_corners_of_another_program_are_the_session_s(tmp_path, is_of_opencv):
+    """One file a view beside a table that names them, or the points of OpenCV's calibration."""
+    poses, seen, mount = world()
+    px = corners_px(seen)
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_euler("xyz", degrees=True)
     rows = np.hstack([poses[:, :3, 3], turns])
     said = ["--mount", mount, "--target", "checkerboard_13x10_15mm"]
@@ -275,11 +280,7 @@ def test_angles_come_first_where_some_rows_have_no_corners(fails, tmp_path, monk
     if fails:
         monkeypatch.setattr(rereading, "may_agree", faulty)
     poses, seen = turning(12)
-    grid = np.stack(np.meshgrid(np.arange(13), np.arange(10)), axis=-1).reshape(-1, 2)
-    points = np.hstack([0.015 * grid, np.zeros((130, 1)), np.ones((130, 1))])
-    lens = np.array([[520.0, 0, 320], [0, 520, 200], [0, 0, 1]])
-    shown = np.einsum("ij,njk,mk->nmi", lens, seen[:, :3], points)
-    px = shown[..., :2] / shown[..., 2:]
+    px = corners_px(seen)
     angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("xyz", degrees=True)
     rows = np.hstack([angles, 1e3 * poses[:, :3, 3]]).tolist()
     corners = [None if at in (0, 2) else each.tolist() for at, each in enumerate(px)]

@@ -63,7 +63,7 @@ class FitAssessment:
     moved: tuple[Moved, ...]  # Frames that moved, in the order of time.
     faults: tuple[PoseFault, ...]  # Wrong poses and images that explain outliers.
     # Views left out that are off by no more than an arm's errors now and then.
-    strays: frozenset[int]
+    marginal: frozenset[int]
     views: tuple[ViewResult, ...]  # Result of each observation.
     # Estimated standard deviations, by frame or robot and by name.
     sigmas: Mapping[str, Mapping[str, float]]
@@ -175,7 +175,7 @@ def assess_fit(
         beside[BOARD_OR_ARM] = between
     fit = replace(with_lasting_errors(fit, cell_fit.arms) if is_fit else fit, beside=beside)
     held_out = left_out(cell_fit)
-    (faults, reasons, strays), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
+    (faults, reasons, marginal), middles = explained_outliers(cell_fit), middles_of(cell_fit.cell)
     return FitAssessment(
         cell_fit,
         fit,
@@ -184,7 +184,7 @@ def assess_fit(
         held_out,
         movements(cell_fit),
         faults,
-        strays,
+        marginal,
         _views(observed, cell, cell_fit, held_out, reasons),
         _sigmas(cell_fit),
     )

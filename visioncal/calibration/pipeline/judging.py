@@ -63,12 +63,12 @@ def findings_of(run: RunState) -> Findings:
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {run.cell_fit.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     return Findings(
-        _pairs(connected, explained | answer.strays, answer, alone=run.mount is not None),
+        _pairs(connected, explained | answer.marginal, answer, alone=run.mount is not None),
         _sensors(connected, run),
         _arms(run),
         _worst(run),
         (*contested(run, found_in(run)), *run.warnings),
-        (*run.notes, *_stray_words(answer)),
+        (*run.notes, *_marginal_words(answer)),
         run.session.need,
         predict_picks(_pick_inputs(run, explained), run.session.need),
         run.session.corrects_targets,
@@ -107,9 +107,9 @@ def _pick_inputs(run: RunState, explained: Collection[int]) -> PickInputs:
     )
 
 
-def _stray_words(answer: FitAssessment) -> Iterator[str]:
+def _marginal_words(answer: FitAssessment) -> Iterator[str]:
     """Remark on views that an arm's ordinary errors put off."""
-    if views := sorted(answer.strays):
+    if views := sorted(answer.marginal):
         were = "was" if len(views) == 1 else "were"
         yield f"V{view_words(views)[1:]} {were} left out: off by what arms err by now and then."
 

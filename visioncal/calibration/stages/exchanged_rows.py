@@ -72,13 +72,15 @@ def _at_stops(
     return squares
 
 
-def exchanged(problem: Problem, fitting: Mapping[int, Sequence[int]]) -> dict[int, int]:
-    """Observations that fit each other's stops: to each, the one whose stop it fits.
+def exchanged(
+    problem: Problem, fitting: Mapping[int, Sequence[int]]
+) -> tuple[tuple[int, ...], ...]:
+    """Circles of observations that fit each other's stops, each that of the next one.
 
-    Two that each fit the other's, or circles of more, by the stop that each fits best; `fitting` is
-    the result of `other_stops`.
+    Pairs, best first, then circles of more by the stop that each fits best; an observation is in
+    one at most. `fitting` is the result of `other_stops`.
     """
-    seen, partners = problem.observations, dict[int, int]()
+    seen, circles = problem.observations, list[tuple[int, ...]]()
     frames = [
         (observer.partition("@")[0], observed.partition("@")[0])
         for observer, observed in zip(seen.observers, seen.observed, strict=True)
@@ -87,17 +89,19 @@ def exchanged(problem: Problem, fitting: Mapping[int, Sequence[int]]) -> dict[in
     for a, b in combinations(sorted(fitting), 2):
         if frames[a] == frames[b] and stops[b] in fitting[a] and stops[a] in fitting[b]:
             mutual.append((fitting[a].index(stops[b]) + fitting[b].index(stops[a]), a, b))
-    # Where stops are alike, an observation fits several: each has one partner, the best first.
-    for _, a, b in sorted(mutual):
-        if not {a, b} & partners.keys():
-            partners |= {a: b, b: a}
-    left = sorted(fitting.keys() - partners.keys())
-    own = {(frames[at], stops[at]): at for at in left}
+    left = {*fitting}
+    # Where stops are alike, an observation fits several.
+    for _, *pair in sorted(mutual):
+        if left.issuperset(pair):
+            circles.append(tuple(pair))
+            left.difference_update(pair)
+    own = {(frames[at], stops[at]): at for at in sorted(left)}
     following = {at: own.get((frames[at], fitting[at][0])) for at in left}
-    for first in left:
+    for first in sorted(left):
         circle = [first]
         while (after := following[circle[-1]]) is not None and after not in circle:
             circle.append(after)
-        if after == first and first not in partners:
-            partners |= zip(circle, [*circle[1:], first], strict=True)
-    return partners
+        if after == first and first in left:
+            circles.append(tuple(circle))
+            left.difference_update(circle)
+    return tuple(circles)

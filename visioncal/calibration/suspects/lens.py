@@ -136,10 +136,7 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
                 '"hold" keeps them; what this does to the result counts in its sigmas.',
                 NEW_LENS if camera == ONLY_CAMERA else _FREE_LENS,
                 mahalanobis_sq=squared,
-                up_to_mm=1e3
-                * mean_distance_m(fitted, camera)
-                * moved_px
-                / float(np.mean(held.matrix[:2])),
+                up_to_mm=_misplaced_mm(fitted, camera, moved_px),
             )
 
 
@@ -158,13 +155,12 @@ def _misread(stated: Camera, refined: Camera, px: FloatArray, moved_px: float) -
         words = "They are in the order k1, k2, k3, p1, p2, and OpenCV's is k1, k2, p1, p2, k3: "
         words += f"write distortion = [{', '.join(f'{value:.6g}' for value in other)}]."
         ways[words] = replace(stated, distortion=other)
-    right, below = (-moves).round().tolist()
     # A part begins within the picture, and no centre is known to the pixel.
-    if max(right, below) > _CROPPED_PX and min(right, below) > -_CROPPED_PX:
-        right, below = max(right, 0.0) + 0.0, max(below, 0.0) + 0.0
+    if max(-moves) > _CROPPED_PX and min(-moves) > -_CROPPED_PX:
+        right, below = (max(round(-move), 0) for move in moves.tolist())
         words = (
-            f"The pictures are a part of this lens's, which begins {right:g} px to the right and "
-            f"{below:g} px below: subtract these from the centre in matrix."
+            f"The pictures are a part of this lens's, which begins {right} px to the right and "
+            f"{below} px below: subtract these from the centre in matrix."
         )
         ways[words] = replace(stated, matrix=np.append(stated.matrix[:2], refined.matrix[2:]))
     left = {words: _moved_px(lens, refined, px)[0] for words, lens in ways.items()}
@@ -184,6 +180,12 @@ def _moved_px(stated: Camera, other: Camera, px: FloatArray) -> tuple[float, flo
         for at in (stated, unbent)
     )
     return moved_px, bent_px
+
+
+def _misplaced_mm(fitted: Fit, camera: str, px: float) -> float:
+    """By how much so many pixels misplace a thing where the views of a camera looked [mm]."""
+    focal_px = float(np.mean(fitted.camera(camera).matrix[:2]))
+    return 1e3 * px / focal_px * mean_distance_m(fitted, camera)
 
 
 def has_changed(fitted: Fit, columns: IntArray) -> bool:
@@ -209,8 +211,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             if (model := _of_fisheye(run, name, of)) is not None:
                 yield replace(model, mahalanobis_sq=field)
                 continue
-            optics, field_px = fit.linearised.camera_parameters, levels.field * noise_px
-            focal_px = float(np.mean(optics.camera(name).matrix[:2]))
+            field_px = levels.field * noise_px
             words = "corners of one part of the image are off alike, by "
             words = f"{of} departs from its model: {words}{figure(field_px)} px."
             advice = _OTHER_MODEL
@@ -223,7 +224,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
                 f"{words} The result counts it, and belongs to this lens.",
                 Remedy(advice),
                 mahalanobis_sq=field,
-                up_to_mm=1e3 * field_px / focal_px * distance_m,
+                up_to_mm=_misplaced_mm(fit, name, field_px),
             )
         percents = [100.0 * noise_px * share for share in (levels.breathing, levels.jitter)]
         when = ("where the distance doubles", "from view to view")

@@ -4,7 +4,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -45,7 +45,7 @@ _ONE_END = 1e-3
 _WRONG = "its pose or its reading is wrong, or something had moved"
 # An arm's errors have longer tails than noise: views within so many times the limit of outliers, at
 # most one to so many that agree, are no mistakes where arms err by as much.
-_TAIL, _STRAY_SHARE = 1.5, 10
+_MARGIN, _MARGINAL_SHARE = 1.5, 10
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
 
@@ -136,7 +136,7 @@ def crept_findings(cell_fit: CellFit) -> Iterator[Finding]:
 def explained_outliers(
     cell_fit: CellFit,
 ) -> tuple[tuple[PoseFault, ...], dict[int, str], frozenset[int]]:
-    """Faults that explain outliers, the reason why each view is left out, and mere strays.
+    """Faults that explain outliers, the reason why each view is left out, and the marginal ones.
 
     Exchanged or wrong poses, and what moved; else the stops that a view fits instead of its own.
     """
@@ -148,12 +148,12 @@ def explained_outliers(
         for name, target in cell_fit.cell.session.boards.items()
     }
     fitting = other_stops(agreed.problem, agreed.fit, outliers, agreed.moves, turns)
-    mutual = exchanged(agreed.problem, fitting)
-    faults = [*_exchanged(cell_fit, mutual)]
+    circles = exchanged(agreed.problem, fitting)
+    faults = [*_exchanged(cell_fit, circles)]
     if cell_fit.cell.mount is not None and not faults:
         faults += _moved_run(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
-    causes = {at: _cause(cell_fit, at, fitting, mutual) for at in outliers.tolist()} | clauses
+    causes = {at: _cause(cell_fit, at, fitting, circles) for at in outliers.tolist()} | clauses
     return tuple(faults), *_reasons(cell_fit, causes)
 
 
@@ -305,11 +305,12 @@ def _step_of(
     return step, np.linalg.norm(left / TWIST_UNITS[3:], axis=-1)
 
 
-def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
+def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[PoseFault]:
     """Poses of one robot that are exchanged, and views that fit each other's poses."""
     rows, problem, used = cell_fit.cell.rows, cell_fit.inlier_fit.problem, cell_fit.inlier_fit.used
-    yield from _exchanged_in_turn(cell_fit, mutual)
-    pairs = [(a, b) for a, b in sorted(mutual.items()) if a < b and mutual[b] == a]
+    if in_turn := [circle for circle in circles if len(circle) > 2]:
+        yield _exchanged_in_turn(cell_fit, in_turn)
+    pairs = sorted((a, b) for a, b, *others in circles if not others)
     for robot, flange in problem.tree.flanges.items() if cell_fit.cell.mount is None else ():
         by_robot = np.flatnonzero(problem.observations_through(flange)).tolist()
         through = [pair for pair in pairs if pair[0] in by_robot]
@@ -348,27 +349,19 @@ def _exchanged(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFau
     yield _fault(cell_fit, EXCHANGED, [row for pair in pairs for row in pair], words, do)
 
 
-def _exchanged_in_turn(cell_fit: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
-    """More than two views, of which each fits the pose of the next."""
-    rows, shown, left = cell_fit.cell.rows, _shown(cell_fit), sorted(mutual)
-    words, typed, exchanged_rows = list[str](), list[str](), list[int]()
-    while left:
-        circle = [left[0]]
-        while (after := mutual[circle[-1]]) not in circle:
-            circle.append(after)
-        left = [at for at in left if at not in circle]
-        if len(circle) > 2:
-            first, *others = (rows[at].view for at in circle)
-            words.append(" to ".join(map(str, (first, *others, first))))
-            typed += [f"{first},{other}" for other in others]
-            exchanged_rows += circle
-    if words:
-        text = (
-            f"{{views}} are exchanged in turn ({listed(words)}): the {shown} of each fits the pose "
-            "in the next one's row. They were left out."
-        )
-        do = mending(f"their {shown}s are exchanged", f"--exchange {','.join(typed)}")
-        yield _fault(cell_fit, EXCHANGED, sorted(exchanged_rows), text, do)
+def _exchanged_in_turn(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> PoseFault:
+    """Circles of more than two views, of which each fits the pose of the next."""
+    shown, words, typed = _shown(cell_fit), list[str](), list[str]()
+    for circle in circles:
+        first, *others = (cell_fit.cell.rows[at].view for at in circle)
+        words.append(" to ".join(map(str, (first, *others, first))))
+        typed += [f"{first},{other}" for other in others]
+    text = (
+        f"{{views}} are exchanged in turn ({listed(words)}): the {shown} of each fits the pose in "
+        "the next one's row. They were left out."
+    )
+    do = mending(f"their {shown}s are exchanged", f"--exchange {','.join(typed)}")
+    return _fault(cell_fit, EXCHANGED, sorted(chain.from_iterable(circles)), text, do)
 
 
 def _shown(cell_fit: CellFit) -> str:
@@ -384,13 +377,13 @@ def farthest_by_arms(robots: Iterable[Robot]) -> tuple[float, float]:
 
 
 def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> tuple[dict[int, str], frozenset[int]]:
-    """Why outliers are left out, by view, given the likely cause of each; and mere strays."""
+    """Why outliers are left out, by view, given the likely cause of each; and the marginal ones."""
     inliers, alone = cell_fit.inlier_fit, cell_fit.cell.mount is not None
     directions = np.maximum(inliers.distances.directions, 1)
     distance = np.sqrt(inliers.distances.squares / directions)
     limit = np.sqrt(inliers.distances.limit / directions)
     off_m, off_rad = pose_residuals(inliers.problem, inliers.fit.state)
-    strays, reasons = set[int](), dict[int, str]()
+    marginal, reasons = set[int](), dict[int, str]()
     known = (arm.matched for arm in cell_fit.arms.values())
     robots = [matched.robot for matched in known if matched is not None]
     most_mm, most_deg = farthest_by_arms(robots)
@@ -405,27 +398,30 @@ def _reasons(cell_fit: CellFit, causes: Mapping[int, str]) -> tuple[dict[int, st
         if distance[at] > limit[at]:
             beyond = f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"
         target = f"the {row.seen.partition('_')[0]}" if alone else row.seen.partition("@")[0]
-        if may_err and distance[at] < _TAIL * limit[at]:
-            strays.add(row.view)
+        if may_err and distance[at] < _MARGIN * limit[at]:
+            marginal.add(row.view)
         reasons[row.view] = (
             f"disagrees with the other views: it places {target} {figure(mm)} mm{turned} away, "
             f"{beyond}; {cause}{', or the arm errs so there' if may_err else ''}"
         )
     rows = cell_fit.cell.rows
     used = Counter(row.seer for row, one in zip(rows, inliers.used.tolist(), strict=True) if one)
-    astray = Counter(row.seer for row in rows if row.view in strays)
-    few = {seer for seer, count in astray.items() if _STRAY_SHARE * count <= used[seer]}
-    return reasons, frozenset(row.view for row in rows if row.view in strays and row.seer in few)
+    out = Counter(row.seer for row in rows if row.view in marginal)
+    few = {seer for seer, count in out.items() if _MARGINAL_SHARE * count <= used[seer]}
+    return reasons, frozenset(row.view for row in rows if row.view in marginal and row.seer in few)
 
 
 def _cause(
-    cell_fit: CellFit, at: int, fitting: Mapping[int, Sequence[int]], mutual: Mapping[int, int]
+    cell_fit: CellFit,
+    at: int,
+    fitting: Mapping[int, Sequence[int]],
+    circles: Sequence[Sequence[int]],
 ) -> str:
     """Likely cause of an outlier, by stops that it fits and by inliers of its stop and target."""
     rows, stops = cell_fit.cell.rows, cell_fit.cell.stops
-    if at in mutual:
-        own, other = rows[at], rows[mutual[at]]
-        if mutual[mutual[at]] != at:
+    for circle in (some for some in circles if at in some):
+        own, other = rows[at], rows[circle[(circle.index(at) + 1) % len(circle)]]
+        if len(circle) > 2:
             return f"it fits stop {stops[other.station]}, of view {other.view}"
         return (
             f"it fits stop {stops[other.station]}, and view {other.view} fits stop "
