@@ -728,6 +728,20 @@ def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind,
     assert causes[0].words.startswith("Robot b, in its rows of cam_left and target_plate_b: ")
     assert {*causes[0].views} <= wrong
     assert len(causes[0].views) >= 0.7 * len(wrong)
+    # The command that mends it is of one robot alone.
+    assert not causes[0].do.command
+    assert causes[0].do.words.endswith("convert writes no such copy: correct the files.")
+
+
+def test_a_cell_gets_no_command_that_would_drop_the_lenses_of_all_its_cameras():
+    session = recorded(simulate(replace(OPTIONS, seed=0, stops=24)))
+    left = session.document["cameras"]["left"]
+    other = {**left, "matrix": [1.3 * left["matrix"][0], *left["matrix"][1:]]}
+    cameras = {**session.document["cameras"], "left": other}
+    session = session.with_content(document={**session.document, "cameras": cameras})
+    cause = visioncal.calibrate(session).verdict.causes[0]
+    assert cause.kind == "other_lens"
+    assert not cause.do.command
 
 
 def test_beside_a_mistake_of_one_robot_another_one_that_is_misread_is_named():

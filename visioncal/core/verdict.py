@@ -34,6 +34,8 @@ GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW = "visioncal show OUT --viewer"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
+# Options of `convert` that take sessions of one camera and one robot, or change all of them.
+_OF_ONE = re.compile(r"--(?:guess|shift|by-joints|intrinsics)\b")
 # Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"
 # After a calibration's output stands the need that was typed.
@@ -53,6 +55,14 @@ class Remedy:
     def __str__(self) -> str:
         is_shown = self.command and AGAIN not in self.command
         return f"{self.words} Run: {self.command}" if is_shown else self.words
+
+    @property
+    def of_cell(self) -> "Remedy":
+        """The same for several robots or cameras: by hand where its command takes one of each."""
+        if not _OF_ONE.search(self.command):
+            return self
+        by_hand = "Of several robots or cameras, convert writes no such copy: correct the files."
+        return Remedy(f"{self.words} {by_hand}")
 
 
 def look_at(view: int) -> str:
@@ -125,6 +135,13 @@ class Finding:
     def reason(self) -> str:
         """Its text and advice."""
         return self.words if self.do is None else f"{self.words} {self.do}"
+
+
+def of_cell(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Findings with remedies for a session of several robots or cameras."""
+    return tuple(
+        found if found.do is None else replace(found, do=found.do.of_cell) for found in findings
+    )
 
 
 def remarks(sentences: Iterable[str], kind: str = "remark") -> tuple[Finding, ...]:

@@ -29,7 +29,7 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Progress
-from visioncal.core.verdict import CALIBRATE, Finding, Remedy, with_paths
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy, of_cell, with_paths
 from visioncal.estimation.observability import Turning, check_determined
 from visioncal.estimation.solve import starting_noise
 from visioncal.robot.model import REPEATABILITY
@@ -75,6 +75,8 @@ def doctor(session: Session | Path | str, *, progress: Progress | None = None) -
         run, error = _run_stages(run)
         run = with_undone(run) if error is None else run
         findings = [*_findings(run, error)]
+    if error is None and run.mount is None:
+        findings = [*of_cell(findings)]
     if not isinstance(session, Session):
         for at, finding in enumerate(findings):
             if (do := finding.do) is not None:

@@ -7,7 +7,7 @@ from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.misread_poses import with_misreading
 from visioncal.calibration.suspects.ranking import add_views_remedy
 from visioncal.core.errors import DegenerateError, VisioncalError
-from visioncal.core.verdict import Remedy
+from visioncal.core.verdict import Remedy, of_cell
 
 
 def explained(
@@ -26,7 +26,8 @@ def explained(
     if is_pair and not are_located:
         return error
     state = with_misreading(state)
-    for misread in state.misread or ():
+    read = state.misread or ()
+    for misread in read if is_pair else of_cell(read):
         # Directions that are undetermined with misread poses mean nothing.
         return type(error)(misread.words, next_step=str(misread.do))
     if (plan := more_views(error, state)) is None:

@@ -22,7 +22,7 @@ from visioncal.core.conventions import controller_form
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg, some_of, view_words
 from visioncal.core.types import FloatArray, Rejection
-from visioncal.core.verdict import Finding, Remedy
+from visioncal.core.verdict import Finding, Remedy, of_cell
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.intervals import freedom_of
 from visioncal.estimation.observability import (
@@ -52,6 +52,8 @@ def judge_run(state: RunState) -> RunState:
             rest = (found for found in findings.warnings if found.kind not in BY_CHAIN)
             findings = replace(findings, warnings=(*state.misread, *rest))
             verdict = judge(findings)
+    if state.mount is None:
+        verdict = replace(verdict, findings=of_cell(verdict.findings))
     warnings = tuple(findings.warnings)
     return replace(state, warnings=warnings, findings=findings, verdict=verdict)
 

@@ -27,9 +27,6 @@ T = TypeVar("T", bound=Observed)
 
 # Zeros that are off by less are estimated with the arm [rad].
 _ESTIMATED_RAD = 0.1
-_ZERO_TOOL = Remedy(
-    "If the flange itself is meant, set the controller's tool to zero, and record again."
-)
 
 
 def read_robots(observed: T) -> T:
@@ -52,14 +49,7 @@ def read_robots(observed: T) -> T:
         reported = reported_poses(replace(session, views=of_robot), model)
         reports[name] = _with_stops(session, name, reported)
         label = _label(session, name)
-        warnings = reported.warnings
-        if len(session.robots) > 1:
-            # The command that takes poses of joint angles takes those of all robots.
-            warnings = tuple(
-                replace(warning, do=_ZERO_TOOL) if warning.kind == "tool_frame" else warning
-                for warning in warnings
-            )
-        observed = observed.noting((), (warning.of(label) for warning in warnings))
+        observed = observed.noting((), (warning.of(label) for warning in reported.warnings))
         notes = (remark.of(label).words for remark in remarks(reported.notes))
         observed = replace(observed, notes=(*observed.notes, *notes))
     rows = [row for row in session.observations if row.view.number not in observed.spared]

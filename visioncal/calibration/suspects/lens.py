@@ -48,11 +48,6 @@ _BETTER, _FAR_BETTER = 1.1, 2.0
 _STEEPEST = float(np.cos(np.deg2rad(75.0)))
 _OTHER_MODEL = "Give matrix and distortion of a model that fits the lens, or keep to the middle of "
 _OTHER_MODEL += "the image."
-# Of several cameras, the command would drop what is stated of the others, too.
-_FREE_LENS = Remedy(
-    'In session.toml, write intrinsics = "refine" in its table of [cameras], or calibrate it anew.',
-    CALIBRATE,
-)
 _ONE_LENS = "Keep one lens, and one setting of the driver that rectifies pictures"
 
 
@@ -134,7 +129,7 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
                 "lens",
                 f"The given intrinsics do not fit these images: free, {would}. But intrinsics = "
                 '"hold" keeps them; what this does to the result counts in its sigmas.',
-                NEW_LENS if camera == ONLY_CAMERA else _FREE_LENS,
+                NEW_LENS,
                 mahalanobis_sq=squared,
                 up_to_mm=_misplaced_mm(fitted, camera, moved_px),
             )

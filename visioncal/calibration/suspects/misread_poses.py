@@ -109,10 +109,7 @@ def with_undone(run: RunState) -> RunState:
             if mistake is None:
                 continue
             whose = f"Robot {robot}, in its rows of {pair.camera} and {pair.target}"
-            # The commands that write a copy take one camera and one robot only.
-            step = "Correct these rows in views.csv, or delete them, and calibrate again."
-            found = mistake.found
-            found = replace(found, words=f"{whose}: {found.words}", do=Remedy(step, CALIBRATE))
+            found = replace(mistake.found, words=f"{whose}: {mistake.found.words}")
             run = undone(run, replace(mistake, found=found))
     # Other robots' poses may be misread beside it.
     return replace(run, misread=run.misread or None)
@@ -136,18 +133,11 @@ def misreadings(run: RunState) -> Iterator[Finding]:
             hint = next(_misread_poses(_of_pair(run, robot, pair)), None)
             if hint is None:
                 continue
-            within, of_these = "", ""
+            within = ""
             if len(wrong) < len(every):
                 # Through other cameras or targets its poses are right.
                 seen = " and ".join(filter(None, [pair.camera, pair.target]))
-                within, of_these = f", in its rows of {seen}", f" that are of {seen}"
-            if hint.do is not None and hint.do.command:
-                # The command that writes a copy takes one camera and one robot only.
-                step = (
-                    f"Correct the rows of {whose} in views.csv{of_these} (base_from_flange in "
-                    "metres, quaternion x, y, z, w), and calibrate again."
-                )
-                hint = replace(hint, do=Remedy(step))
+                within = f", in its rows of {seen}"
             yield replace(hint, words=f"{whose[0].upper()}{whose[1:]}{within}: {hint.words}")
             # All of these would show the same.
             break

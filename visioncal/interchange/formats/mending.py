@@ -163,9 +163,9 @@ def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -
     )
     if corners is not None:
         ids = corners.points.copy()
-        for view in chosen:
-            points = corner_positions(next(iter(boards.values())))
-            own = corners.views == view
+        for view in (view for view in session.views if view.number in chosen):
+            own = corners.views == view.number
+            points = corner_positions(boards[session.board_of(view)])
             turned = apply(right_from_read, points)[ids[own]]
             away = np.linalg.norm(turned[:, None] - points, axis=-1)
             ids[own] = away.argmin(axis=1)
