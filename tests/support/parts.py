@@ -5,7 +5,7 @@ from scipy.linalg import expm
 
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
-from visioncal.estimation.pointfit import PointPairs
+from visioncal.frames.pointfit import PointPairs
 
 
 def placed(frame: FloatArray, points: FloatArray) -> FloatArray:

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.estimation.pivot import Touches
 from visioncal.estimation.problem_parts import Noise
+from visioncal.frames.pivot import Touches
 
 TIP = np.array([0.034, 0.001, 0.16])
 TURN = Rotation.from_euler("xyz", [10.0, -20.0, 35.0], degrees=True)

@@ -13,10 +13,11 @@ from visioncal.core.limits import FixtureLimits, ToolLimits
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Remedy, Verdict
-from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.observability import Direction
-from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m, worst_of
-from visioncal.estimation.pointfit import (
+from visioncal.estimation.procrustes import spreads
+from visioncal.frames.group_outliers import GroupInliers
+from visioncal.frames.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m, worst_of
+from visioncal.frames.pointfit import (
     FEATURE_KINDS,
     FeatureKind,
     Mistake,
@@ -25,7 +26,6 @@ from visioncal.estimation.pointfit import (
     fit_points,
     mistake_of,
 )
-from visioncal.estimation.procrustes import spreads
 from visioncal.frames.touches import (
     MeasuredPoints,
     NominalPoints,

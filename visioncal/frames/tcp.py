@@ -14,9 +14,9 @@ from visioncal.core.limits import CLEAR_RATIO, WIDE_RAD, ToolLimits
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import AGAIN, Finding, Remedy
-from visioncal.estimation.pivot import PivotFit, Touches, TouchKind, fit_pivot, scatter_m
-from visioncal.estimation.placing import assumed_words
 from visioncal.frames.fixture import FitSettings, PointsFit
+from visioncal.frames.pivot import PivotFit, Touches, TouchKind, fit_pivot, scatter_m
+from visioncal.frames.placing import assumed_words
 from visioncal.frames.touches import TouchRows, flange_poses, refuse_copies, robot_noise
 from visioncal.results import Calibration, Edge, Frame
 from visioncal.robot import Robot

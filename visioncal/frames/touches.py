@@ -12,8 +12,8 @@ from visioncal.core.limits import FAR_M, WIDE_RAD
 from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.transforms import invert, rotation_angle, skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.pointfit import PointPairs
 from visioncal.estimation.problem_parts import Noise
+from visioncal.frames.pointfit import PointPairs
 from visioncal.results import Calibration, Edge, Frame, Verdict
 from visioncal.robot import Robot
 from visioncal.session import Session

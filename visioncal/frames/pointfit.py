@@ -22,12 +22,12 @@ from visioncal.core.number_format import figure, some_of
 from visioncal.core.quantiles import FALSE_REJECTION, t_chance
 from visioncal.core.transforms import apply, compose, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.observability import Direction
-from visioncal.estimation.placing import TOUCH_NOISE_M, check_sides, refuse_poor, worst_of
 from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem, fit_groups
 from visioncal.estimation.procrustes import align, spreads
 from visioncal.estimation.robust import SETS, small_sets
+from visioncal.frames.group_outliers import GroupInliers, find_inlier_groups
+from visioncal.frames.placing import TOUCH_NOISE_M, check_sides, refuse_poor, worst_of
 
 FeatureKind: TypeAlias = Literal["origin", "x", "xy"]
 FEATURE_KINDS: tuple[FeatureKind, ...] = ("origin", "x", "xy")

@@ -17,12 +17,12 @@ from support.touched import touched as touches_of
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import FloatArray
-from visioncal.estimation.group_outliers import distances, find_inlier_groups
-from visioncal.estimation.pivot import fit_pivot, tool_problem
-from visioncal.estimation.pointfit import PointPairs, fit_features, fit_points, fixture_problem
 from visioncal.estimation.points import Groups, Placement, fit_groups
 from visioncal.estimation.problem_parts import Noise
 from visioncal.estimation.robust import small_sets
+from visioncal.frames.group_outliers import distances, find_inlier_groups
+from visioncal.frames.pivot import fit_pivot, tool_problem
+from visioncal.frames.pointfit import PointPairs, fit_features, fit_points, fixture_problem
 from visioncal.results import Edge
 
 TRUTH = np.array([0.3, -0.2, 0.5, 0.1, 0.0, -0.4])

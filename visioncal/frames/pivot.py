@@ -25,10 +25,13 @@ from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply, apply_each, compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
-from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import Direction, Turning
-from visioncal.estimation.placing import (
+from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem
+from visioncal.estimation.problem_parts import Noise
+from visioncal.estimation.robust import small_sets
+from visioncal.frames.group_outliers import GroupInliers, find_inlier_groups
+from visioncal.frames.placing import (
     LEAST_NOISE_M,
     TOUCH_NOISE_M,
     check_sides,
@@ -36,9 +39,6 @@ from visioncal.estimation.placing import (
     refuse_poor,
     worst_of,
 )
-from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem
-from visioncal.estimation.problem_parts import Noise
-from visioncal.estimation.robust import small_sets
 
 TouchKind: TypeAlias = Literal["point", "z", "xz"]
 # The coordinates that are zero, by kind.
