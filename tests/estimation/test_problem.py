@@ -24,13 +24,6 @@ from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.linalg import covariance_from, damped_step, eigenvalue_shares
 from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.model_evidence import (
-    CalibrationPosterior,
-    ChangeHypothesis,
-    evidence_of,
-    undone,
-    with_change,
-)
 from visioncal.estimation.normal_equations import Whitening, normal_equations
 from visioncal.estimation.outliers import distances, inliers_and_moves, refine_inliers
 from visioncal.estimation.problem_parts import ROBOT, Effect, FramePrior, Noise, State, by_size
@@ -48,6 +41,13 @@ from visioncal.estimation.trajectory import Trajectory
 from visioncal.fit.consensus import Candidates
 from visioncal.fit.joining import Network
 from visioncal.simulation import CAMERAS, CellOptions, simulate
+from visioncal.verification.model_evidence import (
+    CalibrationPosterior,
+    ChangeHypothesis,
+    evidence_of,
+    undone,
+    with_change,
+)
 from visioncal.vision.camera import intrinsics
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")

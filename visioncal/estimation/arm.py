@@ -26,6 +26,10 @@ from visioncal.robot import Robot
 LEVER_M = 0.5
 # Units of a twist: a rotation by 1 rad, or a translation by the lever.
 TWIST_UNITS: FloatArray = np.repeat([1.0, LEVER_M], 3)
+# Sizes of changes: from a tenth of a millimetre to a tenth of a metre, by half decades.
+SIZES_M = tuple(float(value) for value in 10.0 ** np.arange(-4.0, -0.9, 0.5))
+# A change of a millimetre rotates by 4 mrad.
+TURN_PER_M = 4.0
 # Limits of twice the gain in log-likelihood that noise exceeds in one session of ten thousand, and
 # of twenty.
 SIGNIFICANT, _LIKELY = map(float, chi2_limit([FALSE_ALARM, 0.05], 1))

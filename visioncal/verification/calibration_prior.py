@@ -17,7 +17,6 @@ from visioncal.estimation.appearance import (
 from visioncal.estimation.arm import posture_correlation
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.model_evidence import CalibrationPosterior, RepeatedStops
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.results import Calibration
@@ -25,6 +24,7 @@ from visioncal.results.arm import FUNCTIONS
 from visioncal.results.sections import FittedArm, JointFit
 from visioncal.robot import Robot
 from visioncal.robot.elasticity import WeightFunctions
+from visioncal.verification.model_evidence import CalibrationPosterior, RepeatedStops
 from visioncal.vision.targets import numbered_positions, target_from_document
 
 # Correlation of the arm's errors from which a stop repeats a calibrated one.

@@ -8,11 +8,12 @@ import numpy as np
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray
+from visioncal.estimation.arm import TURN_PER_M
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.corners import CornerStack
-from visioncal.estimation.model_evidence import TURN_PER_M, ChangeHypothesis
 from visioncal.estimation.poses import fit_poses
 from visioncal.verification.calibration_prior import CalibrationPrior
+from visioncal.verification.model_evidence import ChangeHypothesis
 from visioncal.verification.prediction import PredictedStops, board_changes
 
 CAMERA, LENS, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW, PAIRING = (

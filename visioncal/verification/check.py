@@ -15,19 +15,19 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import log, mean_transform
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import DEPTH_CHANGED, Finding
-from visioncal.estimation.model_evidence import (
-    ChangeHypothesis,
-    HypothesisEvidence,
-    evidence_of,
-    undone,
-    with_change,
-)
 from visioncal.results import Calibration, select_matching
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.selecting import Choice
 from visioncal.verification.calibration_prior import CalibrationPrior
 from visioncal.verification.change_hypotheses import CAMERA, NOISE, PAIRS, causes_of
+from visioncal.verification.model_evidence import (
+    ChangeHypothesis,
+    HypothesisEvidence,
+    evidence_of,
+    undone,
+    with_change,
+)
 from visioncal.verification.prediction import PredictedStops, board_changes, predict_stops
 
 _LIMITS = CheckLimits()

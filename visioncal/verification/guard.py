@@ -15,11 +15,10 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M
 from visioncal.core.transforms import invert, rigid_fault
 from visioncal.core.types import Corners, FloatArray
-from visioncal.estimation.arm import ArmErrors, link_basis, posture_features
+from visioncal.estimation.arm import TURN_PER_M, ArmErrors, link_basis, posture_features
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.model_evidence import TURN_PER_M
 from visioncal.estimation.poses import determines_pose
 from visioncal.estimation.problem_parts import ROBOT, Effect
 from visioncal.results import Calibration

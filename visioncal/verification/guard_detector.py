@@ -34,8 +34,7 @@ import numpy as np
 
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import LEVER_M
-from visioncal.estimation.model_evidence import SIZES_M
+from visioncal.estimation.arm import LEVER_M, SIZES_M
 
 # Candidates for the look of the change, and the looks after which one is given up.
 _CANDIDATES, _OLDEST = 14, 1000

@@ -24,12 +24,6 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, remarks
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.model_evidence import (
-    CalibrationPosterior,
-    ChangeHypothesis,
-    HypothesisEvidence,
-    evidence_of,
-)
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT
 from visioncal.results import Calibration, Edge, Rms, Validation, ViewResult
@@ -40,6 +34,12 @@ from visioncal.session import Session
 from visioncal.verification.change_hypotheses import BOARD, BOTH, CAMERA, JOINT, nominal_model
 from visioncal.verification.check import Check, PossibleChange, verify
 from visioncal.verification.messages import change_words
+from visioncal.verification.model_evidence import (
+    CalibrationPosterior,
+    ChangeHypothesis,
+    HypothesisEvidence,
+    evidence_of,
+)
 
 # Possible causes, as a user says them: the base moved on its foundation, or the flange's mount
 # was exchanged, with all that stands on that side of the arm.

@@ -27,14 +27,11 @@ from scipy.linalg import block_diag, cholesky, solve_triangular
 
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.arm import SIZES_M
 from visioncal.estimation.mixed import LEAST_SIGMA, PriorInformation
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 
-# Sizes of changes: from a tenth of a millimetre to a tenth of a metre, by half decades.
-SIZES_M = tuple(float(value) for value in 10.0 ** np.arange(-4.0, -0.9, 0.5))
-# A change of a millimetre rotates by 4 mrad.
-TURN_PER_M = 4.0
 # Shares of the noise's variance that are new at a repeated posture: sigmas are halved in each step.
 _NEW_SHARES = tuple(float(value) for value in 4.0 ** -np.arange(0.0, 5.0))
 # Repeatability of well-kept arms [m], and the factor by which others differ from it: the log-normal
