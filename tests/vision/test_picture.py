@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.boards import any_page, raster
 from support.commands import visioncal
+from support.marks import slow
 from support.misfits import misfit
 from support.printed import PICTURES, Look, label, photographed, photographed_cell, pose_at, poster
 
@@ -45,7 +46,7 @@ def seen(picture, covered=0.0, seed=0):
     return photographed(picture, 0.3, CAMERA, pose, Look(covered=covered), seed), pose
 
 
-@pytest.mark.parametrize("covered", [0.0, 0.15])
+@pytest.mark.parametrize("covered", [slow(0.0), 0.15])
 def test_patches_are_where_they_are_through_a_lens_that_nobody_states(target, covered):
     image, pose = seen(poster(), covered)
     found = find_target(image, target)
@@ -58,6 +59,7 @@ def test_patches_are_where_they_are_through_a_lens_that_nobody_states(target, co
     assert np.sqrt(np.mean((off * found.weights[:, None]) ** 2)) < 0.025
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["label", "board"])
 def test_prints_of_many_alike_features_are_found(kind, tmp_path):
     picture = PICTURES[kind](0)
@@ -86,7 +88,10 @@ def test_a_simulated_cell_shows_the_picture(target):
 
 @pytest.mark.parametrize(
     "look",
-    [Look(disc_px=12.0), Look(twist=(0.012, 0.006, 0.002, 0.001, 0.002, 0.005), covered=0.1)],
+    [
+        Look(disc_px=12.0),
+        slow(Look(twist=(0.012, 0.006, 0.002, 0.001, 0.002, 0.005), covered=0.1)),
+    ],
     ids=["defocus", "motion"],
 )
 def test_blurred_pictures_whose_pose_is_known_to_millimetres_are_registered(target, look):
@@ -123,7 +128,7 @@ def test_a_picture_calibrates_a_lens_that_nobody_states(tmp_path):
     assert misfit(edge, cell.transforms["flange_from_cam"]) < 16.8
 
 
-@pytest.mark.parametrize("disc_px", [4.0, 8.0])
+@pytest.mark.parametrize("disc_px", [4.0, slow(8.0)])
 def test_pictures_out_of_focus_are_registered_by_a_disc(target, disc_px):
     pose = pose_at(0.45, 20.0, np.array([0.15, 0.11, 0.0]), np.random.default_rng(2))
     found = find_target(photographed(poster(), 0.3, CAMERA, pose, Look(disc_px=disc_px)), target)
@@ -134,17 +139,19 @@ def test_pictures_out_of_focus_are_registered_by_a_disc(target, disc_px):
     assert found.blur_px == pytest.approx(disc_px / 2, abs=0.5)
 
 
-def test_small_prints_of_alike_letters_are_found(tmp_path):
+@pytest.mark.parametrize("views", [[1], slow([1, 6])])
+def test_small_prints_of_alike_letters_are_found(tmp_path, views):
     cell = simulate(CellOptions(views=8, seed=0, camera=CAMERA))
     cv2.imwrite(str(tmp_path / "print.png"), label())
     document = {"kind": "picture", "width_m": 0.3, "image": kept_picture(tmp_path / "print.png")}
     small = target_from_document(document, "label")
     # A pixel is four of the picture's own, whose clearest features are finer.
-    for pose in cell.cam_from_target[[1, 6]]:
+    for pose in cell.cam_from_target[views]:
         image = photographed(label(), 0.3, CAMERA, pose)
         assert len(find_target(image, small).ids) > 50
 
 
+@pytest.mark.slow
 def test_a_guard_and_locate_look_for_the_picture_in_images(target, tmp_path, monkeypatch):
     session, cell = photographed_cell(poster(), target, 8, seed=0)
     monkeypatch.chdir(tmp_path)

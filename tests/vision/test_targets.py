@@ -398,14 +398,14 @@ DOTS = requested_target(BoardRequest("dots"), pages_named("A4", None))
 @pytest.mark.parametrize(
     ("board", "mount"),
     [
-        ("aprilgrid", "eye-in-hand"),
+        slow("aprilgrid", "eye-in-hand"),
         slow("aprilgrid", "eye-to-hand"),
         ("circles", "eye-to-hand"),
         slow("circles", "eye-in-hand"),
         slow("symmetric-circles", "eye-in-hand"),
         slow("symmetric-circles", "eye-to-hand"),
-        ("dots", "eye-in-hand"),
-        ("tags", "eye-in-hand"),
+        slow("dots", "eye-in-hand"),
+        slow("tags", "eye-in-hand"),
     ],
 )
 def test_a_cell_is_calibrated_with_it(tmp_path, board, mount):
@@ -429,6 +429,7 @@ def test_a_cell_is_calibrated_with_it(tmp_path, board, mount):
     assert min(errors) < 32.9
 
 
+@pytest.mark.slow
 def test_sound_circles_of_few_pixels_are_not_said_to_be_of_another_diameter(tmp_path):
     options = CellOptions(views=17, mount="eye-to-hand", seed=77, camera=CAMERAS["fisheye"])
     cell = simulate(replace(options, target=BOARDS["circles"], robot="generic-6r-1800"))
@@ -464,6 +465,7 @@ def test_circles_of_another_diameter_are_named_until_it_is_written(tmp_path, mon
     assert sum(view.used for view in found.views) == sum(view.used for view in sound.views)
 
 
+@pytest.mark.slow
 def test_a_public_set_of_circles_is_sharp(real_data):
     result = calibrate(real_data / "field/sets/ji1024")
     assert [view.used for view in result.views].count(True) == len(result.views) == 16
@@ -493,7 +495,7 @@ def test_a_board_is_what_its_files_say(dots):
         target_from_document({"kind": "dots", **alike}, "mine")
 
 
-@pytest.mark.parametrize("camera", ["wide", "fisheye"])
+@pytest.mark.parametrize("camera", ["wide", slow("fisheye")])
 def test_centres_are_exact_and_rightly_numbered(dots, camera):
     cell = simulate(
         CellOptions(target=dots, camera=CAMERAS[camera], views=4, cut_views=0.0, seed=1)
