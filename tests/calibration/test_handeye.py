@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from support.cells import calibrated, error_of, known_of, pairs_session, showing
 from support.edges import solved
-from support.marks import seeds
+from support.marks import seeds, slow
 from support.misfits import misfit
 from support.refusals import raised
 
@@ -36,7 +36,7 @@ NOISE = Noise.of_robot(1e-3, 5e-4)
 FLAT = {"tilt_rad": (0.0, 0.002), "distance_m": (0.5, 0.505), "roll_rad": 0.0}
 
 
-@pytest.mark.parametrize("draws", seeds(4, 8))
+@pytest.mark.parametrize("draws", seeds(2, 8))
 def test_the_whole_chain_states_its_errors_honestly(draws):
     surprises, noises, sigmas = [], [], np.array([5e-5, 3e-5])
     options = CellOptions(pixel_sigma_px=0.1, robot_sigma_rad=sigmas[0], robot_sigma_m=sigmas[1])
@@ -111,7 +111,7 @@ def test_noise_and_errors_are_as_stated():
 
 
 @pytest.mark.parametrize("runs", seeds(1, 2))
-@pytest.mark.parametrize(("of_flange", "name"), [(True, "robot"), (False, "combined")])
+@pytest.mark.parametrize(("of_flange", "name"), [slow(True, "robot"), (False, "combined")])
 def test_the_noise_of_pose_pairs_is_where_it_arises(of_flange, name, runs):
     """Of a servo arm at its flange; of a poor detection at the target, 0.3 m from the camera."""
     rng, squares = np.random.default_rng(4), []

@@ -98,7 +98,7 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
         *(("steps", 1.5e-3), ("knocks", 1.5e-3)),
     ],
 )
-@pytest.mark.parametrize("draws", seeds(3, 4))
+@pytest.mark.parametrize("draws", seeds(1, 4))
 def test_what_moves_is_opened_and_its_result_is_fair(kind, size, draws):
     squares, found = [], 0
     for seed in draws:
@@ -156,7 +156,7 @@ def slow(seed, kinds=(), walks=False):
 @pytest.mark.parametrize(
     ("kinds", "walks"), [(("creeps",), False), (("creeps", "slips"), False), ((), True)]
 )
-@pytest.mark.parametrize("draws", seeds(2, 6))
+@pytest.mark.parametrize("draws", seeds(1, 6))
 def test_what_is_slow_is_told_from_errors_that_last_where_joints_are_known(kinds, walks, draws):
     squares, named = [], 0
     for seed in draws:

@@ -109,7 +109,7 @@ def assert_honest(squares, directions):
 
 
 @pytest.mark.parametrize("payloads", [CARRIED, ()])
-@pytest.mark.parametrize("draws", seeds(2, 8))
+@pytest.mark.parametrize("draws", seeds(1, 8))
 def test_springs_are_found_within_their_covariance(payloads, draws):
     squares = []
     for seed in draws:
@@ -122,7 +122,7 @@ def test_springs_are_found_within_their_covariance(payloads, draws):
     assert_honest(squares, 6)
 
 
-@pytest.mark.parametrize("draws", seeds(2, 8))
+@pytest.mark.parametrize("draws", seeds(1, 8))
 def test_play_of_stops_from_both_sides_is_found_within_its_covariance(draws):
     squares = []
     for seed in draws:
@@ -136,7 +136,7 @@ def test_play_of_stops_from_both_sides_is_found_within_its_covariance(draws):
     assert_honest(squares, 6)
 
 
-@pytest.mark.parametrize("draws", seeds(2, 8))
+@pytest.mark.parametrize("draws", seeds(1, 8))
 def test_play_is_found_by_the_order_of_the_stops_alone(draws):
     """Joints of a servo stand on the side from which they came, and no column says which."""
     squares = []
@@ -152,7 +152,7 @@ def test_play_is_found_by_the_order_of_the_stops_alone(draws):
     assert_honest(squares, 6)
 
 
-@pytest.mark.parametrize("draws", seeds(4, 8))
+@pytest.mark.parametrize("draws", seeds(2, 8))
 def test_zeros_are_found_within_their_covariance_and_are_no_errors_of_links(draws):
     squares = []
     for seed in draws:
@@ -168,7 +168,7 @@ def test_zeros_are_found_within_their_covariance_and_are_no_errors_of_links(draw
     assert_honest(squares, 6)
 
 
-@pytest.mark.parametrize("draws", seeds(4, 8))
+@pytest.mark.parametrize("draws", seeds(2, 8))
 def test_a_board_beside_links_that_err_is_held_unless_its_size_is_clear(draws):
     """Random errors of links lengthen an arm by as much as a printed board may be off."""
     squares = []
@@ -188,7 +188,7 @@ def test_a_board_beside_links_that_err_is_held_unless_its_size_is_clear(draws):
 
 
 @pytest.mark.parametrize("options", [GOOD, WRONG_LINKS, replace(SAGGING, compliance_rad_per_nm=())])
-@pytest.mark.parametrize("draws", seeds(3, 8))
+@pytest.mark.parametrize("draws", seeds(1, 8))
 def test_arms_that_do_not_yield_have_no_springs_and_no_play(options: CellOptions, draws):
     for seed in draws:
         made = simulate(replace(options, seed=seed, mount=MOUNTS[seed % 2]))
@@ -198,7 +198,7 @@ def test_arms_that_do_not_yield_have_no_springs_and_no_play(options: CellOptions
             assert fit.unknowns.closed >= {"links flange", "zeros flange"}
 
 
-@pytest.mark.parametrize("draws", seeds(2, 4))
+@pytest.mark.parametrize("draws", seeds(1, 4))
 def test_an_arm_of_unknown_weight_is_found_with_its_sag(draws):
     left, before = [], []
     for seed in draws:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.marks import seeds
+from support.marks import seeds, slow
 from support.small_cells import PX, ROBOT_RAD, made
 from support.whole_cells import FLOOR, OPTIONS, PLATE, recorded
 
@@ -48,7 +48,7 @@ def test_arms_that_no_sighting_connects_are_eliminated_apart():
     assert fit.used.mean() > 0.9
 
 
-@pytest.mark.parametrize("in_hand", [True, False])
+@pytest.mark.parametrize("in_hand", [True, slow(False)])
 def test_swaying_cameras_are_separated_from_corners_noise_and_from_the_arm(in_hand):
     squares, views, errors, used = [], [], [], []
     for seed in range(4):
@@ -90,7 +90,7 @@ def ring(seed):
     )
 
 
-@pytest.mark.parametrize("draws", seeds(2, 6))
+@pytest.mark.parametrize("draws", seeds(1, 6))
 def test_all_edges_of_a_rig_err_as_their_joint_covariance_says(draws):
     squares, count = [], len(draws)
     for seed in draws:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.marks import slow
 from support.small_cells import TABLE, made, pose, seen_at
 
 from visioncal.core.quantiles import f_limit
@@ -33,7 +34,7 @@ def shifted(cell, start, by):
 
 
 @pytest.mark.parametrize("by", [1, -1, 3])
-@pytest.mark.parametrize("in_hand", [True, False])
+@pytest.mark.parametrize("in_hand", [True, slow(False)])
 def test_rows_that_are_shifted_from_one_on_are_left_out(by, in_hand):
     for seed in range(2):
         small = made(seed, stops=18, in_hand=in_hand)
