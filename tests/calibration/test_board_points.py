@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from support.cells import calibrated, error_of, known_of, showing
+from support.marks import slow
 
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.board_points import point_errors
@@ -42,7 +43,7 @@ def on_board(cell):
     return point_errors(known.session.boards[""], lens, corners, poses)
 
 
-@pytest.mark.parametrize("shift_mm", [0.36, 0.72])
+@pytest.mark.parametrize("shift_mm", [0.36, slow(0.72)])
 def test_a_row_that_was_glued_back_is_named_and_harms_no_result(shift_mm):
     shifts = 1e-3 * shift_mm * np.outer(ROW == 2, [0.55, 0.83])
     cell = with_print(simulate(CellOptions(target=BOARD, pixel_sigma_px=0.06, seed=3)), shifts)

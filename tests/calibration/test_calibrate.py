@@ -337,7 +337,7 @@ def test_a_board_of_another_kind_is_named():
     assert 'write target = "seen.toml"' in found.do.words
 
 
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", [slow(name) if name == "no turns" else name for name in NAMED])
 def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
     folder = broken_session(tmp_path / "session", BROKEN[name])
     found = visioncal.doctor(folder)
@@ -361,7 +361,7 @@ SLIGHT = {"tilt_rad": (0.0, 0.015), "roll_rad": 0.015}
     [
         ("eye-in-hand", {"motion": "one_axis"}),
         slow("eye-to-hand", {"motion": "one_axis"}),
-        ("eye-to-hand", {"motion": "translation"}),
+        slow("eye-to-hand", {"motion": "translation"}),
         ("eye-in-hand", SLIGHT),
     ],
 )

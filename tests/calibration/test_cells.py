@@ -129,6 +129,7 @@ def test_any_frame_is_placed_in_any_other_with_the_covariance_of_the_chain(clean
     raised(DataError, "no frame 'cam_lft'", found.between, "cam_lft", "base_a")
 
 
+@pytest.mark.slow
 def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     pushes = (Moved("target_floor", 9), Moved("cam_right", 12))
     cell = simulate(replace(PLAIN, moved=pushes, swapped_rows=1, stray_images=3, seed=3))
@@ -150,6 +151,7 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert away_m < 2.5e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["cam_right", slow("target_floor")])
 def test_a_frame_that_creeps_was_not_bumped_again_and_again(frame):
     cell = simulate(replace(PLAIN, moved=(Moved(frame, creeps=True, shift_m=0.012),), seed=3))
@@ -223,6 +225,7 @@ def test_cameras_whose_wrong_lenses_are_held_leave_out_few_views():
     assert len(left_out) < 0.25 * len(found.views)
 
 
+@pytest.mark.slow
 def test_cameras_in_the_hand_and_poses_that_are_given():
     cameras = (CameraAt("left", "a"), CameraAt("right", "b"))
     cell = simulate(replace(PLAIN, cameras=cameras, boards=(FLOOR,)))
@@ -400,6 +403,7 @@ def test_noise_refuses_nothing():
     assert reason(found, "Where the others predict them, views are off")
 
 
+@pytest.mark.slow
 def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
     height = {"z_m": 0.06, "sigma_m": 1e-4}
     cell, session = turned(0.0, stops=8, turn_deg=115.0, prior=height)
@@ -414,6 +418,7 @@ def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
     )
 
 
+@pytest.mark.slow
 def test_a_prior_narrows_what_it_is_of_and_is_named_where_it_is_wrong(clean):
     cell, before = clean
     height = float(cell.between("base_a", "base_b")[2, 3])
@@ -471,6 +476,7 @@ def warm():
     return cell, solved(cell, level="thermal")
 
 
+@pytest.mark.slow
 def test_an_arm_of_a_cell_drifts_with_its_own_temperatures(warm, tmp_path):
     cell, found = warm
     found.save(tmp_path / "calibration.json")
@@ -493,6 +499,7 @@ def test_an_arm_of_a_cell_drifts_with_its_own_temperatures(warm, tmp_path):
     raised(DataError, "warms up needs pace_s", replace, cell.options, pace_s=0.0)
 
 
+@pytest.mark.slow
 def test_a_camera_that_sees_a_moving_robot_by_a_clock_of_its_own_is_placed():
     robots = tuple(replace(robot, offset_sigma_rad=1e-3) for robot in ROBOTS)
     # At its stops it takes no image.
@@ -543,6 +550,7 @@ PICTURED = NetworkOptions(
 )
 
 
+@pytest.mark.slow
 def test_pictures_of_several_cameras_are_one_cell(tmp_path):
     cell, out = simulate(PICTURED), tmp_path / "out"
     session = Session.load(write_session(cell, tmp_path / "cell"))
@@ -568,6 +576,7 @@ def test_pictures_of_several_cameras_are_one_cell(tmp_path):
     assert "Worst used view" in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_two_images_that_are_exchanged_have_a_command_that_mends_them(three):
     # The images of one camera at two stops.
     views = [view for view in three.views if view.text.get("target") == "plate_b"]

@@ -270,7 +270,7 @@ def test_the_offset_is_told_by_a_sweep():
     assert clock.shutter is None
 
 
-@pytest.mark.parametrize(("seed", "how"), [(0, SHORT), (1, HURRIED)], ids=["global", "rolling"])
+@pytest.mark.parametrize(("seed", "how"), [slow(0, SHORT), (1, HURRIED)], ids=["global", "rolling"])
 def test_images_are_placed_in_time_by_their_corners_and_their_readout_is_found(seed, how):
     cell = swept(seed, how=how)
     known = calibrated_sweep(cell)
@@ -330,6 +330,7 @@ def going(way=lambda times_s: np.outer(times_s, SCREW), hz=30) -> Session:
     return streamed((frames_s, seen), (times_s, exp(way(times_s))))
 
 
+@pytest.mark.slow
 def test_motion_that_repeats_itself_is_refused_unless_the_offset_is_stated():
     """Every two seconds."""
     turns, sizes = np.pi * np.array([1, 2, 1, 2, 1, 2]), np.array([0.4, 0.5, 0.3, 0.1, 0.1, 0.1])

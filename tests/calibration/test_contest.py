@@ -202,7 +202,7 @@ def moving(kind, mount, count=16):
     [
         slow("gantry", MOUNTS[0], "base_from_target", "xyz"),
         ("gantry", MOUNTS[1], "flange_from_target", "xyz"),
-        ("scara", MOUNTS[0], "flange_from_cam", "z"),
+        slow("scara", MOUNTS[0], "flange_from_cam", "z"),
         slow("scara", MOUNTS[1], "base_from_cam", "z"),
     ],
 )
@@ -231,6 +231,7 @@ def test_a_rail_leaves_a_turn_open_too(mount):
     assert "move along a second direction" in error.next_step
 
 
+@pytest.mark.slow
 def test_a_lens_that_far_views_leave_open_hears_what_to_state():
     far = CellOptions(
         views=14, seed=1, state_intrinsics=False, distance_m=(2.8, 3.2), pixel_sigma_px=0.3

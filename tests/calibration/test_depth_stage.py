@@ -101,6 +101,7 @@ def test_the_noise_of_the_robot_is_in_no_depth():
     assert found.camera.depth.values == pytest.approx(depth.values, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_true_depth_is_not_accused():
     _, result = made(depth=TRUE)
     words = {found.kind: found.words for found in result.calibration.verdict.findings}
@@ -298,6 +299,7 @@ def test_verify_says_whether_depth_is_what_it_was():
     assert verify(changed(lambda raw, _: np.zeros_like(raw)), result.calibration).passed
 
 
+@pytest.mark.slow
 def test_without_depth_nothing_of_it_is_loaded():
     code = (
         "import sys, numpy as np, visioncal; from visioncal import simulation as s;"
@@ -310,7 +312,8 @@ def test_without_depth_nothing_of_it_is_loaded():
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize(("mount", "count"), [slow("eye-in-hand", 300), ("eye-to-hand", 100)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("mount", "count"), [("eye-in-hand", 300), ("eye-to-hand", 300)])
 def test_picks_by_depth_are_within_their_radius(mount, count):
     cell, _, result = calibrated(1, mount, FALSE, 12)
     error, raw, radius = picks(cell, result, FALSE, np.random.default_rng(2), count).T

@@ -36,6 +36,7 @@ def test_a_far_board_and_an_unknown_lens_are_told_apart_by_the_robots_motion(rea
     assert np.sqrt(np.diag(edge.covariance)[3:].max()) < 5e-3
 
 
+@pytest.mark.slow
 def test_a_lens_field_turns_no_long_session(real_data):
     # Errors of 0.08 px beyond the lens model in 200 views before a fixed camera.
     path = real_data / "field/worlds/o_clean200_field.08-t-4000"

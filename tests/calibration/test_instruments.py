@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import visioncal as command
+from support.marks import slow
 from support.refusals import raised
 from support.tracked import errors_of, known_of
 
@@ -40,7 +41,7 @@ PROBE, POINT, POINTS = (
 WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3, "offset_sigma_rad": 1e-3}
 
 
-@pytest.mark.parametrize("options", [PROBE, POINT], ids=["probe", "point"])
+@pytest.mark.parametrize("options", [PROBE, slow(POINT)], ids=["probe", "point"])
 def test_errors_follow_their_covariance(options):
     kept = np.arange(12) if options.poses else np.r_[:6, 9:12]
     squares = 0.0
@@ -316,7 +317,7 @@ def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
     assert height == pytest.approx(0.05, abs=1e-5)
 
 
-@pytest.mark.parametrize("beyond", [0.5, 1.0])
+@pytest.mark.parametrize("beyond", [0.5, slow(1.0)])
 def test_gears_of_two_slopes_are_told_under_heavy_loads(beyond, monkeypatch):
     """Shoulder and elbow yield half as much beyond a torque, or as much."""
     stiff, knees = np.array([1e6, 4.7e5, 3e5, 1e5, 1e5, 7e4]), {1: 900.0, 2: 500.0}

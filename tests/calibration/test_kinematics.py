@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support.cells import arm_found, calibrated, known_of, reporting
 from support.live_cell import postures_in_view, true_cell
-from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
 from support.slopes import jacobian, twists
@@ -400,6 +399,7 @@ def test_weight_is_among_the_functions():
     assert again == pytest.approx(torques, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_sagging_arm_of_unknown_weight_is_calibrated_with_its_sag():
     cell = simulate(replace(SAGGING, views=60, seed=4))
     known = calibrated(cell, robot=of_unknown_weight())
@@ -430,7 +430,8 @@ def test_play_is_told_by_stops_from_both_sides_and_is_no_stiffness():
     assert any(words in reason for reason in worn.verdict.reasons)
 
 
-@pytest.mark.parametrize("way", [1.0, slow(-1.0)], ids=["from", "to"])
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["from", "to"])
 def test_an_arm_that_is_right_but_for_its_play(way):
     cell = simulate(replace(GOOD, views=40, backlash_rad=PLAY, seed=3))
     # Some write the side that the joints moved to; a dead-band is a width all the same.

@@ -360,6 +360,7 @@ def test_what_is_advised_runs_as_it_is_printed_and_mends_it(tmp_path, monkeypatc
     assert Calibration.load(Path("out/calibration.json")).verdict.status == "good"
 
 
+@pytest.mark.slow
 def test_positions_and_rotations_that_two_signs_may_belong_to_are_both_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     poses = cell_poses()
@@ -408,7 +409,7 @@ def test_another_size_that_leaves_most_of_a_misfit_is_none(seed):
     assert not guess.is_open
 
 
-@pytest.mark.parametrize("lost", ["rotations", "poses", "positions"])
+@pytest.mark.parametrize("lost", ["rotations", "poses", slow("positions")])
 def test_what_was_never_recorded_is_named(lost):
     poses = cell_poses()
     told = poses.robot.poses()
@@ -507,7 +508,9 @@ SLIPS = {
 }
 
 
-@pytest.mark.parametrize("name", SLIPS)
+@pytest.mark.parametrize(
+    "name", [slow(name) if name == "an encoder's zero in both" else name for name in SLIPS]
+)
 def test_slips_are_named(name):
     changes, words = SLIPS[name]
     assert words in str(visioncal.doctor(session_with(**changes)))
@@ -560,6 +563,7 @@ def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     assert "multiply q1_rad to q6_rad by pi / 180" in error.next_step
 
 
+@pytest.mark.slow
 def test_a_lost_encoder_is_named_and_estimated_with_the_arm():
     joints = Q - LOST
     result = visioncal.calibrate(session_with(joints, ROBOT.base_from_flange(joints)))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from support.cells import board_numbers, calibrated, error_of, known_of, pairs_session, session_of
 from support.following import follow
-from support.marks import crossed
+from support.marks import crossed, slow
 from support.misfits import misfit
 from support.refusals import raised
 
@@ -288,7 +288,7 @@ REFINE, HOLD, RIGHT = {"intrinsics": "refine"}, {"intrinsics": "hold"}, by(0, 0,
         lens(FINE, RIGHT, refined=True, status="good", **REFINE),
         lens(FINE, by_sigma(0.5), 0.2, 2.0, 4, matrix_sigma_px=0.5),
         # The corners' noise does not absorb the lens's error, and nothing is accused for it.
-        lens(MARKER, within(6.0), 0.5, 1.7, 5, True, "good", matrix_sigma_px=6.0),
+        slow(*lens(MARKER, within(6.0), 0.5, 1.7, 5, True, "good", matrix_sigma_px=6.0)),
         # Without a prior, one marker tells no lens.
         lens(MARKER, RIGHT, refined=False, **REFINE),
         # A lens that is stated for images twice as large.
@@ -349,7 +349,10 @@ BENT = [-0.28, 0.09, 0.0012, -0.0009, -0.015]
     ],
     ids=["another order", "rectified", "cropped"],
 )
-def test_a_lens_that_was_misread_is_named_with_its_right_reading(true, off_px, stated, words):
+@pytest.mark.parametrize("is_long", [False, slow(True)], ids=["", "and another"])
+def test_a_lens_that_was_misread_is_named_with_its_right_reading(
+    true, off_px, stated, words, is_long
+):
     camera = replace(CAMERAS["wide"], distortion=np.array(true))
     cell = simulate(replace(FINE, camera=camera, seed=4))
     known = calibrated(cell, session=with_camera(cell, off_px, distortion=stated))
@@ -357,6 +360,8 @@ def test_a_lens_that_was_misread_is_named_with_its_right_reading(true, off_px, s
     assert cause.kind == "lens"
     assert words in cause.words
     assert mahalanobis_sq(cell, known) < 2.74
+    if not is_long:
+        return
     # Another one is of rectified pictures, too, but of no order and no part.
     other = calibrated(cell, session=with_camera(cell, off_px, distortion=[0.1, *stated[1:]]))
     assert (words in other.verdict.causes[0].words) == (not any(true))
@@ -377,6 +382,7 @@ def test_a_fisheye_camera_goes_the_whole_way():
 LENS_FREE = CellOptions(state_intrinsics=False, seed=3)
 
 
+@pytest.mark.slow
 def test_a_fisheye_lens_that_is_taken_for_another_is_named():
     wide = known_of(simulate(replace(LENS_FREE, camera=CAMERAS["fisheye"])))
     document = wide.session.document
@@ -506,7 +512,7 @@ def test_what_cannot_be_used_is_said():
     assert any("was not used: the closed form park cannot" in reason for reason in closed.reasons)
 
 
-@pytest.mark.parametrize("scale", [1.01, 0.484])
+@pytest.mark.parametrize("scale", [1.01, slow(0.484)])
 def test_measured_distances_of_another_scale_are_named_and_mended(scale, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = CellOptions(mount="eye-to-hand", views=16, board_scale=scale, seed=2)

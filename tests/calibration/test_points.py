@@ -168,6 +168,7 @@ def test_a_rig_that_is_larger_than_its_table_is_named_with_its_size():
     assert not any(finding.kind == "board_size" for finding in mended.findings)
 
 
+@pytest.mark.slow
 def test_sigmas_weigh_the_corners_and_the_camera_is_where_it_is_within_its_own():
     squares, variances = 0.0, {None: 0.0, 1.0: 0.0}
     for seed in range(2):

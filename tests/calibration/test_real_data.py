@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.marks import slow
 from support.tracked import known_of
 
 import visioncal
@@ -68,6 +67,7 @@ def test_charuco_before_a_fixed_camera(real_data):
     assert 1e3 * np.linalg.norm(away) < 4 + 3 * result.edges["base_from_cam"].sigma_mm
 
 
+@pytest.mark.slow
 def test_a_six_axis_arm_by_a_laser(real_data):
     known = known_of(rokae(real_data))
     assert known.robot_arm.kinematics.result.nominal.rms_mm > 2.0
@@ -93,6 +93,7 @@ def test_a_real_session_of_images_is_not_accused(real_data, name, views, said):
     assert said in guess.sentence
 
 
+@pytest.mark.slow
 def test_a_real_lens_that_departs_from_its_model_is_no_pane_of_negative_thickness(real_data):
     """A pane of -7.6 mm explained its field, and doubled what its arm errs by."""
     found = visioncal.calibrate(real_data / "sessions/kuka_checkerboard_in_hand").verdict
@@ -100,7 +101,8 @@ def test_a_real_lens_that_departs_from_its_model_is_no_pane_of_negative_thicknes
     assert "window" not in {finding.kind for finding in found.findings}
 
 
-@pytest.mark.parametrize("stops", [30, slow(40)])
+@pytest.mark.slow
+@pytest.mark.parametrize("stops", [30, 40])
 def test_two_cameras_of_one_arm_agree_within_a_bounded_search(real_data, monkeypatch, stops):
     # Cameras 1 and 3 of four, whose lenses are not as stated; rows 25 and 26 are exchanged.
     steps, minimise = [], solve.levenberg_marquardt

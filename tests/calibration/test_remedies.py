@@ -165,11 +165,7 @@ FAULTS = {
         "late_poses", read_late(2e-2, 7e-2), command="--by-joints", has_joints=True
     ),
 }
-QUICK = (
-    "four rows exchanged in turn",
-    "quaternions that begin with w",
-    "poses read on the way",
-)
+QUICK = ("poses read on the way",)
 
 
 @pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in FAULTS])

@@ -195,6 +195,7 @@ def test_pictures_that_were_stored_anew_are_copies():
     assert finding.words.startswith("Views 6-11 repeat 0-5: ")
 
 
+@pytest.mark.slow
 def test_a_lens_is_not_moved_by_what_repeated_views_have_wrong_alike():
     """The bias is within the noise of one view, and clear in fourteen that count as one."""
     options = read_cell("two-cameras")

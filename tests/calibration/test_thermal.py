@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from support.commands import visioncal as run
+from support.marks import slow
 from support.pages import Page
 from support.refusals import raised
 from support.slopes import twists
@@ -93,17 +95,15 @@ def inputs(kind="currents", hours=2.0, seed=0):
 
 @pytest.fixture(scope="module")
 def learnt():
-    return {
-        told: warmed(temperatures=told == "temperatures") for told in ("temperatures", "currents")
-    }
+    return cache(lambda told: warmed(temperatures=told == "temperatures"))
 
 
 # Over 8 worlds the median share was 0.10 and 0.18, the worst of each 0.14 and 0.34; this world is
 # not the worst. The limits are those that are promised of the median.
-@pytest.mark.parametrize(("told", "limit"), [("temperatures", 0.2), ("currents", 0.25)])
+@pytest.mark.parametrize(("told", "limit"), [("temperatures", 0.2), slow("currents", 0.25)])
 def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
     """All over the workspace, between the training and the fifth hour."""
-    found = learnt[told]
+    found = learnt(told)
     arm, drift = found.truth.robot.true_arm, found.calibration.drift
     q = postures(load_robot(CELL.robot))[:PLACES]
     at_s = np.linspace(TRAINED_S, END_S, len(q))
@@ -125,7 +125,7 @@ def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
 
 
 def test_what_is_not_told_stays_at_its_prior_and_is_named(learnt):
-    thermal = learnt["temperatures"].calibration.thermal
+    thermal = learnt("temperatures").calibration.thermal
     # The last link is a tenth of a metre: it grows by a micrometre for a kelvin.
     assert "growth of wrist_3_joint" in thermal.not_determined
     assert thermal.joints[5].growth_per_k == pytest.approx(17.5e-6, abs=5.5e-6)
@@ -133,8 +133,9 @@ def test_what_is_not_told_stays_at_its_prior_and_is_named(learnt):
     assert thermal.residual_mm.with_drift < 0.85 * thermal.residual_mm.without
 
 
+@pytest.mark.slow
 def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
-    known, truth = learnt["currents"].calibration, learnt["currents"].truth.transforms
+    known, truth = learnt("currents").calibration, learnt("currents").truth.transforms
     away = [log(invert(true) @ known.edges[name].matrix) for name, true in truth.items()]
     error = np.concatenate(away)
     # Chi-square of 12 degrees of freedom is below 32.9 but for one in a thousand; a drift taken for
@@ -150,7 +151,7 @@ def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
 
 
 def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):
-    found = learnt["temperatures"]
+    found = learnt("temperatures")
     cold, warm = found.session.views[:24:4], found.session.views[-6:]
     passed = verify(replace(found.session, views=cold), found.calibration)
     assert passed.passed
@@ -208,7 +209,7 @@ def test_the_compensator_refuses_what_does_not_fit():
 
 
 def test_the_report_shows_the_drift(learnt):
-    found = learnt["temperatures"]
+    found = learnt("temperatures")
     page = Page(render(found.calibration, found.session, ()))
     assert "Drift with temperature" in page.text
     assert "Steel grows by 12, aluminium by 23" in page.text
@@ -216,7 +217,7 @@ def test_the_report_shows_the_drift(learnt):
 
 
 def test_the_calibration_tells_the_arm_at_any_temperature(learnt, tmp_path):
-    known = learnt["temperatures"].calibration
+    known = learnt("temperatures").calibration
     known.save(tmp_path / "calibration.json")
     again, warm = Calibration.load(tmp_path / "calibration.json"), known.drift.reference_c + 15.0
     at, cold = again.base_from_flange(Q, temperatures_c=warm), again.base_from_flange(Q)
@@ -271,12 +272,12 @@ def of_the_first_hour(session):
     ("change", "words"),
     [
         (without_heat, r"all of temp1_c \.\.\. temp6_c or current1_a"),
-        (of_five_joints, r"all of temp1_c \.\.\. temp6_c"),
-        (of_the_first_hour, r"from 0 to 2990 s, and views were taken from 0 to 57\d\d s"),
+        slow(of_five_joints, r"all of temp1_c \.\.\. temp6_c"),
+        slow(of_the_first_hour, r"from 0 to 2990 s, and views were taken from 0 to 57\d\d s"),
     ],
 )
 def test_a_session_without_temperatures_is_refused_by_what_it_needs(learnt, change, words):
-    raised(DataError, words, calibrate, change(learnt["temperatures"].session), level="thermal")
+    raised(DataError, words, calibrate, change(learnt("temperatures").session), level="thermal")
 
 
 def test_sessions_in_which_nothing_warms_up_are_refused():
@@ -292,7 +293,7 @@ def test_sessions_in_which_nothing_warms_up_are_refused():
 
 
 def test_correct_goes_by_the_temperatures_and_kelvin_is_no_celsius(learnt, tmp_path):
-    known, session = learnt["temperatures"].calibration, learnt["temperatures"].session
+    known, session = learnt("temperatures").calibration, learnt("temperatures").session
     known.save(tmp_path / "calibration.json")
     q = np.array([[0.4, -1.3, 1.5, -1.75, -1.57, 0.3]])
     warm = known.drift.reference_c + 15.0

@@ -339,6 +339,7 @@ def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> No
     assert "late_poses" not in {found.kind for found in sound.findings}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_images_that_are_shifted_from_some_view_on_are_told_from_a_camera_that_moved(mount) -> None:
     cell = simulate(CellOptions(views=24, mount=mount, pixel_sigma_px=0.1, seed=2))
@@ -389,8 +390,8 @@ def test_a_view_just_beyond_the_limit_of_outliers_is_no_mistake():
     ("step_mm", "step_deg", "noise_mm", "words"),
     [
         (1.0, 0.0, 0.03, "their positions to 1 mm: this alone puts the flange off by 0.29 mm an"),
-        (1.0, 1.0, 0.03, "their positions to 1 mm and angles to 1 deg:"),
-        (0.1, 0.0, 0.03, ""),
+        slow(1.0, 1.0, 0.03, "their positions to 1 mm and angles to 1 deg:"),
+        slow(0.1, 0.0, 0.03, ""),
         # Rounding is the smaller part of it.
         (1.0, 0.0, 0.6, ""),
     ],
@@ -409,6 +410,7 @@ def test_poses_with_too_few_digits_are_the_cause(step_mm, step_deg, noise_mm, wo
     assert ("rounded_poses" in [found.kind for found in doctor(session).findings]) == bool(words)
 
 
+@pytest.mark.slow
 def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():
     cell = simulate(CellOptions(views=18, seed=3))
     switched = exp(np.array([0.0, 0.5, 0.7, 0.02, -0.01, 0.18]))
@@ -459,6 +461,7 @@ def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:
     assert "wrong_views" in found
 
 
+@pytest.mark.slow
 def test_all_views_of_one_end_are_off_by_no_chance_whatever_each_is_off_by():
     """As where the zero of a joint is lost, which moves each flange by its own posture."""
     cell, rng = simulate(CellOptions(views=20)), np.random.default_rng(1)
@@ -475,7 +478,7 @@ def test_all_views_of_one_end_are_off_by_no_chance_whatever_each_is_off_by():
     assert "something_moved" not in ids(calibrate(session_of(cell, amid)).verdict)
 
 
-@pytest.mark.parametrize("orders", [("xyz", "ZYZ"), ("ZYZ", "ZYX"), ("ZYZ", "xyz")])
+@pytest.mark.parametrize("orders", [("xyz", "ZYZ"), *map(slow, [("ZYZ", "ZYX"), ("ZYZ", "xyz")])])
 def test_angles_taken_for_another_makers_are_brought_back_row_by_row(orders: tuple[str, str]):
     """Of the two triples of angles of a rotation, some rows had the one that writing gives."""
     cell, (order, taken) = simulate(CellOptions(views=16)), orders
@@ -831,7 +834,7 @@ SHUFFLED = CellOptions(mount="eye-to-hand", views=18, seed=4)
 @pytest.mark.parametrize(
     ("options", "order", "status", "words"),
     [
-        (SHUFFLED, lambda rng: rng.permutation(18), "bad", "poses are not those of the images"),
+        slow(SHUFFLED, lambda rng: rng.permutation(18), "bad", "poses are not those of the images"),
         # Where the other half is as it should be, that is not said.
         (
             replace(SHUFFLED, mount="eye-in-hand"),
@@ -915,7 +918,8 @@ def test_what_an_arm_does_again_moves_no_pick() -> None:
     )
 
 
-def test_what_happens_now_and_then_or_from_image_to_image_happens_at_picks() -> None:
+@pytest.mark.slow
+def test_what_happens_now_and_then_happens_at_picks() -> None:
     cell, rng = simulate(CellOptions(views=25)), np.random.default_rng(1)
     poses, away = cell.robot.base_from_flange.copy(), np.zeros((25, 6))
     # At four stops the flange is 0.6 mm off, which is twice as much as is needed.
@@ -930,6 +934,9 @@ def test_what_happens_now_and_then_or_from_image_to_image_happens_at_picks() -> 
     # The look and the pick are eight of 21 + 8 chances, and the others stay as they were.
     assert after == pytest.approx(before * 21 / 29, abs=0.05)
     assert before > 0.95
+
+
+def test_what_happens_from_image_to_image_happens_at_picks() -> None:
     # A focus of 0.2 %, which shows a thing that much nearer or farther.
     cell, rng, share = simulate(CellOptions()), np.random.default_rng(3), 2e-3
     centre = cell.options.camera.matrix[2:]
