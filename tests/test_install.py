@@ -10,6 +10,8 @@ import sys
 import zipfile
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -47,6 +49,7 @@ def test_a_wheel_carries_its_data_and_finds_it(tmp_path):
         assert f"visioncal/{data}" in names
 
 
+@pytest.mark.slow
 def test_a_test_that_hangs_is_ended_and_named(tmp_path):
     """With the options of `.ci/run`, but for their time; the hang keeps Python's lock."""
     (options,) = re.findall(r"PYTEST_ADDOPTS='(.*)'", (ROOT / ".ci" / "run").read_text("utf-8"))

@@ -139,6 +139,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_no_command_runs_code_of_the_current_folder(trap, inputs, tmp_path):
     typed, program = list[list[str]](), tmp_path / "bin/visioncal"
     program.parent.mkdir()
@@ -158,6 +159,7 @@ def test_no_command_runs_code_of_the_current_folder(trap, inputs, tmp_path):
     assert trap.read_text("utf-8") == ""
 
 
+@pytest.mark.slow
 def test_processes_of_the_page_and_of_the_simulated_cell_run_none_either(trap, tmp_path):
     # From a script elsewhere, so that the current folder is not on the path of this process.
     script = tmp_path / "script.py"

@@ -716,7 +716,7 @@ def test_a_name_does_not_steer_the_terminal(pairs, tmp_path):
 
 
 # Of each kind of advice one; the others are slow.
-QUICK = ("two rows exchanged",)
+QUICK = ("two images missing",)
 # Read as they are, as tests of tables show: what is then printed is that of semicolons.
 ALIKE = ("decimal commas", "a byte-order mark", "empty rows")
 

@@ -127,12 +127,13 @@ def of_few_views(folder: Path) -> Path:
 @pytest.mark.parametrize(
     "name", [name if name == "half of another size" else slow(name) for name in PLANTED]
 )
-def test_pictures_of_several_sizes_are_no_circle(place, name):
+@pytest.mark.parametrize("words", ["calibrate cell -o out", slow("doctor cell")])
+def test_pictures_of_several_sizes_are_no_circle(place, name, words):
     PLANTED[name](of_few_views(sound_session(place / "cell")))
-    assert follow("doctor", "cell").last.status == 0
-    assert follow("calibrate", "cell", "-o", "out").last.status == 0
+    assert follow(*words.split()).last.status == 0
 
 
+@pytest.mark.slow
 def test_a_board_of_markers_where_another_kind_is_declared_is_followed_to_a_result(place):
     sound = of_few_views(sound_session(place / "cell"))
     (sound / "board.toml").write_text(
@@ -198,7 +199,7 @@ def test_a_size_that_poses_gave_is_known_no_better_than_so(place):
     assert board["square_sigma_m"] == pytest.approx(0.01 * board["square_m"])
 
 
-@pytest.mark.parametrize("mistake", ["images named .jpg", "images in another folder"])
+@pytest.mark.parametrize("mistake", [slow("images named .jpg"), "images in another folder"])
 def test_images_that_are_elsewhere_are_found(place, mistake):
     BROKEN[mistake].plant(sound_session(place / "cell", SMALL))
     followed = follow("calibrate", "cell", "-o", "out")
@@ -256,6 +257,7 @@ def nothing(_folder: Path) -> None:
     pass
 
 
+@pytest.mark.slow
 def test_the_part_of_a_lens_that_does_not_fit_is_named(place):
     sound = sound_session(place / "cell")
     document = tomllib.loads((sound / "session.toml").read_text("utf-8"))

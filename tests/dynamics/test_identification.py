@@ -368,6 +368,7 @@ def test_breaking_loose_is_found():
     assert np.sqrt(np.diag(covariance)[6:]).max() < 0.05
 
 
+@pytest.mark.slow
 def test_an_arm_without_humps_gets_none(worlds):
     built, _, _, _ = worlds[0]
     rng = np.random.default_rng(7)
@@ -413,6 +414,7 @@ def panda():
     return RecordedSamples("streams/panda.csv", load(PANDA / "time.txt"), q, dq, torques)
 
 
+@pytest.mark.slow
 def test_a_real_panda_is_predicted(panda):
     """First 70 % to train, last 30 % to test, 8 Hz; a plain script's errors are the limits."""
     train, test = condition(panda.part(0.0, 0.7), 8.0), condition(panda.part(0.7, 1.0), 8.0)

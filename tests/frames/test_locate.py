@@ -173,6 +173,7 @@ def test_exact_sights_give_exact_places(exact_cell):
     np.testing.assert_allclose(centre.p_base, base_from_target[:3, 3], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_calibrated_arm_errs_by_what_its_calibration_left_open():
     point, surprises, shares = np.array([0.13, 0.09, 0.0]), [], []
     for seed in range(2):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.cells import exact
 from support.imaged import Shot, calibrated_cell, session_of, shots
+from support.marks import seeds
 from support.misfits import misfit
 from support.picks import calibration_of, really, seen_corners
 from support.refusals import raised
@@ -104,9 +105,10 @@ def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
     np.testing.assert_allclose(here.flange_jacobian, twists(standing, 6, 1e-4), atol=1e-6)
 
 
-def test_places_follow_their_stated_covariance():
+@pytest.mark.parametrize("draws", seeds(2, 5))
+def test_places_follow_their_stated_covariance(draws):
     surprises = []
-    for seed in range(5):
+    for seed in draws:
         cell, calibration = calibrated(IN_HAND, seed)
         rng = np.random.default_rng(seed)
         place = place_of(cell, "base", rng)

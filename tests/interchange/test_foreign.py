@@ -179,6 +179,7 @@ def test_mistakes_are_answered_with_what_there_is(tmp_path, requested, words):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_offset_of_two_clocks_is_found(tmp_path):
     ahead_s = 0.337
     robot_s, camera_s = np.arange(0, 12, 0.01), np.arange(0.5, 11.5, 1 / 30)

@@ -217,6 +217,7 @@ def test_a_ur10_from_its_joints(real_data, calibrated):
     assert np.max([view.residual_mm for view in result.views]) < 21
 
 
+@pytest.mark.slow
 def test_a_guess_finds_what_was_not_said(real_data, tmp_path):
     source = real_data / "doosan_a0509_charuco"
     done = convert(source, tmp_path / "s", "--robot-unit", "m", "--guess", "--yes").good()
@@ -241,6 +242,7 @@ def test_touches_alone_are_no_session_of_a_camera(real_data, tmp_path):
     assert not (tmp_path / "s").exists()
 
 
+@pytest.mark.slow
 def test_a_pan_tilt_head_of_a_urdf_of_any_name(real_data, tmp_path):
     case, out = real_data / "field/cases/pan-tilt", tmp_path / "s"
     seen = "board_x,board_y,board_z,board_qx,board_qy,board_qz,board_qw"

@@ -14,6 +14,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.following import follow
+from support.marks import slow
 from support.samples import made_up
 from support.urdf_arm import URDF, of_urdf
 
@@ -1053,7 +1054,20 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("make", LAYOUTS.values(), ids=LAYOUTS.keys())
+# Others are read by the same; of their poses many readings are tried, which takes seconds.
+SEARCHED = {
+    "below_headings", "beside_a_decoy", "blanks", "columns_as_lists", "comment_above",
+    "letters_of_a_lost_picture", "letters_of_a_picture_too_many", "lines_before_the_first_picture",
+    "lines_with_brackets", "lists_alone", "lists_in_a_log", "mappings_of_any_names",
+    "sorted_as_text", "tf2_echo", "two_of_a_day",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "make",
+    [slow(make) if name in SEARCHED else make for name, make in LAYOUTS.items()],
+    ids=LAYOUTS.keys(),
+)
 def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
     make(tmp_path / "in")
     poses, pictures, sample = world()
@@ -1203,6 +1217,7 @@ def test_xml_with_entities_is_refused(tmp_path):
     done.refused("a document type is declared")
 
 
+@pytest.mark.slow
 def test_a_guess_needs_no_second_step_where_it_contradicts_nothing_stated(tmp_path):
     sixes(tmp_path / "in")
     said = ("--target", world()[2].document["target"], "--mount", "eye-in-hand")
@@ -1600,7 +1615,7 @@ def test_rows_of_joints_and_of_a_tracker_belong_together_by_their_id(tmp_path):
 @pytest.mark.parametrize(
     ("name", "target", "words"),
     [
-        ("npz-base2ee", "checkerboard_4x7_33mm", "The poses fit as first read"),
+        slow("npz-base2ee", "checkerboard_4x7_33mm", "The poses fit as first read"),
         ("rpy-unstated", "checkerboard_11x8_20mm", "as Euler angles xyz about fixed axes in rad"),
     ],
 )
@@ -1612,6 +1627,7 @@ def test_cases_of_the_field_come_in(tmp_path, name, target, words):
     assert words in done.good().err
 
 
+@pytest.mark.slow
 def test_a_board_of_other_counts_is_named_before_the_form_is_asked_for(tmp_path):
     if not FIELD.is_dir():
         pytest.skip("the cases of the field are not here (../shared/data)")

@@ -118,6 +118,7 @@ def fatal(job):
     return work(job)
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_loses_nothing(fleet, tmp_path, monkeypatch):
     monkeypatch.setattr(batch_run, "work", fatal)
     rows = batch([fleet / "robot_0", fleet / "robot_1"], tmp_path, workers=2, without=BARE).rows

@@ -318,6 +318,7 @@ def test_other_motions_are_known_by_their_turns_before_any_fit():
     assert not turns_alike(Recording(other, numbers(seen), mount, is_measured=True))
 
 
+@pytest.mark.slow
 def test_what_keeps_images_from_telling_a_form_comes_before_the_form(tmp_path, monkeypatch):
     sample = made_up(9).session
     sample.save(tmp_path / "shots")

@@ -116,6 +116,7 @@ def test_the_program_drives_to_each_stop_by_way_of_what_lies_between(planned, do
     assert sum("popup" in value and "take images/" in value for value in inside) == 6
 
 
+@pytest.mark.slow
 def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one_axis, tmp_path):
     refused = visioncal("calibrate", one_axis, "-o", tmp_path / "out")
     # An arm of six axes is not told of those that cannot tilt.

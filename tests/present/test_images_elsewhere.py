@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from support.commands import visioncal
+from support.marks import slow
 
 from visioncal.calibration.run import run
 from visioncal.core.errors import DataError
@@ -27,7 +28,7 @@ def cell(tmp_path_factory):
     return session, run(session)
 
 
-@pytest.mark.parametrize("kept", ["thumbnail", "none"])
+@pytest.mark.parametrize("kept", [slow("thumbnail"), "none"])
 def test_the_session_stays_what_it_is_without_its_images(cell, tmp_path, kept):
     session, done = cell
     write_outputs(tmp_path / "full", session, done, images="full")

@@ -18,6 +18,7 @@ from support.arm_documents import calibrated
 from support.cells import pairs_session
 from support.commands import visioncal
 from support.findings import with_contradiction, with_findings
+from support.marks import slow
 from support.pages import Page, section
 from support.samples import REJECTED, made_up
 
@@ -140,7 +141,7 @@ def test_figures_are_drawn_and_their_identifiers_stay_apart(sample):
     )
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand", "two arms"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand", slow("two arms")])
 def test_the_cell_is_pictured_with_each_place_of_camera_and_board(mount):
     options = two_arms.OPTIONS if mount == "two arms" else CellOptions(views=10, mount=mount)
     session = cell_session(simulate(options), "cell", seen="corners")

@@ -58,12 +58,13 @@ def test_a_camera_that_stands_is_not_accused(lights):
     assert moves(episodes(lights, [[0] * LENGTH] * 4)) == []
 
 
-@pytest.mark.parametrize("at", [0, slow(5), LENGTH - 1])
+@pytest.mark.parametrize("at", [0, slow(5), slow(LENGTH - 1)])
 def test_a_move_is_named_by_its_frame(lights, at):
     courses = [[0] * LENGTH, [0] * at + [1] * (LENGTH - at), [1] * LENGTH, [1] * LENGTH]
     assert moves(episodes(lights, courses)) == [(1, at, True)]
 
 
+@pytest.mark.slow
 def test_a_camera_that_looks_elsewhere_and_back_moved_twice(lights):
     courses = [[0] * LENGTH, [0] * 5 + [2] * 2, [2] * LENGTH, [0] * LENGTH, [0] * LENGTH]
     assert moves(episodes(lights, courses)) == [(1, 5, False), (3, 0, False)]
