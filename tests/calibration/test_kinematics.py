@@ -154,6 +154,35 @@ def test_a_wrong_gear_ratio_is_told():
     assert known.robot_arm.model.robot.chain.functions[1:4, 1] == pytest.approx(1.001, abs=2e-4)
 
 
+def test_one_length_that_is_mistyped_is_named_with_its_size():
+    document = json.loads(json.dumps(load_robot("ur5e").document))
+    document["joint"][1]["a_m"] += 3e-3
+    mistyped = Robot.from_document(document)
+    cell = simulate(replace(GOOD, dh_sigma_m=1e-4, dh_sigma_rad=2e-4, seed=4))
+    poses = mistyped.base_from_flange(cell.robot.joints)
+    cause = calibrated(reporting(cell, base_from_flange=poses), robot=mistyped).verdict.causes[0]
+    assert cause.kind == "arm_parameter"
+    assert "The length a of joint 2 (shoulder_lift_joint) is 3" in cause.words
+    assert "mm longer than stated" in cause.words
+
+
+@pytest.mark.slow
+def test_one_gear_ratio_that_is_off_is_named_with_its_joint():
+    cell = simulate(replace(GOOD, dh_sigma_m=1e-4, dh_sigma_rad=2e-4, seed=4, views=40))
+    joints = cell.robot.joints.copy()
+    joints[:, 2] *= 1.0 - 3e-3
+    poses = load_robot("ur5e").base_from_flange(joints)
+    known = calibrated(reporting(cell, joints=joints, base_from_flange=poses))
+    cause = known.verdict.causes[0]
+    assert cause.kind == "arm_parameter"
+    assert "The gear ratio of joint 3 (elbow_joint) is off by 0.3" in cause.words
+
+
+def test_links_that_are_all_off_are_no_single_one(wrong):
+    _, known = wrong
+    assert all(found.kind != "arm_parameter" for found in known.verdict.findings)
+
+
 def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
     sure = replace(WRONG_LINKS.target, square_sigma_m=1e-6 * WRONG_LINKS.target.square_m)
     cell = simulate(replace(WRONG_LINKS, seed=3, target=sure))

@@ -131,6 +131,11 @@ def joint_words(joint: int, robot: Robot) -> str:
     return f"joint {joint + 1} ({robot.joint_names[joint]})"
 
 
+def parameter_words(parameter: Parameter, robot: Robot) -> str:
+    """A parameter of an arm's table by its kind and joint."""
+    return f"the {_WORDS[parameter.kind]} of {joint_words(parameter.joint, robot)}"
+
+
 def undetermined(
     stops: Jacobians,
     anywhere: Jacobians,
@@ -141,7 +146,7 @@ def undetermined(
     """Names parameters, by the errors (k, p), that other stops would determine."""
     is_open = (stops.shares(moves) > DETERMINED) & (anywhere.shares(moves) < DETERMINED)
     things = [
-        f"the {_WORDS[parameter.kind]} of {joint_words(parameter.joint, robot)}"
+        parameter_words(parameter, robot)
         for parameter, found in zip(named, is_open.tolist(), strict=True)
         if found
     ]

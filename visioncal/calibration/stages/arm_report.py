@@ -11,7 +11,7 @@ from visioncal.core.choices import Convention
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Finding
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.armmodel import RIGID
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.identifiability import (
@@ -19,9 +19,11 @@ from visioncal.estimation.identifiability import (
     Jacobians,
     joint_words,
     observability_indices,
+    parameter_words,
     undetermined,
 )
-from visioncal.estimation.parameters import free_parameters, parameter_moves
+from visioncal.estimation.one_parameter import FarParameter, far_parameters
+from visioncal.estimation.parameters import Parameter, free_parameters, parameter_moves
 from visioncal.estimation.workspace import postures
 from visioncal.results.arm import (
     ArmParameter,
@@ -34,7 +36,7 @@ from visioncal.results.arm import (
 )
 from visioncal.robot import Robot
 from visioncal.robot.conversion import convert_table, parallel_axes, table_of
-from visioncal.robot.tables import table_from_document
+from visioncal.robot.tables import DHTable, table_from_document
 
 # Number of postures of a map of the accuracy.
 _PLACES = 200
@@ -74,14 +76,15 @@ def report_of(arm: ArmData, levels: SelectedArmLevel, convention: Convention | N
             for name, column in zip(model.nominal.joint_names, arm.q.T, strict=True)
         ),
     )
+    mistyped = list[Finding]()
     # With backlash and compliance alone the table stays nominal.
     if model.weights.keys() & set(RIGID):
-        result, advice = add_parameters(result, arm, convention)
+        result, advice, mistyped = add_parameters(result, arm, convention)
         result = replace(result, left_out=levels.left_out())
         notes += [*far_off(result.parameters, model.nominal), *([advice] if advice else [])]
     springs = elastic.elastic_of(arm, levels.fit.errors)
     notes += () if springs is None else elastic.remarks(springs)
-    doubts = [*elastic.play_findings(result.backlash)]
+    doubts = [*mistyped, *elastic.play_findings(result.backlash)]
     doubts += () if springs is None else elastic.doubts(springs)
     return ArmReport(ArmSections(arm=result, elastic=springs), tuple(notes), tuple(doubts))
 
@@ -105,7 +108,7 @@ def far_off(parameters: Sequence[ArmParameter], robot: Robot) -> Iterator[str]:
 
 def add_parameters(
     result: ArmResult, arm: ArmData, convention: Convention | None
-) -> tuple[ArmResult, str]:
+) -> tuple[ArmResult, str, list[Finding]]:
     """Adds the parameters of an arm that the stops determine, and how accurate the arm is.
 
     Args:
@@ -115,7 +118,8 @@ def add_parameters(
             nearly parallel, as it has no singularity there.
 
     Returns:
-        The section, and which stops to add; empty where none would determine more.
+        The section; which stops to add, empty where none would determine more; and the finding on
+        a parameter that explains the errors alone, if one does.
     """
     model, nominal, advice = arm.model, arm.model.nominal, ""
     has_table = "convention" in nominal.document
@@ -147,6 +151,8 @@ def add_parameters(
         sigmas_mm, near_mm = (1e3 * arm.place_sigmas_m(array) for array in (anywhere, near))
         covariance = arm.arm_covariance
         sigmas = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian)).tolist()
+    far = [(parameters[at.at], at) for at in far_parameters(arm, parameters, jacobian)]
+    mistyped = [*_mistyped(far, before, nominal)]
     links, rows = arm.error_rad * model.weights.get("links", 1.0), []
     for parameter, sigma, by_row in zip(parameters, sigmas, jacobian, strict=True):
         stated, identified = parameter.value(before), parameter.value(after)
@@ -183,7 +189,52 @@ def add_parameters(
         ),
         not_determined=tuple(not_determined),
     )
-    return result, advice
+    return result, advice, mistyped
+
+
+def _mistyped(
+    far: Sequence[tuple[Parameter, FarParameter]], table: DHTable, robot: Robot
+) -> Iterator[Finding]:
+    """The finding on a table's parameter that explains an arm's errors alone.
+
+    Lost zeros and eccentric encoders are named by `far_off`.
+    """
+    if not far or any(name in far[0][0].name for name, *_ in _FAR_OFF):
+        return
+    first, *others = (_off(*each, table, robot) for each in far)
+    either = f" Or {' or '.join(others)}: these stops do not tell them apart." if others else ""
+    words = (
+        f"{first[0].upper()}{first[1:]}. This alone explains what the arm errs by: beside it, its "
+        f"other parameters are off by {100.0 * far[0][1].rest:.0f} % of what they are without."
+    )
+    yield Finding(
+        "arm_parameter",
+        f"{words}{either}",
+        Remedy(
+            "Compare it with the maker's data sheet, correct the table or .urdf that [robot] model "
+            "in session.toml names, and calibrate again; or keep the arm as calibrated."
+        ),
+        until_mm=0.0,
+        mahalanobis_sq=2.0 * far[0][1].gain,
+    )
+
+
+def _off(parameter: Parameter, found: FarParameter, table: DHTable, robot: Robot) -> str:
+    """By how much a parameter is off, in words."""
+    stated, size = parameter.value(table), abs(found.change)
+    if parameter.kind == "ratio":
+        by = f"is off by {figure(100.0 * size)} % (sigma {figure(100.0 * found.sigma)} %)"
+    elif parameter.is_length:
+        longer = "longer" if abs(stated + found.change) > abs(stated) else "shorter"
+        by = (
+            f"is {figure(1e3 * size)} mm {longer} than stated (sigma "
+            f"{figure(1e3 * found.sigma)} mm): {1e3 * (stated + found.change):.2f} and not "
+            f"{1e3 * stated:.2f} mm"
+        )
+    else:
+        size_deg, sigma_deg = np.rad2deg([size, found.sigma]).tolist()
+        by = f"is off by {figure(size_deg)} deg (sigma {figure(sigma_deg)} deg)"
+    return f"{parameter_words(parameter, robot)} {by}"
 
 
 def _error_jacobians(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobians:

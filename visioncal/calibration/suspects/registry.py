@@ -126,6 +126,13 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("joint_play", None, 1e-6, hides=("wrong_views",)),
     # The frames are by the poses, which a wrong model does not change.
     Suspect("other_arm", None, REMARK, hides=(ARM_ERRORS,), inflates=(ARM_ERRORS,)),
+    # Links that share the size of one that is far off are scaled along, and so is the board.
+    Suspect(
+        "arm_parameter",
+        chance=1e-4,
+        hides=(ARM_ERRORS, "board_size", "workspace"),
+        inflates=(ARM_ERRORS, "unmeasured_board", "calibration"),
+    ),
     # It precedes sigmas beyond their limits, which have less to say where the frame is another.
     Suspect("tool_frame", chance=REMARK),
     *map(Suspect, ("contradicting_joints", "base_link", "level", "load", "clock")),
