@@ -560,6 +560,17 @@ def test_columns_that_stand_in_other_rows_are_no_rail(part, columns, mount):
     assert sum(view.used for view in mended.views) == len(boards) - 1
 
 
+@pytest.mark.parametrize("mount", [slow(MOUNTS[0]), MOUNTS[1]])
+def test_a_column_in_other_rows_is_named_where_it_hardly_varies(mount):
+    edges, (flat, _) = calibrated(mount).edges, poses_of(mount)
+    flat[:, 2, 3] = 0.5 + 0.1 * (flat[:, 2, 3] - 0.5)
+    x, z = (edge.matrix for edge in edges.values())
+    boards = invert(flat @ x) @ z if mount == MOUNTS[0] else invert(x) @ flat @ z
+    flat[:, 2, 3] = np.roll(flat[:, 2, 3], 1)
+    cause = visioncal.calibrate(pairs_session(mount, flat, boards)).verdict.causes[0]
+    assert "the numbers of z_m stand 1 row later than the others" in cause.words
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_a_column_that_was_sorted_by_itself_is_no_rail(mount):

@@ -150,6 +150,10 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
     except VisioncalError:
         # Too little to guess from; the calibration's own error says so.
         return
+    # A reading that closes it roughly does not precede columns that close it to the noise.
+    if apart := [*of_other_rows(run, guess.best.fit.score)]:
+        yield from apart
+        return
     # Units that merely bring both sides nearer do not precede an axis that closes the chain.
     unknown = [] if guess.best.fit.closes else [*_unrecorded(run)]
     if guess.stands_out and all(hint.do in (_UNRECORDED, _LOG_ANEW) for hint in unknown):
@@ -169,9 +173,6 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
 
 def _unrecorded(run: RunState) -> Iterator[Finding]:
     """The finding that the robot's poses are not those of the images, whatever the frames are."""
-    if apart := [*of_other_rows(run)]:
-        yield from apart
-        return
     views, both = _both_sides(run.base_from_flange, run.poses_of_one_board, run.session.mount)
     kept, robot = thinned(np.arange(len(both))), both[:, 0]
     views, both = views[kept], both[kept]

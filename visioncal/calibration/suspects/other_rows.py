@@ -11,6 +11,7 @@ from visioncal.calibration.guess.readings import shifted
 from visioncal.calibration.guess.search import CLEAR, EVIDENCE, FEWEST_ROWS
 from visioncal.calibration.pipeline.guess_inputs import alike_turning
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import counted, listed
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, IntArray
@@ -23,8 +24,11 @@ _PARTS = "xyzR"
 _NAMES = dict(zip(_PARTS, ("x_m", "y_m", "z_m", "qx to qw"), strict=True))
 
 
-def of_other_rows(run: RunState) -> Iterator[Finding]:
-    """The finding that some columns close the chain with the numbers of rows before or after."""
+def of_other_rows(run: RunState, beside: float) -> Iterator[Finding]:
+    """The finding that some columns close the chain with the numbers of rows before or after.
+
+    It does so clearly better than another reading, whose score is `beside`.
+    """
     if run.mount is None or run.mount == "instrument":
         return
     seen = alike_turning(run.base_from_flange, run.poses_of_one_board, run.mount)
@@ -53,7 +57,7 @@ def of_other_rows(run: RunState) -> Iterator[Finding]:
         return
     best, parts, by = max(found, key=lambda item: item[0].log_likelihood)
     odds = EVIDENCE * (best.log_likelihood - declared.log_likelihood) - np.log(len(tried))
-    if not best.closes or odds < 2.0 * CLEAR:
+    if not best.closes or odds < 2.0 * CLEAR or CLEAR_RATIO * best.score > beside:
         return
     names, apart = listed([_NAMES[part] for part in parts]), counted(abs(by), "row")
     stand, where = ("later", "up") if by > 0 else ("earlier", "down")
