@@ -36,7 +36,7 @@ from visioncal.simulation import (
     simulate,
     simulate_warm_up,
 )
-from visioncal.simulation.arms import heated_poses
+from visioncal.simulation.heat import heated_poses
 from visioncal.simulation.layout import BoardAt, CameraAt, Moved, NetworkOptions, RobotAt, Swept
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "sessions"

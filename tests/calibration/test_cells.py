@@ -36,7 +36,7 @@ from visioncal.simulation import (
     simulate,
     write_session,
 )
-from visioncal.simulation.arms import Heat
+from visioncal.simulation.heat import Heat
 from visioncal.simulation.layout import InstrumentAt, Moved, PointAt
 
 # Looks the same after half a turn: both counts are even.

@@ -33,7 +33,7 @@ from visioncal.simulation import (
     cell_session,
     simulate_warm_up,
 )
-from visioncal.simulation.arms import Heat, Warming, heated_poses
+from visioncal.simulation.heat import Heat, Warming, heated_poses
 from visioncal.simulation.optics import CAMERAS
 from visioncal.verification import verify
 from visioncal.verification.calibration_prior import CalibrationPrior

@@ -14,7 +14,8 @@ from visioncal.core.types import IntArray
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import fields_of_lengths
-from visioncal.fit.linearise import linearised, pairs_of
+from visioncal.fit.linearise import linearised
+from visioncal.fit.pairs import pairs_of
 from visioncal.fit.solve import solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
 from visioncal.fit.unknowns import State, lens_field

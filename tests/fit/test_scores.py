@@ -9,7 +9,8 @@ from support.small_cells import TABLE, made
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.candidates import effects_of_lenses
 from visioncal.fit.lens_field import fields_of_lengths, waves
-from visioncal.fit.linearise import linearised, pairs_of
+from visioncal.fit.linearise import linearised
+from visioncal.fit.pairs import pairs_of
 from visioncal.fit.score import of_effect, of_waves
 from visioncal.fit.solve import solve
 from visioncal.fit.unknowns import State, lens_field, random_effect

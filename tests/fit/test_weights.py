@@ -8,7 +8,7 @@ from support.marks import seeds
 from support.small_cells import PX, made
 
 from visioncal.core.transforms import invert, log
-from visioncal.fit.linearise import pairs_of
+from visioncal.fit.pairs import pairs_of
 from visioncal.fit.solve import solve
 from visioncal.fit.start import start_lenses, start_of
 from visioncal.fit.weights import by_homography, first_weighed, weighed

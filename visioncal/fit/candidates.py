@@ -12,17 +12,11 @@ from visioncal.fit import processes
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
-from visioncal.fit.linearise import Pair, images_of, linearised, predicted
+from visioncal.fit.linearise import linearised, predicted
+from visioncal.fit.pairs import Pair, images_of
 from visioncal.fit.score import best_displacement, best_field, of_effect, of_rows
 from visioncal.fit.sizes import most_likely
-from visioncal.fit.unknowns import (
-    State,
-    Unknowns,
-    Vector,
-    given_lens,
-    lens_field,
-    random_effect,
-)
+from visioncal.fit.unknowns import State, Unknowns, Vector, given_lens, lens_field, random_effect
 from visioncal.model import MeasuredPose
 from visioncal.model.effects import (
     NAMED,

@@ -10,7 +10,8 @@ from scipy.special import expit, logit
 
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit
-from visioncal.fit.linearise import linearised, pairs_of
+from visioncal.fit.linearise import linearised
+from visioncal.fit.pairs import pairs_of
 from visioncal.fit.processes import Considered
 from visioncal.fit.score import Score
 from visioncal.fit.unknowns import Key, Vector, given_lens

@@ -16,15 +16,9 @@ from visioncal.core.transforms import apply_each
 from visioncal.core.types import FloatArray
 from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field, fields_of_lengths, orders_of_waves, waves
-from visioncal.fit.linearise import (
-    CornerRows,
-    Gram,
-    Pair,
-    corner_rows,
-    images_of,
-    of_pose_alone,
-)
+from visioncal.fit.linearise import CornerRows, Gram, corner_rows, of_pose_alone
 from visioncal.fit.mixed import body_with, weights_at
+from visioncal.fit.pairs import Pair, images_of
 from visioncal.model.effects import Displacement, Effect, RowMotion
 from visioncal.vision.camera import project_with_jacobian
 

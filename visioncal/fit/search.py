@@ -8,8 +8,9 @@ from visioncal.core.quantiles import FALSE_REJECTION, f_limit
 from visioncal.core.types import FloatArray, Mask, chosen_rows
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.fit import Fit, LeftOut
-from visioncal.fit.linearise import Gram, Pair, linearised, pairs_of
+from visioncal.fit.linearise import Gram, linearised
 from visioncal.fit.mixed import Mixed
+from visioncal.fit.pairs import Pair, pairs_of
 from visioncal.fit.sizes import Found, most_likely, significant
 from visioncal.fit.start import Start
 from visioncal.fit.unknowns import State, Unknowns

@@ -12,7 +12,8 @@ import numpy as np
 
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.estimation.viewnoise import weights_by_view
-from visioncal.fit.linearise import Pair, corner_rows, predicted_sightings
+from visioncal.fit.linearise import corner_rows, predicted_sightings
+from visioncal.fit.pairs import Pair
 from visioncal.fit.unknowns import State, Unknowns
 from visioncal.model import Cell
 from visioncal.vision.camera import normalise

@@ -4,11 +4,12 @@ Boards are drawn as they are printed. Nothing here uses the application's camera
 estimator, so that an error in a projection or in a kinematic chain cannot cancel out.
 """
 
-from visioncal.simulation.arms import ArmOptions, Heat, Payload, arm_named, forward
+from visioncal.simulation.arms import ArmOptions, Payload, arm_named, forward
 from visioncal.simulation.boards import BOARDS
 from visioncal.simulation.cell import SimulatedCell
 from visioncal.simulation.cell_files import read_cell
 from visioncal.simulation.depth import DepthOptions
+from visioncal.simulation.heat import Heat
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,

@@ -1,12 +1,17 @@
 """Boards of simulated cells, and the surface of a printed, scaled and bowed one."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.core.types import FloatArray, Target
-from visioncal.vision.targets import corner_positions, extent_m, load_target
+from visioncal.core.types import Corners, FloatArray, Target
+from visioncal.vision.targets import corner_positions, extent_m, load_target, rotation_transforms
+
+# Corners closer to the image's edge are not detected [px].
+EDGE_PX = 2.0
+# Smallest cosine of the angle between view and board normal.
+LEAST_COSINE = 0.5
 
 
 def _tags() -> Target:
@@ -103,3 +108,18 @@ def bow_depth_m(sheet: Sheet, flat: FloatArray) -> FloatArray:
 def _lifted(sheet: Sheet, flat: FloatArray) -> FloatArray:
     """Maps (..., 2) points of the flat sheet onto the bowed surface, (..., 3) [m]."""
     return np.concatenate([flat, bow_depth_m(sheet, flat)[..., None]], axis=-1)
+
+
+def detected(sheet: Sheet, exact: Corners, sigma_px: float, noise: np.random.Generator) -> Corners:
+    """Corners of a view as detected, with noise.
+
+    The numbering of a symmetric board starts at the upper left.
+    """
+    corners = replace(exact, px=exact.px + sigma_px * noise.standard_normal(exact.px.shape))
+    is_symmetric = len(rotation_transforms(sheet.target)) > 1
+    if not is_symmetric or not len(corners.ids):
+        return corners
+    if corners.px[0].sum() <= corners.px[-1].sum():
+        return corners
+    last = sheet.target.columns * sheet.target.rows - 1
+    return replace(corners, ids=(last - corners.ids)[::-1], px=corners.px[::-1])

@@ -5,73 +5,35 @@ camera takes frames at its own rate, and the controller reports joints and poses
 Faults of mounting, motion and rows are planted while a cell is observed.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import apply, apply_each, compose, exp, invert
+from visioncal.core.transforms import apply, compose, exp, invert
 from visioncal.core.types import Corners, FloatArray, Mask
-from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
-from visioncal.session.columns import POSE
-from visioncal.simulation.arms import (
-    DhArm,
-    Heat,
-    Warming,
-    arm_named,
-    forward,
-    heated_flanges,
-    inverse,
-    warm_up,
-)
-from visioncal.simulation.boards import Sheet, corners_m
+from visioncal.simulation.arms import DhArm, arm_named, forward, inverse
+from visioncal.simulation.boards import EDGE_PX, LEAST_COSINE, corners_m, detected
 from visioncal.simulation.cell import (
     InstrumentReading,
     SimulatedCell,
     SimulatedRobot,
     SimulatedSight,
 )
-from visioncal.simulation.layout import (
-    CELL,
-    CameraOptions,
-    CellOptions,
-    NetworkOptions,
-    RandomStream,
-    SweepOptions,
-    Swept,
-)
+from visioncal.simulation.heat import Heat, Warming, heated_flanges, warm_up
+from visioncal.simulation.layout import CellOptions, NetworkOptions, RandomStream, SweepOptions
 from visioncal.simulation.optics import inaccurate_camera, project, sees
+from visioncal.simulation.passages import Passage, with_sweep
 from visioncal.simulation.poses import LEAST_SHARE, MARGIN_PX, Viewpoints, filling_m
 from visioncal.simulation.postures import mounted, mounted_single, postures_of, postures_single
-from visioncal.vision.targets import is_seen_in_part, rotation_transforms
+from visioncal.vision.targets import is_seen_in_part
 
-# Corners closer to the image's edge are not detected [px].
-EDGE_PX = 2.0
-# Smallest cosine of the angle between view and board normal.
-_LEAST_COSINE = 0.5
 # Corresponding sources of randomness in cells with several robots.
 _OF_SEVERAL = {RandomStream.ARM: RandomStream.ARMS, RandomStream.ROBOT: RandomStream.ROBOTS}
-
-
-def detected(sheet: Sheet, exact: Corners, sigma_px: float, noise: np.random.Generator) -> Corners:
-    """Corners of a view as detected, with noise.
-
-    The numbering of a symmetric board starts at the upper left.
-    """
-    corners = replace(exact, px=exact.px + sigma_px * noise.standard_normal(exact.px.shape))
-    is_symmetric = len(rotation_transforms(sheet.target)) > 1
-    if not is_symmetric or not len(corners.ids):
-        return corners
-    if corners.px[0].sum() <= corners.px[-1].sum():
-        return corners
-    last = sheet.target.columns * sheet.target.rows - 1
-    return replace(corners, ids=(last - corners.ids)[::-1], px=corners.px[::-1])
 
 
 def moved_cell(
@@ -236,8 +198,8 @@ def _shown(cell: SimulatedCell, camera: str, board: str, pose: FloatArray) -> Ma
     # In view, and not too oblique.
     points = apply(pose, corners_m(sheet))
     directions = points / np.linalg.norm(points, axis=2, keepdims=True)
-    facing = np.einsum("mni,mi->mn", directions, pose[:, :3, 2]) > _LEAST_COSINE
-    seen = np.asarray(facing.all(axis=1) & (directions[:, :, 2] > _LEAST_COSINE).all(axis=1))
+    facing = np.einsum("mni,mi->mn", directions, pose[:, :3, 2]) > LEAST_COSINE
+    seen = np.asarray(facing.all(axis=1) & (directions[:, :, 2] > LEAST_COSINE).all(axis=1))
     if seen.any():
         share = sees(cell.camera(camera).camera, points[seen], MARGIN_PX).mean(axis=1)
         seen[seen] = share >= (LEAST_SHARE if is_seen_in_part(sheet.target) else 1.0)
@@ -348,131 +310,6 @@ def _pool(pools: list[list[int]], least: int) -> list[int]:
 def _showing(row: SimulatedSight, image: SimulatedSight) -> SimulatedSight:
     """A row with the image of another stop."""
     return replace(image.numbered(row.view), stop=row.stop)
-
-
-@dataclass(frozen=True, eq=False)
-class Passage:
-    """A smooth joint path through a robot's stops, and its sampling times."""
-
-    options: SweepOptions  # Options of the sweep.
-    path: CubicSpline  # Joint path (k, n) [rad] over k times [s], with continuous acceleration.
-    robot_s: FloatArray  # Times of the controller's reports, by its own clock [s].
-    taken_s: FloatArray  # Times of the frames' middle rows, by that clock [s].
-
-    @classmethod
-    def through(cls, stops: FloatArray, options: SweepOptions) -> "Passage":
-        """A path through (s, n) postures [rad], in nearest-neighbour order."""
-        left, order = list(range(1, len(stops))), [0]
-        while left:
-            distances = [float(np.abs(stops[index] - stops[order[-1]]).max()) for index in left]
-            order.append(left.pop(int(np.argmin(distances))))
-        way = CubicSpline(options.pace_s * np.arange(len(stops)), stops[order], bc_type="clamped")
-        end_s = options.pace_s * (len(stops) - 1)
-        return cls(
-            options,
-            way,
-            np.arange(0.0, end_s, 1.0 / options.robot_hz),
-            np.arange(0.5 / options.frames_hz, end_s, 1.0 / options.frames_hz),
-        )
-
-    def reported(self, arm: DhArm, rng: np.random.Generator) -> Recorded:
-        """The controller's stream, from the nominal arm and noisy encoders."""
-        joints = self.path(self.robot_s)
-        joints = joints + self.options.encoder_sigma_rad * rng.standard_normal(joints.shape)
-        poses = forward(arm, joints)
-        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-        # Quaternions keep their sign.
-        flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
-        quaternions[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
-        names = [f"q{joint + 1}_rad" for joint in range(joints.shape[1])]
-        values = np.hstack([self.robot_s[:, None], poses[:, :3, 3], quaternions, joints])
-        return Recorded(("stamp_s", *POSE, *names), values)
-
-    def frame(
-        self,
-        taken_s: float,
-        before: Callable[[FloatArray], FloatArray],
-        camera: CameraOptions,
-        sheet: Sheet,
-        view: int,
-    ) -> Corners:
-        """Corners of one frame, each at the time of its image row.
-
-        `before` maps k postures (k, n) [rad] to `cam_from_target` (k, 4, 4); `taken_s` is the time
-        of the middle row.
-        """
-        corners, optics = corners_m(sheet), camera.camera
-        delays_s = np.zeros(len(corners))
-        # They converge by some thousandths each.
-        for _ in range(5 if self.options.readout_s else 1):
-            points = apply_each(before(self.path(taken_s + delays_s)), corners)
-            px = project(optics, points)
-            delays_s = self.options.readout_s * (px[:, 1] / (optics.resolution[1] - 1) - 0.5)
-        ids = np.flatnonzero(sees(optics, points, EDGE_PX)).astype(np.int64)
-        return Corners(view, ids, px[ids], camera.blur_px)
-
-
-def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> SimulatedCell:
-    """A cell with the frames of one camera during a sweep of one robot.
-
-    Args:
-        cell: The cell at its stops.
-        swept: The sweep.
-        pushed: The cell after all pushes.
-
-    Raises:
-        DataError: A component is unknown, or the robot does not move target and camera relative to
-            each other.
-    """
-    layout = cell.layout
-    for kind, name, things in (
-        ("robot", swept.robot, layout.robots),
-        ("camera", swept.camera, layout.cameras),
-        ("target", swept.target, layout.boards),
-    ):
-        known = [thing.name for thing in things]
-        if name not in known:
-            raise DataError(
-                f"simulation: a sweep is of {kind} {name!r}; there are {', '.join(known)}."
-            )
-    ends = frame_name("camera", swept.camera), frame_name("target", swept.target)
-    carriers = [cell.parents[end] for end in ends]
-    if sorted(carriers) != sorted((CELL, frame_name("flange", swept.robot))):
-        raise DataError(
-            f"simulation: of camera {swept.camera} and target {swept.target} of a sweep, one has "
-            f"to be on robot {swept.robot} and the other in the cell."
-        )
-    options, robot = cell.options, cell.robots[swept.robot]
-    index = list(cell.robots).index(swept.robot)
-    rng = options.stream(RandomStream.SWEEPS, index)
-    stamp_noise = options.stream(RandomStream.SWEEPS, index, 1)
-    passage = Passage.through(robot.joints[: swept.stops], swept)
-    recorded = passage.reported(robot.arm, rng)
-    camera, board = cell.camera(swept.camera), cell.board(swept.target)
-    min_corners = 12 if is_seen_in_part(board.target) else len(corners_m(board))
-    seen_from = pushed.seen_from(swept.robot, swept.camera, swept.target)
-    used_views = [sight.view for sight in cell.sights] + [reading.view for reading in cell.readings]
-    first_view = 1 + max([*used_views, *(row[0] for row in cell.pose_rows)], default=-1)
-    sights: list[SimulatedSight] = []
-
-    def before(jitter: FloatArray, q: FloatArray) -> FloatArray:
-        return seen_from(robot.flange_at(q) @ jitter)
-
-    for taken_s in passage.taken_s.tolist():
-        seen = partial(before, robot.options.jitter(1, rng))
-        exact = passage.frame(taken_s, seen, camera, board, first_view + len(sights))
-        middle = seen(passage.path([taken_s]))[0]
-        if len(exact.ids) < min_corners or middle[2, 2] < _LEAST_COSINE:
-            continue
-        corners = detected(board, exact, options.pixel_sigma_px, rng)
-        ahead_s = swept.camera_minus_robot_s + swept.jitter_s * stamp_noise.standard_normal()
-        names = swept.camera, swept.target
-        stamp_s, at_once = taken_s + ahead_s, not swept.readout_s
-        sights.append(
-            SimulatedSight(exact.view, -1, *names, middle, exact, corners, stamp_s, at_once)
-        )
-    streams = {**cell.streams, swept.robot: recorded}
-    return replace(cell, sights=(*cell.sights, *sights), streams=streams)
 
 
 def sweep(options: CellOptions, how: SweepOptions | None = None) -> SimulatedCell:

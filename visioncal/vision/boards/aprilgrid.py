@@ -12,7 +12,7 @@ from visioncal.vision.boards.gridboard import GridBoard, foreign, marker_grid
 from visioncal.vision.boards.kind import COUNTS, MM, Cells, DetectedCorners, NotFound, marker_cells
 from visioncal.vision.boards.layout import LAYOUT_MISFIT, layout_misfit, once, read_markers
 from visioncal.vision.boards.marker import APRILGRID_DICTIONARY
-from visioncal.vision.boards.template import Print
+from visioncal.vision.boards.prints import Print
 
 # OpenCV detects only tags surrounded by white, but squares touch a tag's corners. The image is grey
 # where two dark corners meet: it counts as white if dark has to be darker than its surroundings by

@@ -11,7 +11,8 @@ from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.boards.imaging import blur_at_corners, shrunk
 from visioncal.vision.boards.kind import BoardKind, DetectedCorners, NotFound
-from visioncal.vision.boards.template import MIN_CORNERS, Print, Refined, refine
+from visioncal.vision.boards.prints import Print
+from visioncal.vision.boards.template import MIN_CORNERS, Refined, refine
 
 # Corners that the template does not fit are dropped, as detectors err there by up to a pixel. If
 # too few fit, all corners of the detector are used, with a tenth of the weight: their accuracy

@@ -28,7 +28,7 @@ from visioncal.vision.boards.kind import (
     size_of,
 )
 from visioncal.vision.boards.layout import LAYOUT_MARKERS, LAYOUT_MISFIT, layout_misfit
-from visioncal.vision.boards.template import Print
+from visioncal.vision.boards.prints import Print
 
 _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
 

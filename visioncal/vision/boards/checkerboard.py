@@ -21,7 +21,7 @@ from visioncal.vision.boards.kind import (
     sigma_of,
     size_of,
 )
-from visioncal.vision.boards.template import Print
+from visioncal.vision.boards.prints import Print
 
 # OpenCV's search takes 170 bytes and a microsecond per pixel, and fails beyond these sides.
 _MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000

@@ -24,7 +24,8 @@ from visioncal.vision.boards.kind import (
     sigma_of,
     size_of,
 )
-from visioncal.vision.boards.template import MIN_CORNERS, Print, Refined
+from visioncal.vision.boards.prints import Print
+from visioncal.vision.boards.template import MIN_CORNERS, Refined
 
 # Largest diameter over spacing of circles, so that their edges remain separate; that of those named
 # without being declared; that of requested ones, as much dark as white between them.

@@ -18,7 +18,7 @@ from visioncal.vision.boards.board import Board
 from visioncal.vision.boards.circles import find_blobs
 from visioncal.vision.boards.kind import BoardRequest, DetectedCorners, NotFound, sigma_of
 from visioncal.vision.boards.points import PointsKind, points_of
-from visioncal.vision.boards.template import Print
+from visioncal.vision.boards.prints import Print
 
 _COLUMNS = ("point", "x_m", "y_m", "radius_m")
 # Radii of a requested board's dots and of its four larger ones, and the largest shift of a dot from

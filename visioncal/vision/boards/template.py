@@ -42,7 +42,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from threading import Lock
-from typing import Self, TypeAlias
+from typing import Self
 
 import cv2
 import numpy as np
@@ -50,8 +50,7 @@ import numpy.typing as npt
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, chosen_rows
 from visioncal.vision.boards.maps import OpticalAxis, maps_about
-
-_Float32Array: TypeAlias = npt.NDArray[np.float32]
+from visioncal.vision.boards.prints import Float32Array, Print, circle, crossing
 
 # Sigma of the smoothing [px].
 _SMOOTH_PX = 0.7
@@ -76,9 +75,6 @@ _FEW, _ONE_IMAGE = 100, Lock()
 # Lone corners converge slowly or not at all, and depend on the blur.
 _LONE_BLUR_TOLERANCE = 0.01
 _STEP_TOLERANCES_PX, _LONE_STEP_TOLERANCES_PX = (0.1, 0.02), (0.004, 0.004)
-# Smaller exponents count as minus infinity: single precision would have denormal numbers there,
-# which are a hundred times slower and negligible.
-_MIN_EXPONENT = np.float32(-80.0)
 # Last step of an accepted corner, for maps and result [px].
 _LAST_STEP_PX, _LONE_LAST_STEP_PX = (0.1, 0.02), (0.02, 0.02)
 
@@ -103,29 +99,6 @@ class Refined:
 
 
 @dataclass(frozen=True, eq=False)
-class Print:
-    """The print around n corners."""
-
-    # (n,) colour of the squares where x y > 0: one sign for light. On a checkerboard, which may be
-    # described rotated, either sign may be light; on an AprilGrid one sign stands for dark.
-    signs: FloatArray
-    # Margin of a light square around its marker, or of a tag around its bits [squares]; infinite
-    # without them.
-    inset: float
-    half: float = 0.42  # Half-width of the patch around a corner [squares].
-    radii: FloatArray | None = None  # (n,) radii of circles [squares]; None without circles.
-    # (n, 2) signs of x and y on the dark square of a lone tag's corner; None where two dark squares
-    # meet.
-    lone: FloatArray | None = None
-    outside: float = np.inf  # Width of the white around a lone tag [squares].
-    # Distance of pixels from a marker, or from the surroundings of a lone tag's white [edge
-    # widths].
-    clear: float = 1.5
-    # (n, 2, 2) from the board to each corner's own axes and units; None if these are the board's.
-    axes: FloatArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class _Windows:
     """Pixels around n corners, and the maps from there to the board."""
 
@@ -134,9 +107,9 @@ class _Windows:
     # (n, 2, 2) Jacobian of pixels with respect to the board position [px/square].
     jacobian: FloatArray
     widths: FloatArray  # (n, 2) squares per pixel, across the lines of constant x and y.
-    x: _Float32Array  # (n, h, w) x of each pixel on the board, relative to the corner [squares].
-    y: _Float32Array  # (n, h, w) y, likewise.
-    grey: _Float32Array  # (n, h, w) the smoothed image, less 128.
+    x: Float32Array  # (n, h, w) x of each pixel on the board, relative to the corner [squares].
+    y: Float32Array  # (n, h, w) y, likewise.
+    grey: Float32Array  # (n, h, w) the smoothed image, less 128.
     within: Mask  # (n, h, w) mask of a corner's patch.
     inside: Mask  # (n, h, w) mask of pixels inside the image.
     neighbours: IntArray  # (n, k) neighbours of each corner.
@@ -145,7 +118,7 @@ class _Windows:
     @classmethod
     def cut(
         cls,
-        smooth: _Float32Array,
+        smooth: Float32Array,
         board: FloatArray,
         px: FloatArray,
         good: Mask,
@@ -519,11 +492,11 @@ def _steps(
         # At a slanted corner the blur is not a product of two edges.
         used &= (np.abs(x) > np.float32(_SLANT) * sx) | (np.abs(y) > np.float32(_SLANT) * sy)
     if pattern.radii is not None:
-        product, *derivatives = _circle(pattern, x, y, sx, sy)[: None if blurs else 3]
+        product, *derivatives = circle(pattern, x, y, sx, sy)[: None if blurs else 3]
     else:
         # Next lines matter if any corner's edge is so wide [squares].
         wide = bool(max(sx.max(), sy.max()) > 0.16)
-        product, *derivatives = _crossing(pattern, x, y, sx, sy, blurs=blurs, wide=wide)
+        product, *derivatives = crossing(pattern, x, y, sx, sy, blurs=blurs, wide=wide)
     columns: list[npt.NDArray[np.floating]] = [product, *derivatives]
     if pattern.lone is not None:
         # Gradients apply to white, where the product is 0; in the dark it is 4.
@@ -558,90 +531,6 @@ def _steps(
         )
         for index in range(unknowns, len(columns) + 1)
     ]
-
-
-def _crossing(
-    pattern: Print,
-    x: _Float32Array,
-    y: _Float32Array,
-    sx: _Float32Array,
-    sy: _Float32Array,
-    *,
-    blurs: bool,
-    wide: bool,
-) -> tuple[_Float32Array, ...]:
-    """Product of two crossing edges, and its derivatives."""
-    # Derivatives are with respect to x, y and, with `blurs`, the logarithms of the widths.
-    signs = np.asarray(pattern.signs, np.float32)[:, None, None]
-    edge_x, slope_x, *width_x = _edges(x, sx, blurs=blurs, wide=wide)
-    edge_y, slope_y, *width_y = _edges(y, sy, blurs=blurs, wide=wide)
-    if pattern.lone is not None:
-        lone_x, lone_y = np.asarray(pattern.lone.T, np.float32)[:, :, None, None]
-        edge_x, edge_y = edge_x + lone_x, edge_y + lone_y
-    edge_x *= signs
-    return (
-        edge_x * edge_y,
-        np.multiply(signs * slope_x, edge_y),
-        edge_x * slope_y,
-        *(signs * array * edge_y for array in width_x),
-        *(edge_x * array for array in width_y),
-    )
-
-
-def _circle(
-    pattern: Print, x: _Float32Array, y: _Float32Array, sx: _Float32Array, sy: _Float32Array
-) -> tuple[_Float32Array, ...]:
-    """A disc, likewise; its last derivative is with respect to the radius."""
-    distance = np.hypot(x, y) + np.float32(1e-6)
-    part_x, part_y = (sx * x / distance) ** 2, (sy * y / distance) ** 2
-    width = np.sqrt(part_x + part_y)
-    depth = np.asarray(pattern.radii, np.float32)[:, None, None] - distance
-    edge, slope, width_derivative = _edges(depth, width, blurs=True, wide=False)
-    inward = -slope / distance
-    by_width = width_derivative / (part_x + part_y)
-    return edge, inward * x, inward * y, by_width * part_x, by_width * part_y, slope
-
-
-def _edges(
-    positions: _Float32Array, sigma: _Float32Array, *, blurs: bool, wide: bool
-) -> tuple[_Float32Array, ...]:
-    """E of the module, its derivative by position, and with `blurs` by the logarithm of sigma."""
-    sums = _edge(positions / sigma, sigma, blurs=blurs)
-    for line in (-1, 1) if wide else ():
-        neighbour = _edge((positions - np.float32(line)) / sigma, sigma, blurs=blurs)
-        for total, part in zip(sums, neighbour, strict=True):
-            np.subtract(total, part, out=total)
-    return sums
-
-
-def _edge(t: _Float32Array, sigma: _Float32Array, *, blurs: bool) -> tuple[_Float32Array, ...]:
-    """Contribution of one line to `_edges`."""
-    gaussian = np.float32(-0.5) * t
-    gaussian *= t
-    np.copyto(gaussian, -np.inf, where=gaussian < _MIN_EXPONENT)
-    np.exp(gaussian, out=gaussian)
-    edge = _erf(t, gaussian)
-    gaussian *= np.float32(np.sqrt(2.0 / np.pi))
-    if not blurs:
-        gaussian /= sigma
-        return edge, gaussian
-    return edge, gaussian / sigma, -t * gaussian
-
-
-def _erf(t: _Float32Array, gaussian: _Float32Array) -> _Float32Array:
-    """erf(t / sqrt 2), given exp(-t^2 / 2), to 2e-7 (Abramowitz and Stegun 7.1.26)."""
-    # Five times as fast as scipy's, which is not vectorised.
-    u = np.abs(t)
-    u *= np.float32(0.3275911 / np.sqrt(2.0))
-    u += 1
-    np.reciprocal(u, out=u)
-    total = np.float32(1.061405429) * u
-    for factor in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
-        total += np.float32(factor)
-        total *= u
-    total *= gaussian
-    np.subtract(1, total, out=total)
-    return np.copysign(total, t, out=total)
 
 
 def _accepted(
