@@ -26,6 +26,7 @@ SLOW = {
     "springs, loads, 1", "sweep", "eccentricity, 1", "translation, 1", "backlash, 1",
     "6 wrong to hand, 1", "wrong arm, 1", "one axis, 1", "two boards to hand, 1",
     "to hand, lens estimated, 2", "lens 1 px off, 1",
+    "sound arm, 1", "wrong arm, poses, 1", "coarse robot, 1", "small tilts, 1", "6 views, 1",
 }  # fmt: skip
 # Of each kind of message one.
 QUICK = {"two images missing", "another dictionary"}

@@ -33,6 +33,7 @@ def values_of(notebook: Path) -> list[object]:
     return values
 
 
+@pytest.mark.slow
 def test_the_cells_of_the_example_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     session, checkup, calibration, verdict, place, views, again, by_corners, holds = values_of(

@@ -364,6 +364,7 @@ def test_times_in_another_unit_and_times_that_are_missing_are_named(session):
     raised(DataError, "where a stream has the poses, stamp_s", calibrate, with_rows(session, rows))
 
 
+@pytest.mark.slow
 def test_what_is_open_about_the_clocks_counts(session):
     known, names = RunState(session), [stage.name for stage in STAGES]
     after = names.index("clock") + 1

@@ -317,7 +317,8 @@ def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
     assert height == pytest.approx(0.05, abs=1e-5)
 
 
-@pytest.mark.parametrize("beyond", [0.5, slow(1.0)])
+@pytest.mark.slow
+@pytest.mark.parametrize("beyond", [0.5, 1.0])
 def test_gears_of_two_slopes_are_told_under_heavy_loads(beyond, monkeypatch):
     """Shoulder and elbow yield half as much beyond a torque, or as much."""
     stiff, knees = np.array([1e6, 4.7e5, 3e5, 1e5, 1e5, 7e4]), {1: 900.0, 2: 500.0}

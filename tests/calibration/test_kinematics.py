@@ -563,6 +563,7 @@ def test_predictions_move_with_springs_as_their_derivatives_say():
     assert slopes == pytest.approx(model.basis(q, loads), abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_right_arm_stays_nominal_and_without_joints_no_level_can_be_asked_for():
     right = simulate(replace(GOOD, seed=3))
     known, asked = calibrated(right), calibrated(right, level="kinematics")
@@ -580,6 +581,7 @@ def test_a_right_arm_stays_nominal_and_without_joints_no_level_can_be_asked_for(
         calibrated(cell, joints=False, level="kinematics")
 
 
+@pytest.mark.slow
 def test_errors_of_links_count_though_no_stop_shows_them():
     """Postures that are alike let the frames absorb them: the sigma was 0.1 mm for 2.2 mm."""
     found, hidden = [], 0

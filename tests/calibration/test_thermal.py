@@ -280,6 +280,7 @@ def test_a_session_without_temperatures_is_refused_by_what_it_needs(learnt, chan
     raised(DataError, words, calibrate, change(learnt("temperatures").session), level="thermal")
 
 
+@pytest.mark.slow
 def test_sessions_in_which_nothing_warms_up_are_refused():
     heat = replace(Heat.drawn(0), k_per_a2=np.zeros(6), ambient_swing_k=0.0)
     still = WarmUpOptions(CELL, heat, Round(minutes=30.0), hours=0.6)

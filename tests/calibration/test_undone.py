@@ -406,6 +406,7 @@ def test_rows_amid_the_table_that_are_apart_are_one_command(tmp_path, monkeypatc
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lost", "whose"), [((10, 17), "image"), slow((8, 20), "pose")])
 def test_rows_that_two_losses_leave_apart_are_mended_one_after_the_other(
     tmp_path, monkeypatch, lost, whose
@@ -451,6 +452,7 @@ def test_sound_and_otherwise_wrong_sessions_are_not_accused(mount, seeds):
         assert likeliest(located(pairs_session(mount, robot, boards))) is None
 
 
+@pytest.mark.slow
 def test_of_long_sessions_every_row_is_named():
     run = located(pairs_session(MOUNTS[0], *shifted(*poses_of(MOUNTS[0], 200), 90, 3)))
     found = likeliest(run)
@@ -712,6 +714,7 @@ def test_real_records_are_mended(tmp_path, monkeypatch, case, mount, kind):
     assert followed("cell")[0].kind == kind
 
 
+@pytest.mark.slow
 def test_a_small_marker_with_the_other_pose_is_named(tmp_path, monkeypatch):
     if not CASES.is_dir():
         pytest.skip("there are no recordings of others here")

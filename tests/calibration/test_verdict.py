@@ -880,6 +880,7 @@ def drawn_misses_m(known: RunState, mount: str) -> np.ndarray:
     return ((went - camera @ first @ invert(camera) @ flange @ target) @ middle)[:, :3]
 
 
+@pytest.mark.slow
 def test_picks_err_as_the_chain_does() -> None:
     """Against errors that are drawn and put through the chain, by no slope of ours."""
     for mount, seed in (("eye-in-hand", 0), ("eye-to-hand", 4)):

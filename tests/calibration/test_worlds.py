@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from support.cells import calibrated, error_of, reporting, showing
 from support.commands import visioncal
-from support.marks import slow
+from support.marks import seeds, slow
 from support.misfits import misfit
 
 from visioncal.calibration.run import calibrate
@@ -645,9 +645,10 @@ WORLDS: dict[str, World] = {
 # Another world shows the same of a calibration.
 ALIKE = {
     "an angle that was logged once", "an arm errs and nothing grows", "another tool midway",
-    "board exchanged midway", "board within its stated size, 5",
-    "bump", "lens zoomed midway", "lens zoomed once", "lifted in the last views",
-    "poses read on the way", "rectified midway", "views left out after a bump",
+    "board exchanged for the last views", "board exchanged midway",
+    "board within its stated size, 1", "board within its stated size, 5", "bump", "coarse noise",
+    "lens zoomed midway", "lens zoomed once", "lifted in the last views", "links off by little",
+    "poses read on the way", "rectified midway", "sound to hand", "views left out after a bump",
     "wavy lens before lone tags", "wrong arm with joints",
 }  # fmt: skip
 
@@ -736,10 +737,12 @@ def test_a_bracket_that_bends_alone_is_within_its_sigmas():
     assert 0.05 < np.mean(squares) < 4.0
 
 
-def test_a_tilted_window_is_no_motion_and_its_lens_seems_elsewhere():
+@pytest.mark.parametrize("panes", seeds(1, 3))
+def test_a_tilted_window_is_no_motion_and_its_lens_seems_elsewhere(panes):
     """Picks through it are from where its lens seems to be; 6 mm of glass, or 4 mm tilted more."""
     squares = []
-    for seed, (thick_m, tilt) in enumerate(((6e-3, 35.0), (6e-3, 30.0), (4e-3, 45.0))):
+    for seed in panes:
+        thick_m, tilt = ((6e-3, 35.0), (6e-3, 30.0), (4e-3, 45.0))[seed]
         cell = simulate(replace(OPEN, views=24, seed=seed))
         points, camera = corner_positions(cell.options.target), cell.options.camera
         normal = Rotation.from_euler("zx", [40.0 * seed, tilt], degrees=True).as_matrix()[:, 2]
@@ -762,8 +765,8 @@ def test_a_tilted_window_is_no_motion_and_its_lens_seems_elsewhere():
         seems = compose(np.eye(3), nearer(np.array([0.0, 0.0, 1.0])))
         place = cell.transforms["flange_from_cam"] @ seems
         squares.append(misfit(known.assessment.edges["cam"], place) / 6.0)
-    # Of 18 squares; as motion of rows, or as a good result, it is 4 and more each.
-    assert np.mean(squares) < chi2.ppf(0.999, 18) / 18.0, squares
+    # Six squares each; as motion of rows, or as a good result, it is 4 and more each.
+    assert np.mean(squares) < chi2.ppf(0.999, 6 * len(panes)) / (6 * len(panes)), squares
 
 
 def test_a_bump_is_in_the_covariance():

@@ -472,9 +472,9 @@ finally:
         ("calibrate --help", 450, set()),
         # A quarter of today's beyond them: what another Python and other releases may add.
         ("export out --to ur", 1100, {"cv2.typing"}),
-        ("diff out out", 1100, {"cv2.typing"}),
-        ("locate -c out --pixel 320,200 --plane z=20 --pose 0.5,0.1,0.4,0,1,0,0", 1100,
-         {"cv2.typing"}),
+        slow("diff out out", 1100, {"cv2.typing"}),
+        slow("locate -c out --pixel 320,200 --plane z=20 --pose 0.5,0.1,0.4,0,1,0,0", 1100,
+             {"cv2.typing"}),
         ("show out -o report.html", 1250, {"cv2.typing", "jinja2", "matplotlib"}),
         ("history empty.db", 1050, {"rich"}),
     ],

@@ -390,7 +390,7 @@ def test_touches_of_another_maker_are_refused_until_it_is_said(of_maker, tmp_pat
     assert np.abs(tip["flange_from_tip"].edge.matrix[:3, 3] - 0.1).max() < 1e-5
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", BY_FORM)
 def test_targets_are_typed_and_sent_in_the_robot_s_form(work, of_maker, maker, tmp_path):
     poses = poses_of(Session.load(work[0] / "fit"))[:6]
     labels = {"what": [f"pick {at}" for at in range(len(poses))]}
@@ -430,7 +430,7 @@ def test_targets_that_no_form_explains_are_refused(work, of_maker, tmp_path):
     assert done.out == ""
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", BY_FORM)
 def test_a_pixel_is_placed_from_a_pose_as_the_pendant_shows_it(work, of_maker, maker):
     pose = poses_of(Session.load(work[0] / "fit"))[0]
     words = ("locate", "-c", of_maker(maker), "--pixel", "640,400", "--plane", "z=0", "--json")

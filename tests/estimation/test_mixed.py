@@ -346,6 +346,7 @@ def test_noise_is_no_error_of_the_arm_and_what_lasts_is():
     assert find_pose_errors(problem, fit.state, fit.noise, ROBOT) is None
 
 
+@pytest.mark.slow
 def test_frames_are_estimated_beside_what_lasts_in_time():
     """Neighbouring stops err alike: their mean counts for less than independent ones."""
     before, after, squares = [], [], []

@@ -70,6 +70,7 @@ def test_poses_at_random_are_not_taken_for_shifted():
     assert np.flatnonzero(~solve(cell).fit.used).tolist() == sorted(rows.tolist())
 
 
+@pytest.mark.slow
 def test_a_chain_over_two_arms_is_as_sure_as_it_says():
     """A camera on one arm sees a board on the other, whose base is unknown, too."""
     squares = []

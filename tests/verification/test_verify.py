@@ -11,7 +11,7 @@ from support.beyond import with_field
 from support.cells import board_numbers, calibrated, known_of, pairs_session, reporting, session_of
 from support.commands import visioncal
 from support.later import ANYHOW, Change, again, knock, known_again, usual
-from support.marks import crossed
+from support.marks import crossed, slow
 from support.misfits import misfit
 from support.pages import Page
 from support.refusals import raised
@@ -389,7 +389,8 @@ def recovered(either, change, rng, causes=None):
 
 @pytest.mark.parametrize(
     ("kind", "either"),
-    crossed(["camera", "board", "camera and board", "joint 3"], MOUNTS),
+    [*crossed(["camera and board", "joint 3"], MOUNTS)]
+    + [slow(kind, mount) for kind in ("camera", "board") for mount in MOUNTS],
     indirect=["either"],
 )
 def test_what_changed_is_estimated_with_its_covariance_and_the_rest_is_kept(either, kind):

@@ -311,12 +311,11 @@ def test_sound_images_are_not_mended(tmp_path):
     assert "no image is mirrored" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drawn", "declared", "said"),
     [
-        slow(
-            "charuco", {"kind": "checkerboard", "columns": 8, "rows": 5}, "ChArUco board of 9 x 6"
-        ),
+        ("charuco", {"kind": "checkerboard", "columns": 8, "rows": 5}, "ChArUco board of 9 x 6"),
         ("checkerboard", {"kind": "charuco", "columns": 10, "rows": 7}, "checkerboard of 9 x 6"),
     ],
 )

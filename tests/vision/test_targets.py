@@ -181,7 +181,9 @@ def test_two_copies_of_a_charuco_board_in_an_image_are_named():
     )
 
 
-@pytest.mark.parametrize("name", DICTIONARIES)
+@pytest.mark.parametrize(
+    "name", [slow(name) if at % 3 else name for at, name in enumerate(DICTIONARIES)]
+)
 def test_any_share_of_the_square_is_drawn_with_any_dictionary(name):
     rng = np.random.default_rng(DICTIONARIES.index(name))
     count = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
@@ -240,8 +242,8 @@ def test_corners_are_numbered_by_their_tags():
     ("change", "words"),
     [
         ({"columns": 6}, "do not lie as the target describes"),
-        ({"rows": 2}, "the grid has tag 1[0-4] besides the target's 5 x 2"),
-        ({"spacing": 0.25}, "are 0.30 of their side apart, and the target says spacing = 0.25"),
+        slow({"rows": 2}, "the grid has tag 1[0-4] besides the target's 5 x 2"),
+        slow({"spacing": 0.25}, "are 0.30 of their side apart, and the target says spacing = 0.25"),
         ({"marker_id": 30}, r"most tags seen \(0, 1, 2, 3, 4\) are none of the target's"),
     ],
 )
@@ -439,6 +441,7 @@ def test_sound_circles_of_few_pixels_are_not_said_to_be_of_another_diameter(tmp_
     assert not any(finding.kind == "print_size" for finding in result.verdict.findings)
 
 
+@pytest.mark.slow
 def test_circles_of_another_diameter_are_named_until_it_is_written(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     true = BOARDS["circles"]
@@ -465,7 +468,6 @@ def test_circles_of_another_diameter_are_named_until_it_is_written(tmp_path, mon
     assert sum(view.used for view in found.views) == sum(view.used for view in sound.views)
 
 
-@pytest.mark.slow
 def test_a_public_set_of_circles_is_sharp(real_data):
     result = calibrate(real_data / "field/sets/ji1024")
     assert [view.used for view in result.views].count(True) == len(result.views) == 16

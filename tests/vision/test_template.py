@@ -138,6 +138,7 @@ def test_blurred_circles_are_blurred_whatever_their_stated_diameter(stated):
     assert find_target(smeared, target).blur_px == pytest.approx(21 / 12**0.5, rel=0.2)
 
 
+@pytest.mark.slow
 def test_a_misfit_of_the_template_is_no_blur_where_edges_are_sharp(monkeypatch):
     image, truth = photograph(CIRCLES, replace(SMALL, square_px=60), 1)
     board = type(kind_of(CIRCLES))
