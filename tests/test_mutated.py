@@ -11,7 +11,8 @@ QUICK = re.compile(
     r"\{(pairs|pairs_out|pairs.rrd|pairs/\w+.csv|pairs.jsonl|guard.json|typed.txt|stops.txt|frames.json|"
     r"arm.toml|bags/mcap|lerobot/v3.0|foreign/\w+)\}"
 )
-READ = [words for words in READINGS if QUICK.match(words)]
+# Every second one, so that each command is among them.
+READ = [words for words in READINGS if QUICK.match(words)][::2]
 SOUND, COUNT = 2, len(READ)
 
 

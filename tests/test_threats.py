@@ -359,7 +359,12 @@ def test_what_comes_on_stdin_is_refused_by_the_line(program, inputs, tmp_path):
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     assert ["error" in answer for answer in answers] == [True, True, False]
     assert (done.returncode, done.stderr) == (2, b"")
-    none = called(program, words, None)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="stdin is closed as on POSIX")
+def test_a_closed_stdin_and_lines_without_an_end_are_refused(program, inputs, tmp_path):
+    none = called(program, ["guard", "--against", inputs / "pairs_out"], None)
     assert (none.returncode, b"guard --example" in none.stderr + none.stdout) == (2, True)
     pictures = tmp_path / "pictures"
     pictures.mkdir()

@@ -284,6 +284,7 @@ def test_nothing_is_wrong_with_a_sound_session(sound):
     assert re.search(r"in 15 images, over [5-9]\d % of their width and [5-9]\d % of", done.out)
 
 
+@pytest.mark.slow
 def test_views_that_leave_lens_and_mount_open_are_told_of_both():
     board, rng = CellOptions().target, np.random.default_rng(3)
     at_m = corner_positions(board) - corner_positions(board).mean(axis=0)
@@ -325,6 +326,7 @@ def first_of_blurred(shown, sigma_px):
     return visioncal.doctor(session).findings[0]
 
 
+@pytest.mark.slow
 def test_a_board_too_blurred_for_its_markers_is_no_other_board():
     found = first_of_blurred(charuco(12, 6), 2.9)
     assert "no view shows the target" in found.words

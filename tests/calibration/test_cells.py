@@ -166,6 +166,7 @@ def test_a_frame_that_creeps_was_not_bumped_again_and_again(frame):
         assert away_m < 5e-4
 
 
+@pytest.mark.slow
 def test_a_robot_whose_poses_are_misread_is_named_first(three):
     def turned(view):
         """With w first: what other programs write into the same columns."""
@@ -182,6 +183,7 @@ def test_a_robot_whose_poses_are_misread_is_named_first(three):
     assert "rows of robot b in views.csv" in refused.value.next_step
 
 
+@pytest.mark.slow
 def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
     cell = simulate(
         replace(PLAIN, boards=tuple(replace(board, target=ALIKE) for board in PLAIN.boards))
@@ -192,6 +194,7 @@ def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
         assert off(cell, found, *frames)[1] < MOST
 
 
+@pytest.mark.slow
 def test_a_lens_that_is_stated_wrong_is_refined(clean):
     cell, _ = clean
     cameras = session_of(cell).document["cameras"]
@@ -206,6 +209,7 @@ def test_a_lens_that_is_stated_wrong_is_refined(clean):
     assert off(cell, found, "base_a", "base_b")[1] < MOST
 
 
+@pytest.mark.slow
 def test_cameras_whose_wrong_lenses_are_held_leave_out_few_views():
     """They disagree about every stop, unless the board shrinks until they agree."""
     front = CameraAt("front", place_m=(0.9, -0.5, 1.2))

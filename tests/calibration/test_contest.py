@@ -136,7 +136,8 @@ def test_creeping_is_not_sure_where_a_step_does_as_well(seed):
         assert cause.by_limit or cause.is_share or cause.kind == "moved_at_once"
 
 
-@pytest.mark.parametrize("seed", [2, slow(1)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 1])
 def test_a_camera_that_slowly_turns_is_no_lens_that_surely_changed(seed):
     """By a milliradian: its picture moves by a pixel, as by a lens whose centre does."""
     cell = simulate(CellOptions(views=30, seed=seed, pixel_sigma_px=0.3))
@@ -223,7 +224,8 @@ def test_a_machine_that_cannot_tilt_hears_what_to_measure(kind, mount, name, key
     assert not any("tilted" in str(step) for step in found.verdict.next_steps)
 
 
-@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_a_rail_leaves_a_turn_open_too(mount):
     error = raised(
         DegenerateError, "in position only", visioncal.calibrate, moving("rail", mount)[0]

@@ -388,6 +388,7 @@ def cell_with(camera, seed, **changes):
     return simulate(CellOptions(camera=camera, seed=seed, pixel_sigma_px=0.1, **changes))
 
 
+@pytest.mark.slow
 def test_errors_of_a_lens_follow_the_stated_covariance():
     seeds, camera, surprises, sigmas = 24, CAMERAS["wide"], [], []
     for seed in range(seeds):

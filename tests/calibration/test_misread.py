@@ -307,6 +307,7 @@ def test_two_readings_that_close_alike_are_both_named_and_none_is_taken(tmp_path
     assert not guessed(poses).is_open
 
 
+@pytest.mark.slow
 def test_turns_that_agree_beside_places_that_do_not_are_those_of_a_wrong_arm():
     poses = cell_poses(views=20)
     robot = poses.true_robot.copy()

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.marks import crossed, slow
+from support.marks import crossed
 from support.refusals import raised
 
 from visioncal.calibration.run import calibrate
@@ -84,7 +84,8 @@ def test_readings_in_another_form_are_named_instead_of_the_arm(options, change, 
     assert "arm_errors" not in {found.kind for found in verdict.findings}
 
 
-@pytest.mark.parametrize(("options", "first"), [slow(POINT, 0), slow(POINT, 15), (PROBE, 12)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "first"), [(POINT, 0), (POINT, 15), (PROBE, 12)])
 def test_readings_one_row_apart_are_named_and_shifted_back(options, first):
     shop, poses = read(options)
     sound = calibrate(session_of(shop))

@@ -123,7 +123,7 @@ def without(cell, views):
 @pytest.mark.parametrize(
     ("axis", "said", "step"),
     [
-        ("z_m", "has a predicted sigma of 6", "Measure that to 4"),
+        slow("z_m", "has a predicted sigma of 6", "Measure that to 4"),
         ("x_m", "is not determined at all", "; where the arm cannot tilt, measure that offset"),
     ],
 )
@@ -184,6 +184,7 @@ def test_four_axes_give_a_result_with_a_measured_height_and_none_without():
     assert 1.8 < np.sum(squares) < 40.0
 
 
+@pytest.mark.slow
 def test_doctor_says_of_few_stops_what_the_verdict_says_and_tilts_no_arm_that_cannot():
     prior = {"z_m": float(X[2, 3]), "sigma_m": SIGMA_M}
     session = scara(0, {"flange_from_cam": prior}, views=8)
@@ -292,7 +293,7 @@ REFINE, HOLD, RIGHT = {"intrinsics": "refine"}, {"intrinsics": "hold"}, by(0, 0,
         # Without a prior, one marker tells no lens.
         lens(MARKER, RIGHT, refined=False, **REFINE),
         # A lens that is stated for images twice as large.
-        lens(OF_HALF, by(520.0, 519.0, 320.0, 190.0), refined=True),
+        slow(*lens(OF_HALF, by(520.0, 519.0, 320.0, 190.0), refined=True)),
         # Corners as exact as centres of circles: both moves are beyond chance.
         lens(EXACT, by(0.02, -0.02, 0.02, 0.01), status="good"),
         lens(EXACT, by(0.5, -0.5, 0.5, 0.25), status="check"),
@@ -537,6 +538,7 @@ def test_measured_distances_of_another_scale_are_named_and_mended(scale, tmp_pat
     assert said == pytest.approx(factor, abs=0.05 * abs(1.0 - scale))
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_off_is_no_other_scale():
     arm = simulate(CellOptions(views=10, dh_sigma_m=2e-3))
     verdict = calibrate(cell_session(arm, "measured", seen="poses")).verdict
@@ -587,6 +589,7 @@ def test_an_arm_is_not_accused_of_more_than_arms_err_by(mm, deg, is_accused):
         assert "the arm's own errors" not in " ".join(verdict.reasons)
 
 
+@pytest.mark.slow
 def test_the_motion_is_not_to_blame_for_errors_that_last():
     """Chance may explain them, so that no finding on the arm says so."""
     verdict = calibrate(single_tags(0.8, 0.1)).verdict

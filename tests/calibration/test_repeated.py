@@ -250,6 +250,7 @@ def test_copies_of_rows_change_nothing(kind, jitter_m, interleaved):
     assert originals.union(found.views) >= {view.view for view in after.views}
 
 
+@pytest.mark.slow
 def test_readings_of_one_stated_stop_are_no_copies_to_delete():
     session = KINDS["readings"]()
     stated = replace(session, views=tuple(replace(row, stop=row.number) for row in session.views))

@@ -46,6 +46,7 @@ def tags(seed, mount, *, views=25, side_m=0.05, far_m=(0.35, 0.8), arm=(2e-4, 1e
     return pairs_session(mount, np.array(robot), np.array(seen)), name, x
 
 
+@pytest.mark.slow
 def test_how_well_the_scale_of_measured_poses_is_known_may_be_stated():
     """Distances that are too long by half a percent, to a tag in the hand."""
     found = []

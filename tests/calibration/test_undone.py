@@ -270,7 +270,8 @@ def test_angles_of_one_maker_that_were_stated_as_anothers_are_named(
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=1e-6)
 
 
-@pytest.mark.parametrize("mount", [slow(MOUNTS[0]), MOUNTS[1]])
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_poses_that_are_there_twice_hide_no_misread_rotations(mount):
     robot, boards = poses_of(mount)
     angles = Rotation.from_matrix(robot[:, :3, :3]).as_euler("xyz")

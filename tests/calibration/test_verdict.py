@@ -393,7 +393,7 @@ def test_a_view_just_beyond_the_limit_of_outliers_is_no_mistake():
         slow(1.0, 1.0, 0.03, "their positions to 1 mm and angles to 1 deg:"),
         slow(0.1, 0.0, 0.03, ""),
         # Rounding is the smaller part of it.
-        (1.0, 0.0, 0.6, ""),
+        slow(1.0, 0.0, 0.6, ""),
     ],
 )
 def test_poses_with_too_few_digits_are_the_cause(step_mm, step_deg, noise_mm, words) -> None:
@@ -427,6 +427,7 @@ def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named():
     )
 
 
+@pytest.mark.slow
 def test_a_step_by_a_few_times_the_noise_is_named_though_a_view_agrees_by_chance():
     """The views after it are calibrated alone, as the camera stands: picks come after them."""
     cell, rng = simulate(CellOptions(views=20, seed=3)), np.random.default_rng(2)
@@ -442,6 +443,7 @@ def test_a_step_by_a_few_times_the_noise_is_named_though_a_view_agrees_by_chance
     assert cause.do.command.endswith("--views 10-19")
 
 
+@pytest.mark.slow
 def test_a_row_that_was_not_filled_in_is_said_to_be() -> None:
     cell = simulate(CellOptions(views=20))
     flange = cell.robot.base_from_flange.copy()
@@ -497,7 +499,7 @@ def test_angles_taken_for_another_makers_are_brought_back_row_by_row(orders: tup
     np.testing.assert_allclose(best.robot.poses(numbers[0]), poses, atol=1e-7)
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [slow(MOUNTS[0]), MOUNTS[1]])
 def test_a_cell_that_is_the_other_way_round_is_doubted(mount: str) -> None:
     cell = simulate(CellOptions(views=20, mount=mount))
     robot, camera = cell.robot.base_from_flange, cell.cam_from_target
@@ -616,6 +618,7 @@ def without_arm_errors(known: RunState) -> RunState:
     return replace(known, assessment_or_none=changed, cell_fit_or_none=replace(solved, arms=arms))
 
 
+@pytest.mark.slow
 def test_a_wrong_length_of_an_arm_and_a_board_of_another_size_both_stay_possible() -> None:
     """The fit takes the board for 0.23 % larger, since one length of many is off by 3 mm."""
     target = replace(CellOptions().target, square_sigma_m=1e-5)
@@ -836,7 +839,7 @@ SHUFFLED = CellOptions(mount="eye-to-hand", views=18, seed=4)
     [
         slow(SHUFFLED, lambda rng: rng.permutation(18), "bad", "poses are not those of the images"),
         # Where the other half is as it should be, that is not said.
-        (
+        slow(
             replace(SHUFFLED, mount="eye-in-hand"),
             lambda rng: [*rng.permutation(9), *range(9, 18)],
             "check",
@@ -897,6 +900,7 @@ def test_picks_err_as_the_chain_does() -> None:
         assert set(parts) == {"board", "calibration", "pick", "total"} | looks
 
 
+@pytest.mark.slow
 def test_what_an_arm_does_again_moves_no_pick() -> None:
     """Its base and its flange are off by 2 mm and 4 mrad: the frames have taken it up."""
     known = without_arm_errors(calibrated(simulate(CellOptions()), joints=False))

@@ -813,6 +813,7 @@ def test_of_a_tool(place):
         assert followed.done
 
 
+@pytest.mark.slow
 def test_of_a_fixture(place):
     assert visioncal("simulate", "cell", "--touches", "--no-images").status == 0
     assert visioncal("calibrate", "cell", "-o", "out").status == 0

@@ -14,6 +14,7 @@ from scipy.io.matlab import MatlabOpaque
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.fuzz.mistakes import numbers
+from support.marks import slow
 from support.samples import made_up
 
 from visioncal.calibration.guess.search import Recording, turns_alike
@@ -270,7 +271,7 @@ def turning(count):
     return target @ invert(seen) @ invert(camera), seen
 
 
-@pytest.mark.parametrize("fails", [False, True])
+@pytest.mark.parametrize("fails", [slow(False), True])
 def test_angles_come_first_where_some_rows_have_no_corners(fails, tmp_path, monkeypatch):
     """Rows are compared with those that have corners; an error of one reading ends nothing."""
 
@@ -343,6 +344,7 @@ def test_what_keeps_images_from_telling_a_form_comes_before_the_form(tmp_path, m
     done.refused("the same in all 9 rows", "tilted by 20 to 40 degrees")
 
 
+@pytest.mark.slow
 def test_rows_of_another_recording_are_doubted_before_their_form(tmp_path):
     poses, seen, mount = world()
     rng = np.random.default_rng(0)

@@ -78,6 +78,7 @@ def test_another_recording_of_the_cell_is_verified_and_its_board_located(seen):
         assert error @ np.linalg.solve(np.array(value["covariance"]), error) < 21.1
 
 
+@pytest.mark.slow
 def test_a_second_board_is_placed_along(place):
     done("simulate", place / "two", "--second-board", "--no-images", "--views", 12)
     done("calibrate", place / "two", "-o", place / "two-out")

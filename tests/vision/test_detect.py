@@ -184,9 +184,9 @@ def test_too_few_corners_and_corners_on_one_line(charuco, monkeypatch):
 @pytest.mark.parametrize(
     ("declared", "correction"),
     [
-        ({"legacy": True}, "Write legacy = false in"),
+        slow({"legacy": True}, "Write legacy = false in"),
         ({"columns": 6, "rows": 9}, "Write columns = 9 and rows = 6 in"),
-        ({"marker_id": 17}, "Write first_id = 0 in"),
+        slow({"marker_id": 17}, "Write first_id = 0 in"),
         ({"dictionary": "DICT_4X4_100"}, 'Write dictionary = "DICT_5X5_50" in'),
     ],
 )
@@ -206,7 +206,7 @@ def test_negatives_are_named(charuco):
 
 
 @pytest.mark.parametrize(
-    ("described", "kind"), [(4, "aprilgrid"), slow(6, "aprilgrid"), (8, "charuco")]
+    ("described", "kind"), [(4, "aprilgrid"), slow(6, "aprilgrid"), slow(8, "charuco")]
 )
 def test_an_aprilgrid_with_more_rows_than_printed_is_named(described, kind):
     cell, images = images_of(CellOptions(views=6, target=BOARDS[kind], cut_views=0.0, seed=3), 6)

@@ -93,7 +93,7 @@ def test_no_sound_board_is_accused(kind, hard):
     ("seed", "kind", "hard"),
     [
         # Detectors' corners make gaps look wider; a single tag is read by chance.
-        ([404, 6, 3], "gridboard", "blurred"),
+        slow([404, 6, 3], "gridboard", "blurred"),
         slow([404, 8, 7], "gridboard", "steep"),
         ([404, 11, 3], "aprilgrid", "blurred"),
         # 16 bits are read by chance in a tag of 36.

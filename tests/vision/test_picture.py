@@ -73,6 +73,7 @@ def test_prints_of_many_alike_features_are_found(kind, tmp_path):
     assert np.median(np.abs(off)) < 0.03
 
 
+@pytest.mark.slow
 def test_a_simulated_cell_shows_the_picture(target):
     cell = simulate(CellOptions(views=2, seed=1, target=target))
     scene, (width, height) = prepare_scene(cell), cell.camera().camera.resolution
