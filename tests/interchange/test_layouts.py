@@ -1354,11 +1354,20 @@ def test_numbered_columns_of_a_pose_and_of_joints_are_read(tmp_path):
     np.testing.assert_allclose(foreign.joints_rad, q, atol=1e-12)
 
 
-def test_two_files_of_poses_ask_whose_they_are_with_the_command(tmp_path, monkeypatch):
+@pytest.mark.parametrize("are_alone", [True, False])
+def test_two_files_of_poses_ask_whose_they_are_with_the_command(tmp_path, monkeypatch, are_alone):
+    """Alone, or beside joints of seven axes, the robot's raw stream and the camera's, twice."""
     monkeypatch.chdir(tmp_path)
     poses, _, session = world()
     seen = np.array([view.cam_from_target().as_matrix() for view in session.views])
-    for name, turned in (("TrackerToFiducial", seen), ("RobotBaseToTip", poses)):
+    files = [("TrackerToFiducial", seen), ("RobotBaseToTip", poses)]
+    if not are_alone:
+        joints = np.arange(63.0).reshape(9, 7) / 63.0
+        np.savetxt(folder_of(tmp_path / "in") / "joints.txt", joints)
+        streams = {"camera_raw": seen, "camera_raw_again": seen, "arm_raw": poses}
+        more = [(name, np.concatenate([each, each[1:-1]])) for name, each in streams.items()]
+        files += [*more[:2], (more[2][0], more[2][1][:14])]
+    for name, turned in files:
         vectors = Rotation.from_matrix(turned[:, :3, :3]).as_rotvec()
         rows = np.hstack([turned[:, :3, 3], vectors]).tolist()
         write(tmp_path / f"in/{name}.txt", "\n".join(" ".join(map(repr, row)) for row in rows))

@@ -104,7 +104,31 @@ def vectors_by_name(folder):
     write(folder / "robot.json", {"Poses": rows})
 
 
-@pytest.mark.parametrize("make", [opencv_s_calibration, counted_rows, vectors_by_name])
+def in_turn_above_a_result(folder):
+    """Angles of the robot and quaternions of the target in turn, above a printed matrix."""
+    poses, seen, _ = world()
+    lines = []
+    for pose, board in zip(poses, seen, strict=True):
+        turn = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", degrees=True)
+        place = (1e3 * pose[:3, 3]).tolist()
+        lines.append(f"hand,{','.join(map(repr, [*place, *turn.tolist()]))},")
+        quaternion = Rotation.from_matrix(board[:3, :3]).as_quat().tolist()
+        lines.append(f"eye,{','.join(map(repr, [*board[:3, 3].tolist(), *quaternion]))}")
+    write(folder / "run.csv", "\n".join([*lines, "", str(poses[0])]))
+
+
+def copied(folder):
+    """The target's poses once more beside the robot's, under a name of neither side."""
+    poses, seen, _ = world()
+    pairs = [*zip(poses.tolist(), seen.tolist(), strict=True)]
+    write(folder / "seen.json", [{"tag_pose": board} for _, board in pairs])
+    both = [{"T_measured": board, "T_nominal": pose} for pose, board in pairs]
+    write(folder / "transforms.json", both)
+
+
+@pytest.mark.parametrize(
+    "make", [copied, opencv_s_calibration, counted_rows, vectors_by_name, in_turn_above_a_result]
+)
 def test_poses_of_the_target_come_in_as_programs_store_them(make, tmp_path):
     poses, seen, mount = world()
     make(tmp_path / "in")
@@ -187,10 +211,9 @@ def test_a_command_names_two_sides_of_as_many_rows(tmp_path):
         text = "".join(listed(part, row[:, None]) for part, row in vectors)
         write(tmp_path / f"in/{name}.yml", f"%YAML:1.0\n{text}")
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", mount)
-    command = shlex.split(done.refused("handEye.Matrix").err.splitlines()[-1])
-    assert command[-4:] == [
-        "--robot-key", "handEye.Matrix", "--camera-key",
-        "seen.TranslationVectors,seen.RotationVectors",
+    command = shlex.split(done.refused("handEye.yml").err.splitlines()[-1])
+    assert [*map(Path, (command[2], command[-1]))] == [
+        tmp_path / "in/handEye.yml", tmp_path / "in/seen.yml",
     ]  # fmt: skip
     visioncal(*command[1:]).good()
 

@@ -134,7 +134,8 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
     Without a header row, a comment right before the first row is the header if it has one word per
     column after any colon; a first line such as `sep=;` declares the separator. Decimal commas
     are read as points, in quotes between commas. Rows may be lists in brackets, with a name before
-    them. Empty rows, empty trailing columns, and titles or a preamble above the header are ignored.
+    them. Empty rows, empty trailing columns, titles or a preamble above the header, and results
+    below an empty line are ignored.
     Raises DataError.
     """
     text, where = read_plain_text(path) if text is None else text, str(path)
@@ -159,7 +160,7 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
         split = _with_points(_split(lines, where, separator, stripped=True), separator)
     if not split or not all(cells for _, cells in split):
         raise DataError(f"{where} has no rows.", culprits=[where])
-    split = _below_titles(split)
+    split = _below_titles(_above_results(split))
     numbers, cells = [at for at, _ in split], [cells for _, cells in split]
     rows = _without_margin(cells)
     columns = rows[0] if not any(is_number(cell) for cell in rows[0]) else None
@@ -207,6 +208,14 @@ def _below_titles(rows: list[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tu
                 *rows[2:],
             ]
     return rows
+
+
+def _above_results(rows: list[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tuple[str, ...]]]:
+    """Rows without a program's results below them: a few of other widths after an empty line."""
+    gaps = [at for at in range(1, len(rows)) if rows[at][0] > rows[at - 1][0] + 1]
+    end, widths = gaps[-1] if gaps else len(rows), [len(cells) for _, cells in rows]
+    is_result = 4 * end >= 3 * len(rows) and {*widths[:end]}.isdisjoint(widths[end:])
+    return rows[:end] if is_result and len({*widths[:end]}) == 1 else rows
 
 
 def _named(columns: Sequence[str] | None, width: int, where: str) -> tuple[str, ...]:

@@ -384,13 +384,21 @@ def _are_one(fields: Fields, items: Sequence[PoseFields]) -> bool:
     return all(np.allclose(places[0], other, atol=1e-9, equal_nan=True) for other in places)
 
 
+def without_copies(fields: Fields, items: Sequence[PoseFields]) -> Sequence[PoseFields]:
+    """Fields but for copies of the target's poses under a name of no side, where others remain."""
+    seen = [item for item in items if item.is_of_target]
+    plain = [item for item in items if not item.sides and not item.is_seen]
+    copies = [one for one in plain if any(_are_one(fields, (one, other)) for other in seen)]
+    return items if len(copies) == len(plain) else [item for item in items if item not in copies]
+
+
 def ranked_poses(
     fields: Fields, whose: str, taken: Collection[str] = (), *, by_shape: bool = True
 ) -> list[list[PoseFields]]:
     """Fields that may hold the poses of the `robot` or `camera`, in groups, the likeliest first."""
     groups: dict[tuple[int, bool], list[PoseFields]] = defaultdict(list)
     # Those of frames of that side come first.
-    possible = possible_poses(fields, taken, by_shape=by_shape)
+    possible = without_copies(fields, possible_poses(fields, taken, by_shape=by_shape))
     for item in sorted(possible, key=lambda item: item.sides != [whose]):
         is_own, is_plain = item.sides == [whose], not item.sides
         fits = (

@@ -97,16 +97,21 @@ def _paired_rows(table: TextTable, path: Path) -> Fields | None:
     else:
         return None
     numbers = [at for at in columns if at not in worded]
-    if len(numbers) not in POSE_SIZES or any(map(is_image_name, names)):
+    # Of angles beside another side's quaternions the last cell is empty.
+    cells = [[row[at] for at in numbers if row[at]] for row in rows]
+    sizes = [{len(cells[at]) for at in own.tolist()} for own in (first, second)]
+    fits = all(len(own) == 1 and own <= {*POSE_SIZES} for own in sizes)
+    fits &= all(is_number(cell) for own in cells for cell in own)
+    if not fits or any(map(is_image_name, names)):
         return None
-    records, places = list[dict[str, object]](), list[str]()
-    for both in zip(first.tolist(), second.tolist(), strict=True):
-        values = [[rows[at][column] for column in numbers] for at in both]
-        if not all(is_number(cell) for own in values for cell in own):
-            return None
-        arrays = [np.array(own, dtype=float) for own in values]
-        records.append({f"{name}_pose": own for name, own in zip(names, arrays, strict=True)})
-        places.append(table.place(both[0]))
+    records = [
+        {
+            f"{name}_pose": np.array(cells[at], dtype=float)
+            for name, at in zip(names, both, strict=True)
+        }
+        for both in zip(first.tolist(), second.tolist(), strict=True)
+    ]
+    places = [table.place(at) for at in first.tolist()]
     return fields_of_records(records, places, path.stem, path.parent)
 
 

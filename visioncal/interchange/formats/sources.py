@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from visioncal.interchange.formats.poses import (
     pose_names,
     possible_poses,
     ranked_poses,
+    without_copies,
     words_of,
 )
 from visioncal.interchange.formats.reading import (
@@ -328,7 +330,9 @@ def _has(fields: Fields, given: Sequence[str]) -> bool:
 
 def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = ()) -> DataError:
     """The error of a source whose poses are not known, with a command that reads it."""
-    possible = [(fields, item) for fields in rows for item in possible_poses(fields)]
+    possible = [
+        (fields, item) for fields in rows for item in without_copies(fields, possible_poses(fields))
+    ]
     possible.sort(
         key=lambda of: (
             of[1].is_seen,
@@ -394,7 +398,7 @@ def several_recordings(source: Source, requested: ImportOptions) -> DataError | 
 
 
 def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] | None:
-    """The robot's file and the camera's of a folder with two files of poses; None of others.
+    """The robot's file and the camera's where two files of poses are as long; None of others.
 
     The names of the files say whose they are. Raises DataError where they do not.
     """
@@ -402,14 +406,20 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
         (part.group.files[0], fields)
         for part in source.parts
         for fields in part.rows
-        if len(part.group.files) == 1 and possible_poses(fields)
+        if len(part.group.files) == 1 and possible_poses(fields) and "joint" not in part.group.name
     ]
-    if len(files) != 2 or len(files[0][1]) != len(files[1][1]):
+    sides = {file: _sides(file) for file, _ in files}
+    files.sort(key=lambda of: (sides[of[0]] == ["camera"], not _OF_ROBOT.search(of[0].stem)))
+    # Two files of one side, as of a camera's poses before and after a filter, are no pair.
+    pairs = [
+        (a, b, fields)
+        for (a, fields), (b, others) in combinations(files, 2)
+        if len(fields) == len(others) and sides[a] != ["camera"] and sides[b] != ["robot"]
+    ]
+    if len(pairs) != 1 or (len(files) > 2 and len(pairs[0][2]) < FEWEST_ROWS):
         return None
-    files.sort(key=lambda each: _OF_ROBOT.search(each[0].stem) is None)
-    (robot, fields), (camera, _) = files
-    of_robot, of_camera = (PoseFields((at.stem,), _words(at)).sides for at in (robot, camera))
-    if of_robot == ["robot"] and of_camera == ["camera"]:
+    robot, camera, fields = pairs[0]
+    if sides[robot] == ["robot"] and sides[camera] == ["camera"]:
         return robot, camera
     command = [str(robot) if word == str(source.path) else word for word in requested.command]
     raise DataError(
@@ -421,9 +431,9 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
     )
 
 
-def _words(file: Path) -> tuple[str, ...]:
-    """The words of a file's name: `robotData`, `cam_poses_2`."""
-    return tuple(words_of(re.sub(r"[0-9]+", "_", file.stem)))
+def _sides(file: Path) -> list[str]:
+    """The sides whose frames the words of a file's name are: `robotData`, `cam_poses_2`."""
+    return PoseFields((), tuple(words_of(re.sub(r"[0-9]+", "_", file.stem)))).sides
 
 
 def _joined(source: Source) -> list[Fields]:
