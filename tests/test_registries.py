@@ -20,7 +20,7 @@ from visioncal.core.choices import POSE_FORMS
 from visioncal.interchange.exports import EXPORT_FORMATS
 from visioncal.interchange.formats.registry import FOREIGN_FORMATS
 from visioncal.live.capture.devices import ARMS, CAMERAS
-from visioncal.model.effects import NAMED
+from visioncal.model.effects import EFFECTS, NAMED
 from visioncal.vision.boards import KINDS
 
 ROOT = Path(__file__).parents[1]
@@ -163,8 +163,13 @@ def finding_faults(kinds):
             yield f"{kind}: raised in {place}, not in calibration/suspects/registry.py"
 
 
-def effect_faults(effects):
-    """Effects whose kind is no suspect, or that no page names."""
+def effect_faults(kinds, effects):
+    """Effects without a clause or a page, and named ones whose kind is no suspect."""
+    for kind, effect in kinds.items():
+        if not hasattr(effect, "clause"):
+            yield f"{kind}: no clause says what it does"
+        if kind not in page("visioncal/model/README.md"):
+            yield f"{kind}: not among the kinds of visioncal/model/README.md"
     for effect in effects:
         kind = effect.kind.replace(" ", "_")
         if kind not in SUSPECTS:
@@ -213,7 +218,7 @@ def test_every_entry_is_where_a_user_looks():
         *kind_faults(KINDS),
         *command_faults(commands()),
         *finding_faults(raised_kinds()),
-        *effect_faults(NAMED),
+        *effect_faults(EFFECTS, NAMED),
         *import_faults(FOREIGN_FORMATS),
         *contributing_faults(page(".github/CONTRIBUTING.md")),
     ]
@@ -229,6 +234,7 @@ def test_an_entry_that_is_left_out_is_found():
     assert len([*kind_faults({"no-such": KINDS["charuco"]})]) == 3
     assert len([*command_faults(["no-such"])]) == 1
     assert len([*finding_faults({"no-such": "calibration/stages/no_such.py"})]) == 1
+    assert len([*effect_faults({"no such": object}, [])]) == 2
     assert len([*import_faults([replace(FOREIGN_FORMATS[0], name="no-such")])]) == 1
     text = page(".github/CONTRIBUTING.md").replace("`STAGES`", "`STEPS`")
     assert len([*contributing_faults(text)]) == 1

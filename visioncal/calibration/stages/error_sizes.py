@@ -17,29 +17,18 @@ from visioncal.fit.solve import CellFit, solve_from
 from visioncal.fit.start import Start, start_of
 from visioncal.fit.unknowns import Key
 from visioncal.model import MeasuredPose, Reported, Swept, read_cell
-from visioncal.model.effects import Displacement, Effect, LensGrows, LensSags, LensSteps, SightSteps
+from visioncal.model.effects import (
+    EFFECTS,
+    Displacement,
+    Effect,
+    LensGrows,
+    LensSags,
+    LensSteps,
+    SightSteps,
+)
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics, project
 from visioncal.vision.targets import corner_positions, first_corners
-
-# Effects in words.
-_INSTEAD = {
-    "arm grows": "the arm warmed up or cooled",
-    "base creeps": "the base, or what stands in it, crept",
-    "mount creeps": "what the flange carries crept",
-    "frame creeps": "a camera or target crept",
-    "base steps": "the base, or what stands in it, moved at once",
-    "mount steps": "what the flange carries moved at once",
-    "bracket bends": "what the flange carries bends with its weight",
-    "lens grows": "the lens crept",
-    "lens sags": "the lens gives way with its weight",
-    "lens changes": "the lens was exchanged, or its pictures rectified",
-    "lens steps": "the lens changed at once",
-    "row motion": "the camera moved while rows of its images were read",
-    "board sags": "the board bends with its weight",
-    "board swells": "the board grew or shrank",
-    "window": "it was seen through a tilted pane of glass",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +114,7 @@ class ErrorSizes:
 
     def instead_of(self, kind: str) -> str:
         """The rivals of a kind of effects, as a sentence behind others; empty without any."""
-        words = (_INSTEAD.get(rival, rival) for rival in sorted(self.rivals.get(kind, ())))
+        words = (EFFECTS[rival].clause for rival in sorted(self.rivals.get(kind, ())))
         listed = " or ".join(words)
         return f" Or else, as these views leave it open: {listed}." if listed else ""
 

@@ -30,14 +30,11 @@ from visioncal.model.arm import even_progress
 from visioncal.model.effects import (
     NAMED,
     BaseSteps,
-    BaseTilts,
     Creeps,
-    MountCreeps,
     MountSteps,
     Named,
     SightSteps,
     Stood,
-    Stretches,
 )
 from visioncal.model.effects import Effect as GrowingEffect
 from visioncal.session.frames import object_name
@@ -84,13 +81,10 @@ def random_effects(
         flat = PriorInformation.flat(arm.basis.shape[2])
         nuisance = Effect.free(f"postures of {robot}", flat, None, {robot: arm.basis})
         opened = [at for at in sizes.opened if object_name(at.frame, "robot") == robot]
-        # Errors that last look as if a mount crept, a base tilted or an axis stretched: these are
-        # tried where the one likelihood, which knows these errors, has them.
         kinds = [
             kind
             for kind in NAMED
-            if not issubclass(kind, MountCreeps | BaseTilts | Stretches)
-            or any(isinstance(at, kind) for at in opened)
+            if not kind.is_imitated or any(isinstance(at, kind) for at in opened)
         ]
         if any(isinstance(at, SightSteps) for at in sizes.opened):
             kinds = [kind for kind in kinds if not issubclass(kind, Creeps)]

@@ -1,4 +1,4 @@
-"""Effects that move a frame, or change a lens, beside noise: one file each.
+"""Effects that move a frame, or change a lens, beside noise: one file a family.
 
 Those that a finding names are in `NAMED`, too.
 """
@@ -61,3 +61,9 @@ NAMED: tuple[type[Named], ...] = (
     StopsShort,
     MovesOn,
 )
+# All effects, by kind.
+EFFECTS: dict[str, type[Effect]] = {
+    each.kind: each
+    for each in [*globals().values()]
+    if isinstance(each, type) and issubclass(each, Effect) and hasattr(each, "kind")
+}

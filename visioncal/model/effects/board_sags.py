@@ -18,6 +18,7 @@ class BoardSags(Displacement):
     """
 
     kind, bounds, count = "board sags", (0.1, 1e-6, 2.0), 3
+    clause = "the board bends with its weight"
     flange: str
     normal: FloatArray  # (3,) of the board, in the flange's frame.
     marks: FloatArray  # (n, 3) corners of the board [m].

@@ -17,6 +17,7 @@ class Breathing(LensEffect):
     """
 
     kind, bounds = "breathing", (1e-2, 1e-6, 0.1)
+    clause = "the lens focuses on what it sees"
     reference_m: float
     is_stated: bool = False
 

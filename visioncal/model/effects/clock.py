@@ -14,6 +14,7 @@ class Clock(Effect):
     """By how much the camera's clock is farther ahead of the robot's than was taken [s]."""
 
     kind, count = "clock", 1
+    clause = "the clocks of robot and camera are apart"
     camera: str
     sigma_s: float  # Its standard deviation, which is known [s].
 

@@ -95,6 +95,8 @@ class BaseCreeps(Creeps, _OfBase):
     """A base, or what stands in it, that creeps."""
 
     kind, what = "base creeps", "The base, or what stands in it,"
+    clause = "the base, or what stands in it, crept"
+    is_imitated = False
     do = (
         "Fasten the base, the fixed camera and the fixed target, let the cell warm up, and record "
         "again."
@@ -112,6 +114,7 @@ class MountCreeps(Creeps, _OfMount):
     """Creep of all that the flange carries."""
 
     kind, what = "mount creeps", "The load on the flange"
+    clause = "what the flange carries crept"
     do = "Fasten what the flange carries, let the cell warm up, and record again."
 
 
@@ -120,6 +123,8 @@ class ArmGrows(Creeps):
     """Share by which the flange is farther from the base's origin, of an arm that warms up."""
 
     kind, what, bounds, count = "arm grows", "The arm", (1e-3, 1e-7, 0.02), 1
+    clause = "the arm warmed up or cooled"
+    is_imitated = False
     most = 1e-3  # Aluminium grows by so much in 43 K, and steel in 90.
     do = "Let the arm warm up at its work for half an hour, and record again."
 
@@ -145,6 +150,7 @@ class FrameCreeps(Creeps, _OfMount):
     """Creep of one of several cameras or targets that share a base or a flange."""
 
     kind, what = "frame creeps", "A camera or target"
+    clause = "a camera or target crept"
     do = "Fasten it, let the cell warm up, and record again."
 
 
@@ -164,6 +170,7 @@ class BaseSteps(_Step, _OfBase):
     """A base, or what stands in it, that was moved at once."""
 
     kind = "base steps"
+    clause = "the base, or what stands in it, moved at once"
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +178,7 @@ class MountSteps(_Step, _OfMount):
     """A sudden move of all that the flange carries."""
 
     kind = "mount steps"
+    clause = "what the flange carries moved at once"
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +186,7 @@ class SightSteps(_Step):
     """A camera, or what measures poses by it, whose distances changed at once."""
 
     kind, count = "sight steps", 1
+    clause = "the camera's distances changed at once"
 
     def columns(self, moments: Moments, distances: FloatArray) -> FloatArray:
         """See `Effect`."""

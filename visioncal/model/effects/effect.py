@@ -44,6 +44,7 @@ class Effect(ABC):
 
     place: ClassVar[Place] = "edge"
     kind: ClassVar[str]
+    clause: ClassVar[str]  # Its action as a clause: it may stand for another one.
     wider: ClassVar[str] = ""  # Kind of one that has its columns and more: no rival of it.
     bounds: ClassVar[tuple[float, float, float]]  # `start`, `low` and `high` of its size.
     curvature: ClassVar[float] = (
@@ -113,6 +114,9 @@ class Named(ABC):
     most: ClassVar[float]
     do: ClassVar[str]  # Advice.
     hides: ClassVar[tuple[str, ...]] = ()  # Kinds of findings that are mere effects of it.
+    # Whether errors of the arm that last look like it: only the one likelihood, which has these,
+    # can say that it acts.
+    is_imitated: ClassVar[bool] = True
 
     @classmethod
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:

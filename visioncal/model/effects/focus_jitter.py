@@ -14,6 +14,7 @@ class FocusJitter(LensEffect):
     """Growth of the focal lengths at each of some stops, independent of the others."""
 
     kind, bounds = "focus jitter", (1e-2, 1e-6, 0.1)
+    clause = "the lens focuses anew at each stop"
     stops: IntArray  # (c,) in order.
     is_breathing: bool = False  # Whether the lens is known to focus: then this is likely.
 

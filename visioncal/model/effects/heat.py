@@ -22,6 +22,7 @@ class Heat(Effect):
     """
 
     kind, curvature = "heat", 1.0
+    clause = "the arm is warmer at some stops than at others"
     robot: Robot
     inputs: Inputs  # Its heat sources.
 

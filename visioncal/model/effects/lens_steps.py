@@ -20,6 +20,7 @@ class LensSteps(LensEffect):
     """
 
     kind, bounds, count = "lens steps", (1e-2, 1e-6, 0.3), 3
+    clause = "the lens changed at once"
     wider = "lens changes"
     stop: int  # The first stop after it.
 
@@ -38,6 +39,7 @@ class LensChanges(LensSteps):
     """The same with the first two coefficients of distortion, as where pictures are rectified."""
 
     kind, count, wider = "lens changes", 5, ""
+    clause = "the lens was exchanged, or its pictures rectified"
 
     @property
     def size(self) -> Size:

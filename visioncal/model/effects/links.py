@@ -21,6 +21,7 @@ class Links(Effect):
     """
 
     kind, bounds = "links", (1e-3, 1e-7, 0.1)
+    clause = "the arm's links are not as stated"
     robot: Robot
 
     @property

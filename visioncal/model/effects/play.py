@@ -17,6 +17,7 @@ class Play(JointEffect):
     """
 
     kind, bounds = "play", (1e-2, 1e-7, 0.1)
+    clause = "the arm's joints have play"
 
     @property
     def count(self) -> int:

@@ -91,6 +91,7 @@ class BaseTilts(PostureEffect, Named):
     """
 
     kind, bounds, count, most = "base tilts", (1e-2, 1e-7, 0.1), 4, 5e-3
+    clause = "the base tilts as the arm reaches out"
     do = "Tighten the base's screws, and stiffen what it stands on, or keep to one reach."
 
     @classmethod
@@ -151,24 +152,28 @@ class XStretches(Stretches):
     """Along its base's x."""
 
     kind, shares = "x stretches", ((0, 0),)
+    clause = "the robot's x has another scale"
 
 
 class YStretches(Stretches):
     """Along its base's y."""
 
     kind, shares = "y stretches", ((1, 1),)
+    clause = "the robot's y has another scale"
 
 
 class ZStretches(Stretches):
     """Along its base's z."""
 
     kind, shares = "z stretches", ((2, 2),)
+    clause = "the robot's z has another scale"
 
 
 class AxesSkew(Stretches):
     """Linear axes that are not square to each other."""
 
     kind, count, shares = "axes skew", 3, ((0, 1), (0, 2), (1, 2))
+    clause = "the robot's linear axes are not square"
     do = "Measure the axes with a square, and correct them in the controller; then record again."
 
     @classmethod
@@ -195,6 +200,8 @@ class BracketBends(PostureEffect, Named):
     """
 
     kind, bounds, count, most = "bracket bends", (1e-2, 1e-7, 0.1), 18, 3e-3
+    clause = "what the flange carries bends with its weight"
+    is_imitated = False
     do = "Stiffen the bracket, or record and work in the same attitudes."
 
     @classmethod

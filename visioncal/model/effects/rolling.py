@@ -15,6 +15,7 @@ class Rolling(Effect):
     """Time from an image's first row to its last, whose middle row has the stamp [s]."""
 
     place, kind, count, bounds = "corners", "rolling", 1, (1e-2, 1e-6, 0.1)
+    clause = "rows of an image were read one after the other"
     curvature = 1.0  # At a radian per second.
     height: int  # Of the images [px].
 
@@ -38,6 +39,7 @@ class RowMotion(Effect):
 
     # Half a metre away, at 0.2 m/s, rows of 25 ms move by a hundredth.
     place, kind, bounds = "corners", "row motion", (3e-3, 1e-7, 0.01)
+    clause = "the camera moved while rows of its images were read"
     lens: Camera
     stops: IntArray  # (s,) in order.
 

@@ -16,6 +16,7 @@ class Springs(JointEffect):
     """Compliance of each joint [rad/(N m)], under torques that are known."""
 
     kind, bounds = "springs", (1e-3, 1e-9, 0.1)
+    clause = "the arm's joints give way under loads"
     curvature = 200.0  # Under so many newton metres.
 
     @property
@@ -37,6 +38,7 @@ class Weight(JointEffect):
     """
 
     kind, bounds = "weight", (1e-2, 1e-7, 0.1)
+    clause = "the arm's joints give way under its own weight"
 
     @cached_property
     def functions(self) -> WeightFunctions:

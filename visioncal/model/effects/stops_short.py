@@ -25,7 +25,7 @@ class _AlongMotion(Effect, Named):
     the cell's stops the poses are right.
     """
 
-    count, bounds, most = 6, (1e-2, 1e-6, 0.1), 5e-2
+    count, bounds, most, is_imitated = 6, (1e-2, 1e-6, 0.1), 5e-2, False
     # After the largest motions it is no multiple of these.
     hides = ("wrong_views",)
     poses: FloatArray  # (s, 4, 4) `base_from_flange` at the cell's stops; NaN where unknown.
@@ -80,6 +80,7 @@ class StopsShort(_AlongMotion):
     """An arm that stands short of its poses, along its last motion."""
 
     kind = "stops short"
+    clause = "the arm stood short of its poses"
     do = (
         "Wait until the arm stands still before each image, and log the poses that the controller "
         "measures, not those that it was sent to."
@@ -106,6 +107,7 @@ class MovesOn(_AlongMotion):
     """An arm that moves on to its next stop between pose and image."""
 
     kind = "moves on"
+    clause = "the arm had moved on between pose and image"
     do = "Log pose and image of each stop while the arm stands still, before it is sent on."
 
     @classmethod

@@ -22,6 +22,7 @@ class BoardSwells(Displacement):
     """
 
     kind, bounds, count = "board swells", (1e-2, 1e-6, 0.1), 1
+    clause = "the board grew or shrank"
 
     @property
     def size(self) -> Size:

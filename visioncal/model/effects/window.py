@@ -27,6 +27,7 @@ class Window(Displacement):
     """
 
     kind, bounds, count, is_positive = "window", (3e-3, 1e-6, 0.05), 3, True
+    clause = "it was seen through a tilted pane of glass"
     normal: tuple[float, float, float]  # About the pane's normal, in the camera's frame.
 
     @classmethod

@@ -14,6 +14,7 @@ class Zeros(JointEffect):
     """Offset of each joint's zero [rad]."""
 
     kind, bounds = "zeros", (1e-2, 1e-7, 0.1)
+    clause = "the arm's joints have other zeros"
 
     @property
     def count(self) -> int:
