@@ -21,6 +21,8 @@ from visioncal.calibration.guess.search import Recording, turns_alike
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert
 from visioncal.interchange.formats import rereading
+from visioncal.interchange.formats.joints import joint_names
+from visioncal.interchange.formats.poses import possible_poses
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.sources import describe
 from visioncal.session import Session
@@ -386,15 +388,43 @@ def test_rows_of_another_recording_are_doubted_before_their_form(tmp_path):
     assert "1, 2, 3, 4, 5, 6, 7: look like a pose" in describe(tmp_path / "rows.txt").words()
 
 
+@pytest.mark.parametrize("form", ["braces", "OpenCV"])
+def test_rows_within_a_program_in_cpp_are_read_where_it_is_named(tmp_path, form):
+    poses = world()[0]
+    numbers = np.hstack([1e3 * poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()])
+    rows = [", ".join(map(repr, row)) for row in numbers.tolist()]
+    if form == "braces":
+        lines = "".join(f"    {{{row}}},  // a view\n" for row in rows)
+        text = f"std::vector<std::vector<double>> tool = {{\n{lines}}};\nint lens[2] = {{1, 2}};\n"
+    else:
+        lines = ",\n    ".join(rows)
+        text = f"Mat tool = (cv::Mat_<double>(9, 6) <<\n    {lines});\n"
+    write(tmp_path / "solve.cpp", f"int main() {{\n{text}    return 0.5 > 0.25;\n}}\n")
+    fields = read_fields(tmp_path / "solve.cpp")
+    np.testing.assert_array_equal(fields.column("tool"), numbers)
+    # Beside pictures it is a program's own code.
+    assert "1 kind not read: solve.cpp" in describe(tmp_path).words()
+
+
+def test_a_file_called_joints_without_a_header_has_no_poses(tmp_path):
+    angles = np.linspace(-80.0, 80.0, 60).reshape(10, 6)
+    np.savetxt(tmp_path / "joints_tool.txt", angles)
+    fields = read_fields(tmp_path / "joints_tool.txt")
+    assert not possible_poses(fields)
+    assert joint_names(fields, ()) == tuple(f"joint_{at}" for at in range(1, 7))
+
+
 def test_files_of_objects_say_how_to_write_them(tmp_path, monkeypatch):
-    """A table of MATLAB, and a pickle."""
+    """A table of MATLAB, a pickle, and a workbook."""
     write(tmp_path / "in/frame.pkl", "numbers 0.1 0.2 0.3 0.4 0.5 0.6")
     write(tmp_path / "in/read.m", "T = 1;")
+    write(tmp_path / "in/run.xlsx", "numbers 0.1 0.2 0.3 0.4 0.5 0.6")
     write(tmp_path / "in/poses.mat", "a file of MATLAB")
     table = MatlabOpaque(np.zeros(1, [("s0", "O"), ("s1", "O"), ("s2", "O"), ("arr", "O")]))
     monkeypatch.setattr(scipy.io, "loadmat", lambda _: {"__version__": "1.0", "T": table})
     words = describe(tmp_path / "in").words()
     assert "frame.pkl: a pickle, which runs code when it is opened" in words
+    assert "run.xlsx: a workbook: save its sheet with the poses as .csv" in words
     assert "poses.mat holds no arrays of numbers: its values are a table" in words
     assert "1 kind not read: read.m" in words
     with pytest.raises(DataError, match=r"writetable\(T, 'poses.csv'\)"):

@@ -28,13 +28,13 @@ from visioncal.interchange.formats.fields import (
     named_by,
     number_in,
 )
-from visioncal.interchange.formats.reading import ENDINGS
+from visioncal.interchange.formats.reading import ENDINGS, SOURCES
 from visioncal.session.images import CLOUD_ENDINGS, IMAGE_ENDINGS
 
 # Endings of texts with numbers that are none of a recording.
 _NO_DATA = (
     *(".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg"),
-    *(".ply", ".pcd"),
+    *(".m", ".sln", "cmakelists.txt", "requirements.txt", ".ply", ".pcd"),
 )
 # Folders below a source that are looked through, and the most files in all; a source of more files
 # than a recording in folders has, such as a disk, is looked through less deep.
@@ -81,7 +81,7 @@ class FileGroup:
     label: str  # Their path in the source: `images/img_#.png`.
     files: tuple[Path, ...]  # In natural order.
     numbers: tuple[int, ...] = ()  # The number by which they differ; empty without one.
-    is_source: bool = False  # Whether it is the source itself, which may be a Python program.
+    is_source: bool = False  # Whether it is the source itself, which may be a program.
 
     @property
     def name(self) -> str:
@@ -98,8 +98,10 @@ class FileGroup:
     def is_data(self) -> bool:
         """Whether they have the ending of numbers, or an unknown one and numbers in them."""
         words = self.label.lower()
-        if words.endswith((*ENDINGS, *_NO_DATA, *IMAGE_ENDINGS)):
-            return words.endswith((*ENDINGS, ".py") if self.is_source else ENDINGS)
+        if words.endswith(_NO_DATA):
+            return self.is_source and words.endswith(SOURCES)
+        if words.endswith((*ENDINGS, *IMAGE_ENDINGS)):
+            return words.endswith(ENDINGS)
         return len(re.findall(r"[0-9]\.[0-9]", head(self.files[0]))) > 5
 
     @cached_property

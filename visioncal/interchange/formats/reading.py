@@ -40,6 +40,7 @@ from visioncal.interchange.formats.fields import (
     is_image_name,
     is_small,
     joined,
+    separate,
 )
 from visioncal.interchange.formats.lines import (
     COMMENTS,
@@ -70,6 +71,14 @@ def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
         return None
     places = tuple(f"{table.label}, matrix {at}" for at in range(1, len(matrices) + 1))
     return Fields(path.stem, path.parent, places, {"matrix": matrices.reshape(-1, 16)})
+
+
+def _of_joints(table: TextTable, path: Path) -> TextTable:
+    """The table; without a header in a file called joints or angles, with the joints' names."""
+    is_whole = not table.has_header and 5 <= len(table.columns) <= 8
+    if is_whole and re.search("joint|angle", path.stem.lower()):
+        return replace(table, columns=tuple(map("joint_{}".format, table.columns)))
+    return table
 
 
 def _paired_rows(table: TextTable, path: Path) -> Fields | None:
@@ -245,6 +254,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
     is_program = path.suffix.lower() in PROGRAMS
     read = (
         _scripted,
+        _initialised,
         _messages,
         _literals,
         lambda text, _: _braced(text),
@@ -259,7 +269,7 @@ def _rows(path: Path, form: str | None, document: object) -> list[Fields]:
     if lines := moves or pendant_poses(text, path, form if form in POSE_FORMS else None):
         return [replace(lines, notes=tool_note(text, path))]
     try:
-        table = read_table(path, text)
+        table = _of_joints(read_table(path, text), path)
     except DataError:
         if blocks := blocks_of(placed(text, path), path):
             return [blocks]
@@ -604,6 +614,13 @@ def _literals(text: str, path: Path) -> list[object]:
     return records if len(records) == len(lines) else []
 
 
+# Programs whose lists are read where they are named as the source.
+SOURCES = (".py", ".cpp", ".cc")
+# An array that a C++ program initialises, and a matrix of OpenCV that it fills.
+_INITIALISED = re.compile(r"(\w++)\s*+(?:\[\w*+\]\s*+)*+=?\s*+(\{[-+0-9.eE,\s{}]++)\s*+;")
+_FILLED = re.compile(
+    r"(\w++)\s*+=\s*+\(?(?:cv::)?Mat_<\w++>\(\s*+([0-9]++)[\s,0-9]++\)\s*+<<([-+0-9.eE,\s]++)"
+)
 # A list that a Python program assigns to a name, over several lines.
 _ASSIGNED = re.compile(r"^\w+ *= *(?:\w+\.)?(?:as)?(?:array\()?\[ *(?:#.*)?$", re.MULTILINE)
 
@@ -625,6 +642,22 @@ def _scripted(text: str, path: Path) -> dict[str, object]:
                 # A list of four may be a matrix.
                 if isinstance(listed, list) and len(listed) > 4:
                     found[node.targets[0].id] = listed
+    check_values(found, str(path))
+    return found
+
+
+def _initialised(text: str, path: Path) -> dict[str, object]:
+    """Rows with which a C++ program initialises arrays, or fills matrices of OpenCV."""
+    found, lists = dict[str, object](), str.maketrans("{}", "[]")
+    plain = re.sub("//.*", "", text) if path.suffix.lower() in SOURCES[1:] else ""
+    for name, cells in _INITIALISED.findall(plain):
+        with suppress(ValueError, SyntaxError, MemoryError, RecursionError):
+            listed = ast.literal_eval(cells.translate(lists))
+            # Four rows may be a matrix.
+            found |= {name: listed} if len(listed) > 4 else {}
+    for name, count, cells in _FILLED.findall(plain):
+        with suppress(ValueError):
+            found[name] = np.reshape([*separate(cells)], (int(count), -1)).tolist()
     check_values(found, str(path))
     return found
 

@@ -58,6 +58,10 @@ from visioncal.robot.files import read_robot_document
 _OF_BOARDS, _MOST_OF_BOARD = (".toml", ".yaml", ".yml"), 10_000
 # Files without poses that are listed one by one.
 _LISTED = 6
+# Files of numbers that are not read, and how to write them.
+_PICKLE = "a pickle, which runs code when it is opened: write its arrays as .npz or .json"
+_WORKBOOK = "a workbook: save its sheet with the poses as .csv"
+_SHUT = dict.fromkeys((".pkl", ".pickle"), _PICKLE) | dict.fromkeys((".xlsx", ".xls"), _WORKBOOK)
 # Readings of one source that are tested, and names of rows that are a robot's.
 _MOST_READINGS, _NAMED = 16, re.compile("pose|robot|arm", re.IGNORECASE)
 _OF_ROBOT = re.compile("robot|arm|gripper|flange|tcp|hand", re.IGNORECASE)
@@ -213,8 +217,7 @@ def _array(fields: Fields) -> FloatArray | None:
 
 
 def _part(group: FileGroup, form: str | None) -> Part:
-    if group.label.lower().endswith((".pkl", ".pickle")):
-        fault = "a pickle, which runs code when it is opened: write its arrays as .npz or .json"
+    if fault := next((_SHUT[end] for end in _SHUT if group.label.lower().endswith(end)), ""):
         return Part(group, fault=DataError(f"{fault}.", culprits=[group.label]))
     if not group.is_data:
         return Part(group)
@@ -364,7 +367,8 @@ def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = (
         culprits=[str(source.path)],
         next_step=step
         or next((part.fault.next_step for part in source.parts if part.fault), "")
-        or "Write the poses into a CSV with a header, a row a view.",
+        or "Write the poses into a CSV with a header, a row a view. Lists in a .py or .cpp program "
+        "are read where it is named as the source.",
     )
 
 
