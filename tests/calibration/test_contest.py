@@ -14,6 +14,7 @@ from support.sound_findings import SOUND, changed, directions
 
 import visioncal
 from visioncal.calibration.pipeline.judging import findings_of
+from visioncal.calibration.suspects.contest import contested
 from visioncal.calibration.suspects.judge import judge
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert
@@ -108,6 +109,10 @@ def test_a_cause_is_sure_where_its_cure_leaves_noise():
     (step,) = known.assessment.steps
     both = replace(known.assessment, steps=(step, step))
     assert judge(findings_of(replace(known, assessment_or_none=both))).causes[0].by_limit
+    # Nor beside corners that show another lens from there on.
+    lens = Finding("focus", "The lens changed at once.", mahalanobis_sq=2.0 * cause.mahalanobis_sq)
+    (moved, _) = contested(known, [cause, lens])
+    assert not moved.is_proven
 
 
 def test_a_small_step_of_an_arm_without_joints_may_be_its_other_posture():

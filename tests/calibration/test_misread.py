@@ -658,6 +658,12 @@ def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
     assert "left-handed frame" in fixed.declaration.corrected[0]
     # Of mirrored corners the board is still seen from behind.
     assert visioncal.calibrate(fixed).verdict.status == "check"
+    mend = next(command for command in printed_commands(done.said) if "--mend-images" in command)
+    assert mend.count("cell-fixed") == 2
+    typed("convert", tmp_path / "cell", tmp_path / "mended", "--mend-images").good()
+    mended = Session.load(tmp_path / "mended")
+    assert [*mended.declaration.corrected] == ["the corners of all views were mirrored back"]
+    assert visioncal.calibrate(mended).verdict.status == "good"
 
 
 def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):

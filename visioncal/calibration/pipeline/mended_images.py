@@ -3,11 +3,13 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import PurePath
 
 import cv2
 import numpy as np
 
+from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.detect import is_scaled
@@ -30,7 +32,8 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
     Changed images are stored as PNG, without loss; all others stay as they are.
 
     Args:
-        session: The session; images of views with rows in corners.csv are left alone.
+        session: The session; images of views with rows in corners.csv are left alone, unless the
+            robot's motion shows that all are mirrored, and the corners with them.
         progress: Called with the progress of long work.
 
     Raises:
@@ -63,6 +66,8 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
     for name, quarters in _turned(mended, present, progress).items():
         images[name] = np.ascontiguousarray(np.rot90(images[name], quarters))
         done[name].append(_TURNED[quarters])
+    if not any(done.values()) and _is_mirrored(session, progress):
+        return _mirrored_back(session)
     if not any(done.values()):
         raise DataError(
             f"session {session.name!r}: nothing was written, as no image is mirrored, turned, a "
@@ -91,14 +96,61 @@ def with_turned_images(session: Session, views: Sequence[View], quarters: int) -
 
 def _turned(session: Session, views: Sequence[View], progress: Progress | None) -> dict[str, int]:
     """Images that the robot's motion shows turned beside others, and by how many quarters."""
-    found, names = dict[int, int](), {"robot", "detect", "intrinsics", "pnp"}
+    found = dict[int, int]()
     with suppress(VisioncalError):
-        state = RunState(session, progress)
-        state = run_stages(state, [stage for stage in STAGES if stage.name in names])
+        state = _located(session, progress)
         while (mistake := likeliest(state)) is not None and not state.misread:
             found |= dict.fromkeys(mistake.found.views, mistake.quarters)
             state = undone(state, mistake)
     return {view.image: found[view.number] for view in views if found.get(view.number)}
+
+
+def _located(session: Session, progress: Progress | None) -> RunState:
+    """The run with the target's pose in each image."""
+    names = {"robot", "detect", "intrinsics", "pnp"}
+    stages = [stage for stage in STAGES if stage.name in names]
+    return run_stages(RunState(session, progress), stages)
+
+
+def _is_mirrored(session: Session, progress: Progress | None) -> bool:
+    """Whether robot and camera agree only with one of them mirrored."""
+    with suppress(VisioncalError):
+        state = _located(session, progress)
+        guess = None if state.mount is None else guess_from_camera_poses(state)
+        return guess is not None and guess.stands_out and guess.best.hypothesis.robot.mirrored
+    return False
+
+
+def _mirrored_back(session: Session) -> Session:
+    """The session of one camera with all images and corners mirrored left to right.
+
+    Raises:
+        DataError: It has corners of pictures of unknown width.
+    """
+    corners = session.corner_table
+    if corners is not None:
+        (size,) = (camera.size for camera in session.cameras.values())
+        if size is None:
+            raise DataError(
+                f"session {session.name!r} states no resolution, within which corners mirror.",
+                culprits=["resolution"],
+                next_step="Write resolution = [width, height] in [camera].",
+            )
+        corners = replace(corners, px=corners.px * [-1.0, 1.0] + [size[0] - 1.0, 0.0])
+        note = "the corners of all views were mirrored back"
+        corrected = [*session.declaration.corrected, note]
+        cells = [[view.cell(key) for key in session.columns] for view in session.views]
+        document = {**session.document, "corrected": corrected}
+        session = session.with_content(document=document, cells=cells, corners=corners)
+    names = {view.image for view in session.views if view.image}
+    files = {name: session.images.read(name) for name in names if session.images.exists(name)}
+    read = {name: decode_image(data, colour=True) for name, data in files.items()}
+    images = {
+        name: np.ascontiguousarray(image[:, ::-1])
+        for name, image in read.items()
+        if not isinstance(image, str)
+    }
+    return _with(session, images, {name: ["mirrored back"] for name in images})
 
 
 def _usual_size(session: Session, images: Mapping[str, Image]) -> tuple[int, int]:
@@ -135,7 +187,7 @@ def _with(session: Session, images: Mapping[str, Image], done: Mapping[str, list
             next_step="Record it again, with color and depth of one orientation and size.",
         )
     names = {name: str(PurePath(name).with_suffix(".png")) for name in done if done[name]}
-    kept = {view.image for view in session.views} - names.keys()
+    kept = {view.image for view in session.views if view.image} - names.keys()
     if kept & {*names.values()} or len({*names.values()}) < len(names):
         names = {name: f"{PurePath(name).with_suffix('')}-mended.png" for name in names}
     files = {name: session.images.read(name) for name in kept if session.images.exists(name)}

@@ -34,6 +34,7 @@ from visioncal.robot.model import REPEATABILITY
 from visioncal.vision.camera import intrinsics
 
 _LIMITS = CalibrationLimits()
+_OF_LENSES = ("focus", "image_shifted")
 _CREEPS = [name for name, kind in KINDS.items() if issubclass(kind, Creeps)]
 
 
@@ -59,7 +60,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
     Errors of arms follow the posture beside all that the fit has: of a misfit that a cure there
     clearly removes, they explain what it leaves.
     """
-    by_arms, rest = list[Finding](), 1.0
+    by_arms, rest, found = list[Finding](), 1.0, [*found]
+    by_lens = max((at.mahalanobis_sq for at in found if at.kind in _OF_LENSES), default=0.0)
     is_stepped = False
     for finding in found:
         if finding.kind == ARM_ERRORS:
@@ -90,6 +92,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
             is_stepped |= is_proven
             # Others about as likely are named with it.
             is_proven &= not _may_be_of_arm(run) and len(run.assessment.steps) == 1
+            # Images that moved look as if the camera had, and corners show more than the robot.
+            is_proven &= by_lens < finding.mahalanobis_sq
         yield replace(
             finding,
             words=finding.words + instead,

@@ -15,6 +15,7 @@ from visioncal.calibration.guess.search import FEWEST_ROWS, PAIRS_SHARE, relativ
 from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.corner_numbers import are_from_behind
+from visioncal.calibration.stages.other_board import MEND_IMAGES
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.calibration.suspects.late_poses import by_joints
@@ -43,9 +44,10 @@ _ALIKE_RAD, _PAIRS_IN_PLACE = 0.01, 1.0 / 9.0
 # Poses are mirrored only on request: another sign of y would fit as well.
 _MIRRORED = Remedy(
     "Look at an image first: where it is mirrored (a flip in the camera's driver, a mirror before "
-    "the lens), turn the images back, and find the corners anew (in a corners.csv, u_px counts to "
-    "the right and v_px down), and calibrate anew. Only where the robot's frame is left-handed, "
-    "convert with --guess --yes --mirror-poses."
+    "the lens; in a corners.csv, u_px counts to the right and v_px down), write a copy in which "
+    "images and corners are mirrored back, and calibrate it. Only where the robot's frame is "
+    "left-handed, convert with --guess --yes --mirror-poses.",
+    MEND_IMAGES,
 )
 _LOST_TURNS = Remedy(
     "Where the poses were made of the robot's angles, convert these to radians first (np.deg2rad, "
