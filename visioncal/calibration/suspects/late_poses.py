@@ -4,10 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import robust_fits
+from visioncal.calibration.guess.fit import distances, robust_fits
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
+from visioncal.core.number_format import view_words
 from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Finding, mending
 from visioncal.estimation.chain import robot_part
@@ -15,10 +16,18 @@ from visioncal.estimation.chain import robot_part
 _KIND = "late_poses"
 # Poses are those of the joint angles [m, rad].
 _SAME = 1e-6
+_BY_JOINTS = mending(
+    "the poses are those of the joint angles (next time, log both at one instant, while the arm "
+    "stands)",
+    "--by-joints",
+)
 
 
 def by_joints(run: RunState) -> Iterator[Finding]:
-    """The finding that the images agree with the joint angles alone; none of misread poses."""
+    """The finding that the images agree with the joint angles alone; none of misread poses.
+
+    In all views, or in those where angles and poses contradict each other.
+    """
     matched = run.reported.matched
     if run.mount not in MOUNTS or matched is None or matched.misread:
         return
@@ -31,24 +40,43 @@ def by_joints(run: RunState) -> Iterator[Finding]:
     if len(views) <= FEWEST_COMPARED:
         return
     camera = np.array([seen[view].cam_from_target[0] for view in views])
-    of_joints = [matched.pose(joints_rad[view]) for view in views]
-    poses = robot_part(np.array([[reported[view] for view in views], of_joints]), run.mount)
-    # Of an arm that cannot tilt, the same poses close by chance to any length along its axes.
-    if np.abs(poses[1] - poses[0]).max() < _SAME:
-        return
+    by_model = {view: matched.pose(joints) for view, joints in joints_rad.items()}
+    poses = np.array([[of[view] for view in views] for of in (reported, by_model)])
+    poses = robot_part(poses, run.mount)
     by_report, by_angles = robust_fits(poses, np.broadcast_to(camera, poses.shape))
-    if CLEAR_RATIO * by_angles.score < by_report.score:
+    # Of an arm that cannot tilt, the same poses close by chance to any length along its axes.
+    are_same = np.abs(poses[1] - poses[0]).max() < _SAME
+    if not are_same and CLEAR_RATIO * by_angles.score < by_report.score:
         yield Finding(
             _KIND,
             f"The images agree with the joint angles to {by_angles.figures}, and with the "
             f"reported poses to {by_report.figures}: these were read at another instant, or are "
             "commanded ones.",
-            mending(
-                "the poses are those of the joint angles (next time, log both at one instant, "
-                "while the arm stands)",
-                "--by-joints",
-            ),
+            _BY_JOINTS,
             until_mm=0.0,
+        )
+        return
+    late = [view for view in matched.contradicting if view in seen and view in joints_rad]
+    if not late:
+        return
+    camera = np.array([seen[view].cam_from_target[0] for view in late])
+    poses = np.array([[of[view] for view in late] for of in (reported, by_model)])
+    sides, edges = robot_part(poses, run.mount), (by_angles.x, by_angles.z)
+    own, right = (distances(side, camera, by_angles.lever, edges) for side in sides)
+    is_right = right.residuals < CLEAR_RATIO * by_angles.score
+    some = np.flatnonzero(is_right & (CLEAR_RATIO * right.residuals < own.residuals))
+    if len(some):
+        named = tuple(late[at] for at in some.tolist())
+        report, angles = (
+            distances(side[some], camera[some], by_angles.lever, edges).figures for side in sides
+        )
+        yield Finding(
+            _KIND,
+            f"In {view_words(named)} the image{'s agree' * (len(named) > 1) or ' agrees'} with the "
+            f"joint angles to {angles}, and with the reported pose{'s' * (len(named) > 1)} to "
+            f"{report}: read at another instant, with another tool, or commanded.",
+            _BY_JOINTS,
+            named,
         )
 
 
@@ -57,6 +85,9 @@ LATE_POSES = Suspect(
     by_joints,
     1e-6,
     of_chain=True,
-    hides=(UNEXPLAINED, ARM_ERRORS, "stops_short", "other_arm", "wrong_views", "something_moved"),
+    hides=(
+        *(UNEXPLAINED, ARM_ERRORS, "stops_short", "other_arm", "wrong_views", "something_moved"),
+        "contradicting_joints",
+    ),
     inflates=("robot_noise", "robot_noise_of_pick", "calibration", ARM_ERRORS),
 )
