@@ -76,6 +76,18 @@ def exchanged(*views: int) -> Callable[[Path], None]:
     return poses_from(lambda count: [after.get(row, row) for row in range(count)])
 
 
+def with_tool(folder: Path) -> None:
+    """A tool is active in six rows, and another one is elsewhere."""
+    each(
+        lambda place, turn: (
+            place + turn.apply([0.0, 0.01, 0.12]),
+            (turn * Rotation.from_rotvec([0.0, 0.0, 0.3])).as_quat(),
+        ),
+        (2, 5, 6, 11, 14, 17),
+    )(folder)
+    each(lambda place, turn: (np.add(place, [0.02, 0.0, -0.03]), turn.as_quat()), (9,))(folder)
+
+
 def moved_lens(document: dict) -> None:
     camera = document["camera"]
     camera["matrix"] = np.add(camera["matrix"], [6.0, 6.0, -5.0, 4.0]).tolist()
@@ -156,6 +168,9 @@ FAULTS = {
     ),
     "a camera that was pushed for the last views": Fault(
         "something_moved", seen=pushed, options=replace(SOUND, views=32), command="--views 20-31"
+    ),
+    "a tool that is active here and there": Fault(
+        "something_moved", with_tool, command="--without-tool 2,5-6,11,14,17:"
     ),
     "poses of another instant than the joints": Fault(
         "late_poses", read_late(1e-3, 6e-4), command="--by-joints", has_joints=True

@@ -50,6 +50,7 @@ def convert_command(options: ConvertOptions) -> None:
             shift=options.shift,
             turned=options.turned,
             positions=options.positions,
+            without_tool=options.without_tool,
             board_scale=options.board_scale,
             mends_images=options.mend_images,
             by_joints=options.by_joints,

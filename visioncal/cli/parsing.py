@@ -72,6 +72,12 @@ def turn_in(words: str, option: str) -> tuple[tuple[int, ...], tuple[float, ...]
     return views_in(views, option), numbers_in(turn, option, parts)
 
 
+def tool_in(words: str, option: str) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Parses views, and a tool's place [mm] and rotation vector [deg]: 3,7:0,0,140,0,0,30."""
+    views, _, tool = words.partition(":")
+    return views_in(views, option), numbers_in(tool, option, "x,y,z,rx,ry,rz")
+
+
 def scale_in(words: str, option: str) -> tuple[str, float]:
     """Parses a board's true over its stated size, written as 1.01, or left:1.01 of several."""
     name, _, factor = words.rpartition(":")

@@ -21,7 +21,15 @@ from visioncal.cli.options import (
     session_argument,
     yes_flag,
 )
-from visioncal.cli.parsing import names_in, pairs_in, places_in, scale_in, shift_in, turn_in
+from visioncal.cli.parsing import (
+    names_in,
+    pairs_in,
+    places_in,
+    scale_in,
+    shift_in,
+    tool_in,
+    turn_in,
+)
 from visioncal.core.choices import (
     PLAN_SPEED,
     POSE_FORMS,
@@ -410,6 +418,11 @@ class ConvertOptions(RobotPoseOptions):
     positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = _doubt(
         "Views whose positions are made of other columns: 0,4-6:x,-y,z+rail_m.",
         parse=places_in,
+    )
+    without_tool: tuple[tuple[int, ...], tuple[float, ...]] | None = _doubt(
+        "Views whose poses are of a tool's tip, and the tool, in mm and by a rotation vector in "
+        "degrees: 3,7:0,0,140,0,0,30. It is taken off them.",
+        parse=tool_in,
     )
     board_scale: tuple[str, float] | None = _doubt(
         "True over stated size of the board: 1.01, or, of several, left:1.01. Poses that were "

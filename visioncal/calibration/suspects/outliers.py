@@ -3,7 +3,7 @@
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 
 import numpy as np
@@ -12,7 +12,7 @@ from visioncal.calibration.stages.cell_fit import OTHER_POSTURE, CellFit
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
-from visioncal.core.number_format import figure, listed, mm_and_deg, some_of, view_words
+from visioncal.core.number_format import figure, listed, mm_and_deg, ranges, some_of, view_words
 from visioncal.core.transforms import (
     apply,
     compose,
@@ -201,9 +201,10 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         most = 1.0 / CLEAR_RATIO
         if len(run) < FEWEST_VIEWS or (change := _common_change(inliers, run, most)) is None:
             return
-        some = [rows[row].view for row in np.sort(run).tolist()]
+        run, change = _alike(inliers, np.sort(run), *change)
+        some = [rows[row].view for row in run.tolist()]
         words += ". The result is that of the other views; calibrate these alone, too."
-        do = or_alone(words, some)
+        do = _tool_taken_off(cell_fit, change, some) or or_alone(words, some)
     what, how = _changed_words(cell_fit, *change)
     outliers = np.sort(run).tolist()
     if cell_fit.may_be_of_arms(change[1]):
@@ -212,6 +213,23 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         how += ", or another load bends the arm"
     words = f"{{views}} were left out: {when}, {what} was another one{how}."
     yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
+
+
+def _tool_taken_off(
+    cell_fit: CellFit, change: tuple[str, FloatArray], views: Sequence[int]
+) -> Remedy | None:
+    """Advice to take the tool off some views' poses; None where another frame was another one."""
+    frame, step = change
+    on_camera = "cam" if cell_fit.cell.mount == "eye-in-hand" else "target"
+    if not frame.startswith(on_camera) or cell_fit.cell.mount == "instrument":
+        return None
+    edge = cell_fit.fit.frames[frame]
+    tool = edge @ invert(edge @ step)
+    twist = *(1e3 * tool[:3, 3]), *np.rad2deg(log(tool)[:3])
+    numbers = ",".join(f"{value:.4f}" for value in twist)
+    done = mending("it is taken off their poses", f"--without-tool {ranges(views)}:{numbers}")
+    first = f"Look whether a tool was active there. If so, {done.words[0].lower()}{done.words[1:]}"
+    return replace(done, words=f"{first} Else the result is that of the other views.")
 
 
 def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str, str]:
@@ -279,6 +297,20 @@ def _common_change(
         return None
     is_alone = all(CLEAR_RATIO * ratio < rival for rival, other, _ in found if other != frame)
     return (frame if is_alone else ""), step
+
+
+def _alike(
+    inliers: InlierFit, rows: IntArray, frame: str, step: FloatArray
+) -> tuple[IntArray, tuple[str, FloatArray]]:
+    """Those of some outliers (n,) that a step of a frame explains, and this step by them alone."""
+    if not frame:
+        return rows, (frame, step)
+    every, state = np.arange(len(inliers.problem)), inliers.fit.state
+    part = inliers.problem.subset(np.isin(every, rows))
+    away = _step_of(part, frame, state, step)[1]
+    rows = rows[CLEAR_RATIO * away < np.linalg.norm(log(step) / TWIST_UNITS)]
+    part = inliers.problem.subset(np.isin(every, rows))
+    return rows, (frame, _step_of(part, frame, state)[0])
 
 
 def _step_of(

@@ -260,6 +260,30 @@ def write_positions(
     return _with_cells(session, cells, note)
 
 
+def remove_tool(session: Session, views: Sequence[int], tool: Sequence[float]) -> Session:
+    """Takes a tool off the robot's poses in some views, in which it was active.
+
+    Args:
+        session: A session.
+        views: Their numbers.
+        tool: The tool's x, y, z [mm] and rotation vector [deg] in the flange of the other views.
+
+    Raises:
+        DataError: There are no such views, or one has no pose of the robot.
+    """
+    chosen = _chosen_views(session, views, "--without-tool")
+    turn = Rotation.from_rotvec(tool[3:], degrees=True).as_matrix()
+    flange_from_tool = compose(turn, 1e-3 * np.array(tool[:3]))
+    poses = numbers_in(session, POSE).poses() @ invert(flange_from_tool)
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    for view, row, pose in zip(session.views, cells, poses, strict=True):
+        if view.number in chosen and np.isfinite(pose).all():
+            row.update({name: repr(value) for name, value in pose_row(pose).items()})
+    at = "({:g}, {:g}, {:g}) mm, turned by ({:g}, {:g}, {:g}) deg".format(*tool)
+    note = f"a tool at {at} was taken off the poses of views {ranges(chosen)}"
+    return _with_cells(session, cells, note)
+
+
 def scaled_board(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
     """The content of a target's `.toml`, and of its table, with all lengths times a factor."""
     found = dict(document)

@@ -22,6 +22,7 @@ from visioncal.interchange.formats.industrial import EASY_HANDEYE, HAND_EYE, KIN
 from visioncal.interchange.formats.lerobot import LEROBOT
 from visioncal.interchange.formats.mending import (
     exchange_views,
+    remove_tool,
     scale_board,
     shift_views,
     turn_boards,
@@ -79,6 +80,7 @@ def convert(
     shift: tuple[tuple[int, ...], int] | None = None,
     turned: tuple[tuple[int, ...], tuple[float, ...]] | None = None,
     positions: tuple[tuple[int, ...], tuple[tuple[tuple[float, str], ...], ...]] | None = None,
+    without_tool: tuple[tuple[int, ...], tuple[float, ...]] | None = None,
     board_scale: tuple[str, float] | None = None,
     mends_images: bool = False,
     by_joints: bool = False,
@@ -102,6 +104,8 @@ def convert(
             about which point of the board [mm] (x, y). With an angle alone, pictures are turned.
         positions: Views whose positions are sums of columns, and these sums by axis: pairs of a
             factor and a column's name.
+        without_tool: Views whose poses are of a tool's tip, and the tool in the flange: place [mm]
+            and rotation vector [deg].
         board_scale: A board's name, empty for the only one, and its true over its stated size.
         mends_images: Whether images are mirrored, turned and scaled back: see `mend_images`.
         by_joints: Whether the robot's poses are those of its joint angles, not the reported ones.
@@ -154,6 +158,7 @@ def convert(
         (shift_views, shift),
         (turn_boards, turned),
         (write_positions, positions),
+        (remove_tool, without_tool),
         (scale_board, board_scale),
     )
     for mend, asked in mends:
