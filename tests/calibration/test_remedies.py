@@ -221,3 +221,14 @@ def test_what_is_named_is_mended_by_what_is_printed(tmp_path, monkeypatch, name)
     away = edge.matrix[:3, :3].T @ (edge.matrix[:3, 3] - true[:3, 3])
     # Exceeded in one case of a thousand.
     assert away @ np.linalg.solve(edge.covariance[3:, 3:], away) < chi2.isf(1e-3, 3)
+
+
+def test_another_distortion_is_no_picture_of_another_size(tmp_path):
+    cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
+    k1, k2, *_ = SOUND.camera.distortion
+    other = {"distortion": [k1, k2, -0.05, 0.08, 0.06]}
+    document_of(lambda it: it["camera"].update(other))(tmp_path / "cell")
+    cause = visioncal.calibrate(tmp_path / "cell").verdict.causes[0]
+    assert cause.kind == "other_lens"
+    assert "The matrix is about as stated: the distortion is another one" in cause.words
+    assert "times as large" not in cause.words

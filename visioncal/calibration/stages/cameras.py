@@ -292,7 +292,10 @@ def _other_lens(
         f"fx, fy, cx, cy = {', '.join(f'{value:.1f}' for value in lens.camera.matrix)} px."
     )
     ratios = stated.matrix / lens.camera.matrix
-    if np.ptp(ratios) < _SAME_RATIO * ratios.mean():
+    if np.abs(ratios - 1.0).max() < _SAME_RATIO:
+        words += " The matrix is about as stated: the distortion is another one, or another "
+        words += "program's order of it (OpenCV's is k1, k2, p1, p2, k3)."
+    elif np.ptp(ratios) < _SAME_RATIO * ratios.mean():
         width, height = (round(ratios.mean() * side, -1) for side in look.resolution)
         words += f" Those stated are all {figure(ratios.mean())} times as large, as of images of "
         words += f"about {width:.0f} x {height:.0f} px."
