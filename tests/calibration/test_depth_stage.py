@@ -19,9 +19,10 @@ from visioncal.calibration.stages.depth import with_depth
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.frames.locate import cloud_in_base
+from visioncal.present.recording import write_recording
 from visioncal.results import Calibration
 from visioncal.results.depth import bending
-from visioncal.session import MemoryImages
+from visioncal.session import MemoryImages, Session
 from visioncal.session.depth import npy_of, read_cloud
 from visioncal.simulation import DepthOptions
 from visioncal.verification import verdict_of, verify
@@ -99,6 +100,19 @@ def test_the_noise_of_the_robot_is_in_no_depth():
     found, _ = with_depth(without(result.calibration), evidence, session)
     depth = result.calibration.camera.depth
     assert found.camera.depth.values == pytest.approx(depth.values, abs=1e-12)
+
+
+@pytest.mark.parametrize("images", ["thumbnail", "none"])
+def test_a_recording_keeps_what_depth_is_compared_with(tmp_path, images):
+    session, run = made()
+    write_recording(tmp_path / "a.rrd", session, None, (), None, images, run.searches)
+    stored = Session.load(tmp_path / "a.rrd")
+    assert stored.images.kept == images
+    assert stored.digest() == session.digest()
+    found, _ = with_depth(without(run.calibration), run.evidence, stored)
+    depth = run.calibration.camera.depth
+    assert found.camera.depth.ink_m == depth.ink_m
+    assert np.array_equal(found.camera.depth.values, depth.values)
 
 
 @pytest.mark.slow

@@ -256,6 +256,7 @@ def test_toml_errors_give_the_line():
         ("mount = \N{LEFT DOUBLE QUOTATION MARK}eye-in-hand\N{RIGHT DOUBLE QUOTATION MARK}", MOUNT),
         ("mount = eye-in-hand", MOUNT),
         ("asymmetric = True", {"asymmetric": True}),
+        ("z_m = np.float64(0.0814)", {"z_m": 0.0814}),
         ("b = [1,, 2]", None),
         ('b = "it', None),
     ],

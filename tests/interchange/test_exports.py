@@ -230,7 +230,10 @@ def test_the_optical_pose_is_not_written_under_the_name_of_a_body(name):
 @pytest.mark.parametrize(
     ("chosen", "words"),
     [
-        (Selection(child_from_cam=stated(BODY)), "under the name None.*--child camera_link"),
+        (
+            Selection(child_from_cam=stated(BODY)),
+            "without a name.*--child camera_link.*--inverse.*--parent",
+        ),
         (Selection("base_from_target", child="a", child_from_cam=stated(BODY)), "for target under"),
         (Selection(child="a", child_from_cam=(0, 15, 0, 0, 0, 0, 1)), "0, 15, 0.*at most 3 m"),
         (Selection(child="a", child_from_cam=(0, 0, np.nan, 0, 0, 0, 1)), "missing"),

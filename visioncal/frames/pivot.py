@@ -237,7 +237,7 @@ def _check_counts(touches: Touches) -> None:
         raise DataError(
             f"tcp: {len(tips)} touches of kind point ({counted}), but it takes at least "
             f"{FEWEST_POINTS} of one point, or 2 each of two points.",
-            culprits=touches.names,
+            culprits=[name for name in touches.names if name] or touches.labels,
             next_step=_ADVICE,
         )
     axes = [row for row, kind in enumerate(touches.kinds) if kind != "point"]

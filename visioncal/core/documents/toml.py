@@ -22,6 +22,8 @@ _TOML_MISTAKES = (
     (r"\\", "/"),
     (r"(?<=\d),(?=\d)", "."),
     ("[\u201c-\u201f]", '"'),
+    # Numbers as NumPy prints them.
+    (r"\bnp\.\w+\(([^()]*)\)", r"\1"),
     (r"\bTrue\b", "true"),
     (r"\bFalse\b", "false"),
     (r"=\s*([^\W\d][^\"'#=]*?)\s*$", r'= "\1"'),

@@ -269,13 +269,15 @@ def _carried(edge: Edge, matrix: FloatArray, jacobian: FloatArray) -> Edge:
 def _child_from_cam(numbers: Sequence[float], child: str | None, frame: str) -> FloatArray:
     """(4, 4) pose of a camera's optical frame in the frame that is exported; raises DataError."""
     # No part of a camera is farther away [m].
+    named = f"under the name {child!r}" if child else "without a name"
     if child is None or not is_camera(frame) or max(map(abs, numbers[:3])) > 3.0:
         raise DataError(
             f"--child-from-cam is ({', '.join(f'{value:g}' for value in numbers)}), for {frame} "
-            f"under the name {child!r}, but must be the pose of a camera's optical frame in a "
-            "named frame, in metres, at most 3 m away.",
+            f"{named}, but must be the pose of a camera's optical frame in a named frame, in "
+            "metres, at most 3 m away.",
             culprits=["--child-from-cam"],
-            next_step="Give x,y,z,qx,qy,qz,qw and a name, as --child camera_link, of a camera.",
+            next_step="Give x,y,z,qx,qy,qz,qw and a name, as --child camera_link, of a camera "
+            "(with --inverse it is the parent: --parent camera_link).",
         )
     return stated_pose(numbers, "--child-from-cam")
 

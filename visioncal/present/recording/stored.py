@@ -120,7 +120,8 @@ class RecordedImages(ImageStore):
     places: Mapping[str, _Place]  # Places of the stored images or faint copies, by name.
     # Corners found in each image, by its name and that of the board in the session's `boards`.
     searches: Mapping[tuple[str, str], Searched]
-    depths: Mapping[str, bytes] = field(default_factory=dict)  # Depth files, by name.
+    # Depth files, and the images beside them, by name.
+    depths: Mapping[str, bytes] = field(default_factory=dict)
 
     def read(self, path: str) -> bytes:
         """Reads the bytes of one image or depth file; raises DataError."""

@@ -53,7 +53,7 @@ def write_recording(
         blueprint: Viewer layout, as by `viewer.blueprint`; None for the viewer's own.
         images: What is stored of the images beside their digests. They are stored whole where the
             session could not be calibrated again without them: unless all searched ones are in
-            `searches`.
+            `searches`. Images beside depth are always.
         searches: What was found in each image, by view.
 
     Raises:
@@ -182,6 +182,13 @@ def session_record(
     # Of some views alone, a table may have no rows.
     if table is not None:
         corners = table.views, table.points, table.px, table.targets, table.sigmas_px
+    # Depth is compared where the image beside it is white, or black.
+    with_depth = [view for view in session.views if view.depth]
+    kept_whole = {
+        path: None
+        for view in with_depth
+        for path in ((view.depth,) if kept == "full" else view.files)
+    }
     return {
         "session_toml": tomli_w.dumps(session.document),
         "target": session.target_document,
@@ -192,7 +199,7 @@ def session_record(
         "digests": digests,
         "depths": {
             path: np.frombuffer(session.images.read(path), np.uint8)
-            for path in {view.depth: None for view in session.views if view.depth}
+            for path in kept_whole
             if session.images.exists(path)
         },
         "streams": {
