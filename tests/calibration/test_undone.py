@@ -20,6 +20,7 @@ from support.refusals import raised
 from support.whole_cells import OPTIONS, recorded
 
 import visioncal
+from visioncal.calibration.pipeline.explaining import explained
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.suspects.suspect import UNDONE
@@ -790,6 +791,20 @@ def test_beside_a_mistake_of_one_robot_another_one_that_is_misread_is_named():
     session = session.with_content(document=session.document, cells=rows)
     with pytest.raises(DegenerateError, match="Robot a: With the robot's rotations as a quat"):
         visioncal.calibrate(session)
+
+
+def test_a_motion_that_is_ample_is_not_refused_where_no_reading_closes_the_chain():
+    robot, boards = poses_of(MOUNTS[0])
+    w_first = np.roll(Rotation.from_matrix(robot[:, :3, :3]).as_quat(), 1, axis=1)
+    mixed = compose(Rotation.from_quat(w_first).as_matrix(), robot[:, :3, 3])
+    mixed[8:] = np.roll(mixed, 3, axis=0)[8:][::-1]
+    state = RunState(pairs_session(MOUNTS[0], mixed, boards))
+    names = {"robot", "detect", "intrinsics", "pnp"}
+    state = run_stages(state, [stage for stage in STAGES if stage.name in names])
+    refusal = DegenerateError("a predicted sigma of 108 mm: add views in which it is tilted")
+    error = explained(refusal, state, "answer", are_located=True)
+    assert error.message.startswith("No reading that was tried stands out: as first read")
+    assert "tilted" not in str(error)
 
 
 @pytest.mark.parametrize("words", ["3", "3-5:0", "3-5:x", "90:2"])

@@ -1,12 +1,16 @@
 """Why a calibration failed: the misreadings, boards and motions that explain it."""
 
+from contextlib import suppress
+
+from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses
 from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.image_checks import unseen_cause
 from visioncal.calibration.stages.other_board import OtherBoardError
-from visioncal.calibration.suspects.misread_poses import with_misreading
+from visioncal.calibration.suspects.misread_poses import UNRECORDED, closes, with_misreading
 from visioncal.calibration.suspects.ranking import add_views_remedy
 from visioncal.core.errors import DegenerateError, VisioncalError
+from visioncal.core.types import MOUNTS
 from visioncal.core.verdict import Remedy, of_cell
 
 
@@ -30,9 +34,27 @@ def explained(
     for misread in read if is_pair else of_cell(read):
         # Directions that are undetermined with misread poses mean nothing.
         return type(error)(misread.words, next_step=str(misread.do))
+    if isinstance(error, DegenerateError) and (words := _open_chain(state)):
+        return DegenerateError(words, next_step=str(UNRECORDED))
     if (plan := more_views(error, state)) is None:
         return error
     return type(error)(error.message, culprits=error.culprits, next_step=str(plan))
+
+
+def _open_chain(state: RunState) -> str:
+    """How robot and camera disagree though the motion is ample; empty where they agree.
+
+    The sigmas of a fit that does not close say nothing of the motion.
+    """
+    if state.mount not in MOUNTS or poor_motion(state) is not None:
+        return ""
+    if closes(state.base_from_flange, state.poses_of_one_board, state.mount):
+        return ""
+    with suppress(VisioncalError):
+        guess = guess_from_camera_poses(state)
+        more = " The poses may be misread in two ways, or not be those of the images."
+        return "" if guess.best.fit.closes else guess.sentence + more
+    return ""
 
 
 def more_views(error: VisioncalError, state: RunState) -> Remedy | None:

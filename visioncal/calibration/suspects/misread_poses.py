@@ -69,7 +69,7 @@ _IN_MOTION = Remedy(
 )
 # Shares of the way to another stop that are tried.
 _SHARES = np.linspace(-0.4, 0.4, 81).round(2)
-_UNRECORDED = Remedy(
+UNRECORDED = Remedy(
     "Convert the recording itself again with --guess, if the session was made of one: angles that "
     "were misread cannot all be read anew from here. Or look how the poses were recorded, and how "
     "they were paired with the images: a logger that repeats one pose, or writes positions of 0, "
@@ -158,7 +158,7 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
         return
     # Units that merely bring both sides nearer do not precede an axis that closes the chain.
     unknown = [] if guess.best.fit.closes else [*_unrecorded(run)]
-    if guess.stands_out and all(hint.do in (_UNRECORDED, _LOG_ANEW) for hint in unknown):
+    if guess.stands_out and all(hint.do in (UNRECORDED, _LOG_ANEW) for hint in unknown):
         robot = guess.best.hypothesis.robot
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
         step = _MIRRORED if robot.mirrored else step
@@ -204,7 +204,7 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
         )
     else:
         return
-    yield Finding("misread_poses", words, _UNRECORDED)
+    yield Finding("misread_poses", words, UNRECORDED)
 
 
 def _still(robot: FloatArray) -> str:
