@@ -478,7 +478,6 @@ def test_an_arm_that_is_right_but_for_its_play(way):
     assert arm_found(calibrated(one_side)).sections.arm.backlash == ()
 
 
-@pytest.mark.slow
 def test_play_follows_from_the_last_motion_where_no_side_is_stated():
     cell = simulate(replace(GOOD, views=40, seed=3))
     worn, play = cell.robot.joints.copy(), 4e-3

@@ -484,13 +484,6 @@ WORLDS: dict[str, World] = {
         words=("Or else the corners of lone tags were found off",),
     ),
     "focus follows the distance": World(FINE, breathing, kinds=("focus",)),
-    "lens zoomed once": World(
-        FINE,
-        zoomed_once(0.03),
-        status="check",
-        causes=("focus",),
-        words=("from view 9 on, its focal length is 3 % longer",),
-    ),
     "lens refocused once": World(
         FINE,
         zoomed_once(-0.005),
@@ -648,7 +641,7 @@ ALIKE = {
     "an arm errs and nothing grows", "another tool midway", "board exchanged for the last views",
     "board exchanged midway", "board within its stated size, 1", "board within its stated size, 5",
     "bump", "coarse noise", "lens crept", "lens refocused once", "lens zoomed midway",
-    "lens zoomed once", "lifted in the last views", "links off by little", "poses read on the way",
+    "lifted in the last views", "links off by little", "poses read on the way",
     "rectified midway", "size within what is stated", "sound to hand", "stops err in groups",
     "views left out after a bump", "wavy lens before lone tags", "weak motion",
     "wrong arm with joints",

@@ -257,24 +257,6 @@ def nothing(_folder: Path) -> None:
     pass
 
 
-@pytest.mark.slow
-def test_the_part_of_a_lens_that_does_not_fit_is_named(place):
-    sound = sound_session(place / "cell")
-    document = tomllib.loads((sound / "session.toml").read_text("utf-8"))
-    fx, fy, cx, cy = document["camera"]["matrix"]
-    k1, k2, p1, p2, k3 = document["camera"]["distortion"]
-    for given, is_distorted in (
-        # As some programs order the coefficients; and of an image that is cut out of another.
-        ({"distortion": [k1, k2, k3, p1, p2]}, True),
-        ({"matrix": [fx, fy, cx + 30.0, cy - 20.0]}, False),
-    ):
-        camera = document["camera"] | given
-        (sound / "session.toml").write_text(tomli_w.dumps(document | {"camera": camera}), "utf-8")
-        said = visioncal(*calibrate("cell")).good().said
-        assert "The given intrinsics do not fit" in said
-        assert ("the distortion, k1, k2, p1, p2, k3, moved corners by" in said) == is_distorted
-
-
 def calibrate(path: str) -> tuple[str, ...]:
     return "calibrate", path, "-o", "out"
 
