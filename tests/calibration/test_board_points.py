@@ -64,7 +64,7 @@ def test_a_print_that_is_off_everywhere_has_its_size():
     assert found.sigma_m == pytest.approx(2e-4, rel=0.25)
 
 
-@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("every", [1, slow(2)])
 def test_corners_under_glare_are_left_out(every):
     cell = simulate(CellOptions(target=BOARD, pixel_sigma_px=0.06, roll_rad=2.0, seed=5))
     wrong = np.flatnonzero(np.arange(len(ROW)) % COLUMNS < 2)
@@ -82,7 +82,7 @@ def test_corners_under_glare_are_left_out(every):
     assert off @ np.linalg.solve(covariance, off) < 22.5
 
 
-@pytest.mark.parametrize("name", ["charuco", "checkerboard", "aprilgrid", "circles"])
+@pytest.mark.parametrize("name", ["charuco", "checkerboard", slow("aprilgrid"), "circles"])
 def test_sound_boards_have_none(name):
     for seed in range(2):
         bow_m = 5e-4 * (seed % 2)

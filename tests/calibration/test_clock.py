@@ -342,6 +342,7 @@ def test_motion_that_repeats_itself_is_refused_unless_the_offset_is_stated():
     assert abs(clock.camera_minus_robot_s - 2.0) < 1e-3
 
 
+@pytest.mark.slow
 def test_motion_that_does_not_tell_the_offset_is_refused_unless_it_is_stated():
     # Its sigma would be longer than the recording.
     words = r"is left open by 420 views, of which 0 .* at rest: the motion says nothing of it"

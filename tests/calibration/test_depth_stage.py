@@ -176,6 +176,7 @@ def test_an_empty_picture_and_one_of_another_size_are_named_and_left_out():
     assert depth is None
 
 
+@pytest.mark.slow
 def test_distances_along_the_ray_and_clouds_give_the_same():
     session, result = made()
     depth = result.calibration.camera.depth

@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from support.cells import calibrated, error_of, known_of, pairs_session, showing
 from support.edges import solved
-from support.marks import seeds, slow
+from support.marks import seeds
 from support.misfits import misfit
 from support.refusals import raised
 
@@ -110,8 +110,9 @@ def test_noise_and_errors_are_as_stated():
     assert np.mean(surprises) == pytest.approx(1.04, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", seeds(1, 2))
-@pytest.mark.parametrize(("of_flange", "name"), [slow(True, "robot"), (False, "combined")])
+@pytest.mark.parametrize(("of_flange", "name"), [(True, "robot"), (False, "combined")])
 def test_the_noise_of_pose_pairs_is_where_it_arises(of_flange, name, runs):
     """Of a servo arm at its flange; of a poor detection at the target, 0.3 m from the camera."""
     rng, squares = np.random.default_rng(4), []

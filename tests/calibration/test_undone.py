@@ -409,7 +409,7 @@ def test_rows_amid_the_table_that_are_apart_are_one_command(tmp_path, monkeypatc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lost", "whose"), [((10, 17), "image"), slow((8, 20), "pose")])
+@pytest.mark.parametrize(("lost", "whose"), [((10, 17), "image"), ((8, 20), "pose")])
 def test_rows_that_two_losses_leave_apart_are_mended_one_after_the_other(
     tmp_path, monkeypatch, lost, whose
 ):

@@ -340,7 +340,7 @@ def test_poses_of_another_instant_than_the_joints_are_told_by_the_images() -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_images_that_are_shifted_from_some_view_on_are_told_from_a_camera_that_moved(mount) -> None:
     cell = simulate(CellOptions(views=24, mount=mount, pixel_sigma_px=0.1, seed=2))
     shifts = np.where(np.arange(24)[:, None] < 10, 0.0, [24.0, -16.0])

@@ -715,8 +715,6 @@ def test_a_name_does_not_steer_the_terminal(pairs, tmp_path):
     assert all("[31mred" in page and not STEERING.search(page) for page in pages)
 
 
-# Of each kind of advice one; the others are slow.
-QUICK = ("two images missing",)
 # Read as they are, as tests of tables show: what is then printed is that of semicolons.
 ALIKE = ("decimal commas", "a byte-order mark", "empty rows")
 
@@ -728,9 +726,9 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK else slow(name) for name in BROKEN if name not in ALIKE]
-)
+# Of each kind of advice, tests/cli/test_following.py has a quick one.
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in BROKEN if name not in ALIKE])
 def test_of_broken_sessions(place, name):
     broken_session(place / "session", BROKEN[name])
     for words in (("doctor", "session"), ("calibrate", "session", "-o", "out")):

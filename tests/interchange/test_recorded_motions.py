@@ -161,7 +161,7 @@ def test_depth_of_another_frame_is_named_and_left_out(with_depth, tmp_path):
     assert "align_depth.enable" in said
 
 
-PACKED = [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "MESSAGE"), ("mcap", "STORAGE")]
+PACKED = [slow("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "MESSAGE"), ("mcap", "STORAGE")]
 
 
 @pytest.mark.parametrize(("form", "compression"), PACKED)

@@ -207,7 +207,7 @@ def detection_errors(options):
     "options",
     [
         CellOptions(),
-        CellOptions(camera=CAMERAS["fisheye"], tilt_rad=(0.1, 0.5)),
+        slow(CellOptions(camera=CAMERAS["fisheye"], tilt_rad=(0.1, 0.5))),
         slow(CellOptions(target=BOARDS["checkerboard"], blur_px=1.0)),
         CellOptions(target=replace(BOARDS["charuco"], legacy=True)),
         slow(CellOptions(board_scale=1.01, board_bow_m=0.003)),

@@ -48,7 +48,8 @@ def white(rows, rng, time_s, factor=1.0):
     return replace(rows, time_s=time_s, residual=factor * noise)
 
 
-@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_the_rows_of_a_look_are_what_changes_of_the_cell_do_to_it(mount):
     place = usual(mount)
     guard, cell, at = Guard(place.calibration), place.cell, FITTED + 3

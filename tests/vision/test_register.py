@@ -68,7 +68,7 @@ def away(found, pose, flat):
 
 @pytest.mark.parametrize(
     ("disc_px", "twist"),
-    [slow(0.0, ()), (6.0, ()), (0.0, (0.004, 0.002, 0.001, 0.002, 0.001, 0.004))],
+    [slow(0.0, ()), slow(6.0, ()), (0.0, (0.004, 0.002, 0.001, 0.002, 0.001, 0.004))],
 )
 def test_derivatives_are_those_of_differences(disc_px, twist):
     flat, image, pose, _ = view(1, Look())

@@ -268,12 +268,13 @@ def test_a_marker_too_small_for_the_template_keeps_the_detectors_corners():
 LARGE_SHOT = Shot(square_px=32, noise=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "shot"),
     [
-        slow(CHECKERBOARD, replace(LARGE_SHOT, motion_px=20)),
+        (CHECKERBOARD, replace(LARGE_SHOT, motion_px=20)),
         (CHECKERBOARD, replace(LARGE_SHOT, disc_px=9, uneven=0.3)),
-        slow(CHARUCO, replace(LARGE_SHOT, disc_px=8)),
+        (CHARUCO, replace(LARGE_SHOT, disc_px=8)),
     ],
 )
 def test_corners_of_smeared_images_are_within_their_sigmas(target, shot):
