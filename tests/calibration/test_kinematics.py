@@ -88,7 +88,7 @@ def identified(data):
     """The arm's section with its parameters, and which stops to add."""
     level = ArmLevel(level="nominal", unknowns=0, rms_mm=0.0, held_out_mm=0.0, likelihood_ratio=0.0)
     result = ArmResult(level="nominal", levels=(level,))
-    return add_parameters(result, data, None)
+    return add_parameters(result, data, None)[:2]
 
 
 # Three axes and a wrist, with rails among them.
