@@ -223,6 +223,22 @@ def test_what_is_named_is_mended_by_what_is_printed(tmp_path, monkeypatch, name)
     assert away @ np.linalg.solve(edge.covariance[3:, 3:], away) < chi2.isf(1e-3, 3)
 
 
+def test_turns_that_are_wrong_each_in_its_way_are_no_other_frame(tmp_path):
+    cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
+    turns = iter(([3.0, 0.1, 0.0], [0.1, 3.0, 0.1], [2.2, 2.1, 0.0]))
+    wrong = each(
+        lambda place, turn: (place, (turn * Rotation.from_rotvec(next(turns))).as_quat()),
+        (3, 9, 14),
+    )
+    wrong(tmp_path / "cell")
+    joints = re.compile(r"q\d_rad").fullmatch
+    rows_of(lambda rows: [{key: row[key] for key in row if not joints(key)} for row in rows])(
+        tmp_path / "cell"
+    )
+    cause = visioncal.calibrate(tmp_path / "cell").verdict.causes[0]
+    assert (cause.kind, cause.views) == ("wrong_views", (3, 9, 14))
+
+
 def test_another_distortion_is_no_picture_of_another_size(tmp_path):
     cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
     k1, k2, *_ = SOUND.camera.distortion

@@ -21,10 +21,11 @@ from visioncal.core.transforms import (
     log,
     mean_transform,
     pose_difference,
+    rotation_angle,
 )
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
-from visioncal.estimation.arm import TWIST_UNITS
+from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.estimation.moves import creep_effects
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
@@ -48,6 +49,10 @@ _WRONG = "its pose or its reading is wrong, or something had moved"
 _MARGIN, _MARGINAL_SHARE = 1.5, 10
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
+# Another size turns nothing, and a small marker's noise less than so [rad].
+_TURNED_RAD = 0.2
+# Errors of an arm as a twist [rad].
+_ARM_LEAVES = float(np.hypot(1e-3 * _ARM_ERRS[0] / LEVER_M, np.deg2rad(_ARM_ERRS[1])))
 
 
 @dataclass(frozen=True)
@@ -199,7 +204,10 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         # Views here and there, as of every second row.
         run, when = order[~is_used], "in all of these"
         most = 1.0 / CLEAR_RATIO
-        if len(run) < FEWEST_VIEWS or (change := _common_change(inliers, run, most)) is None:
+        if len(run) < FEWEST_VIEWS:
+            return
+        # Of views here and there, wrong poses alike by chance are no frame.
+        if (change := _common_change(inliers, run, most, _ARM_LEAVES)) is None:
             return
         run, change = _alike(inliers, np.sort(run), *change)
         some = [rows[row].view for row in run.tolist()]
@@ -258,11 +266,12 @@ def other_frame(before: FloatArray, after: FloatArray) -> str:
 
 
 def _common_change(
-    inliers: InlierFit, rows: IntArray, most: float
+    inliers: InlierFit, rows: IntArray, most: float, leaves: float = np.inf
 ) -> tuple[str, FloatArray] | None:
     """The frame whose step explains most of some outliers, and the step; None where none does.
 
-    It leaves a third of them; up to `most`, as a share, where that is as much as others scatter by.
+    It leaves a third of them; up to `most`, as a share, where that is as much as others scatter by;
+    and no more than `leaves` [rad], or than others scatter by.
 
     Its name is empty where another size of the target does, or steps of several frames alike. Rows
     with other poses, or of other images, have none in common.
@@ -272,9 +281,9 @@ def _common_change(
     are_places = not part.observations.has_rotation.all()
     if are_places and len(part) < FEWEST_STOPS:
         most = 1.0 / CLEAR_RATIO**2
-    measured, predicted = (
-        poses[:, :3, 3] for poses in (part.measured(state), part.predicted(state))
-    )
+    both = part.measured(state), part.predicted(state)
+    turned = float(np.median(rotation_angle(invert(both[0]) @ both[1])))
+    measured, predicted = (poses[:, :3, 3] for poses in both)
     sizes = np.sum(measured * (predicted - measured), axis=1) / np.sum(measured**2, axis=1)
     of_size = float(np.ptp(sizes) / max(abs(np.median(sizes)), np.finfo(float).tiny))
     found = list[tuple[float, str, FloatArray]]()
@@ -288,10 +297,12 @@ def _common_change(
         left, usual = np.median(away), np.median(usually)
         # Poses that are wrong may have much in common, and differ by far more than noise.
         is_noise = CLEAR_RATIO * left < size or left < CLEAR_RATIO * usual
+        is_noise &= bool(left < max(leaves, CLEAR_RATIO * usual))
         found.append((float(left / size) if is_noise else np.inf, frame, step))
     ratio, frame, step = min(found, default=(np.inf, "", np.eye(4)), key=lambda item: item[0])
     # A tool that is longer along the line of sight looks like another size, too.
-    if not are_places and CLEAR_RATIO * of_size < min(1.0, CLEAR_RATIO**2 * ratio):
+    is_size = CLEAR_RATIO * of_size < min(1.0, CLEAR_RATIO**2 * ratio) and turned < _TURNED_RAD
+    if not are_places and is_size:
         return "", np.eye(4)
     if ratio >= most:
         return None
@@ -322,7 +333,11 @@ def _step_of(
     """
     if part.observations.has_rotation.all():
         changes = part.change_of(frame, state)
-        step = mean_transform(changes) if step is None else step
+        if step is None:
+            apart = np.linalg.norm(log(invert(changes)[:, None] @ changes) / TWIST_UNITS, axis=-1)
+            nearest = apart[int(np.median(apart, axis=1).argmin())]
+            # One wrong pose among few would put their mean off.
+            step = mean_transform(changes[nearest <= CLEAR_RATIO * np.median(nearest)])
         return step, np.linalg.norm(log(invert(step) @ changes) / TWIST_UNITS, axis=-1)
     measured, predicted = part.measured(state), part.predicted(state)
     if frame.startswith("instrument"):
