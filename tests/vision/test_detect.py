@@ -201,8 +201,10 @@ def test_another_layout_than_declared_is_named(charuco, declared, correction):
 
 def test_negatives_are_named(charuco):
     cell, images = charuco
-    files = {f"{at}.png": encoded(255 - image) for at, image in enumerate(images)}
-    raised(DataError, "printed in white on black", detect, session_of(files, cell.options.target))
+    # One small image is searched for a second alone.
+    files = {"0.png": encoded(255 - cv2.resize(images[0], (640, 400)))}
+    session = session_of(files, cell.options.target, (640, 400))
+    raised(DataError, "printed in white on black", detect, session)
 
 
 @pytest.mark.parametrize(
