@@ -335,3 +335,22 @@ def test_a_board_of_another_kind_is_no_circle(tmp_path, monkeypatch, drawn, decl
     # Whether ChArUco's markers hide beside a checkerboard's corners or not: one step, and a result.
     assert len(followed.done) == 1
     assert followed.last.status == 0
+
+
+def test_a_board_whose_first_pictures_are_cut_is_identified_by_others():
+    squares = np.kron(np.indices((7, 10)).sum(axis=0) % 2, np.ones((40, 40))) * 200.0 + 30.0
+    print_ = np.pad(squares, 40, constant_values=230.0).astype(np.uint8)
+    images = []
+    for at in range(6):
+        # Of the first three that are looked at, outer squares lie beyond the picture's edge.
+        left, top = (-70.0, 60.0) if at % 2 == 0 else (70.0 + 4.0 * at, 40.0)
+        turn = np.array([[1.0, 0.04 * at, left], [-0.02 * at, 1.0, top], [1e-4 * at, 0.0, 1.0]])
+        images.append(cv2.warpPerspective(print_, turn, (640, 480), borderValue=128))
+    declared = target_from_document(
+        {"kind": "checkerboard", "columns": 10, "rows": 7, "square_m": 0.03}, "board"
+    )
+    session = Session.from_arrays(images, np.tile(np.eye(4), (6, 1, 1)), declared)
+    with pytest.raises(OtherBoardError, match="9 x 6"):
+        detect(session)
+    with pytest.raises(DataError, match="No board is seen"):
+        identify(images[::2], declared)

@@ -16,6 +16,7 @@ import numpy as np
 from visioncal.calibration.stages.corner_numbers import lack_of_corners, usable_corners
 from visioncal.calibration.stages.other_board import (
     LOOKED_AT,
+    LOOKED_AT_LAST,
     MEND_IMAGES,
     OtherBoardError,
     board_correction,
@@ -101,6 +102,14 @@ def detect(
             found[view.number] = searched
             if progress is not None:
                 progress("detect", len(found), len(views))
+    # A board without markers is identified only where all of it is in the picture: by more images.
+    seen = {
+        session.board_of(view) for view in views if isinstance(found[view.number].found, Corners)
+    }
+    for name in session.boards.keys() - seen:
+        searched = [view for view in views if session.board_of(view) == name]
+        if len(searched) > LOOKED_AT:
+            _refuse_another(session, name, spread(searched, LOOKED_AT_LAST))
     resolution = _resolution(session, among, found)
     sized = {view.number: _of_size(view, found[view.number], resolution) for view in views}
     for name in session.boards:
@@ -128,12 +137,17 @@ def _looked_at_first(
         first |= seen
         if any(isinstance(searched.found, Corners) for searched in seen.values()):
             continue
-        present = [view for view in some if session.images.exists(view.image)]
-        images = [(view, image_of(session, view)) for view in present]
-        shown = [(view, image) for view, image in images if not isinstance(image, Rejection)]
-        if shown and (finding := other_board(session, name, shown)):
-            raise OtherBoardError.of(finding)
+        _refuse_another(session, name, some)
     return {view.number: first[view.number] for view in views if view.number in first}
+
+
+def _refuse_another(session: Session, name: str, views: Sequence[View]) -> None:
+    """Refuses images of another board than one of the session's that none of them shows."""
+    present = [view for view in views if session.images.exists(view.image)]
+    images = [(view, image_of(session, view)) for view in present]
+    shown = [(view, image) for view, image in images if not isinstance(image, Rejection)]
+    if shown and (finding := other_board(session, name, shown)):
+        raise OtherBoardError.of(finding)
 
 
 def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Searched]) -> Size:

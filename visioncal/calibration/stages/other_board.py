@@ -24,8 +24,8 @@ from visioncal.vision.targets import (
     target_names,
 )
 
-# Images that are searched for any board.
-LOOKED_AT = 3
+# Images that are searched for any board: at first, and where none shows the declared one.
+LOOKED_AT, LOOKED_AT_LAST = 3, 12
 # Least share of a board's corners in an image that identifies it.
 _LEAST_CORNERS = 0.2
 # Paper that is looked for beyond a checkerboard [squares].
@@ -53,9 +53,9 @@ class OtherBoardError(DataError):
         return error
 
 
-def spread(views: Sequence[View]) -> Sequence[View]:
+def spread(views: Sequence[View], count: int = LOOKED_AT) -> Sequence[View]:
     """A few views from all over a session."""
-    return views[:: max(len(views) // LOOKED_AT, 1)][:LOOKED_AT]
+    return views[:: max(len(views) // count, 1)][:count]
 
 
 def other_board(
