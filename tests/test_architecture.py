@@ -299,3 +299,32 @@ def test_no_docstring_or_comment_begins_with_a_relative_clause():
         for at, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             is_heading = '"## What' in line
             assert is_heading or not RELATIVE.search(line), f"{path}:{at}: {line.strip()}"
+
+
+# A later sentence of a text; questions may begin so.
+LATER = re.compile(r"[.!] (?!What to do next)(?:What|Which|That) [^.?|]*(?:[.|]|$)")
+
+
+def texts(path: Path):
+    """Docstrings of a module, or paragraphs of a page without its examples, each in one line."""
+    if path.suffix == ".md":
+        prose = re.sub(r"^(?: {4}|```).*$", "", path.read_text(encoding="utf-8"), flags=re.M)
+        yield from (" ".join(part.split()) for part in prose.split("\n\n"))
+        return
+    for node in nodes(path):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            yield " ".join((ast.get_docstring(node) or "").split())
+
+
+@pytest.mark.parametrize("folder", ["visioncal", ".github", "docs"])
+def test_no_later_sentence_begins_with_a_relative_clause(folder):
+    for path in sorted((PACKAGE.parent / folder).rglob("*.*")):
+        is_read = path.suffix in (".py", ".md") and path.name != "CHANGELOG.md"
+        for text in texts(path) if is_read else ():
+            found = LATER.search(text)
+            assert found is None, f"{path}: {found and found[0]}"
+
+
+def test_a_relative_clause_amid_a_text_is_found():
+    assert LATER.search("It is held. What is clipped stays, too.")
+    assert not LATER.search("It is held. Which one is meant? That of a cell, or its own?")

@@ -228,7 +228,7 @@ def test_near_views_have_one_pose_and_no_pose_has_itself_for_a_rival():
 def test_a_lens_that_views_leave_open_is_refused():
     raised(DegenerateError, "focal length open to", estimate, cell_with(CAMERAS["wide"], 4, **FLAT))
     for views, words in ((1, "1 view shows"), (2, "2 views show")):
-        with pytest.raises(DataError, match=f"{words} the target, and at least 3"):
+        with pytest.raises(DataError, match=f"{words} the target, but it takes at least 3"):
             estimate(cell_with(CAMERAS["wide"], 6, views=views))
 
 

@@ -214,7 +214,7 @@ def test_a_urdf_gets_the_inertias_and_keeps_the_rest():
     )
     assert "<visual />" in written
     assert "<!-- identified - - yesterday -->" in written
-    raised(DataError, "a robot of a URDF is needed", urdf_with_inertias, load_robot("ur5e"), found)
+    raised(DataError, "must be one of a URDF", urdf_with_inertias, load_robot("ur5e"), found)
 
 
 TRUE = np.array([2.0, -1.0, 0.5])

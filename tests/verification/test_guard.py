@@ -278,7 +278,7 @@ def test_a_look_that_cannot_be_used_is_refused_and_changes_nothing():
     for document in damaged:
         raised(DataError, "cannot be used", guard.restore, document)
     for wrong in ({"false_alarm_looks": 1.0}, {"slow_mm": -1.0}):
-        raised(DataError, "are needed", Guard, place.calibration, **wrong)
+        raised(DataError, "must be 100", Guard, place.calibration, **wrong)
     without = replace(place.calibration, joint_fit=None)
     raised(DataError, "holds no fit", Guard, without)
 

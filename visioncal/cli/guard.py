@@ -154,7 +154,7 @@ def _look(document: dict[str, Any], targets: Mapping[str, Target]) -> Look:
 
 def _found(path: Path, content: Mapping[str, Any], targets: Mapping[str, Target]) -> Corners:
     if "corners" in content:
-        raise DataError("the look has image and corners; one of both is needed.")
+        raise DataError("the look has image and corners, but must have one of both.")
     names = [content["target"]] if "target" in content else list(targets)
     if len(names) != 1 or names[0] not in targets:
         known = ", ".join(filter(None, targets)) or "none, or one without a name"

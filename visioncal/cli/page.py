@@ -208,7 +208,8 @@ def _confined(
 ) -> Task:
     """Makes the task that a browser of the network chose, with files of the site alone.
 
-    What the command states or offers may be elsewhere; all else is read as a path, names, too.
+    Values that the command states or offers may be elsewhere; all else is read as a path, names,
+    too.
 
     Raises:
         DataError: It names others.

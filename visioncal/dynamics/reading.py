@@ -108,8 +108,8 @@ def read_recorded(
     times_s, values = stream.group(columns)
     if len(times_s) < _LEAST_SAMPLES:
         raise DataError(
-            f"{label} has {len(times_s)} samples with angles and torques of all joints, and at "
-            f"least {_LEAST_SAMPLES} are needed.",
+            f"{label} has {len(times_s)} samples with angles and torques of all joints, but "
+            f"needs at least {_LEAST_SAMPLES}.",
             culprits=[label],
             next_step=_HOW,
         )

@@ -82,8 +82,8 @@ def estimate_intrinsics(
     # gives the distortion and a first check.
     if len(corners) < FEWEST_VIEWS:
         raise DataError(
-            f"intrinsics: {counted(len(corners), 'view', ('shows', 'show'))} the target, and at "
-            f"least {FEWEST_VIEWS} are needed.",
+            f"intrinsics: {counted(len(corners), 'view', ('shows', 'show'))} the target, but it "
+            f"takes at least {FEWEST_VIEWS}.",
             culprits=["views"],
             next_step="Add views, or give matrix and distortion in [camera].",
         )

@@ -296,7 +296,7 @@ def maximised(
 def _step(found: _Likelihood, inside: IntArray, damping: float) -> tuple[FloatArray, float]:
     """A damped Newton step (k,) of some sizes, none longer than the longest, and what it promises.
 
-    What is clipped is fixed, and the others are solved anew: a size that vanishes goes far. The
+    Clipped components are fixed, and the others are solved anew: a size that vanishes goes far. The
     average information may be indefinite: all solve the one matrix that is not.
     """
     step, slope = np.zeros(len(found.logs)), found.gradient[inside]

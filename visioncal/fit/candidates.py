@@ -185,7 +185,7 @@ def _sags(fit: Fit, pairs: Sequence[Pair], camera: str) -> Iterator[tuple[BoardS
 def of_distances(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """Distances of measured poses that changed at once: as noise, they have a size of their own.
 
-    That hides them from a score.
+    A score does not see them so.
     """
     used, known = np.flatnonzero(fit.used), {effect.name for effect in fit.unknowns.effects}
     for camera in {fit.cell.sightings[at].seer for at in used} & fit.cell.cameras.keys():

@@ -221,7 +221,8 @@ def body_with(bodies: Sequence[Body], flanges: Sequence[str]) -> int:
 def inverse(information: FloatArray) -> tuple[FloatArray, float]:
     """Inverse (p, p) of an information matrix, and its log-determinant.
 
-    What nothing determines, or elimination leaves slightly indefinite, gets a large variance.
+    Directions that nothing determines, or that elimination leaves slightly indefinite, get a large
+    variance.
 
     Raises:
         LinAlgError: It is not finite: a search diverges.

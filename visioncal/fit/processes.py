@@ -1,13 +1,12 @@
 """Errors of arms that last from stop to stop: they judge no sighting, and move the result last.
 
 An arm's errors are functions of its posture and of time that nobody knows; where joint angles are,
-beside those of its links.
-Which sightings agree and how large the noise is is found as if they were independent. The
-covariance is then averaged over processes by posture and by time, each over a grid of sizes and of
-levels of what is independent, by their restricted likelihood (Hoeting, Madigan, Raftery and
-Volinsky 1999), and so is the estimate over those by time. Estimates under processes by posture are
-further off than that of independent errors: they take a camera's transform for the arm's error.
-What each stop alone says of its flange follows from the factorisation.
+beside those of its links. Inliers and noise are found as if they were independent. The covariance
+is then averaged over processes by posture and by time, each over a grid of sizes and of levels of
+what is independent, by their restricted likelihood (Hoeting, Madigan, Raftery and Volinsky 1999),
+and so is the estimate over those by time. Estimates under processes by posture are further off than
+that of independent errors: they take a camera's transform for the arm's error. The estimate of each
+flange by its stop alone follows from the factorisation.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -197,7 +197,7 @@ def added_by(fit: Fit, effect: Effect) -> list[Added]:
 def of_rows(fit: Fit, pairs: Sequence[Pair], motion: RowMotion) -> Score:
     """The score of a motion of rows, by what each image shows beside a pose of its own.
 
-    What lens and board may absorb of it counts as if they did.
+    The part of it that lens and board may absorb counts as if they did.
     """
     count, own = len(motion.stops), images_of(pairs, motion.frame)
     pull, information = np.zeros((count, 4)), np.zeros((count, 4, 4))

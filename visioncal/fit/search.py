@@ -172,8 +172,8 @@ class Search:
 def _is_settled(fit: Fit) -> bool:
     """Whether one more step would be a small share of every sigma.
 
-    What a step leaves is of second order: as much of it as frames turn, lenses zoom, and slopes of
-    effects change, by it.
+    A step leaves a residual of second order: as much of it as frames turn, lenses zoom, and slopes
+    of effects change, by it.
     """
     steps, kept = fit.estimate.values, fit.unknowns
     turns = [np.abs(steps[kept.columns("edge", name)]) for name in fit.cell.unknown]

@@ -266,8 +266,8 @@ def _measuring(cell: Cell) -> dict[str, bool]:
 def _compared(cell: Cell) -> set[str]:
     """Cameras whose poses of boards can be compared with others at enough stops.
 
-    What mounts, exposure and lens add to a pose, beside what the corners' noise does, is no error
-    of the arm there: it has a size of its own.
+    Errors that mounts, exposure and lens add to a pose, beside the corners' noise, are no
+    errors of the arm there: they have a size of their own.
     """
     seers: dict[int, list[str]] = {}
     for sighting in cell.sightings:

@@ -199,7 +199,8 @@ def locate_by_depth(
 def seen_distances(calibration: Calibration, depth_m: FloatArray, px: FloatArray) -> FloatArray:
     """Distances at pixels of the image by the picture of a depth camera, NaN where there are none.
 
-    That of a camera beside is interpolated between the nearest of its points that are seen there.
+    The depth of a camera beside is interpolated between the nearest of its points that are seen
+    there.
 
     Args:
         calibration: The camera's.

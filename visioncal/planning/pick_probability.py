@@ -58,7 +58,7 @@ class Picking:
     def fewest(self, rows: IntArray) -> tuple[int, float]:
         """Least number of the first candidates that are enough, and the probability to reach.
 
-        That is the required one, or nearly that of all of them.
+        This is the required one, or nearly that of all of them.
         """
         # Stops that together add less to the probability are left out.
         share = min(NeedLimits.probability[0], self.chance(rows) - 0.01)

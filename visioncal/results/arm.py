@@ -132,8 +132,8 @@ class UnseenView:
 class ArmResult(Section):
     """The calibrated arm: `kinematics` in calibration.json.
 
-    What follows the levels is present where one other than `nominal` was chosen, `parameters` where
-    that frees some.
+    The fields after the levels are present where one other than `nominal` was chosen, `parameters`
+    where that frees some.
     """
 
     level: str  # The chosen level; `nominal` where no level improves the fit significantly.

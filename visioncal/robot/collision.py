@@ -149,8 +149,8 @@ def _thickness(robot: Robot, usual_m: float) -> list[tuple[float, float]]:
         length = float(np.abs(robot.chain.placements[:, :3, 3]).sum())
         if max(radius, abs(offset)) > length:
             raise DataError(
-                f"{row.label}: body_radius_m = {radius!r} and body_offset_m = {offset!r}; lengths "
-                f"in metres, less than the arm's {length:.3g} m, are needed.",
+                f"{row.label}: body_radius_m = {radius!r} and body_offset_m = {offset!r}, but "
+                f"must be in metres, and less than the arm's {length:.3g} m.",
                 culprits=[row.label],
             )
         sizes.append((radius, offset))

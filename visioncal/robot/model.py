@@ -264,9 +264,9 @@ class Robot:
     def load_torques(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Torques (m, n) of weight, payload and force on the joints [N m; N if prismatic].
 
-        That of the links' weight is the negative of the generalised gravity (Featherstone 2008,
-        section 5.3), zero where masses are unknown or the controller compensates it; those at the
-        flange follow by the transpose of the geometric Jacobian.
+        The torque of the links' weight is the negative of the generalised gravity (Featherstone
+        2008, section 5.3), zero where masses are unknown or the controller compensates it; those at
+        the flange follow by the transpose of the geometric Jacobian.
         """
         torques = -self.gravity_torques(q)
         if self.weight_compensated:

@@ -228,7 +228,7 @@ def fit_links(
 def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) -> str:
     """Writes the URDF of a robot with a calibrated geometry.
 
-    What the URDF says stays, though not its formatting: only the origins of the joints between
+    The content of the URDF stays, though not its formatting: only the origins of the joints between
     base and tip change, and that of the fixed joint before the tip; where there is none, a link
     NAME_corrected with a fixed joint is added. Joint offsets go into the origins. A URDF cannot
     hold gear ratio and eccentricity; a comment lists those that are missing.
@@ -244,7 +244,7 @@ def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) 
     text = nominal.document.get("urdf")
     if not isinstance(text, str) or nominal.joint_names != corrected.joint_names:
         raise DataError(
-            f"robot {nominal.name}: a robot of a URDF and its corrected model are needed.",
+            f"robot {nominal.name} must be one of a URDF, with its corrected model.",
             culprits=[nominal.name],
             next_step="Write a small URDF or a joint table instead.",
         )
@@ -358,7 +358,7 @@ def urdf_with_inertias(robot: Robot, inertias: Inertias, notes: Sequence[str] = 
     text = robot.document.get("urdf")
     if not isinstance(text, str):
         raise DataError(
-            f"robot {robot.name}: a robot of a URDF is needed.",
+            f"robot {robot.name} must be one of a URDF.",
             culprits=[robot.name],
             next_step="Write a small URDF or a joint table instead.",
         )

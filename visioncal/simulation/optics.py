@@ -125,8 +125,8 @@ def _parameters(camera: Camera) -> tuple[FloatArray, FloatArray]:
     count, allowed = camera.distortion.size, (4,) if camera.model == "fisheye" else (5, 8)
     if count not in allowed:
         raise DataError(
-            f"simulation: a {camera.model} camera has {count} distortion coefficients, "
-            f"{' or '.join(map(str, allowed))} are needed."
+            f"simulation: a {camera.model} camera has {count} distortion coefficients, but "
+            f"must have {' or '.join(map(str, allowed))}."
         )
     fx, fy, cx, cy = camera.matrix
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -147,8 +147,8 @@ class Guard:
             calibration = Calibration.load(calibration)
         if not (100.0 <= false_alarm_looks < 1e9 and 0.0 <= slow_mm <= 10.0):
             raise DataError(
-                f"guard: false_alarm_looks is {false_alarm_looks:g} and slow_mm {slow_mm:g}; 100 "
-                "or more, and 0 to 10, are needed.",
+                f"guard: false_alarm_looks is {false_alarm_looks:g} and slow_mm {slow_mm:g}, but "
+                "must be 100 or more, and 0 to 10.",
                 culprits=["false_alarm_looks", "slow_mm"],
             )
         self.prior = prior = CalibrationPrior.of(calibration.of(camera, robot, target))
@@ -310,8 +310,8 @@ class Guard:
             # Beyond two turns there are few joints, and their degrees are there at once.
             if (np.abs(joints) > 4.0 * np.pi)[:, ~self._arm.robot.chain.prismatic].any():
                 raise DataError(
-                    f"{label}: joints_rad is {look.joints_rad.tolist()}, in degrees by its size; "
-                    "radians are needed.",
+                    f"{label}: joints_rad is {look.joints_rad.tolist()}, in degrees by its size, "
+                    "but must be in radians.",
                     culprits=["joints_rad"],
                 )
             offsets = self._arm.columns("offsets", joints)[0]

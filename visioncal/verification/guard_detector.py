@@ -20,10 +20,10 @@ correlation with the motion that was predicted, which is none if it is as large 
 Looks that are off by more than linear rows can say are counted alone: after a change of that size
 nearly every look is so, and otherwise one of 200.
 
-What no model has, a machine that is off at weekends, gives the statistic a heavier tail. It is a
-power of the limit (in simulated cells with exponents of 0.6 to 1.3), as of the maxima of many
-sequences (Hill 1975): how often two small limits are passed is counted, and the limit of the stated
-rate extrapolated from them.
+Events that no model has, as a machine that is off at weekends, give the statistic a heavier tail.
+It is a power of the limit (in simulated cells with exponents of 0.6 to 1.3), as of the maxima of
+many sequences (Hill 1975): how often two small limits are passed is counted, and the limit of the
+stated rate extrapolated from them.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Pose performance of an arm by ISO 9283:1998, section 7, from cycles of commanded poses.
 
 Accuracy AP is the distance of the mean attained pose from the commanded one, repeatability
-RP = mean + 3 s of the distances from that mean, in rotation 3 s about each axis. What the device
-adds is known and taken off: a repeatability under its sigma is a bound. Intervals are of 95 %.
+RP = mean + 3 s of the distances from that mean, in rotation 3 s about each axis. The device's own
+noise is known and taken off: a repeatability under its sigma is a bound. Intervals are of 95 %.
 """
 
 from collections.abc import Mapping, Sequence

@@ -28,7 +28,7 @@ def places_of(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Places of square patches in the image.
 
-    What shifts of neighbours differ by beyond their noise counts in their sigmas.
+    Differences of neighbours beyond their noise count in their sigmas.
 
     Args:
         found: The registered print.

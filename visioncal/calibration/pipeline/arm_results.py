@@ -110,8 +110,8 @@ def misfit_covariance(fit: Fit, robot: str, errors: ArmErrors) -> FloatArray:
 def with_lasting_errors(fit: Fit, arms: Mapping[str, RobotArm]) -> Fit:
     """The fit at what its unknowns are beside errors of arms that last in time.
 
-    What lasts is alike at neighbouring stops: their mean says less than their number suggests. Its
-    noise stays that of the stops one by one.
+    Lasting errors are alike at neighbouring stops: their mean says less than their number suggests.
+    Its noise stays that of the stops one by one.
     """
     step = np.zeros(fit.problem.size)
     for robot, arm in arms.items():

@@ -107,9 +107,9 @@ def detect(
         session.board_of(view) for view in views if isinstance(found[view.number].found, Corners)
     }
     for name in session.boards.keys() - seen:
-        searched = [view for view in views if session.board_of(view) == name]
-        if len(searched) > LOOKED_AT:
-            _refuse_another(session, name, spread(searched, LOOKED_AT_LAST))
+        unseen = [view for view in views if session.board_of(view) == name]
+        if len(unseen) > LOOKED_AT:
+            _refuse_another(session, name, spread(unseen, LOOKED_AT_LAST))
     resolution = _resolution(session, among, found)
     sized = {view.number: _of_size(view, found[view.number], resolution) for view in views}
     for name in session.boards:

@@ -469,7 +469,7 @@ def _turned(
 def _is_reading(record: Record, turn: FloatArray, lever: float) -> bool:
     """Whether a board may be read so: where its corners were numbered, they are others of its own.
 
-    Else its own middle is in the picture. What turns about another place is another frame.
+    Else its own middle is in the picture. A turn about another place is that of another frame.
     """
     if not record.is_numbered:
         centre = np.linalg.solve(np.eye(2) - turn[:2, :2], turn[:2, 3])

@@ -1,6 +1,6 @@
 """The calibrated arm as a URDF, a DH table, UR's own file or JSON.
 
-What a format cannot hold of the arm is said in its comments and warnings.
+Parts of the arm that a format cannot hold are named in its comments and warnings.
 """
 
 from collections.abc import Iterator

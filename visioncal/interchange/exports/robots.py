@@ -70,7 +70,7 @@ def _identifier(language: str, name: str) -> str:
     if shape.fullmatch(name) and not {name, name.lower() if language == "abb" else name} & taken:
         return name
     raise DataError(
-        f"{name!r} cannot be a name in {title}: {needed}, are needed, and no word of its own.",
+        f"{name!r} cannot be a name in {title}: it must have {needed}, and be no word of its own.",
         culprits=[name],
         next_step="Choose another with --child.",
     )

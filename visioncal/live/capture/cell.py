@@ -66,8 +66,8 @@ class LiveCell:
             )
         if age_s > _STALE_S:
             raise DriverError(
-                f"{self.arm.name}: its newest state is {age_s:.1f} s old; one of the last "
-                f"{_STALE_S:g} s is needed.",
+                f"{self.arm.name}: its newest state is {age_s:.1f} s old, but must be "
+                f"of the last {_STALE_S:g} s.",
                 culprits=[self.arm.name],
                 next_step="Check the network cable to the controller.",
             )

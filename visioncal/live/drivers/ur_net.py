@@ -163,8 +163,8 @@ def check_states_come(host: str) -> None:
             kind, reply = _read(file)
             if kind != PROTOCOL or reply != b"\x01":
                 raise DriverError(
-                    f"{label} does not speak version 2 of RTDE: a UR controller with PolyScope "
-                    "3.4 or newer is needed.",
+                    f"{label} does not speak version 2 of RTDE: it must be a UR controller with "
+                    "PolyScope 3.4 or newer.",
                     culprits=[label],
                     next_step="Check the address; update PolyScope where it is older.",
                 )

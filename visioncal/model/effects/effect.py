@@ -38,8 +38,8 @@ class Effect(ABC):
     """Random unknowns a ~ N(0, s^2): they add `columns @ a` to a frame's pose or a lens.
 
     Of an edge, a robot's or an unknown one, the columns are right perturbations of
-    `parent_from_frame` [rad, m]; of a lens, changes of its intrinsics. What differs from corner to
-    corner of an image is in no column.
+    `parent_from_frame` [rad, m]; of a lens, changes of its intrinsics. Changes from corner to
+    corner of an image are in no column.
     """
 
     place: ClassVar[Place] = "edge"

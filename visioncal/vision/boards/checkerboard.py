@@ -29,7 +29,7 @@ _MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
 # parts of larger ones.
 _FEWEST = ((4, 4), (3, 3))
 # Shares of a square at which its grey levels are compared, and their range in units of contrast
-# from which on it is not plain: light and noise leave a tenth. What is averaged there.
+# from which on it is not plain: light and noise leave a tenth. The part that is averaged.
 _INSIDE, _MARKS, _DOTS = (0.25, 0.4, 0.6, 0.75), 0.4, 0.25
 # Share of the way from a corner to the middle of a dark square; usual circles end before.
 _TIP = 0.2

@@ -111,8 +111,8 @@ def encode_png(image: Image | Image16) -> bytes:
     pixels: npt.NDArray[np.integer[Any]] = np.asarray(image)
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim not in (2, 3) or not pixels.size:
         raise DataError(
-            f"an image has the shape {pixels.shape} and the type {pixels.dtype}; (h, w) or "
-            "(h, w, 3) of uint8 or uint16 is needed.",
+            f"an image has the shape {pixels.shape} and the type {pixels.dtype}, but must "
+            "be (h, w) or (h, w, 3) of uint8 or uint16.",
             culprits=["images"],
         )
     return bytes(cv2.imencode(".png", pixels)[1].tobytes())
