@@ -56,7 +56,9 @@ def by_joints(run: RunState) -> Iterator[Finding]:
             until_mm=0.0,
         )
         return
-    late = [view for view in matched.contradicting if view in seen and view in joints_rad]
+    # Views whose joint angles are wrong have no pose any more.
+    known = reported.keys() & seen.keys() & joints_rad.keys()
+    late = [view for view in matched.contradicting if view in known]
     if not late:
         return
     camera = np.array([seen[view].cam_from_target[0] for view in late])
