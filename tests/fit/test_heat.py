@@ -14,7 +14,7 @@ from visioncal.model.effects import Heat
 from visioncal.robot import load_robot
 from visioncal.robot.thermal import Inputs
 from visioncal.simulation import CellOptions, Round, WarmUpOptions, cell_session, simulate_warm_up
-from visioncal.simulation import arms as simulated
+from visioncal.simulation import heat as simulated
 from visioncal.simulation.optics import CAMERAS
 
 OPTIONS = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1, branches=True, roll_rad=np.pi)
