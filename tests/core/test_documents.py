@@ -225,6 +225,8 @@ def test_columns_without_names_are_numbered(file):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        # Two rows or more below an empty line may be a program's results.
+        ("a,b,c\n" + 12 * "1,2,3\n" + "\n1,2\n", r"line 15: 2 cells, but must be 3"),
         ("a,b\n1,2,3\n", r"line 2: 3 cells, but must be 2.*semicolons"),
         ("a,a\n1,2\n", "two columns are named 'a'"),
         ("a,b\n", "a header and no rows"),

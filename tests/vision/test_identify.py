@@ -28,7 +28,8 @@ from visioncal.calibration.stages.detect import detect
 from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
-from visioncal.session import Session
+from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE
 from visioncal.simulation import BOARDS
 from visioncal.vision.boards import DetectedCorners, find_target
 from visioncal.vision.boards.identify import identify
@@ -354,3 +355,36 @@ def test_a_board_whose_first_pictures_are_cut_is_identified_by_others():
         detect(session)
     with pytest.raises(DataError, match="No board is seen"):
         identify(images[::2], declared)
+
+
+def test_a_board_that_is_never_seen_is_no_other_one_of_the_session():
+    board = cv2.aruco.CharucoBoard(
+        (7, 5), 0.03, 0.022, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    )
+    print_ = np.pad(board.generateImage((420, 300)), 30, constant_values=255)
+    blank, files = np.full((480, 640), 128, np.uint8), {}
+    for at in range(12):
+        turn = np.array([[1.0, 0.03 * at, 60.0 + 3 * at], [-0.02 * at, 1.0, 60.0], [0.0, 0.0, 1.0]])
+        turn[2, 0] = 1e-4 * at
+        seen = cv2.warpPerspective(print_, turn, (640, 480), borderValue=128) if at % 4 else blank
+        files[f"{at}.png"] = cv2.imencode(".png", seen)[1].tobytes()
+    pose = ("0.1", "0.2", "0.3", "0", "0", "0", "1")
+    rows = [
+        [str(2 * at + board), str(at), f"{at}.png", name, *pose]
+        for at in range(12)
+        for board, name in enumerate("ab")
+    ]
+    shown = {"kind": "charuco", "columns": 7, "rows": 5, "square_m": 0.03, "marker_m": 0.022}
+    documents = {
+        "a": shown | {"dictionary": "DICT_4X4_50"},
+        "b": {"kind": "aprilgrid", "columns": 6, "rows": 6, "size_m": 0.03, "spacing": 0.3},
+    }
+    document = {
+        "schema": 1, "name": "two", "mount": "eye-in-hand", "camera": {"resolution": [640, 480]},
+        "targets": {name: {"target": f"{name}.toml"} for name in documents},
+    }  # fmt: skip
+    columns = ("view", "stop", "image", "target", *POSE)
+    session = Session.assemble(
+        document, columns, rows, MemoryImages(files), target_document=documents
+    )
+    assert {view % 2 for view in detect(session).corners} == {0}

@@ -34,8 +34,9 @@ GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW = "visioncal show OUT --viewer"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
-# Options of `convert` that take sessions of one camera and one robot, or change all of them.
-_OF_ONE = re.compile(r"--(?:guess|shift|by-joints|intrinsics)\b")
+# Options of `convert` that take sessions of one camera and one robot, or change all of them, or not
+# all rows of a robot's stop.
+_OF_ONE = re.compile(r"--(?:guess|shift|by-joints|intrinsics|positions)\b")
 # Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"
 # After a calibration's output stands the need that was typed.
@@ -61,7 +62,9 @@ class Remedy:
         """The same for several robots or cameras: by hand where its command takes one of each."""
         if not _OF_ONE.search(self.command):
             return self
-        by_hand = "Of several robots or cameras, convert writes no such copy: correct the files."
+        by_hand = "Of several robots or cameras, correct the files by hand."
+        if "--intrinsics" in self.command:
+            by_hand = 'Of several cameras, write intrinsics = "refine" in the table of this one.'
         return Remedy(f"{self.words} {by_hand}")
 
 

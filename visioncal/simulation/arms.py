@@ -62,7 +62,7 @@ BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
         (5.0, (0.0, 0.0, -0.04)),
     ),
 }
-_JOINTS = 6
+JOINTS = 6
 # Stroke of a joint that slides [m].
 STROKE_M = 0.2
 
@@ -93,7 +93,7 @@ class DhArm:
     @property
     def is_planar(self) -> bool:
         """Whether the flange turns about the vertical alone."""
-        return self.a.size < _JOINTS
+        return self.a.size < JOINTS
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def arm_named(name: str) -> DhArm:
     elif name == "generic-scara-600":
         a, d, quarters = [0.325, 0.275, 0, 0], [0.4, 0, 0, 0.05], [0, 2, 0, 0]
     none = np.zeros((4, len(a)))
-    offset, slides = none[0].copy(), (2,) if len(a) < _JOINTS else ()
+    offset, slides = none[0].copy(), (2,) if len(a) < JOINTS else ()
     if name == "generic-6r-1800":
         offset[[1, 5]] = -_QUARTER, _HALF_TURN
     alpha = _QUARTER * np.array(quarters)

@@ -8,7 +8,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, interpolated
 from visioncal.session import Stream
-from visioncal.simulation.arms import _JOINTS, DhArm, forward
+from visioncal.simulation.arms import JOINTS, DhArm, forward
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,14 @@ class Heat:
     def drawn(cls, seed: int) -> "Heat":
         """Draws an arm whose joints warm up by 10 to 35 K within hours."""
         rng = np.random.default_rng([99, seed])
-        duty = rng.uniform(1.5, 4.0, _JOINTS)
+        duty = rng.uniform(1.5, 4.0, JOINTS)
         # Rises [K] and time constants [s]; expansion between steel's and aluminium's [1/K].
         return cls(
             duty,
-            rng.uniform(10.0, 35.0, _JOINTS) / duty**2,
-            rng.uniform(1500.0, 3600.0, _JOINTS),
-            rng.uniform(12e-6, 23e-6, _JOINTS),
-            rng.normal(0.0, 5e-6, _JOINTS),
+            rng.uniform(10.0, 35.0, JOINTS) / duty**2,
+            rng.uniform(1500.0, 3600.0, JOINTS),
+            rng.uniform(12e-6, 23e-6, JOINTS),
+            rng.normal(0.0, 5e-6, JOINTS),
         )
 
 
@@ -75,7 +75,7 @@ def warm_up(heat: Heat, hours: float, *, step_s: float = 10.0, seed: int = 0) ->
         raise DataError("simulation: a warm-up needs a time and a step above 0.")
     rng = np.random.default_rng([98, seed])
     stamps = np.arange(0.0, 3600.0 * hours + step_s, step_s)
-    pieces = np.exp(0.25 * rng.standard_normal((len(stamps) // 30 + 1, _JOINTS)))
+    pieces = np.exp(0.25 * rng.standard_normal((len(stamps) // 30 + 1, JOINTS)))
     duty = heat.duty_a * np.repeat(pieces, 30, axis=0)[: len(stamps)]
     ambient = heat.ambient_c + heat.ambient_swing_k * np.sin(2.0 * np.pi * stamps / 21600.0)
     joints, links = np.empty_like(duty), np.empty_like(duty)

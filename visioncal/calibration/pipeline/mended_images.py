@@ -13,7 +13,7 @@ from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.detect import is_scaled
-from visioncal.calibration.stages.other_board import spread
+from visioncal.calibration.stages.other_board import LOOKED_AT_LAST, spread
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import ranges
@@ -51,7 +51,7 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
         done[name] += how
     for board, target in session.boards.items():
         mine = [view for view in present if session.board_of(view) == board]
-        some = [images[view.image] for view in spread(mine) if view.image in images]
+        some = [images[view.image] for view in spread(mine, LOOKED_AT_LAST) if view.image in images]
         shown = None
         with suppress(DataError):
             shown = identify([*map(grey_of, some)], target) if some else None
@@ -128,6 +128,11 @@ def _mirrored_back(session: Session) -> Session:
         DataError: It has corners of pictures of unknown width.
     """
     corners = session.corner_table
+    if corners is None and not any(view.image for view in session.views):
+        raise DataError(
+            f"session {session.name!r} has neither images nor corners to be mirrored back.",
+            next_step="Mirror the target's poses in the program that measured them.",
+        )
     if corners is not None:
         (size,) = (camera.size for camera in session.cameras.values())
         if size is None:

@@ -76,7 +76,8 @@ def detect(
         The corners and the rejected views.
 
     Raises:
-        OtherBoardError: The first images that are looked at show another board, or are mirrored.
+        OtherBoardError: Images that are looked at, first or where none shows the target, show
+                another board, or are mirrored.
         DataError: No view shows the target, more images have some other size than the camera's,
             the size of the images is unknown, or the printed board has another layout than the
             declared one.
@@ -106,7 +107,7 @@ def detect(
     seen = {
         session.board_of(view) for view in views if isinstance(found[view.number].found, Corners)
     }
-    for name in session.boards.keys() - seen:
+    for name in () if seen else session.boards:
         unseen = [view for view in views if session.board_of(view) == name]
         if len(unseen) > LOOKED_AT:
             _refuse_another(session, name, spread(unseen, LOOKED_AT_LAST))

@@ -85,10 +85,12 @@ def other_board(
     if not is_sure or identity.corners_seen < _LEAST_CORNERS * identity.corners:
         return None
     numbers = tuple(view.number for view, _ in looked)
+    # Of many images, some may not show it.
+    where = f" (view {numbers[0]})" if len(looked) <= LOOKED_AT else ""
     if identity.is_mirrored:
         return Finding(
             "mirrored_images",
-            f"The images are mirrored: a {describe(identity)} (view {numbers[0]}), is seen only "
+            f"The images are mirrored: a {describe(identity)}{where}, is seen only "
             "where they are mirrored back.",
             Remedy(
                 "Write a copy of the session with its images mirrored back, and calibrate it; "
@@ -101,7 +103,7 @@ def other_board(
         return Finding(
             "negative_images",
             f"The board is printed in white on black, or the images are negatives: a "
-            f"{describe(identity)} (view {numbers[0]}).",
+            f"{describe(identity)}{where}.",
             Remedy(
                 "Write a copy of the session with light and dark exchanged, and calibrate it; "
                 "where the print is as it should be, turn the negative off in the camera's driver.",
@@ -119,7 +121,7 @@ def other_board(
             stated += ", which looks like metres: spacing is a share of the side"
     return Finding(
         "other_board",
-        f"The images show another board than declared: {describe(identity)} (view {numbers[0]}), "
+        f"The images show another board than declared: {describe(identity)}{where}, "
         f"and {declared.name} is {stated}.",
         _remedy(session, name, identity, found, looked),
         numbers,

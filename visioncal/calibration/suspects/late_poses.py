@@ -4,22 +4,28 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from visioncal.calibration.guess.fit import distances, robust_fits
+from visioncal.calibration.guess.fit import distances as residuals_of
+from visioncal.calibration.guess.fit import robust_fits
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED
 from visioncal.core.number_format import view_words
+from visioncal.core.transforms import distances
 from visioncal.core.types import MOUNTS
-from visioncal.core.verdict import Finding, mending
+from visioncal.core.verdict import Finding, Remedy, mending
 from visioncal.estimation.chain import robot_part
 
 _KIND = "late_poses"
-# Poses are those of the joint angles [m, rad].
-_SAME = 1e-6
+# Poses are those of the joint angles, and of the flange [m, rad].
+_SAME, _ROUNDED = 1e-6, 1e-4
 _BY_JOINTS = mending(
     "the poses are those of the joint angles (next time, log both at one instant, while the arm "
     "stands)",
     "--by-joints",
+)
+_OF_TIP = Remedy(
+    "Write the poses of these rows anew, by their joint angles and the tool of the other rows, or "
+    "calibrate the other views alone."
 )
 
 
@@ -64,20 +70,24 @@ def by_joints(run: RunState) -> Iterator[Finding]:
     camera = np.array([seen[view].cam_from_target[0] for view in late])
     poses = np.array([[of[view] for view in late] for of in (reported, by_model)])
     sides, edges = robot_part(poses, run.mount), (by_angles.x, by_angles.z)
-    own, right = (distances(side, camera, by_angles.lever, edges) for side in sides)
+    own, right = (residuals_of(side, camera, by_angles.lever, edges) for side in sides)
     is_right = right.residuals < CLEAR_RATIO * by_angles.score
     some = np.flatnonzero(is_right & (CLEAR_RATIO * right.residuals < own.residuals))
-    if len(some):
+    # Views whose joint angles are wrong, too, are said to be so for each.
+    if len(some) == len(matched.contradicting):
         named = tuple(late[at] for at in some.tolist())
+        # The command writes the flange's pose for all views.
+        away = distances(np.eye(4)[None], matched.flange_from_reported[None])
+        is_flange = all(part.max() < _ROUNDED for part in away)
         report, angles = (
-            distances(side[some], camera[some], by_angles.lever, edges).figures for side in sides
+            residuals_of(side[some], camera[some], by_angles.lever, edges).figures for side in sides
         )
         yield Finding(
             _KIND,
             f"In {view_words(named)} the image{'s agree' * (len(named) > 1) or ' agrees'} with the "
             f"joint angles to {angles}, and with the reported pose{'s' * (len(named) > 1)} to "
             f"{report}: read at another instant, with another tool, or commanded.",
-            _BY_JOINTS,
+            _BY_JOINTS if is_flange else _OF_TIP,
             named,
         )
 

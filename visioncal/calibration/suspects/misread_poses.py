@@ -29,7 +29,7 @@ from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy, mending
+from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy, mending, or_alone
 from visioncal.estimation.chain import robot_part
 
 # A robot that moves by less stood still [m].
@@ -111,7 +111,12 @@ def with_undone(run: RunState) -> RunState:
             if mistake is None:
                 continue
             whose = f"Robot {robot}, in its rows of {pair.camera} and {pair.target}"
-            found = replace(mistake.found, words=f"{whose}: {mistake.found.words}")
+            found, do = mistake.found, mistake.found.do
+            if do is not None and "--views" in do.command:
+                # The other views are those of all pairs.
+                others = [at.number for at in run.session.views if at.number not in found.views]
+                do = or_alone(do.words, others)
+            found = replace(found, words=f"{whose}: {found.words}", do=do)
             run = undone(run, replace(mistake, found=found))
     # Other robots' poses may be misread beside it.
     return replace(run, misread=run.misread or None)
@@ -161,7 +166,8 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
     if guess.stands_out and all(hint.do in (UNRECORDED, _LOG_ANEW) for hint in unknown):
         robot = guess.best.hypothesis.robot
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
-        step = _MIRRORED if robot.mirrored else step
+        if robot.mirrored:
+            step = _MIRRORED if run.cameras else replace(_MIRRORED, command="")
         yield Finding("misread_poses", guess.sentence, step)
     elif guess.is_open:
         step = Remedy(_WHICH)

@@ -229,7 +229,9 @@ def _tool_taken_off(
     """Advice to take the tool off some views' poses; None where another frame was another one."""
     frame, step = change
     on_camera = "cam" if cell_fit.cell.mount == "eye-in-hand" else "target"
-    if not frame.startswith(on_camera) or cell_fit.cell.mount == "instrument":
+    # Joint angles that belong to the poses rule a tool out.
+    has_joints = any(arm.matched is not None for arm in cell_fit.arms.values())
+    if has_joints or not frame.startswith(on_camera) or cell_fit.cell.mount == "instrument":
         return None
     edge = cell_fit.fit.frames[frame]
     tool = edge @ invert(edge @ step)

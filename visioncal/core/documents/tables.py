@@ -211,10 +211,11 @@ def _below_titles(rows: list[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tu
 
 
 def _above_results(rows: list[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tuple[str, ...]]]:
-    """Rows without a program's results below them: a few of other widths after an empty line."""
+    """Rows without results of a program below: two or more of other widths after an empty line."""
     gaps = [at for at in range(1, len(rows)) if rows[at][0] > rows[at - 1][0] + 1]
     end, widths = gaps[-1] if gaps else len(rows), [len(cells) for _, cells in rows]
-    is_result = 4 * end >= 3 * len(rows) and {*widths[:end]}.isdisjoint(widths[end:])
+    is_result = 3 * len(rows) <= 4 * end < 4 * (len(rows) - 1)
+    is_result &= {*widths[:end]}.isdisjoint(widths[end:])
     return rows[:end] if is_result and len({*widths[:end]}) == 1 else rows
 
 

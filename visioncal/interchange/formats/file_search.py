@@ -33,7 +33,7 @@ from visioncal.session.images import CLOUD_ENDINGS, IMAGE_ENDINGS
 
 # Endings of texts with numbers that are none of a recording.
 _NO_DATA = (
-    *(".py", ".md", ".html", ".sh", ".c", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg"),
+    *(".py", ".md", ".html", ".sh", ".c", ".cc", ".cpp", ".h", ".ipynb", ".urdf", ".xacro", ".svg"),
     *(".m", ".sln", "cmakelists.txt", "requirements.txt", ".ply", ".pcd"),
 )
 # Folders below a source that are looked through, and the most files in all; a source of more files
@@ -99,7 +99,7 @@ class FileGroup:
         """Whether they have the ending of numbers, or an unknown one and numbers in them."""
         words = self.label.lower()
         if words.endswith(_NO_DATA):
-            return self.is_source and words.endswith(SOURCES)
+            return self.is_source and words.endswith((*SOURCES, ".m"))
         if words.endswith((*ENDINGS, *IMAGE_ENDINGS)):
             return words.endswith(ENDINGS)
         return len(re.findall(r"[0-9]\.[0-9]", head(self.files[0]))) > 5

@@ -73,10 +73,16 @@ def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
     return Fields(path.stem, path.parent, places, {"matrix": matrices.reshape(-1, 16)})
 
 
+# Words in the name of a file of joint angles, and in that of one of poses.
+_JOINTS = {"joint", "joints", "angle", "angles"}
+_POSES = {"pose", "poses", "tcp", "xyz", "euler", "rpy", "quat", "camera", "cam", "target"}
+
+
 def _of_joints(table: TextTable, path: Path) -> TextTable:
     """The table; without a header in a file called joints or angles, with the joints' names."""
     is_whole = not table.has_header and 5 <= len(table.columns) <= 8
-    if is_whole and re.search("joint|angle", path.stem.lower()):
+    words = {*re.split("[^a-z]+", path.stem.lower())}
+    if is_whole and words & _JOINTS and not words & _POSES:
         return replace(table, columns=tuple(map("joint_{}".format, table.columns)))
     return table
 
@@ -617,9 +623,9 @@ def _literals(text: str, path: Path) -> list[object]:
 # Programs whose lists are read where they are named as the source.
 SOURCES = (".py", ".cpp", ".cc")
 # An array that a C++ program initialises, and a matrix of OpenCV that it fills.
-_INITIALISED = re.compile(r"(\w++)\s*+(?:\[\w*+\]\s*+)*+=?\s*+(\{[-+0-9.eE,\s{}]++)\s*+;")
+_INITIALISED = re.compile(r"\b(\w++)\s*+(?:\[\w*+\]\s*+)*+=?\s*+(\{[-+0-9.eE,\s{}]++)\s*+;")
 _FILLED = re.compile(
-    r"(\w++)\s*+=\s*+\(?(?:cv::)?Mat_<\w++>\(\s*+([0-9]++)[\s,0-9]++\)\s*+<<([-+0-9.eE,\s]++)"
+    r"\b(\w++)\s*+=\s*+\(?(?:cv::)?Mat_<\w++>\(\s*+([0-9]++)[\s,0-9]++\)\s*+<<([-+0-9.eE,\s]++)"
 )
 # A list that a Python program assigns to a name, over several lines.
 _ASSIGNED = re.compile(r"^\w+ *= *(?:\w+\.)?(?:as)?(?:array\()?\[ *(?:#.*)?$", re.MULTILINE)
