@@ -28,9 +28,10 @@ from visioncal.calibration.suspects.undoing import likeliest
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import ranges
 from visioncal.core.transforms import compose, exp, invert
-from visioncal.interchange.formats.mending import shift_views, turn_boards
+from visioncal.interchange.formats.mending import remove_tool, shift_views, turn_boards
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE
 from visioncal.simulation import simulate
 from visioncal.vision.targets import corner_positions, load_target
 
@@ -675,6 +676,18 @@ def test_views_that_a_symmetric_board_lets_read_turned_are_said_and_turned_back(
     for edge_name, edge in found.edges.items():
         # The same corners under the same numbers.
         np.testing.assert_allclose(again.edges[edge_name].matrix, edge.matrix, atol=1e-6)
+
+
+def test_a_tool_is_taken_off_no_view_without_a_pose():
+    px = np.random.default_rng(0).uniform(0, 600, (4, 20, 2))
+    seen = [(np.arange(20), each) for each in px]
+    session = Session.from_corners(seen, poses_of(MOUNTS[0], 4)[0], BOARD, (640, 480))
+    cells = [
+        ["" if view.number == 1 and name in POSE else view.cell(name) for name in session.columns]
+        for view in session.views
+    ]
+    with pytest.raises(DataError, match="view 1 has no pose of the robot"):
+        remove_tool(session.with_content(cells=cells), [1], (0.0,) * 6)
 
 
 def test_corners_are_numbered_back_and_views_without_partner_go():

@@ -329,7 +329,7 @@ def test_what_a_urdf_cannot_hold_is_said():
         assert "Not in this file" in text
         assert "turn: ratio " in text
         Robot.from_document({"schema": 1, "name": "x", "tip": "flange", "urdf": text})
-    raised(DataError, "a robot of a URDF", corrected_urdf, load_robot("ur5"), load_robot("ur5"))
+    raised(DataError, "must be one of a URDF", corrected_urdf, load_robot("ur5"), load_robot("ur5"))
 
 
 # What ur_description's config/ur5e/default_kinematics.yaml holds, pi / 2 in full.

@@ -179,10 +179,7 @@ def _with_poses(session: Session, chosen: Sequence[int], poses: FloatArray) -> l
     """Cells of a session's rows, with (n, 4, 4) other measured poses in some views."""
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     for view, row, pose in zip(session.views, cells, poses, strict=True):
-        if view.number in chosen and not np.isfinite(pose).all():
-            words = f"views.csv: view {view.number} has no pose of the robot."
-            raise DataError(words, culprits=["--without-tool"], next_step="Name other views.")
-        if view.number in chosen:
+        if view.number in chosen and np.isfinite(pose).all():
             row.update({f"cft_{name}": repr(value) for name, value in pose_row(pose).items()})
     return cells
 
@@ -280,7 +277,10 @@ def remove_tool(session: Session, views: Sequence[int], tool: Sequence[float]) -
     poses = numbers_in(session, POSE).poses() @ invert(flange_from_tool)
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     for view, row, pose in zip(session.views, cells, poses, strict=True):
-        if view.number in chosen and np.isfinite(pose).all():
+        if view.number in chosen and not np.isfinite(pose).all():
+            words = f"views.csv: view {view.number} has no pose of the robot."
+            raise DataError(words, culprits=["--without-tool"], next_step="Name other views.")
+        if view.number in chosen:
             row.update({name: repr(value) for name, value in pose_row(pose).items()})
     at = "({:g}, {:g}, {:g}) mm, turned by ({:g}, {:g}, {:g}) deg".format(*tool)
     note = f"a tool at {at} was taken off the poses of views {ranges(chosen)}"

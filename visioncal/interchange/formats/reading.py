@@ -73,16 +73,10 @@ def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
     return Fields(path.stem, path.parent, places, {"matrix": matrices.reshape(-1, 16)})
 
 
-# Words in the name of a file of joint angles, and in that of one of poses.
-_JOINTS = {"joint", "joints", "angle", "angles"}
-_POSES = {"pose", "poses", "tcp", "xyz", "euler", "rpy", "quat", "camera", "cam", "target"}
-
-
 def _of_joints(table: TextTable, path: Path) -> TextTable:
-    """The table; without a header in a file called joints or angles, with the joints' names."""
+    """The table; without a header in a file called joints, with the joints' names."""
     is_whole = not table.has_header and 5 <= len(table.columns) <= 8
-    words = {*re.split("[^a-z]+", path.stem.lower())}
-    if is_whole and words & _JOINTS and not words & _POSES:
+    if is_whole and {"joint", "joints"} & {*re.split("[^a-z]+", path.stem.lower())}:
         return replace(table, columns=tuple(map("joint_{}".format, table.columns)))
     return table
 
