@@ -59,7 +59,7 @@ def far_parameters(
     information = vectors * np.maximum(values, 0.0) @ vectors.T
     seen = (information + np.eye(len(columns))) @ (arm.model.values / size)
     others = _Rest(information, seen, np.ones(len(columns)))
-    found = list[FarParameter]()
+    found, beside = list[FarParameter](), dict[bytes, list[_Rest]]()
     for at, direction in enumerate(np.linalg.pinv(moves).T):
         if not moves[at].any():
             continue
@@ -67,11 +67,14 @@ def far_parameters(
         own, whole = np.zeros(len(columns), dtype=bool), np.sum(direction**2)
         for block in blocks:
             own[block] = np.sum(direction[block] ** 2) > _OF_BLOCK * whole
+        # Parameters of one kind share their blocks.
+        if (key := own.tobytes()) not in beside:
+            sizes = (np.where(own, rest, 1.0) for rest in _RESTS.tolist())
+            beside[key] = [_Rest(information, seen, each) for each in sizes]
         prior = _MISTYPED_RAD * parameters[at].unit / size
         fits = []
-        for rest in _RESTS.tolist():
-            beside = _Rest(information, seen, np.where(own, rest, 1.0))
-            gain, change, sigma = beside.with_free(direction, prior)
+        for rest, errors in zip(_RESTS.tolist(), beside[key], strict=True):
+            gain, change, sigma = errors.with_free(direction, prior)
             fits.append(FarParameter(at, size * change, size * sigma, rest, gain - others.log))
         found.append(max(fits, key=lambda fit: fit.gain))
     found.sort(key=lambda fit: -fit.gain)
@@ -92,15 +95,15 @@ class _Rest:
 
     def __init__(self, information: FloatArray, seen: FloatArray, sizes: FloatArray) -> None:
         self._information, self._seen = information, seen
-        self._precision = information + np.diag(sizes**-2.0)
+        self._covariance = np.linalg.inv(information + np.diag(sizes**-2.0))
         scaled = np.eye(len(sizes)) + sizes[:, None] * information * sizes
-        half_squares = 0.5 * float(seen @ np.linalg.solve(self._precision, seen))
+        half_squares = 0.5 * float(seen @ self._covariance @ seen)
         self.log = half_squares - 0.5 * float(np.linalg.slogdet(scaled)[1])
 
     def with_free(self, direction: FloatArray, prior: float) -> tuple[float, float, float]:
         """With a step along a direction, too: log evidence, the step and its sigma."""
         by_step = self._information @ direction
-        beside = np.linalg.solve(self._precision, by_step)
+        beside = self._covariance @ by_step
         weight = float(direction @ by_step - by_step @ beside)
         pull = float(direction @ self._seen - beside @ self._seen)
         variance = 1.0 / (weight + prior**-2.0)

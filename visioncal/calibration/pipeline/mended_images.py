@@ -62,11 +62,11 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
             if shown is not None and shown.is_negative:
                 images[name] = np.asarray(cv2.bitwise_not(images[name]), np.uint8)
                 done[name].append("turned from negatives")
-    mended = _with(session, images, done)
-    for name, quarters in _turned(mended, present, progress).items():
+    located = _located(_with(session, images, done), progress)
+    for name, quarters in _turned(located, present).items():
         images[name] = np.ascontiguousarray(np.rot90(images[name], quarters))
         done[name].append(_TURNED[quarters])
-    if not any(done.values()) and _is_mirrored(session, progress):
+    if not any(done.values()) and _is_mirrored(located):
         return _mirrored_back(session)
     if not any(done.values()):
         raise DataError(
@@ -94,30 +94,31 @@ def with_turned_images(session: Session, views: Sequence[View], quarters: int) -
     return _with(session, turned, done) if turned else session
 
 
-def _turned(session: Session, views: Sequence[View], progress: Progress | None) -> dict[str, int]:
+def _located(session: Session, progress: Progress | None) -> RunState | None:
+    """The run with the target's pose in each image; None where it comes to none."""
+    names = {"robot", "detect", "intrinsics", "pnp"}
+    with suppress(VisioncalError):
+        stages = [stage for stage in STAGES if stage.name in names]
+        return run_stages(RunState(session, progress), stages)
+    return None
+
+
+def _turned(state: RunState | None, views: Sequence[View]) -> dict[str, int]:
     """Images that the robot's motion shows turned beside others, and by how many quarters."""
     found = dict[int, int]()
     with suppress(VisioncalError):
-        state = _located(session, progress)
-        while (mistake := likeliest(state)) is not None and not state.misread:
+        while state and (mistake := likeliest(state)) is not None and not state.misread:
             found |= dict.fromkeys(mistake.found.views, mistake.quarters)
             state = undone(state, mistake)
     return {view.image: found[view.number] for view in views if found.get(view.number)}
 
 
-def _located(session: Session, progress: Progress | None) -> RunState:
-    """The run with the target's pose in each image."""
-    names = {"robot", "detect", "intrinsics", "pnp"}
-    stages = [stage for stage in STAGES if stage.name in names]
-    return run_stages(RunState(session, progress), stages)
-
-
-def _is_mirrored(session: Session, progress: Progress | None) -> bool:
+def _is_mirrored(state: RunState | None) -> bool:
     """Whether robot and camera agree only with one of them mirrored."""
     with suppress(VisioncalError):
-        state = _located(session, progress)
-        guess = None if state.mount is None else guess_from_camera_poses(state)
-        return guess is not None and guess.stands_out and guess.best.hypothesis.robot.mirrored
+        if state is not None and state.mount is not None:
+            guess = guess_from_camera_poses(state)
+            return guess.stands_out and guess.best.hypothesis.robot.mirrored
     return False
 
 

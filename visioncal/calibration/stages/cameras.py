@@ -25,6 +25,7 @@ from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
 from visioncal.core.verdict import Finding, mending
 from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.results import CameraResult
+from visioncal.results.compare import intrinsics_names
 from visioncal.session import Session, View, frame_name
 from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
@@ -293,8 +294,9 @@ def _other_lens(
     )
     ratios = stated.matrix / lens.camera.matrix
     if np.abs(ratios - 1.0).max() < _SAME_RATIO:
+        order = ", ".join(intrinsics_names(stated)[4:])
         words += " The matrix is about as stated: the distortion is another one, or another "
-        words += "program's order of it (OpenCV's is k1, k2, p1, p2, k3)."
+        words += f"program's order of it (OpenCV's is {order})."
     elif np.ptp(ratios) < _SAME_RATIO * ratios.mean():
         width, height = (round(ratios.mean() * side, -1) for side in look.resolution)
         words += f" Those stated are all {figure(ratios.mean())} times as large, as of images of "

@@ -77,7 +77,7 @@ def detect(
 
     Raises:
         OtherBoardError: Images that are looked at, first or where none shows the target, show
-                another board, or are mirrored.
+            another board, or are mirrored.
         DataError: No view shows the target, more images have some other size than the camera's,
             the size of the images is unknown, or the printed board has another layout than the
             declared one.

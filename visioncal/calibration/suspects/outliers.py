@@ -23,7 +23,7 @@ from visioncal.core.transforms import (
     pose_difference,
     rotation_angle,
 )
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray, IntArray, evenly
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.estimation.moves import creep_effects
@@ -49,6 +49,8 @@ _WRONG = "its pose or its reading is wrong, or something had moved"
 _MARGIN, _MARGINAL_SHARE = 1.5, 10
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
+# Outliers among which a common step is sought: of more, all would take memory by their square.
+_CANDIDATES = 200
 # Another size turns nothing, and a small marker's noise less than so [rad].
 _TURNED_RAD = 0.2
 # Errors of an arm as a twist [rad].
@@ -336,7 +338,8 @@ def _step_of(
     if part.observations.has_rotation.all():
         changes = part.change_of(frame, state)
         if step is None:
-            apart = np.linalg.norm(log(invert(changes)[:, None] @ changes) / TWIST_UNITS, axis=-1)
+            some = changes[evenly(len(changes), _CANDIDATES)]
+            apart = np.linalg.norm(log(invert(some)[:, None] @ changes) / TWIST_UNITS, axis=-1)
             nearest = apart[int(np.median(apart, axis=1).argmin())]
             # One wrong pose among few would put their mean off.
             step = mean_transform(changes[nearest <= CLEAR_RATIO * np.median(nearest)])

@@ -175,12 +175,17 @@ def turn_boards(session: Session, views: Sequence[int], turn: Sequence[float]) -
     return _with_cells(session, cells, note, corners=corners)
 
 
-def _with_poses(session: Session, chosen: Sequence[int], poses: FloatArray) -> list[dict[str, str]]:
-    """Cells of a session's rows, with (n, 4, 4) other measured poses in some views."""
+def _with_poses(
+    session: Session, chosen: Sequence[int], poses: FloatArray, prefix: str = "cft_"
+) -> list[dict[str, str]]:
+    """Cells of a session's rows, with (n, 4, 4) other poses in some views: the measured ones.
+
+    With an empty prefix, the robot's.
+    """
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     for view, row, pose in zip(session.views, cells, poses, strict=True):
         if view.number in chosen and np.isfinite(pose).all():
-            row.update({f"cft_{name}": repr(value) for name, value in pose_row(pose).items()})
+            row.update({f"{prefix}{name}": repr(value) for name, value in pose_row(pose).items()})
     return cells
 
 
@@ -275,16 +280,13 @@ def remove_tool(session: Session, views: Sequence[int], tool: Sequence[float]) -
     turn = Rotation.from_rotvec(tool[3:], degrees=True).as_matrix()
     flange_from_tool = compose(turn, 1e-3 * np.array(tool[:3]))
     poses = numbers_in(session, POSE).poses() @ invert(flange_from_tool)
-    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
-    for view, row, pose in zip(session.views, cells, poses, strict=True):
+    for view, pose in zip(session.views, poses, strict=True):
         if view.number in chosen and not np.isfinite(pose).all():
             words = f"views.csv: view {view.number} has no pose of the robot."
             raise DataError(words, culprits=["--without-tool"], next_step="Name other views.")
-        if view.number in chosen:
-            row.update({name: repr(value) for name, value in pose_row(pose).items()})
     at = "({:g}, {:g}, {:g}) mm, turned by ({:g}, {:g}, {:g}) deg".format(*tool)
     note = f"a tool at {at} was taken off the poses of views {ranges(chosen)}"
-    return _with_cells(session, cells, note)
+    return _with_cells(session, _with_poses(session, chosen, poses, ""), note)
 
 
 def scaled_board(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
