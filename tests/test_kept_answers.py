@@ -13,6 +13,7 @@ FIGURE_SHARE = 0.2
 
 # Those whose effect is in a quicker cell, too.
 SLOW = {
+    "bow, 1", "cell",
     "2 wrong, 1", "6 wrong, 1", "two boards, 1",
     "2 wrong to hand, 1", "4 wrong to hand, 1", "cell, board moved", "lens 1 px off to hand, 1",
     "to hand, lens estimated, 1", "two boards, 3 wrong, 1", "wrong arm to hand, 1",

@@ -62,6 +62,7 @@ def test_threads_write_what_one_alone_writes(tmp_path):
         assert_same_evidence(read_evidence(folder / "recording.rrd"), evidence)
 
 
+@pytest.mark.slow
 def test_threads_change_no_digit(tmp_path, monkeypatch):
     write_session(simulate(CellOptions(views=6, seed=2)), tmp_path / "cell")
     asked = []

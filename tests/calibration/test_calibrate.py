@@ -205,7 +205,7 @@ def test_a_rendered_session_gives_the_truth_within_its_sigma(result, rendered):
     assert np.all(np.abs(result.camera.camera.matrix - truth.matrix) < 4 * sigma)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", [slow("eye-in-hand"), "eye-to-hand"])
 def test_exact_pose_pairs_give_the_exact_edges(mount, tmp_path):
     folder = write_session(
         simulate(exact(CellOptions(mount=mount, seed=4))), tmp_path / "pairs", images=False
@@ -333,6 +333,7 @@ def test_a_board_too_blurred_for_its_markers_is_no_other_board():
     assert "sharp, near enough and not mirrored" in found.do.words
 
 
+@pytest.mark.slow
 def test_a_board_of_another_kind_is_named():
     found = first_of_blurred(circles(4, 7, asymmetric=True), 0.0)
     assert "another board than declared: asymmetric grid of 4 x 7 circles" in found.words
@@ -361,7 +362,7 @@ SLIGHT = {"tilt_rad": (0.0, 0.015), "roll_rad": 0.015}
 @pytest.mark.parametrize(
     ("mount", "motion"),
     [
-        ("eye-in-hand", {"motion": "one_axis"}),
+        slow("eye-in-hand", {"motion": "one_axis"}),
         slow("eye-to-hand", {"motion": "one_axis"}),
         slow("eye-to-hand", {"motion": "translation"}),
         ("eye-in-hand", SLIGHT),
@@ -389,6 +390,7 @@ def test_what_cannot_be_read_is_refused_with_what_to_type(tmp_path, name):
     assert REFUSED[name] in refused.said
 
 
+@pytest.mark.slow
 def test_a_board_that_is_not_declared_is_named_by_calibrate(tmp_path):
     folder = broken_session(tmp_path / "session", BROKEN["another size of board"])
     caught = raised(DataError, "ChArUco board of 9 x 6 squares", visioncal.calibrate, folder)

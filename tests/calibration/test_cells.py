@@ -151,6 +151,7 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert away_m < 2.5e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["cam_right", slow("target_floor")])
 def test_a_frame_that_creeps_was_not_bumped_again_and_again(frame):
     cell = simulate(replace(PLAIN, moved=(Moved(frame, creeps=True, shift_m=0.012),), seed=3))
@@ -265,6 +266,7 @@ def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera(
     assert found.cell.noise["instrument_t1"]["level"] == pytest.approx(1.0, rel=0.25)
 
 
+@pytest.mark.slow
 def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
     cell = simulate(NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=8))
     untied = solved(cell).cell.untied
@@ -312,6 +314,7 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
     assert after < 0.45 * before
 
 
+@pytest.mark.slow
 def test_a_robot_without_joints_stays_as_it_reports_itself():
     cell = simulate(replace(PLAIN, stops=8))
     session = session_of(cell)
@@ -331,6 +334,7 @@ def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
     assert "a camera see a board, one of both on base_b or on its robot" in caught.next_step
 
 
+@pytest.mark.slow
 def test_a_camera_that_one_standing_view_ties_is_refused():
     far = replace(LEFT, place_m=(0.0, -1.5, 1.6))
     boards, cameras = (FLOOR, BoardAt("plate_b", "b")), (far, CameraAt("hand", on="a"))
@@ -340,6 +344,7 @@ def test_a_camera_that_one_standing_view_ties_is_refused():
     assert "cam_left" in caught.next_step
 
 
+@pytest.mark.slow
 def test_a_camera_that_a_board_ties_either_way_round_is_refused():
     beside = CameraAt("right", place_m=(0.15, 0.95, 1.25), looks_at_m=(0.0, 0.0, 0.05))
     boards = (replace(FLOOR, target=ALIKE), BoardAt("plate_a", "a"))
@@ -398,6 +403,7 @@ def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
     assert doctor(turned(35.0)[1]).is_sound
 
 
+@pytest.mark.slow
 def test_noise_refuses_nothing():
     # Thirty times a usual camera's and robot's.
     found = calibrate(turned(35.0, noise=30.0)[1])
@@ -449,8 +455,8 @@ HEIGHT = {"z_m": 0.1, "sigma_m": 1e-3}
     ("name", "prior", "words"),
     [
         ("base_a_from_camleft", HEIGHT, "Did you mean cam_left"),
-        ("base_a_from_target_plate_a", HEIGHT, "robot a moves one"),
-        ("cam_left_from_cam_left", HEIGHT, "they are one"),
+        slow("base_a_from_target_plate_a", HEIGHT, "robot a moves one"),
+        slow("cam_left_from_cam_left", HEIGHT, "they are one"),
         (
             "cam_left_from_cam_right",
             HEIGHT | {"sigma_rad": 1e-3},

@@ -51,6 +51,7 @@ def clocked_of(session):
     return clocked
 
 
+@pytest.mark.slow
 def test_a_clock_that_runs_evenly_is_not_doubted_for_an_arm_that_errs():
     moved = swept(how=SweepOptions(), dh_sigma_m=5e-4, dh_sigma_rad=5e-4)
     assert not clocked_of(cell_session(moved, "swept", seen="poses")).warnings
@@ -67,6 +68,7 @@ def stating(session: Session, ahead_s: float) -> Session:
     return replace(session, document=document)
 
 
+@pytest.mark.slow
 def test_joints_are_placed_in_time_too(session):
     columns = ("stamp_s", *(f"q{at}_rad" for at in range(1, 7)))
     robot = swept().streams["robot"]
@@ -79,6 +81,7 @@ def test_joints_are_placed_in_time_too(session):
     assert "streams/arm.csv" in " ".join(result.verdict.reasons)
 
 
+@pytest.mark.slow
 def test_its_recording_gives_the_same(session, tmp_path):
     write_recording(tmp_path / "session.rrd", session, None, (), None)
     one, other = calibrate(session), calibrate(tmp_path / "session.rrd")
@@ -91,6 +94,7 @@ def test_its_recording_gives_the_same(session, tmp_path):
     assert fact.note.endswith("by motion")
 
 
+@pytest.mark.slow
 def test_a_stated_offset_is_compared(session):
     # A millisecond is a thirtieth of a frame: nobody stamps better.
     right = clocked_of(stating(session, AHEAD_S + 1e-3))
@@ -103,6 +107,7 @@ def test_a_stated_offset_is_compared(session):
     assert abs(wrong.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
 
 
+@pytest.mark.slow
 def test_what_the_stream_does_not_cover_is_left_out_by_name(session):
     def gapped(robot):
         s = robot.stamps_s
@@ -270,6 +275,7 @@ def test_the_offset_is_told_by_a_sweep():
     assert clock.shutter is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "how"), [slow(0, SHORT), (1, HURRIED)], ids=["global", "rolling"])
 def test_images_are_placed_in_time_by_their_corners_and_their_readout_is_found(seed, how):
     cell = swept(seed, how=how)

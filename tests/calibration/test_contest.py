@@ -62,6 +62,7 @@ def pairs(seed, mount, views=18, step=None, farther_m=0.0):
     return pairs_session(mount, np.array(robot), np.array(seen))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [121, *map(slow, (115, 123, 138, *range(20, 30)))])
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_uneven_noise_is_no_step(mount, seed):
@@ -70,6 +71,7 @@ def test_uneven_noise_is_no_step(mount, seed):
     assert not {cause.kind for cause in causes} & {"moved_at_once", "board_changed"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_distances_that_change_at_once_are_no_noise(mount):
     """As noise along the sight, which has a size of its own, they would be let pass."""
@@ -115,6 +117,7 @@ def test_a_cause_is_sure_where_its_cure_leaves_noise():
     assert not moved.is_proven
 
 
+@pytest.mark.slow
 def test_a_small_step_of_an_arm_without_joints_may_be_its_other_posture():
     """An arm that goes over to its other shoulder has its errors the other way at once."""
     cause = calibrated(lifted(simulate(FINE)), joints=False).verdict.causes[0]
@@ -124,6 +127,7 @@ def test_a_small_step_of_an_arm_without_joints_may_be_its_other_posture():
     assert cause.by_limit
 
 
+@pytest.mark.slow
 def test_what_no_cure_was_applied_of_is_not_sure():
     """No fit of an arm's links is possible without its joint angles."""
     cell = simulate(replace(FINE, dh_sigma_m=5e-4, dh_sigma_rad=1e-3))
@@ -133,6 +137,7 @@ def test_what_no_cure_was_applied_of_is_not_sure():
     assert all(cause.by_limit for cause in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *map(slow, range(1, 4))])
 def test_creeping_is_not_sure_where_a_step_does_as_well(seed):
     """A target that moved by 1.1 mm midway."""
@@ -155,6 +160,7 @@ def test_a_camera_that_slowly_turns_is_no_lens_that_surely_changed(seed):
     assert re.search("what the flange carries crept|The load on the flange crept", cause.words)
 
 
+@pytest.mark.slow
 def test_nothing_is_accused_of_more_than_it_can_do():
     """A base that creeps by 40 mm, and as is likelier, whatever else follows the order of views."""
     cell = simulate(FINE)
@@ -203,6 +209,7 @@ def moving(kind, mount, count=16):
     return pairs_session(mount, robot, seen @ exp(noise)), {"cam": x, "target": z}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "mount", "name", "keys"),
     [
@@ -266,6 +273,7 @@ def test_words_say_whether_rivals_are_left():
     assert Verdict("bad", (proven, other)).top[0] == said
 
 
+@pytest.mark.slow
 def test_errors_of_an_arm_explain_what_the_cure_of_a_lens_leaves():
     """The stated lens is another camera's; it was refined, and the arm errs as arms do."""
     cell = simulate(replace(FINE, views=24, seed=4, dh_sigma_m=1e-4, dh_sigma_rad=1e-4))

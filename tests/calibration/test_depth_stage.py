@@ -149,7 +149,7 @@ def test_floats_in_millimetres_are_named_with_their_unit():
     assert "depth_unit_m = 0.001" in str(said.do)
 
 
-@pytest.mark.parametrize("px", [12, 30])
+@pytest.mark.parametrize("px", [12, slow(30)])
 def test_pictures_that_are_not_aligned_are_named_with_their_shift(px):
     findings, depth = again(lambda raw, _: np.roll(raw, px, axis=1))
     assert depth is None

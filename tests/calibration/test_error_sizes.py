@@ -63,6 +63,7 @@ def field_of(cell, size_px, rng):
     )
 
 
+@pytest.mark.slow
 def test_sizes_of_a_field_are_found_and_of_a_sound_cell_none():
     cell = simulate(CellOptions(views=30, seed=4))
     found = sizes_of(estimate_lenses(known_of(cell, joints=False)))
@@ -104,6 +105,7 @@ def test_what_a_held_lens_is_off_by_counts():
     assert np.sqrt(covariance[0, 0]) > 0.005 * longer[0]
 
 
+@pytest.mark.slow
 def test_no_board_explains_poses_that_agree_nowhere():
     cell = simulate(CellOptions(views=14, seed=3))
     places = cell.robot.base_from_flange.copy()

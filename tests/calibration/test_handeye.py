@@ -92,6 +92,7 @@ def some_motion(count, seed=0, tilt=0.5):
     return compose(rotation, rng.uniform(-0.3, 0.3, (count, 3)))
 
 
+@pytest.mark.slow
 def test_noise_and_errors_are_as_stated():
     x, z = some_edges(1)
     robot = some_motion(20, 1)
@@ -148,6 +149,7 @@ def test_the_fit_is_the_least_squares_solution_from_far_starts_too():
     assert np.abs(gradient * np.sqrt(np.diag(np.linalg.inv(information)))).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_three_views_do_not_pass_for_exact():
     for seed in range(20):
         cell = simulate(CellOptions(views=3, seed=seed, pixel_sigma_px=0.1))
@@ -232,6 +234,7 @@ def test_a_lens_that_views_leave_open_is_refused():
             estimate(cell_with(CAMERAS["wide"], 6, views=views))
 
 
+@pytest.mark.slow
 def test_a_robot_that_never_moved_is_named_before_the_lens_that_this_leaves_open():
     cell, rng = cell_with(CAMERAS["wide"], 4, **FLAT), np.random.default_rng(0)
     seen = cell.corners[0]
@@ -248,6 +251,7 @@ def test_a_robot_that_never_moved_is_named_before_the_lens_that_this_leaves_open
     assert "flange is tilted by 20 to 40 degrees" in str(refused.next_step)
 
 
+@pytest.mark.slow
 def test_healthy_motion_is_never_refused_small_tilts_included():
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -292,6 +296,7 @@ def chosen_of(cell):
     return find_start(read_cell(known), known, is_solved=False)
 
 
+@pytest.mark.slow
 def test_poses_follow_their_stated_covariance():
     surprises = []
     for seed in range(10):

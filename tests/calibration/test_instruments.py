@@ -41,6 +41,7 @@ PROBE, POINT, POINTS = (
 WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3, "offset_sigma_rad": 1e-3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [PROBE, slow(POINT)], ids=["probe", "point"])
 def test_errors_follow_their_covariance(options):
     kept = np.arange(12) if options.poses else np.r_[:6, 9:12]
@@ -78,6 +79,7 @@ def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace():
     assert size == 36
 
 
+@pytest.mark.slow
 def test_wrong_rows_are_named_and_left_out():
     shop = tracked(replace(POINT, **WRONG))
     rows = list(shop.rows)
@@ -126,6 +128,7 @@ def test_without_a_model_poses_give_the_frames_alone():
     assert all(point.sigma_mm < 0.024 for point in result.points)
 
 
+@pytest.mark.slow
 def test_outputs_are_whole_and_the_recording_gives_them_again(tmp_path):
     session_of(tracked(replace(PROBE, **WRONG))).save(tmp_path / "shop")
     out = tmp_path / "out"
@@ -287,6 +290,7 @@ def test_a_joint_that_slips_between_readings_is_named():
     assert sigma_deg < 0.03
 
 
+@pytest.mark.slow
 def test_an_arm_that_cannot_tilt_is_asked_for_a_measured_height():
     scara = load_robot("generic-scara-600")
     rng, place = np.random.default_rng(1), np.array([0.06, 0.02, 0.05, 1.0])

@@ -128,6 +128,7 @@ def place_sigmas_m(known):
     return arm.data(answer.fit, middles).place_sigmas_m(postures(arm.model.robot))
 
 
+@pytest.mark.slow
 def test_offsets_alone_are_told_from_wrong_links():
     cell = simulate(replace(GOOD, offset_sigma_rad=1e-3, seed=1))
     known = calibrated(cell)
@@ -178,11 +179,13 @@ def test_one_gear_ratio_that_is_off_is_named_with_its_joint():
     assert "The gear ratio of joint 3 (elbow_joint) is off by 0.3" in cause.words
 
 
+@pytest.mark.slow
 def test_links_that_are_all_off_are_no_single_one(wrong):
     _, known = wrong
     assert all(found.kind != "arm_parameter" for found in known.verdict.findings)
 
 
+@pytest.mark.slow
 def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
     sure = replace(WRONG_LINKS.target, square_sigma_m=1e-6 * WRONG_LINKS.target.square_m)
     cell = simulate(replace(WRONG_LINKS, seed=3, target=sure))
@@ -360,6 +363,7 @@ def carrying():
     return cell, calibrated(cell)
 
 
+@pytest.mark.slow
 def test_springs_are_told_within_their_sigmas(carrying):
     cell, known = carrying
     # Some disagree with the arm as stated, which does not bend; they come back.
@@ -442,6 +446,7 @@ def test_a_sagging_arm_of_unknown_weight_is_calibrated_with_its_sag():
     assert any(words in reason for reason in known.verdict.reasons)
 
 
+@pytest.mark.slow
 def test_play_is_told_by_stops_from_both_sides_and_is_no_stiffness():
     cell = simulate(replace(SAGGING, backlash_rad=PLAY, seed=2))
     worn = calibrated(cell)

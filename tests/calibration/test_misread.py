@@ -134,6 +134,7 @@ def test_three_tenths_of_the_views_may_be_wrong_and_are_not_fitted():
     assert sorted(fit.kept) == [at for at in range(20) if at not in wrong]
 
 
+@pytest.mark.slow
 def test_a_long_recording_takes_no_more_memory_than_what_is_looked_at():
     rng, edge = np.random.default_rng(1), np.eye(4)
     edge[:3, 3] = [0.0, 0.1, 0.2]
@@ -243,6 +244,7 @@ def test_a_planted_mistake_is_named(make, mount, views):
         assert not any("sorted as text" in change.words for change in tried)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "mount"), [("xyz", MOUNTS[0]), slow("ZYZ", MOUNTS[1])])
 def test_angles_in_degrees_that_lost_turns_are_named_and_not_made_up(tmp_path, mount, order):
     poses = cell_poses(mount)
@@ -283,6 +285,7 @@ def test_both_sides_in_millimetres_and_inverse_poses_of_the_camera_are_read_righ
         guess_reading(numbers(poses.true_robot[:3]), numbers(poses.camera.poses()[:3]), "")
 
 
+@pytest.mark.slow
 def test_two_readings_that_close_alike_are_both_named_and_none_is_taken(tmp_path):
     poses = cell_poses(views=14)
     turned = np.linalg.inv(poses.true_robot[:, :3, :3])
@@ -335,7 +338,13 @@ SOUND = {
 }
 
 
-@pytest.mark.parametrize(("world", "mount"), list(zip(SOUND, cycle(MOUNTS), strict=False)))
+@pytest.mark.parametrize(
+    ("world", "mount"),
+    [
+        slow(*pair) if pair[0] == "one axis" else pair
+        for pair in zip(SOUND, cycle(MOUNTS), strict=False)
+    ],
+)
 def test_sound_poses_are_not_accused(world, mount):
     poses = seen_in(simulate(replace(CellOptions(mount=mount, views=12), **SOUND[world])))
     guess = guessed(replace(poses, is_measured=mount == MOUNTS[0]))
@@ -375,6 +384,7 @@ def test_positions_and_rotations_that_two_signs_may_belong_to_are_both_named(tmp
     assert "--positions" in done.refused("close as first read").err
 
 
+@pytest.mark.slow
 def test_of_readings_that_close_half_of_the_rows_the_likelier_cell_is_taken():
     """A wrong mount looks as inverse poses do; the last rows are those of one row before."""
     cell = simulate(CellOptions(views=14, mount="eye-to-hand"))
@@ -392,6 +402,7 @@ def guessed_of(robot, seen) -> Guess:
     return guess_reading(*numbers, "eye-in-hand", is_measured=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *map(slow, (3, 4))])
 def test_another_size_that_leaves_most_of_a_misfit_is_none(seed):
     """A tool longer by 150 mm in the later rows, from farther away, looks as a larger board."""
@@ -410,6 +421,7 @@ def test_another_size_that_leaves_most_of_a_misfit_is_none(seed):
     assert not guess.is_open
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [slow("rotations"), "poses", slow("positions")])
 def test_what_was_never_recorded_is_named(lost):
     poses = cell_poses()
@@ -545,6 +557,7 @@ def test_joints_alone_that_are_misread_are_refused_with_the_fix():
     assert error.next_step.startswith("Negate q3_rad")
 
 
+@pytest.mark.slow
 def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     session = session_with(np.rad2deg(Q))
     views = list(session.views)
@@ -581,6 +594,7 @@ def test_a_lost_encoder_is_named_and_estimated_with_the_arm():
     assert np.median(away) < 1e-3
 
 
+@pytest.mark.slow
 def test_one_row_of_wrong_joints_costs_its_view_alone():
     joints = Q.copy()
     joints[5, 1] += 0.3
@@ -634,6 +648,7 @@ def converted(source, dest, *more):
     return typed("convert", source, dest, "--guess", *more)
 
 
+@pytest.mark.slow
 def test_poses_are_mirrored_only_when_that_is_asked_for(tmp_path):
     cell = simulate(CellOptions(views=18, seed=3))
     width = cell.stated[""].resolution[0]
@@ -697,6 +712,7 @@ def test_what_is_of_one_log_changes_rows_together(cell, tmp_path, moved):
             assert [view.numbers[name] for name in names] == pytest.approx(wanted, abs=1e-15)
 
 
+@pytest.mark.slow
 def test_nothing_is_written_without_a_word_or_a_reading(cell, tmp_path):
     done = converted(cell, tmp_path / "same", "--yes").good()
     assert "fit as first read" in done.err

@@ -133,6 +133,7 @@ def test_groups_of_readings_that_agree_with_one_change_are_named(options, named)
     assert re.search(words, verdict.causes[0].words)
 
 
+@pytest.mark.slow
 def test_a_calibrated_arm_that_scatters_by_more_than_it_repeats_is_not_good():
     """A load that no column states, or play, leaves a noise that no calibration removes."""
     shaky = replace(POINT, dh_sigma_m=1e-3, dh_sigma_rad=2e-3, robot_sigma_m=6e-4, stops=40)

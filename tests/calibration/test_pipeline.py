@@ -83,6 +83,7 @@ def with_camera(cell, off_px=(0, 0, 0, 0), **table):
     return replace(told, document=told.document | {"camera": told.document["camera"] | table})
 
 
+@pytest.mark.slow
 def test_a_closed_form_is_diagnosed_too():
     cell = simulate(replace(FINE, seed=2))
     joint, park = (calibrated(cell, solver=name).uncertainty for name in ("joint", "park"))
@@ -197,6 +198,7 @@ def test_doctor_says_of_few_stops_what_the_verdict_says_and_tilts_no_arm_that_ca
     assert "tilt" not in str(found)
 
 
+@pytest.mark.slow
 def test_a_board_of_several_may_be_known_whole():
     options = CellOptions(robot="ur5e", motion="one_axis", views=12, second=Second(), seed=2)
     cell = simulate(options)
@@ -215,6 +217,7 @@ def test_a_board_of_several_may_be_known_whole():
     assert sum("was used" in note and name in note for note in notes) == 3
 
 
+@pytest.mark.slow
 def test_only_the_components_that_views_contradict_are_left_out():
     height = float(X[2, 3])
     prior = {"x_m": float(X[0, 3]) + 0.04, "y_m": float(X[1, 3]) - 0.04, "z_m": height}
@@ -233,6 +236,7 @@ def test_only_the_components_that_views_contradict_are_left_out():
     assert misfit(found.edges["flange_from_cam"], X) < 22.0
 
 
+@pytest.mark.slow
 def test_a_plan_counts_what_was_measured():
     cell = simulate(CellOptions(robot="ur5e", motion="one_axis", views=8, seed=4))
     place = cell.transforms["flange_from_cam"][:3, 3].tolist()
@@ -285,17 +289,17 @@ REFINE, HOLD, RIGHT = {"intrinsics": "refine"}, {"intrinsics": "hold"}, by(0, 0,
 @pytest.mark.parametrize(
     ("options", "seeds", "off_px", "table", "limits", "refined", "status"),
     [
-        lens(FINE, by(4.0, 4.0, -3.0, 2.0), most=2.13, seeds=2, refined=True, **REFINE),
+        slow(*lens(FINE, by(4.0, 4.0, -3.0, 2.0), most=2.13, seeds=2, refined=True, **REFINE)),
         lens(FINE, RIGHT, refined=True, status="good", **REFINE),
         slow(*lens(FINE, by_sigma(0.5), 0.2, 2.0, 4, matrix_sigma_px=0.5)),
         # The corners' noise does not absorb the lens's error, and nothing is accused for it.
         slow(*lens(MARKER, within(6.0), 0.5, 1.7, 5, True, "good", matrix_sigma_px=6.0)),
         # Without a prior, one marker tells no lens.
-        lens(MARKER, RIGHT, refined=False, **REFINE),
+        slow(*lens(MARKER, RIGHT, refined=False, **REFINE)),
         # A lens that is stated for images twice as large.
         slow(*lens(OF_HALF, by(520.0, 519.0, 320.0, 190.0), refined=True)),
         # Corners as exact as centres of circles: both moves are beyond chance.
-        lens(EXACT, by(0.02, -0.02, 0.02, 0.01), status="good"),
+        slow(*lens(EXACT, by(0.02, -0.02, 0.02, 0.01), status="good")),
         lens(EXACT, by(0.5, -0.5, 0.5, 0.25), status="check"),
     ],
 )
@@ -326,6 +330,7 @@ def test_a_stated_lens_counts_by_its_prior_and_is_refined_where_that_helps(
     assert limits[0] < np.mean(surprises) < limits[1]
 
 
+@pytest.mark.slow
 def test_a_held_distortion_that_does_not_fit_is_named_and_freed_by_what_is_advised():
     cell = simulate(replace(FINE, camera=CAMERAS["wide"], seed=4))
     held = calibrated(cell, session=with_camera(cell, distortion=[0.0] * 5, **HOLD))
@@ -345,7 +350,7 @@ BENT = [-0.28, 0.09, 0.0012, -0.0009, -0.015]
     ("true", "off_px", "stated", "words"),
     [
         (BENT, (0, 0, 0, 0), [*BENT[:2], BENT[4], *BENT[2:4]], f"write distortion = {BENT}"),
-        ([0.0] * 5, (0, 0, 0, 0), BENT, "The pictures are rectified"),
+        slow([0.0] * 5, (0, 0, 0, 0), BENT, "The pictures are rectified"),
         (BENT, (0, 0, 80, 60), BENT, "begins 80 px to the right and 60 px below"),
     ],
     ids=["another order", "rectified", "cropped"],
@@ -419,6 +424,7 @@ def test_boards_have_names_and_a_common_covariance_that_holds():
         assert np.linalg.norm((invert(true) @ park[name])[:3, 3]) < 2e-3
 
 
+@pytest.mark.slow
 def test_one_view_places_a_board_and_none_is_told():
     cell = simulate(replace(TWO, second=replace(Second(), target=BOARDS["charuco"]), seed=6))
     first, further = (np.flatnonzero(board_numbers(cell) == board) for board in (0, 1))
@@ -457,6 +463,7 @@ def test_every_output_shows_all_boards(tmp_path):
         detect_session_target(session, written.calibration, "base")
 
 
+@pytest.mark.slow
 def test_what_is_written_of_the_fit_is_read_back():
     """Further boards are written relative to the first."""
     wrong = replace(TWO, seed=2, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
@@ -499,6 +506,7 @@ def run_with(cell: SimulatedCell, prior: dict[str, dict[str, float]]) -> RunStat
     return calibrated(cell, session=session, level="hand-eye")
 
 
+@pytest.mark.slow
 def test_what_cannot_be_used_is_said():
     prior = {"z_m": 0.1, "sigma_m": SIGMA_M}
     other = calibrate(scara(5, {"base_from_cam": prior}, 14, tilted=8)).verdict
@@ -513,6 +521,7 @@ def test_what_cannot_be_used_is_said():
     assert any("was not used: the closed form park cannot" in reason for reason in closed.reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.01, slow(0.484)])
 def test_measured_distances_of_another_scale_are_named_and_mended(scale, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -579,6 +588,7 @@ def single_tags(rms_mm, rms_deg, views=30, seed=0):
     return pairs_session("eye-in-hand", flanges, noisy)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mm", "deg", "is_accused"), [(0.8, 0.1, True), slow(8.0, 1.0, False)])
 def test_an_arm_is_not_accused_of_more_than_arms_err_by(mm, deg, is_accused):
     verdict = calibrate(single_tags(mm, deg, seed=7)).verdict
@@ -599,6 +609,7 @@ def test_the_motion_is_not_to_blame_for_errors_that_last():
     assert "tilted" not in weak.do.words
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("off", "mount"), crossed([0.0, 3e-4], ["eye-in-hand", "eye-to-hand"]))
 def test_a_size_of_measured_distances_competes_with_the_lengths_of_an_arm(mount, off) -> None:
     """Both stay in the covariance: neither becomes an error of the frames."""

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.boards import any_page, printed
 from support.commands import visioncal
 from support.edited import changed
+from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
 from support.rendered import line_kernel
@@ -152,6 +153,7 @@ def test_exchanged_points_of_an_exact_rig_are_left_out():
     assert error_of(cell, result) < 40.0
 
 
+@pytest.mark.slow
 def test_a_rig_that_is_larger_than_its_table_is_named_with_its_size():
     """Views alone do not tell: a larger rig farther away looks the same, and so do longer links."""
     _, session = seen(mount=TO_HAND, views=20, joints=True)
@@ -187,6 +189,7 @@ def test_sigmas_weigh_the_corners_and_the_camera_is_where_it_is_within_its_own()
     assert low / 1.2 < squares < 1.2 * high
 
 
+@pytest.mark.slow
 def test_views_that_do_not_serve_are_left_out_by_name_and_images_are_not_searched(folder):
     row, outside = [str(number) for number in CUBE.point_numbers[:4]], []
 
@@ -271,6 +274,7 @@ def test_tags_of_another_spacing_are_named(kind):
         assert "Write spacing = 0.3" in caught.next_step
 
 
+@pytest.mark.slow
 def test_one_image_of_two_targets_is_two_views_and_rows_name_their_targets(tmp_path):
     """A board, and the same board's corners as a rig of another size beside it, in one row."""
     aside = exp(np.array([0.0, 0.0, 0.5, 0.05, 0.02, 0.03]))
@@ -339,7 +343,7 @@ def test_a_board_in_millimetres_is_read_so(tmp_path):
     ("target", "mount", "words"),
     [
         (CHECKERS, TO_HAND, "numbers the corners of the board as if it was"),
-        (load_target("aruco_4x4_50_id0_120mm"), IN_HAND, "counterclockwise"),
+        slow(load_target("aruco_4x4_50_id0_120mm"), IN_HAND, "counterclockwise"),
     ],
     ids=["bottom up", "marker"],
 )
@@ -372,6 +376,7 @@ def errors_px(found, truth):
     return found.px[ours] - truth.px[theirs]
 
 
+@pytest.mark.slow
 def test_tags_are_found_to_a_hundredth_of_a_pixel():
     cell = simulate(CellOptions(target=TAGS, views=3, seed=2))
     truth, image = cell.exact_corners[0], render(prepare_scene(cell), 0)
@@ -446,7 +451,7 @@ def test_dense_corners_bring_in_refused_views_and_leave_sharp_ones_alone():
 
 @pytest.mark.parametrize(
     ("stated", "status", "said", "level"),
-    [(1.1, "good", "", 1.1 * NOISE_PX), (0.4, "check", "corners.csv states 0.08 px", NOISE_PX)],
+    [slow(1.1, "good", "", 1.1 * NOISE_PX), (0.4, "check", "corners.csv states 0.08 px", NOISE_PX)],
 )
 def test_the_verdict_says_where_the_corners_contradict_what_is_stated(stated, status, said, level):
     result = calibrate(seen(CHARUCO, stated=stated)[1])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.marks import slow
 from support.tracked import known_of
 
 import visioncal
@@ -83,7 +84,7 @@ def test_a_six_axis_arm_by_a_laser(real_data):
     [
         ("ric_charuco_eye_to_hand", None, "fit as first read"),
         # Of each image one of two poses is taken, so that no reading explains half of them.
-        ("ur3e_checkerboard_to_hand_cam1", 20, ""),
+        slow("ur3e_checkerboard_to_hand_cam1", 20, ""),
     ],
 )
 def test_a_real_session_of_images_is_not_accused(real_data, name, views, said):
@@ -126,6 +127,7 @@ def test_two_cameras_of_one_arm_agree_within_a_bounded_search(real_data, monkeyp
     assert len(steps) < 5000
 
 
+@pytest.mark.slow
 def test_a_wide_lens_of_exact_corners_is_named_and_mended(real_data, tmp_path):
     shutil.copytree(real_data / "field/cases/fisheye-wrist/session", folder := tmp_path / "session")
     cause = visioncal.calibrate(folder).verdict.causes[0]

@@ -192,6 +192,7 @@ FAULTS = {
 QUICK = ("poses read on the way",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name if name in QUICK else slow(name) for name in FAULTS])
 def test_what_is_named_is_mended_by_what_is_printed(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
@@ -223,6 +224,7 @@ def test_what_is_named_is_mended_by_what_is_printed(tmp_path, monkeypatch, name)
     assert away @ np.linalg.solve(edge.covariance[3:, 3:], away) < chi2.isf(1e-3, 3)
 
 
+@pytest.mark.slow
 def test_turns_that_are_wrong_each_in_its_way_are_no_other_frame(tmp_path):
     cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
     turns = iter(([3.0, 0.1, 0.0], [0.1, 3.0, 0.1], [2.2, 2.1, 0.0]))
@@ -239,6 +241,7 @@ def test_turns_that_are_wrong_each_in_its_way_are_no_other_frame(tmp_path):
     assert (cause.kind, cause.views) == ("wrong_views", (3, 9, 14))
 
 
+@pytest.mark.slow
 def test_another_distortion_is_no_picture_of_another_size(tmp_path):
     cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
     k1, k2, *_ = SOUND.camera.distortion

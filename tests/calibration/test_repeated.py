@@ -87,6 +87,7 @@ def bent(corners, bias_px):
     return replace(corners, px=corners.px + bias_px * terms @ rng.standard_normal((5, 2)))
 
 
+@pytest.mark.slow
 def test_a_film_of_a_few_stops_is_so_many_views():
     session = of_one_camera(8)
     shown = session.corner_table
@@ -156,6 +157,7 @@ def of_one_camera(images, *, stops=True, trembling_m=0.0):
     )
 
 
+@pytest.mark.slow
 def test_images_of_a_stop_share_the_robots_error():
     once, name = calibrate(of_one_camera(1)).edges["flange_from_cam"], "flange_from_cam"
     for stops, trembling_m in ((True, 2e-6), (False, 1e-5)):
@@ -168,6 +170,7 @@ def test_images_of_a_stop_share_the_robots_error():
         assert misfit(edge, STEADY.transforms[name]) < 22.5
 
 
+@pytest.mark.slow
 def test_images_of_what_stands_still_are_no_copies_at_other_stops():
     cell = simulate(replace(read_cell("two-cameras"), stops=14, pixel_sigma_px=0.002))
     found = calibrate(cell_session(cell, "still", seen="corners"))
@@ -232,7 +235,7 @@ KINDS = {
 
 @pytest.mark.parametrize(
     ("kind", "jitter_m", "interleaved"),
-    [("poses", 1e-4, False), ("corners", 0.0, True), slow("readings", 1e-4, True)],
+    [slow("poses", 1e-4, False), ("corners", 0.0, True), slow("readings", 1e-4, True)],
 )
 def test_copies_of_rows_change_nothing(kind, jitter_m, interleaved):
     session = KINDS[kind]()

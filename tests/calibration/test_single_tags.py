@@ -70,6 +70,7 @@ def test_how_well_the_scale_of_measured_poses_is_known_may_be_stated():
 KINDS = [{}, {"far_m": (0.7, 1.3), "views": 40}, {"arm": (3e-3, 1e-3)}]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "how"), [(2, KINDS[0]), *(slow(16, how) for how in KINDS)], ids=str
 )

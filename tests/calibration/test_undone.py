@@ -200,7 +200,13 @@ PLANTED = {
 
 
 # Another one is found by the same.
-ALIKE = ["mixed_units of angles ", "mixed_units of one axis", "mixed_units here and there"]
+ALIKE = [
+    "copied_poses of the target",
+    "mixed_units of angles ",
+    "mixed_units of angles ZYX",
+    "mixed_units of one axis",
+    "mixed_units here and there",
+]
 
 
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
@@ -315,6 +321,7 @@ def test_a_rail_that_is_in_no_pose_is_named_and_added_from_its_column(
             np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scaled", "mount"),
     [
@@ -393,6 +400,7 @@ def test_rows_are_any_few_apart(by):
     assert f":{by} &&" in cause.do.command
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "last", "by"), [slow(6, 14, 1), (10, 16, -2), slow(4, 9, 1)])
 def test_rows_amid_the_table_that_are_apart_are_one_command(tmp_path, monkeypatch, first, last, by):
     monkeypatch.chdir(tmp_path)
@@ -441,6 +449,7 @@ def located(session):
     return run_stages(RunState(session), STAGES[:5])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [3, slow(6)])
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_sound_and_otherwise_wrong_sessions_are_not_accused(mount, seeds):
@@ -463,6 +472,7 @@ def test_of_long_sessions_every_row_is_named():
     assert len(found.found.views) == 107
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_corners_that_are_numbered_a_column_on_get_their_own_numbers(tmp_path, monkeypatch, mount):
     monkeypatch.chdir(tmp_path)
@@ -544,6 +554,7 @@ def test_views_without_pictures_are_not_said_to_be_turned_back():
     raised(DataError, words, turn_boards, read, [0, 1], (180.0,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "columns", "mount"),
     [
@@ -585,6 +596,7 @@ def test_a_column_that_was_sorted_by_itself_is_no_rail(mount):
     assert "The robot's z has the numbers of other rows" in cause.words
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("when", "degrees"), [slow("from view 12 on", 90.0), ("in all of these", 180.0)]
 )
@@ -787,6 +799,7 @@ def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind,
     assert causes[0].do.words.endswith("Of several robots or cameras, correct the files by hand.")
 
 
+@pytest.mark.slow
 def test_a_cell_gets_no_command_that_would_drop_the_lenses_of_all_its_cameras():
     session = recorded(simulate(replace(OPTIONS, seed=0, stops=24)))
     left = session.document["cameras"]["left"]
@@ -798,6 +811,7 @@ def test_a_cell_gets_no_command_that_would_drop_the_lenses_of_all_its_cameras():
     assert not cause.do.command
 
 
+@pytest.mark.slow
 def test_beside_a_mistake_of_one_robot_another_one_that_is_misread_is_named():
     session, _ = in_a_cell(0, "shifted_rows")
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]

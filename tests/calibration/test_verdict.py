@@ -353,7 +353,7 @@ def test_images_that_are_shifted_from_some_view_on_are_told_from_a_camera_that_m
     assert calibrated(bumped).verdict.causes[0].kind != "image_shifted"
 
 
-@pytest.mark.parametrize(("off_mm", "named"), [(2.0, []), (30.0, [(7,)])])
+@pytest.mark.parametrize(("off_mm", "named"), [slow(2.0, []), (30.0, [(7,)])])
 def test_doctor_calls_no_view_wrong_for_what_an_arm_may_err_by(off_mm, named) -> None:
     cell = simulate(CellOptions(views=20))
     flanges = cell.robot.base_from_flange.copy()
@@ -362,6 +362,7 @@ def test_doctor_calls_no_view_wrong_for_what_an_arm_may_err_by(off_mm, named) ->
     assert [each.views for each in found if each.kind == "wrong_views"] == named
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("off_mm", "may_err"), [(2.0, True), (30.0, False)])
 def test_the_arm_is_among_the_causes_of_a_view_that_is_off_by_what_arms_err_by(off_mm, may_err):
     cell = simulate(CellOptions(views=20))
@@ -374,6 +375,7 @@ def test_the_arm_is_among_the_causes_of_a_view_that_is_off_by_what_arms_err_by(o
     assert farthest_by_arms([servo]) == pytest.approx((12.0, 3.0))
 
 
+@pytest.mark.slow
 def test_a_view_just_beyond_the_limit_of_outliers_is_no_mistake():
     cell = simulate(CellOptions(views=20))
     flanges = cell.robot.base_from_flange.copy()
@@ -454,6 +456,7 @@ def test_a_row_that_was_not_filled_in_is_said_to_be() -> None:
     assert "the robot's pose in its row is all zeros" in view.reason
 
 
+@pytest.mark.slow
 def test_wrong_poses_at_the_end_have_no_move_in_common() -> None:
     cell, rng = simulate(CellOptions(views=20)), np.random.default_rng(1)
     flange = cell.robot.base_from_flange.copy()
@@ -647,6 +650,7 @@ def test_a_wrong_length_of_an_arm_and_a_board_of_another_size_both_stay_possible
     assert away @ np.linalg.solve(edge.covariance, away) < chi2_limit(1e-3, 6)
 
 
+@pytest.mark.slow
 def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm() -> None:
     """Its size is known to 0.1 %, and is off by 1.5 times that: the arm becomes as large."""
     size = 1.0015
@@ -667,7 +671,7 @@ def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm() -> None
     assert "square_sigma_m" in cause.do.words
 
 
-@pytest.mark.parametrize(("views", "is_found"), [(slice(1), False), (slice(1, None), True)])
+@pytest.mark.parametrize(("views", "is_found"), [slow(slice(1), False), (slice(1, None), True)])
 def test_only_views_that_are_known_well_show_what_is_not_predicted(views: slice, is_found: bool):
     """A view of a small board from the front: off by 2 deg, which is 2.5 times its sigma."""
     known = calibrated(simulate(CellOptions(views=12)), joints=False)
@@ -941,6 +945,7 @@ def test_what_happens_now_and_then_happens_at_picks() -> None:
     assert before > 0.95
 
 
+@pytest.mark.slow
 def test_what_happens_from_image_to_image_happens_at_picks() -> None:
     # A focus of 0.2 %, which shows a thing that much nearer or farther.
     cell, rng, share = simulate(CellOptions()), np.random.default_rng(3), 2e-3

@@ -334,6 +334,7 @@ def test_help_lists_first_what_most_need():
             assert len(command.params) <= 8, f"{name} has options, and none that matter"
 
 
+@pytest.mark.slow
 def test_examples_work(pairs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("OUT").mkdir()
@@ -475,8 +476,8 @@ finally:
         slow("diff out out", 1100, {"cv2.typing"}),
         slow("locate -c out --pixel 320,200 --plane z=20 --pose 0.5,0.1,0.4,0,1,0,0", 1100,
              {"cv2.typing"}),
-        ("show out -o report.html", 1250, {"cv2.typing", "jinja2", "matplotlib"}),
-        ("history empty.db", 1050, {"rich"}),
+        slow("show out -o report.html", 1250, {"cv2.typing", "jinja2", "matplotlib"}),
+        slow("history empty.db", 1050, {"rich"}),
     ],
 )  # fmt: skip
 def test_a_short_command_loads_what_it_uses(words, most, used, tmp_path):
@@ -491,6 +492,7 @@ def test_a_short_command_loads_what_it_uses(words, most, used, tmp_path):
     assert int(count) <= most
 
 
+@pytest.mark.slow
 def test_what_is_said_is_of_use_where_it_is_said(rendered, pairs, tmp_path, monkeypatch):
     """Coverage, verdicts beside exports, what could not be checked, and guards without looks."""
     out = tmp_path / "out"
@@ -524,6 +526,7 @@ def test_what_is_said_is_of_use_where_it_is_said(rendered, pairs, tmp_path, monk
     visioncal("guard", *against).refused("no look came on stdin", "guard --example")
 
 
+@pytest.mark.slow
 def test_stops_to_repeat_come_with_the_board_of_the_result(rendered, tmp_path, monkeypatch):
     """Of an arm without a model, whose way to the stops nobody plans."""
     monkeypatch.chdir(tmp_path)
@@ -548,6 +551,7 @@ def test_stops_to_repeat_come_with_the_board_of_the_result(rendered, tmp_path, m
     assert "BOARD" not in recovering.err
 
 
+@pytest.mark.slow
 def test_next_steps_keep_the_views_that_were_typed(tmp_path):
     cell, out = tmp_path / "cell", tmp_path / "out"
     visioncal("simulate", cell, "--no-images").good()
@@ -621,7 +625,7 @@ HAS_FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is n
     ("out", "err", "options", "ends", "said"),
     [
         (full, io.StringIO, ["--json"], 2, "stdout cannot be written: No space left on device."),
-        (io.StringIO, full, [], 0, None),
+        slow(io.StringIO, full, [], 0, None),
         # A reader that has gone ends the command quietly.
         (unread, io.StringIO, ["--json"], 141, ""),
         # Streams that were closed before are no error.
@@ -764,7 +768,9 @@ WRONG_PLACES = {
 }
 
 
-@pytest.mark.parametrize("name", WRONG_PLACES)
+@pytest.mark.parametrize(
+    "name", [slow(name) if name == "readings to look in" else name for name in WRONG_PLACES]
+)
 def test_of_what_is_given_in_the_wrong_place(place, name):
     words, said, advised = WRONG_PLACES[name]
     write_session(simulate(CellOptions(views=8, seed=4)), place / "session", images=False)

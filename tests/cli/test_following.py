@@ -124,10 +124,9 @@ def of_few_views(folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "half of another size" else slow(name) for name in PLANTED]
-)
-@pytest.mark.parametrize("words", ["calibrate cell -o out", slow("doctor cell")])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PLANTED)
+@pytest.mark.parametrize("words", ["calibrate cell -o out", "doctor cell"])
 def test_pictures_of_several_sizes_are_no_circle(place, name, words):
     PLANTED[name](of_few_views(sound_session(place / "cell")))
     assert follow(*words.split()).last.status == 0
@@ -343,13 +342,11 @@ DONE_WRONG = {
     ),
 }  # fmt: skip
 QUICK = (
-    "images squeezed",
     "a typing error",
     "no images",
     "no views",
     "no header",
     "a row",
-    "[cam]",
     "a focal",
     "one pose",
     "a path",

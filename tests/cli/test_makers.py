@@ -371,6 +371,7 @@ def test_touches_are_read_and_frames_are_told_in_the_robot_s_form(of_maker, tool
                 assert np.abs(printed(maker, name, done.out) - frame.edge.matrix).max() < SHOWN
 
 
+@pytest.mark.slow
 def test_touches_of_another_maker_are_refused_until_it_is_said(of_maker, tmp_path):
     poses = turned_poses(
         np.random.default_rng(2), np.tile([0.5, -0.1, 0.2], (8, 1)), np.ones(3) / 10, np.eye(3)

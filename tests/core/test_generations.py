@@ -167,6 +167,7 @@ def test_a_result_outlives_a_drawing_that_fails(tmp_path, monkeypatch, module, n
     assert "18 mm of 25 mm" in missing.cause
 
 
+@pytest.mark.slow
 def test_calibrate_ends_with_1_and_the_result_where_a_drawing_fails(tmp_path, monkeypatch):
     cell = write_session(simulate(CellOptions(views=12, seed=1)), tmp_path / "p", images=False)
     out = tmp_path / "out"

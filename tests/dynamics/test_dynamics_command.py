@@ -68,6 +68,7 @@ def test_identify_and_validate(folder, tmp_path):
     assert (shares < 0.02).all()
 
 
+@pytest.mark.slow
 def test_json_holds_what_was_asked_for(folder):
     done = visioncal(
         *("dynamics", "identify", folder, "--stream", "motors", "--validate-on", "fresh"),
@@ -147,6 +148,7 @@ def loaded_streams(identified, session):
     return conditioned_streams(session, identified, IdentificationRequest())
 
 
+@pytest.mark.slow
 def test_torques_are_fed_forward(world, run):
     arm, done = ArmDynamics.of(run.identified), world.done["check"]
     wanted = drive_torques(world.built, done.q, done.dq, done.ddq)

@@ -322,6 +322,7 @@ def test_parameters_are_within_their_sigmas(worlds):
     assert max(shares) < 1.9
 
 
+@pytest.mark.slow
 def test_torques_of_another_motion_are_predicted_to_their_noise(worlds):
     for built, found, fresh, rng in worlds:
         motion = recorded(built, fresh, rng).pieces[0].measured.motion
@@ -349,6 +350,7 @@ def test_links_are_bodies_in_every_run_and_nearer_the_truth(worlds):
     assert np.std(after) < np.std(before)
 
 
+@pytest.mark.slow
 def test_breaking_loose_is_found():
     rng = np.random.default_rng(1)
     built = real_dynamics("ur5e", rng, stribeck=True)

@@ -381,6 +381,7 @@ def test_a_plan_has_tables_a_preview_and_all_of_it_as_json(tmp_path):
     assert abs(row[6 + fast["joint"]]) == pytest.approx(fast["speed_rad_s"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_tables_of_an_earlier_plan_are_taken_away(tmp_path):
     out = tmp_path / "motions"
@@ -400,6 +401,7 @@ def test_tables_of_an_earlier_plan_are_taken_away(tmp_path):
     assert "null" not in done.out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_what_cannot_be_checked_is_said(tmp_path):
     document = small_document(inertia_kg_m2=None)

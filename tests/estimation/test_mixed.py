@@ -218,6 +218,7 @@ def test_a_field_of_size_one_has_it_all_over_the_image():
         assert np.min(variances) > 0.8
 
 
+@pytest.mark.slow
 def test_what_is_eliminated_is_noise_that_corners_share(corners):
     """The Schur complement of the whole problem by a dense covariance, as generalised squares."""
     problem, looks = corners
@@ -265,6 +266,7 @@ def test_a_focus_that_is_fixed_neither_breathes_nor_jitters():
     assert (levels.breathing, levels.jitter) == (0.0, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draws", [range(2, 3), slow(range(2, 9))], ids=str)
 def test_a_focus_that_chance_explains_leaves_the_flange_its_noise(draws):
     """Else errors along the lens's axis alone shrink the noise of all directions."""
@@ -314,7 +316,7 @@ def fitted(errors, seed, stops=22):
     return problem, fit_problem(problem, state)
 
 
-@pytest.mark.parametrize("errors", [white, smooth])
+@pytest.mark.parametrize("errors", [slow(white), smooth])
 def test_errors_are_as_large_as_the_covariance_says(errors):
     before, after = [], []
     for seed in range(12):

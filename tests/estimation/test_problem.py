@@ -547,6 +547,7 @@ def answered(given, **changes):
     return problem, fit_problem(problem, known.assessment.fit.state)
 
 
+@pytest.mark.slow
 def test_the_variance_to_be_expected_is_that_of_a_level_with_its_degrees_of_freedom():
     # Corners know poses far better than the robot stands.
     problem, fit = answered(True, views=6, seed=5, robot_sigma_m=1e-3, robot_sigma_rad=1e-3)

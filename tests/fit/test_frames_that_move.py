@@ -154,7 +154,12 @@ def slow(seed, kinds=(), walks=False):
 
 
 @pytest.mark.parametrize(
-    ("kinds", "walks"), [(("creeps",), False), (("creeps", "slips"), False), ((), True)]
+    ("kinds", "walks"),
+    [
+        (("creeps",), False),
+        pytest.param(("creeps", "slips"), False, marks=pytest.mark.slow),
+        ((), True),
+    ],
 )
 @pytest.mark.parametrize("draws", seeds(1, 6))
 def test_what_is_slow_is_told_from_errors_that_last_where_joints_are_known(kinds, walks, draws):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.marks import seeds
+from support.marks import seeds, slow
 from support.small_cells import TABLE, made
 from support.without_poses import without_poses
 
@@ -283,7 +283,7 @@ def assert_left_out_as_by_refits(fit, left_out):
         assert left_out.squares[row] == pytest.approx(refit.squares[row], rel=1e-3)
 
 
-@pytest.mark.parametrize(("given", "in_hand"), [(True, True), (False, True), (True, False)])
+@pytest.mark.parametrize(("given", "in_hand"), [(True, True), slow(False, True), slow(True, False)])
 @pytest.mark.parametrize("draws", seeds(5, 60))
 def test_errors_are_as_large_as_the_covariance_says(given, in_hand, draws):
     squares = []

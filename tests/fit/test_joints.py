@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from support.cells import reporting
-from support.marks import seeds
+from support.marks import seeds, slow
 from support.wrong_arms import CARRIED, GOOD, SAGGING, WRONG_LINKS, away_m
 
 from visioncal.core.transforms import invert, log
@@ -108,7 +108,7 @@ def assert_honest(squares, directions):
     assert values < chi2.ppf(0.999, directions * len(squares)) / len(squares)
 
 
-@pytest.mark.parametrize("payloads", [CARRIED, ()])
+@pytest.mark.parametrize("payloads", [CARRIED, slow(())])
 @pytest.mark.parametrize("draws", seeds(1, 8))
 def test_springs_are_found_within_their_covariance(payloads, draws):
     squares = []
@@ -168,6 +168,7 @@ def test_zeros_are_found_within_their_covariance_and_are_no_errors_of_links(draw
     assert_honest(squares, 6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draws", seeds(2, 8))
 def test_a_board_beside_links_that_err_is_held_unless_its_size_is_clear(draws):
     """Random errors of links lengthen an arm by as much as a printed board may be off."""
@@ -198,6 +199,7 @@ def test_arms_that_do_not_yield_have_no_springs_and_no_play(options: CellOptions
             assert fit.unknowns.closed >= {"links flange", "zeros flange"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draws", seeds(1, 4))
 def test_an_arm_of_unknown_weight_is_found_with_its_sag(draws):
     left, before = [], []

@@ -66,7 +66,7 @@ def squares_of(small, fit, values):
     return found
 
 
-@pytest.mark.parametrize("in_hand", [True, False])
+@pytest.mark.parametrize("in_hand", [True, slow(False)])
 @pytest.mark.parametrize("draws", seeds(2, 8))
 def test_a_clock_and_a_readout_are_found_within_their_covariance(in_hand, draws):
     squares = []
@@ -145,6 +145,7 @@ def stopping(seed, share, *, onwards=False):
     return replace(small, cell=replace(small.cell, arms=arms, moments=moments))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["stops short", "moves on"])
 @pytest.mark.parametrize("draws", seeds(2, 8))
 def test_an_arm_that_moves_between_pose_and_image_is_found_and_one_that_stands_does_not(

@@ -158,6 +158,7 @@ def test_a_board_that_is_doubted_and_not_freed_counts_in_the_covariance(draws):
     assert 6.0 * np.sum(squares) < chi2.isf(1e-3, 6 * len(squares))
 
 
+@pytest.mark.slow
 def test_what_is_judged_by_combinations_of_many_unknowns_is_the_same():
     fit = solve(made(stops=8, cameras=4).cell).fit
     alone, boards = _alone(fit, "flange"), _boards(fit)

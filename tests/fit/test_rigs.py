@@ -13,6 +13,7 @@ from visioncal.model import read_cell
 from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, RobotAt, simulate
 
 
+@pytest.mark.slow
 def test_a_cell_of_two_arms_is_found_as_surely_as_it_says():
     simulated = simulate(OPTIONS)
     session = recorded(simulated)
@@ -48,6 +49,7 @@ def test_arms_that_no_sighting_connects_are_eliminated_apart():
     assert fit.used.mean() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("in_hand", [True, slow(False)])
 def test_swaying_cameras_are_separated_from_corners_noise_and_from_the_arm(in_hand):
     squares, views, errors, used = [], [], [], []

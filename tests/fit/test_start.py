@@ -109,6 +109,7 @@ def test_a_chain_over_two_arms_is_as_sure_as_it_says():
     assert 0.5 < np.mean(squares) < 1.6
 
 
+@pytest.mark.slow
 def test_far_boards_determine_a_lens_by_the_robots_motion(monkeypatch):
     def far(rng):
         found = seen_at(rng)

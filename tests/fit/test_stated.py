@@ -89,6 +89,7 @@ def test_a_camera_that_no_robot_passes_is_placed_by_a_prior_alone():
     assert np.trace(fit.covariance(("edge", "cam"))[3:, 3:]) > np.trace(covariance[3:, 3:])
 
 
+@pytest.mark.slow
 def test_a_height_that_is_stated_of_a_base_leaves_its_turn_free():
     made_cell = simulate(OPTIONS)
     session = recorded(made_cell)

@@ -571,6 +571,7 @@ def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(located, ra
     assert (f"The gap at {points[3].name} (" in touch_test_finding(test).words) != passed
 
 
+@pytest.mark.slow
 def test_targets_are_printed_and_gaps_join_the_result(proved):
     folder, look, _ = proved
     out = folder / "out"
@@ -596,6 +597,7 @@ def test_targets_are_printed_and_gaps_join_the_result(proved):
     )
 
 
+@pytest.mark.slow
 def test_points_out_of_reach_of_a_calibrated_arm_are_refused(tmp_path):
     options = replace(CELL, views=25, offset_sigma_rad=1e-3, branches=True)
     for name, each in (("fit", options), ("look", replace(options, views=3, recording=1))):
@@ -607,6 +609,7 @@ def test_points_out_of_reach_of_a_calibrated_arm_are_refused(tmp_path):
     visioncal(*words, 1000).refused("is out of reach within the joints' limits")
 
 
+@pytest.mark.slow
 def test_one_image_of_a_camera_that_stands_still_shows_where_to_touch(tmp_path):
     options = CellOptions(mount="eye-to-hand", views=12, seed=5)
     cell_session(simulate(options), "fit", seen="corners").save(tmp_path / "fit")
@@ -623,6 +626,7 @@ def test_one_image_of_a_camera_that_stands_still_shows_where_to_touch(tmp_path):
         assert 1e3 * np.linalg.norm(away_m) < point["radius95_mm"]
 
 
+@pytest.mark.slow
 def test_what_touches_is_the_only_tool_or_the_flange(proved):
     folder, look, _ = proved
     known = Calibration.load(folder / "out")

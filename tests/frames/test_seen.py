@@ -70,6 +70,7 @@ def sights_of(cell, parent, place, rng, count=6, target=BOARD):
     return sights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mount", "parent"), [(IN_HAND, "base"), slow(TO_HAND, "flange")])
 def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
     cell = simulate(exact(CellOptions(mount=mount, views=8, seed=1)))
@@ -105,6 +106,7 @@ def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
     np.testing.assert_allclose(here.flange_jacobian, twists(standing, 6, 1e-4), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draws", seeds(2, 5))
 def test_places_follow_their_stated_covariance(draws):
     surprises = []

@@ -135,6 +135,7 @@ def test_three_touches_say_what_their_sigma_rests_on():
     assert np.allclose(stated.edge.covariance, 9 * assumed.edge.covariance, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_few_touches_that_agree_by_chance_are_not_believed():
     chosen = [0, 1, 3, 4]
     kinds = tuple(KINDS[index] for index in chosen)
@@ -191,6 +192,7 @@ def test_a_mirrored_drawing_is_a_bad_one(count, change):
     assert frame.verdict.reasons[0].startswith("cad.csv is a mirror image of the part")
 
 
+@pytest.mark.slow
 def test_no_mistake_of_names_is_found_where_there_is_none():
     for seed in range(20):
         frame = drawn(CAD_MM, NAMES, seed=seed, noise_m=1e-3)
@@ -262,6 +264,7 @@ def test_a_tool_in_doubt_makes_its_fixture_doubtful(tools, fixtures):
     assert "The tip wobbles." in frame.verdict.reasons[0]
 
 
+@pytest.mark.slow
 def test_errors_that_points_share_are_carried_to_the_answer():
     # As a camera's: another covariance than a tip's, for all points together.
     rng = np.random.default_rng(8)
@@ -587,6 +590,7 @@ def test_one_wrong_touch_in_ten_is_named(tmp_path):
     assert off_mm(tool) < NEAR_MM
 
 
+@pytest.mark.slow
 def test_a_wrong_touch_among_few_is_named_where_it_cannot_be_left_out(tmp_path):
     """Of six touches with 0.3 mm of noise, one that slipped by 2.4 mm is not certain."""
     named, sound = 0, 0

@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support import commands
 from support.following import follow
+from support.marks import slow
 
 import visioncal
 from visioncal.core.transforms import compose, invert, mean_transform, pose_difference
@@ -97,6 +98,7 @@ def test_industrial_calibration(real_data, calibrated):
     assert away_mm(result, "base_from_cam", x_mm) < 0.5 * sigma_mm
 
 
+@pytest.mark.slow
 def test_visp_to_the_hand(real_data, calibrated):
     result, said = calibrated(
         real_data / "visp_franka_hand_eye/data-eye-to-hand",
@@ -114,7 +116,13 @@ def test_visp_to_the_hand(real_data, calibrated):
     ("source", "unit", "count", "park_mm", "scatter"),
     [
         ("doosan_a0509_charuco", "mm", 31, [-17.7, 32.1, -12.0], (1.62, 0.42)),
-        ("pose_pairs_small/franka_charuco_joint_angles", "m", 12, [47.6, 9.2, -35.8], (3.43, 0.72)),
+        slow(
+            "pose_pairs_small/franka_charuco_joint_angles",
+            "m",
+            12,
+            [47.6, 9.2, -35.8],
+            (3.43, 0.72),
+        ),
     ],
     ids=["two units", "a file a view"],
 )

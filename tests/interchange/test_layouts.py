@@ -1060,7 +1060,7 @@ ALIKE = {
     "below_units", "beside_a_decoy", "blanks", "columns_as_lists", "comment_above", "elements",
     "headings_in_turn", "letters_of_a_lost_picture", "letters_of_a_picture_too_many",
     "lines_before_the_first_picture", "lines_with_brackets", "lists_alone", "lists_beside_pictures",
-    "lists_in_a_log", "mappings_of_any_names", "opencv_each", "pictures_to_numbers",
+    "lists_in_a_log", "mappings_of_any_names", "opencv_each", "pictures_to_numbers", "sixes",
     "sorted_as_text", "tf2_echo", "times_and_names", "two_of_a_day",
 }  # fmt: skip
 
@@ -1180,6 +1180,7 @@ def test_a_table_of_uneven_rows_hears_of_commas_only_where_all_are_decimal(tmp_p
     assert ("ommas" in done.refused("cells", words).err) == ("ommas" in words)
 
 
+@pytest.mark.slow
 def test_rounded_quaternions_give_way_to_angles_of_more_digits_that_agree(tmp_path):
     """As tf_echo prints both, by three decimals."""
     poses, away = world()[0], []
@@ -1489,7 +1490,8 @@ def test_files_that_are_each_a_recording_are_named_at_once(tmp_path, monkeypatch
     assert listed.count("code/") == 3
 
 
-@pytest.mark.parametrize("is_listed", [False, True])
+@pytest.mark.slow
+@pytest.mark.parametrize("is_listed", [slow(False), True])
 def test_files_of_a_recording_each_that_differ_in_numbers_are_named(tmp_path, is_listed):
     poses, _, session = world()
     for name, count in (("run_1", 6), ("run_2", 9)):
@@ -1627,7 +1629,9 @@ def test_rows_of_joints_and_of_a_tracker_belong_together_by_their_id(tmp_path):
     ("name", "target", "words"),
     [
         slow("npz-base2ee", "checkerboard_4x7_33mm", "The poses fit as first read"),
-        ("rpy-unstated", "checkerboard_11x8_20mm", "as Euler angles xyz about fixed axes in rad"),
+        slow(
+            "rpy-unstated", "checkerboard_11x8_20mm", "as Euler angles xyz about fixed axes in rad"
+        ),
     ],
 )
 def test_cases_of_the_field_come_in(tmp_path, name, target, words):
@@ -1681,6 +1685,7 @@ def test_the_only_urdf_beside_a_table_gives_its_arm_by_the_names_of_its_joints(t
     assert 'tip = "d"' in (tmp_path / "other/session.toml").read_text()
 
 
+@pytest.mark.slow
 def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypatch):
     session = world()[2]
     shoot(tmp_path / "in", "img{:02d}.png")

@@ -98,6 +98,7 @@ def test_compressed_images_are_kept_byte_by_byte(kind, ending, source, rendered,
         assert session.images.read(view.image) == data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period_s", [slow(0.2), 0.3])
 def test_stops_are_found_at_any_rate_of_the_robot(period_s, source, rendered, tmp_path):
     path = bag(tmp_path / "b", source, rendered, period_s=period_s, frames_s=0.1)

@@ -66,6 +66,7 @@ def expect_results_of_calibrate(fleet, out, rows):
     assert {value.error for value in failed.values()} == {"DataError"}
 
 
+@pytest.mark.slow
 def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
     told = []
     found = batch(
@@ -83,6 +84,7 @@ def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
     assert all(row.words in html.unescape(page) for row in found.rows)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_what_was_done_is_kept(fleet, tmp_path):
     found = batch(fleet / "robot_*/week_1", tmp_path, without=BARE)

@@ -296,6 +296,7 @@ def turning(count):
     return target @ invert(seen) @ invert(camera), seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fails", [slow(False), True])
 def test_angles_come_first_where_some_rows_have_no_corners(fails, tmp_path, monkeypatch):
     """Rows are compared with those that have corners; an error of one reading ends nothing."""

@@ -53,6 +53,7 @@ def plan():
     return fake_plan(5)
 
 
+@pytest.mark.slow
 def test_a_recording_is_a_session_that_calibrates(tmp_path):
     plan = fake_plan(12)
     arm, camera = fake_devices(plan)
@@ -79,6 +80,7 @@ def test_a_recording_is_a_session_that_calibrates(tmp_path):
     assert np.linalg.norm(off) < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hidden", [False, slow(True)], ids=["told by the arm", "seen in the image"]
 )
@@ -129,6 +131,7 @@ def test_a_failure_on_the_way_halts_and_leaves_a_session(plan, tmp_path, failure
     assert len(Session.load(tmp_path / "live").views) == 3
 
 
+@pytest.mark.slow
 def test_a_board_that_is_lost_once_is_told_and_three_times_ends(plan, tmp_path):
     arm, camera = fake_devices(plan)
     # The first move goes to the first stop.
@@ -271,6 +274,7 @@ def test_a_disk_without_room_is_told_before_on_the_way_and_while_it_is_written(
         assert len(Session.load(folder).views) >= views
 
 
+@pytest.mark.slow
 def test_a_killed_recording_loses_nothing(tmp_path):
     folder, acknowledged = tmp_path / "live", set()
     program = Path(__file__).parents[1] / "support" / "recorded.py"
@@ -294,6 +298,7 @@ def test_a_killed_recording_loses_nothing(tmp_path):
     assert [view.number for view in Session.load(folder).views] == [1, 2, 3, 4, 5, 6]
 
 
+@pytest.mark.slow
 def test_what_a_killed_process_left_is_removed(plan, tmp_path):
     arm, camera = fake_devices(plan)
     camera.hidden_at = (5,)
@@ -511,6 +516,7 @@ def test_a_signal_ends_it_like_ctrl_c(planned, cell, tmp_path):
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+@pytest.mark.slow
 def test_stops_without_a_view_end_in_status_2(planned, cell, tmp_path):
     cell[1].hidden_at = (2,)
     record(tmp_path / "live", "--plan", planned[0], "--yes").refused(
@@ -545,6 +551,7 @@ def test_devices_and_pictures_that_do_not_fit_are_named(planned, cell, tmp_path)
     )
 
 
+@pytest.mark.slow
 def test_what_ends_before_its_first_view_leaves_no_folder_behind(planned, cell, tmp_path):
     """The same command can be given again; it said that its folder was not empty."""
     live, sent = tmp_path / "live", ("--plan", planned[0], "--yes")
@@ -581,6 +588,7 @@ def test_a_guided_arm_is_followed(planned, cell, tmp_path):
     assert session.robot_name == "ur5e"
 
 
+@pytest.mark.slow
 def test_each_view_of_a_network_camera_shows_where_the_arm_stood(planned, tmp_path, monkeypatch):
     arm, camera = fake_devices(read_plan(planned[0]))
     arm.clock = HostClock()

@@ -54,6 +54,7 @@ def test_a_motion_keeps_speed_and_acceleration_and_takes_the_shortest_time(dista
     assert motion.ends_s == pytest.approx(shortest)
 
 
+@pytest.mark.slow
 def test_the_truth_is_the_real_arm_and_stays_known(controller):
     began = time.monotonic()
     before = controller.state([began])
@@ -70,6 +71,7 @@ def test_the_truth_is_the_real_arm_and_stays_known(controller):
     assert 1e-4 < np.linalg.norm(shift, axis=1).max() < 1e-2
 
 
+@pytest.mark.slow
 def test_a_controller_ends_with_the_process_that_started_it():
     code = "import os; from visioncal.live.simulated.controller import spawn; running = spawn()\n"
     code += "print(running.host, flush=True); os.kill(os.getpid(), 9)"

@@ -54,6 +54,7 @@ def test_what_keeps_an_arm_from_moving_is_said_with_what_to_press(controller, fa
     read_condition(controller.host).check_moves()
 
 
+@pytest.mark.slow
 def test_a_frozen_controller_is_said_to_be_silent(controller):
     controller.inject("silent")
     try:

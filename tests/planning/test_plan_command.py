@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 from support.commands import visioncal
+from support.marks import slow
 
 from visioncal.core.documents.pendants import read_pose
 from visioncal.core.transforms import exp
@@ -142,7 +143,7 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
         ("ur55e", {}, (), "Did you mean ur5e"),
         ("ur5e", {"cam": "1 2 3"}, (), "--cam is '1,2,3', but must be x,y,z,rx,ry,rz"),
         ("ur5e", {"resolution": "1280"}, (), "--resolution"),
-        ("ur5e", {}, ("--box", "cage:500,0,400:900,900,700"), "Look whether the boxes are"),
+        slow("ur5e", {}, ("--box", "cage:500,0,400:900,900,700"), "Look whether the boxes are"),
         ("ur5e", {}, ("--for", "handeye"), "Did you mean hand-eye"),
         ("ur5e", {}, ("--add", "3"), "holds no recorded session"),
         ("ur5e", {}, ("--need-mm", "-1"), "above zero"),
@@ -175,6 +176,7 @@ def test_stops_are_planned_until_a_need_is_met_in_prediction(tmp_path):
     assert short["need"]["probability"] <= met["need"]["probability"]
 
 
+@pytest.mark.slow
 def test_arms_that_no_ur_program_drives_get_none(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
@@ -185,6 +187,7 @@ def test_arms_that_no_ur_program_drives_get_none(tmp_path):
     assert header[:9] == ["view", "image", *(f"q{index}_rad" for index in range(1, 8))]
 
 
+@pytest.mark.slow
 def test_calibrated_stops_that_a_check_repeats_are_far_apart(tmp_path):
     session = write_session(
         simulate(CellOptions(views=14, seed=8)), tmp_path / "cell", images=False

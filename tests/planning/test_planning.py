@@ -133,6 +133,7 @@ def test_the_values_are_those_of_a_plain_inversion(in_view):
         assert all(after <= before for before, after in pairwise(history))
 
 
+@pytest.mark.slow
 def test_thirty_planned_stops_are_expected_better_than_random_ones():
     # A board whose size is open by 0.1 % would leave 0.5 mm, whatever the stops.
     sure = replace(CELL.target, square_sigma_m=1e-5 * CELL.target.square_m)
@@ -178,6 +179,7 @@ def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
 ERRING = replace(CELL, views=30, seed=5, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
 
 
+@pytest.mark.slow
 def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
     found = so_far_of(simulate(ERRING))
     known = found[0]
@@ -198,6 +200,7 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result():
     assert design.predicted.mm == pytest.approx(mm(world, design.rows), rel=0.1)
 
 
+@pytest.mark.slow
 def test_stops_for_the_arm_need_joint_angles():
     begun = start_from_session(*so_far_of(simulate(replace(ERRING, views=12))))
     q = postures_in_view(CELL, 60)

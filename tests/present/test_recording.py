@@ -21,6 +21,7 @@ from support.arm_documents import calibrated
 from support.drawn import column
 from support.findings import with_findings
 from support.kept import assert_same, assert_same_evidence
+from support.marks import slow
 from support.refusals import raised
 from support.samples import BASE_FROM_FIXTURE, FLANGE_FROM_TOOL, made_up, with_frames
 
@@ -219,6 +220,7 @@ except DataError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_writer_that_has_ended_is_not_waited_for_without_end(tmp_path):
     command = [sys.executable, "-c", _LIMITED, str(tmp_path / "recording.rrd")]
     # A hundred times what it takes: without a limit it would not end at all.
@@ -279,7 +281,7 @@ def test_flipped_bytes_in_images_are_named(sample, recorded, tmp_path):
         assert raised(DataError, "SHA-256", Session.load, broken).culprits == (view.image,)
 
 
-@pytest.mark.parametrize("entity", [paths.SESSION, paths.IMAGE, paths.CALIBRATION])
+@pytest.mark.parametrize("entity", [slow(paths.SESSION), slow(paths.IMAGE), paths.CALIBRATION])
 def test_no_flipped_bit_changes_anything_silently(entity, sample, recorded, tmp_path):
     rng, broken = random.Random(5), tmp_path / "broken.rrd"
     frames = [frame for frame, _, _ in chunks(recorded, (entity,))]

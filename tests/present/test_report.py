@@ -57,6 +57,7 @@ def test_views_that_contradict_the_others_are_set_apart(sample):
     assert " 14 " in section(page, "Residuals by view", "Residuals over joint angles")
 
 
+@pytest.mark.slow
 def test_real_contradictions_are_recognised(tmp_path):
     cell = simulate(CellOptions(views=15, wrong_views=1))
     write_session(cell, tmp_path / "cell", images=False)
@@ -219,6 +220,7 @@ def test_the_command_writes_a_certificate_of_a_recording(outputs, tmp_path):
     assert visioncal("show", outputs, "--certificate", "--serial", "7").status == 2
 
 
+@pytest.mark.slow
 def test_nothing_that_leaves_states_an_accuracy_where_no_fit_explains_the_views(tmp_path):
     """Console, report, certificate, card, JSON, notes and exports of a bad result."""
     cell, rng = simulate(CellOptions(views=12)), np.random.default_rng(1)

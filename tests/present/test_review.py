@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from support.commands import visioncal
+from support.marks import slow
 from support.samples import made_up
 
 from visioncal.interchange.result_files import load_result
@@ -154,7 +155,7 @@ def test_on_windows_the_viewer_s_tree_is_ended(monkeypatch):
             "print('earlier'); print('no display: DISPLAY is not set'); raise SystemExit(3)",
             ("status 3: no display: DISPLAY is not set", "--web"),
         ),
-        (
+        slow(
             ("--web",),
             "print('compiled without web_viewer'); raise SystemExit(2)",
             ("compiled without web_viewer",),
@@ -170,6 +171,7 @@ def test_a_viewer_that_cannot_open_says_what_else_can(out, stub, more, script, w
     assert all(word in done.stderr for word in words)
 
 
+@pytest.mark.slow
 def test_reruns_own_server_answers_this_machine_alone_and_ends_with_the_command(out):
     process = subprocess.Popen(
         command(out, "--web"),

@@ -88,6 +88,7 @@ def test_the_condition_goes_with_every_output(result, tmp_path):
         assert condition.sentence not in " ".join(document(result, form, Selection()).warnings)
 
 
+@pytest.mark.slow
 def test_a_nominal_arm_has_no_condition():
     plain = result_of(calibrated(simulate(replace(SURE, views=12)), joints=False))
     assert plain.conditions == ()

@@ -272,6 +272,7 @@ def test_commands_enter_what_they_did(site, tmp_path):
     visioncal("history", file, "-o", tmp_path / "table.txt").refused(".csv")
 
 
+@pytest.mark.slow
 def test_a_failing_entry_is_a_warning(site, tmp_path):
     """In another process, as users call it: a text where the site's file would be."""
     (site / "line" / SITE_FILE).write_text("no database" * 100)
@@ -377,6 +378,7 @@ def test_a_course_is_in_the_axes_of_the_table():
     assert course.sigmas[0] == pytest.approx([2e-4, 1e-4, 3e-4] * 2)
 
 
+@pytest.mark.slow
 def test_the_time_of_a_miss_is_within_its_interval():
     # The need less 95 % of the latest entry itself, by the chi-square of three dimensions.
     inside, left_m = 0, 0.5e-3 - np.sqrt(chi2.ppf(0.95, 3)) * SIGMA_M

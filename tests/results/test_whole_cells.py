@@ -279,6 +279,7 @@ def test_touches_or_a_tool_of_a_cell_say_which_robot_is_meant(folder, tmp_path):
     visioncal("tcp", bare, "--robot", "b").refused("--robot")
 
 
+@pytest.mark.slow
 def test_stops_are_added_to_one_pair(folder, tmp_path):
     chosen = ("--camera", "left", "--target", "plate_b", "--candidates", 60)
     out = tmp_path / "plan"

@@ -94,7 +94,10 @@ def test_a_second_board_is_placed_along(place):
     assert "without images" in visioncal("plan", place / "two", "--add", 2).err
 
 
-@pytest.mark.parametrize("name", SIMULATED_CELLS)
+# Cells of two arms are the subject of tests/calibration/test_cells.py.
+@pytest.mark.parametrize(
+    "name", [name if name == "two-cameras" else slow(name) for name in SIMULATED_CELLS]
+)
 def test_cells_that_come_with_visioncal_are_calibrated(name, place):
     folder, out = place / name, place / f"{name}-out"
     done("simulate", folder, "--cell", name, "--no-images", "--views", 20)
@@ -131,6 +134,7 @@ def test_another_recording_of_a_whole_cell_is_that_of_a_cell_whose_camera_was_kn
     assert after["moved"] == [{"frame": "cam_left", "from_stop": 0}]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read", ["points", slow("probe")])
 def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
     folder, out = place / f"cell-{read}", place / f"cell-{read}-out"
@@ -248,6 +252,7 @@ def test_depth_is_off_by_what_was_asked_for(place):
     assert 0.01 < np.isnan(depth).mean() < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", [slow("eye-in-hand"), slow("eye-to-hand"), "instrument"])
 def test_an_arm_of_four_axes_is_simulated_with_a_measured_height(mount, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

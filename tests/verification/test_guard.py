@@ -97,6 +97,7 @@ def test_false_alarms_are_as_rare_as_stated(count):
     assert count / 1000 <= alarms <= count / 100 + 4 * np.sqrt(count / 100)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tail", [0.6, slow(1.2)])
 def test_the_limit_follows_the_tail_of_the_statistic(tail):
     rng, count = np.random.default_rng(3), 40_000
@@ -354,6 +355,7 @@ def lights():
     return [[Scene(seed).light(turned(at)) for at in pair] for seed, pair in enumerate(pairs)]
 
 
+@pytest.mark.slow
 def test_turns_are_as_right_as_their_covariance_says(lights):
     """In other light; where parts move; with the camera's offset over a plane."""
     squares, rng = [], np.random.default_rng(0)

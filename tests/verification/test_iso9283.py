@@ -78,6 +78,7 @@ def test_what_is_under_the_devices_sigma_is_a_bound(measuring):
     assert "these are 2 in 8 and more: the figures are no certificate" in words
 
 
+@pytest.mark.slow
 def test_intervals_of_repeatability_cover_it():
     """Of 400 draws 95 % cover; fewer than 365 do with a probability of 0.1 %."""
     rng, noise, inside = np.random.default_rng(0), 1e-10 * np.eye(3), 0
@@ -151,6 +152,7 @@ def test_too_few_rows_are_refused(measuring):
     raised(DataError, "has 5 rows or more", performance, session_of(shop_of(0.1)), measuring)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", ["ur10e", slow("generic-6r-1800")])
 def test_the_cube_is_reached_and_has_the_standards_proportions(arm):
     robot = load_robot(arm)

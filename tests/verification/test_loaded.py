@@ -48,6 +48,7 @@ def off_in_sigmas(result) -> np.ndarray:
     return (found - 1.0 / STIFF) / np.array([spring.sigma_rad_per_nm for spring in springs])
 
 
+@pytest.mark.slow
 def test_three_forces_at_one_pose_show_shoulder_and_elbow(unloaded):
     result = calibrate_loaded(loaded(), unloaded)
     _, shoulder, elbow, *wrist = result.elastic.joints
@@ -67,6 +68,7 @@ def test_three_forces_at_one_pose_show_shoulder_and_elbow(unloaded):
     assert "kg of the stops" not in conditions
 
 
+@pytest.mark.slow
 def test_loads_alone_show_the_stiffness_of_an_arm_whose_weight_is_compensated():
     options = replace(SHOP, weight_compensated=True, robot_sigma_rad=3e-6, robot_sigma_m=3e-6)
     before = calibrate(session_of(tracked(replace(options, seed=1))))
@@ -102,6 +104,7 @@ def test_what_is_no_load_is_said(unloaded):
     raised(DataError, "of a camera", calibrate_loaded, loaded(), seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compensated", [True, slow(False)])
 def test_the_loads_tell_whether_the_arms_own_weight_bends_it(compensated):
     """Controllers of KUKA and ABB compensate it: its stiffness was once denied there."""
@@ -118,6 +121,7 @@ def test_the_loads_tell_whether_the_arms_own_weight_bends_it(compensated):
     assert again.masses is not None
 
 
+@pytest.mark.slow
 def test_twelve_stops_under_payloads_reject_no_sound_view():
     payloads = tuple(Payload(kg, (0.0, 0.0, 0.1)) for kg in (1.0, 2.0, 5.0))
     result = calibrate(session_of(tracked(replace(SHOP, payloads=payloads, stops=12, seed=1))))

@@ -59,6 +59,7 @@ def test_a_camera_that_stands_is_not_accused(lights):
     assert moves(episodes(lights, [[0] * LENGTH] * 4)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [0, slow(5), slow(LENGTH - 1)])
 def test_a_move_is_named_by_its_frame(lights, at):
     courses = [[0] * LENGTH, [0] * at + [1] * (LENGTH - at), [1] * LENGTH, [1] * LENGTH]
@@ -71,6 +72,7 @@ def test_a_camera_that_looks_elsewhere_and_back_moved_twice(lights):
     assert moves(episodes(lights, courses)) == [(1, 5, False), (3, 0, False)]
 
 
+@pytest.mark.slow
 def test_a_hand_before_the_camera_is_no_move(lights):
     shown = episodes(lights, [[0] * LENGTH] * 4)
     shown[1] = [np.full_like(shown[1][0], 9) for _ in shown[1]]
@@ -111,6 +113,7 @@ def test_the_command_names_each_move(lights, tmp_path):
     visioncal("audit", tmp_path / "none").refused("none")
 
 
+@pytest.mark.slow
 def test_a_data_set_of_lerobot_is_read_by_its_episodes(lights, tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     table = pytest.importorskip("pyarrow").table

@@ -87,6 +87,7 @@ def test_a_simulated_cell_shows_the_picture(target):
         assert np.median(np.abs(found.px - simulated_px(cell.camera().camera, places))) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "look",
     [
@@ -129,6 +130,7 @@ def test_a_picture_calibrates_a_lens_that_nobody_states(tmp_path):
     assert misfit(edge, cell.transforms["flange_from_cam"]) < 16.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("disc_px", [4.0, slow(8.0)])
 def test_pictures_out_of_focus_are_registered_by_a_disc(target, disc_px):
     pose = pose_at(0.45, 20.0, np.array([0.15, 0.11, 0.0]), np.random.default_rng(2))
@@ -140,6 +142,7 @@ def test_pictures_out_of_focus_are_registered_by_a_disc(target, disc_px):
     assert found.blur_px == pytest.approx(disc_px / 2, abs=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [[1], slow([1, 6])])
 def test_small_prints_of_alike_letters_are_found(tmp_path, views):
     cell = simulate(CellOptions(views=8, seed=0, camera=CAMERA))
@@ -193,6 +196,7 @@ def test_a_guard_and_locate_look_for_the_picture_in_images(target, tmp_path, mon
     assert (status, answers[-2]["holds"]) == (3, False)
 
 
+@pytest.mark.slow
 def test_other_pictures_are_not_found_and_mirrored_ones_are_named(target):
     image, _ = seen(poster())
     mirrored = find_target(np.ascontiguousarray(image[:, ::-1]), target)
@@ -205,6 +209,7 @@ def test_other_pictures_are_not_found_and_mirrored_ones_are_named(target):
     assert "the image is plain" in plain.reason
 
 
+@pytest.mark.slow
 def test_pictures_by_which_no_pose_is_known_are_refused():
     half = poster()[:450]
     turned = np.concatenate([half, half[::-1, ::-1]])

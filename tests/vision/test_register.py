@@ -66,6 +66,7 @@ def away(found, pose, flat):
     return 1e3 * np.linalg.norm(off[:3]), np.rad2deg(np.linalg.norm(error(found, pose)[:3]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("disc_px", "twist"),
     [slow(0.0, ()), slow(6.0, ()), (0.0, (0.004, 0.002, 0.001, 0.002, 0.001, 0.004))],
@@ -97,6 +98,7 @@ def test_derivatives_are_those_of_differences(disc_px, twist):
         assert numeric @ closed > 0.93 * np.linalg.norm(numeric) * np.linalg.norm(closed), at
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [slow("poster"), "board"])
 @pytest.mark.parametrize("views", seeds(4, 8))
 def test_covariances_of_poses_are_true_where_half_of_the_views_are_covered(kind, views):
@@ -141,6 +143,7 @@ def test_a_lens_that_is_off_counts_in_the_covariance(views):
     assert np.mean(plain) > 20.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("look", "most"),
     [
@@ -170,6 +173,7 @@ def test_blurred_prints_are_found_from_a_start_by_the_robot(look, most, views):
             assert found.seen.disc_px == pytest.approx(look.disc_px, abs=0.7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lens_px", "within"), [(0.3, 0.1), slow(0.5, 0.02)])
 @pytest.mark.parametrize("views", seeds(1, 2))
 def test_the_blur_of_a_small_covered_board_is_found_from_sharper_and_wider_ones(
@@ -195,6 +199,7 @@ def test_the_blur_of_a_small_covered_board_is_found_from_sharper_and_wider_ones(
             assert squared(found, pose) < 2.0
 
 
+@pytest.mark.slow
 def test_a_slanted_label_is_drawn_as_it_is_seen():
     # A Gaussian on the print, as wide along as across, and kernels that blur what is finest too
     # little leave 0.008 of the grey levels' range at this tilt.

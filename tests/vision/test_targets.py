@@ -364,6 +364,7 @@ def test_corners_and_centres_are_as_exact_as_the_image(target, shot, most_px):
     assert np.abs(error.mean(axis=0)).max() < 4 * most_px / np.sqrt(len(error))
 
 
+@pytest.mark.slow
 def test_centres_are_exact_where_a_fisheye_sees_them_slanted():
     # 0.11 m before a board of 0.24 m it looks at circles from up to 66 degrees aside.
     cell = simulate(
@@ -468,6 +469,7 @@ def test_circles_of_another_diameter_are_named_until_it_is_written(tmp_path, mon
     assert sum(view.used for view in found.views) == sum(view.used for view in sound.views)
 
 
+@pytest.mark.slow
 def test_a_public_set_of_circles_is_sharp(real_data):
     result = calibrate(real_data / "field/sets/ji1024")
     assert [view.used for view in result.views].count(True) == len(result.views) == 16
@@ -497,6 +499,7 @@ def test_a_board_is_what_its_files_say(dots):
         target_from_document({"kind": "dots", **alike}, "mine")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", ["wide", slow("fisheye")])
 def test_centres_are_exact_and_rightly_numbered(dots, camera):
     cell = simulate(

@@ -83,7 +83,7 @@ def test_the_start_may_be_off_by_more_than_a_pixel():
     assert rms(refined.px - truth) < 0.01
 
 
-@pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
+@pytest.mark.parametrize("target", [slow(CHECKERBOARD), CHARUCO])
 def test_what_covers_a_corner_leaves_it_to_the_detector(target):
     image, truth = photograph(target, replace(SMALL, square_px=40), 1)
     ids = np.arange(len(truth))
@@ -187,6 +187,7 @@ def test_where_few_corners_are_like_the_print_the_detector_serves(monkeypatch):
             assert (found.weights == 0.1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [CHECKERBOARD, CHARUCO])
 def test_what_a_quick_search_misses_is_searched_thoroughly(target, monkeypatch):
     image, truth = photograph(target, replace(SMALL, square_px=40), 1)
