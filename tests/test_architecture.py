@@ -178,7 +178,7 @@ SMALL = (
     ("visioncal", {"numpy", "typer", "visioncal.core.types"}),
     (
         "visioncal.cli.app, visioncal.cli.session_options, visioncal.cli.result_options, "
-        "visioncal.cli.dynamics_options",
+        "visioncal.cli.frame_options, visioncal.cli.dynamics_options",
         {"numpy", "rich", "visioncal.core.types"},
     ),
     # A finished batch starts no solver, and draws nothing.

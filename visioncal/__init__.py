@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from visioncal.frames.camera_chain import Plane
     from visioncal.frames.fixture import touched_fixture
     from visioncal.frames.frame_from_images import seen_frame
-    from visioncal.frames.locate import Located, locate, locate_target
+    from visioncal.frames.locate import locate, locate_target
+    from visioncal.frames.located import Located
     from visioncal.frames.session_observations import locate_views
     from visioncal.frames.target_pose import Sight, place_seen
     from visioncal.frames.tcp import touched_tool
@@ -59,7 +60,8 @@ _HOMES = {
     "frames.camera_chain": "Plane",
     "frames.fixture": "touched_fixture",
     "frames.frame_from_images": "seen_frame",
-    "frames.locate": "Located locate locate_target",
+    "frames.locate": "locate locate_target",
+    "frames.located": "Located",
     "frames.session_observations": "locate_views",
     "frames.target_pose": "Sight place_seen",
     "frames.tcp": "touched_tool",

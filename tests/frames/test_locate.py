@@ -24,7 +24,8 @@ from visioncal import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.frames.camera_chain import Plane
-from visioncal.frames.locate import Located, locate, locate_target
+from visioncal.frames.locate import locate, locate_target
+from visioncal.frames.located import Located
 from visioncal.frames.touch_test import (
     evaluate_gaps,
     flange_extent_m,

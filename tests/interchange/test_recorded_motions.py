@@ -20,7 +20,13 @@ from visioncal import calibrate, simulation
 from visioncal.calibration.stages.motion import motion_of
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import pose_difference
-from visioncal.interchange.formats import ImportOptions, PoseImportOptions, bags, convert, lerobot
+from visioncal.interchange.formats import (
+    ImportOptions,
+    PoseImportOptions,
+    bag_messages,
+    convert,
+    lerobot,
+)
 from visioncal.interchange.formats.lerobot import FrameImages
 from visioncal.session import Session
 from visioncal.session.depth import read_depth
@@ -175,7 +181,7 @@ def test_few_bytes_do_not_fill_the_memory(form, compression, with_depth, tmp_pat
     sound = bag(tmp_path / f"a{ending}", source, with_depth, **options)
     assert len(convert(sound, tmp_path / "a-out", requested=BOARD).views) == len(source.views)
     path = bag(tmp_path / f"b{ending}", source, with_depth, change=change, **options)
-    monkeypatch.setattr(bags, "MOST_IMAGE_BYTES", 2_000_000)
+    monkeypatch.setattr(bag_messages, "MOST_IMAGE_BYTES", 2_000_000)
     words = "over 2 MB, decompressed"
     raised(DataError, words, convert, path, tmp_path / "out", requested=BOARD)
     assert not (tmp_path / "out").exists()

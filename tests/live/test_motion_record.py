@@ -10,7 +10,8 @@ from visioncal.cli import dynamics
 from visioncal.core.errors import DriverError
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.protocols import ArmState
-from visioncal.live.simulated.controller import ControllerOptions, spawn
+from visioncal.live.simulated.controller import spawn
+from visioncal.live.simulated.machine import ControllerOptions
 from visioncal.session import Session
 
 RATE_HZ = 100.0

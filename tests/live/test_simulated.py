@@ -15,7 +15,8 @@ from visioncal.core.transforms import exp, invert, pose_difference
 from visioncal.live.drivers.protocols import CameraDevice
 from visioncal.live.drivers.ur_net import DASHBOARD_PORT
 from visioncal.live.simulated.cell import GUESS_M, GUESS_RAD, Bench, SimulatedCamera
-from visioncal.live.simulated.controller import ControllerOptions, Motion, spawn
+from visioncal.live.simulated.controller import spawn
+from visioncal.live.simulated.machine import ControllerOptions, Motion
 from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, prepare_scene, read_truth, render, simulate

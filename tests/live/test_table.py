@@ -28,7 +28,8 @@ from visioncal.live.drivers.protocols import ArmState, Frame
 from visioncal.live.page import outcome
 from visioncal.live.page import station as stations
 from visioncal.live.page.outcome import Outcome
-from visioncal.live.page.station import Setup, Station, Task, Visitor
+from visioncal.live.page.state import Setup, Task, Visitor
+from visioncal.live.page.station import Station
 from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.targets import load_target
 

@@ -15,7 +15,8 @@ from support.refusals import raised
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import MovingArm
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.simulated.controller import ControllerOptions, spawn
+from visioncal.live.simulated.controller import spawn
+from visioncal.live.simulated.machine import ControllerOptions
 from visioncal.simulation.arms import forward
 
 pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")

@@ -15,7 +15,8 @@ from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import Stopwatch
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.drivers.ur_net import check_states_come, read_condition, read_tool_offset
-from visioncal.live.simulated.controller import ControllerOptions, free_host, spawn
+from visioncal.live.simulated.controller import free_host, spawn
+from visioncal.live.simulated.machine import ControllerOptions
 
 OPTIONS = ControllerOptions(seed=3, tcp=(0.01, -0.02, 0.15, 0.1, 0.2, -0.3))
 

@@ -12,7 +12,7 @@ from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.problem_parts import Noise
 from visioncal.live.drivers.protocols import ArmState, Frame, Safety
-from visioncal.live.simulated.controller import Motion
+from visioncal.live.simulated.machine import Motion
 from visioncal.planning.cell import Limits, PlanCell
 from visioncal.planning.plan import Stop
 from visioncal.planning.plan_file import PlanFile

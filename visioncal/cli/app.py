@@ -34,7 +34,7 @@ def _group(name: str, words: str, records: str, *listed: str) -> typer.Typer:
 class _Commands(LazyGroup):
     """All commands, in the order of a typical workflow."""
 
-    records = ("visioncal.cli.session_options", "visioncal.cli.result_options")
+    records = tuple(f"visioncal.cli.{kind}_options" for kind in ("session", "result", "frame"))
     homes: ClassVar = {"tcp": "framing", "fixture": "framing"}
     groups: ClassVar = {
         "target": _group(

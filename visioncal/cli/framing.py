@@ -9,10 +9,10 @@ import numpy as np
 
 from visioncal.cli.console import answer, exit_status, print_json, report_written, say
 from visioncal.cli.convert import import_options
+from visioncal.cli.frame_options import FixtureOptions, FrameOptions, TcpOptions
 from visioncal.cli.history import enter
 from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.result_options import FixtureOptions, FrameOptions, TcpOptions
 from visioncal.cli.summary import print_verdict
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.errors import DataError

@@ -9,9 +9,9 @@ import numpy as np
 import typer
 
 from visioncal.cli.console import check_usable, print_json, say, warn
+from visioncal.cli.frame_options import LocateOptions
 from visioncal.cli.parsing import FORMS, POSE, numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.result_options import LocateOptions
 from visioncal.core.conventions import PoseForm, controller_form, stated_pose
 from visioncal.core.documents.pendants import is_marked_pose, read_pose
 from visioncal.core.errors import DataError
@@ -20,13 +20,13 @@ from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.types import FloatArray, Target
 from visioncal.frames.camera_chain import CalibratedCamera, Plane
 from visioncal.frames.locate import (
-    Located,
     cloud_in_base,
     locate,
     locate_by_depth,
     locate_target,
     seen_distances,
 )
+from visioncal.frames.located import Located
 from visioncal.interchange.result_files import load_result
 from visioncal.results import Calibration, Edge
 from visioncal.results.picking import check_mount

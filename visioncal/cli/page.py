@@ -35,7 +35,8 @@ from visioncal.live.drivers.manual import ManualArm
 from visioncal.live.drivers.protocols import StoredPictures
 from visioncal.live.drivers.uvc import without_password
 from visioncal.live.page.outcome import Light
-from visioncal.live.page.station import PageText, Setup, Station, Task
+from visioncal.live.page.state import PageText, Setup, Task
+from visioncal.live.page.station import Station
 from visioncal.live.page.suggestion import NextPose
 from visioncal.planning.cell import PlanCell, seen_from
 from visioncal.planning.path import short_order

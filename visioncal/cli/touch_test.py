@@ -17,11 +17,11 @@ from visioncal.cli.console import (
     say,
     warn,
 )
+from visioncal.cli.frame_options import TouchTestOptions
 from visioncal.cli.history import enter
 from visioncal.cli.locate import known_targets
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
-from visioncal.cli.result_options import TouchTestOptions
 from visioncal.core.conventions import POSE_FORMS, PoseForm, controller_form
 from visioncal.core.documents.pendants import pendant_words
 from visioncal.core.errors import DataError

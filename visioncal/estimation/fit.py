@@ -28,8 +28,8 @@ from visioncal.estimation.effects.lenses import LENSES, CameraParameters, Linear
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import normal_equations
-from visioncal.estimation.problem import Linear, Problem
-from visioncal.estimation.problem_parts import Effect, Noise, Observations, State
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Linear, Noise, Observations, State
 from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.estimation.tree import Tree
 from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, SIZE, Unknown, Unknowns

@@ -6,8 +6,8 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import NULL_SHARE, gram
-from visioncal.estimation.problem import ANYTHING, Linear, Problem
-from visioncal.estimation.problem_parts import Noise, State
+from visioncal.estimation.problem import ANYTHING, Problem
+from visioncal.estimation.problem_parts import Linear, Noise, State
 
 
 @dataclass(frozen=True, eq=False)

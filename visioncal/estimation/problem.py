@@ -23,87 +23,22 @@ from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import (
     Effect,
     FramePrior,
+    JacobianBlock,
+    Linear,
+    MovedGroup,
     Noise,
     Observations,
+    PathGroup,
     State,
     by_size,
+    place_slope,
+    rows_of,
+    units_of,
 )
 from visioncal.estimation.tree import PathStep, Tree
 
 # Uninformative variance of a flange error that was not observed [rad^2 and m^2].
 ANYTHING = 1e4
-
-
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """The observations of one pair of frames, and the path between the two."""
-
-    rows: IntArray
-    path: tuple[PathStep, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _MovedGroup:
-    """Jacobians of a group's m observations with respect to the effects' values."""
-
-    values: IntArray  # (c,) indices of the effects' values that the group depends on.
-    places: IntArray  # (s,) indices, among these, of the values that move the measured poses.
-    by_sensor: FloatArray  # (m, 6, s) Jacobian of the measured poses with respect to those.
-    # (m, 6, c) Jacobian of each path step's flange; None where no effect moves it.
-    by_steps: tuple[FloatArray | None, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class JacobianBlock:
-    """Nonzero block (m, 6, c) of the Jacobian: m rows by the c columns they depend on."""
-
-    rows: IntArray
-    columns: IntArray
-    jacobian: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Linear:
-    """All residuals, linearised."""
-
-    residuals: FloatArray  # (n, 6).
-    # Jacobian with respect to the p unknowns, one block for each pair of frames.
-    blocks: tuple[JacobianBlock, ...]
-    # (n, 6, 6 w) Jacobian with respect to the flange errors, in the slots of the robots of the
-    # observation's unit; see `Problem.units`.
-    by_errors: FloatArray
-    # (n, 6, 6 w) Jacobian with respect to the flange poses; equals `by_errors` unless errors are
-    # those of the observed frame, see `Problem.is_combined`.
-    by_flanges: FloatArray
-    size: int  # Number of unknowns p.
-
-    @property
-    def jacobian(self) -> FloatArray:
-        """Dense Jacobian (n, 6, p)."""
-        return self.jacobian_of(np.arange(len(self.residuals)))
-
-    def jacobian_of(self, rows: IntArray) -> FloatArray:
-        """Dense Jacobian (m, 6, p) of m selected rows."""
-        places = np.full(len(self.residuals), -1)
-        places[rows] = np.arange(len(rows))
-        jacobian = np.zeros((len(rows), 6, self.size))
-        for block in self.blocks:
-            selected_rows = places[block.rows]
-            chosen = selected_rows >= 0
-            jacobian[np.ix_(selected_rows[chosen], np.arange(6), block.columns)] = block.jacobian[
-                chosen
-            ]
-        return jacobian
-
-    def covariance(self, covariance: FloatArray) -> FloatArray:
-        """Covariances (n, 6, 6) of the residuals, propagated from the unknowns' (p, p)."""
-        predicted = np.zeros((len(self.residuals), 6, 6))
-        for block in self.blocks:
-            block_covariance = covariance[np.ix_(block.columns, block.columns)]
-            predicted[block.rows] = (
-                block.jacobian @ block_covariance @ np.swapaxes(block.jacobian, 1, 2)
-            )
-        return predicted
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,13 +181,13 @@ class Problem:
         return tuple(self.poses)
 
     @cached_property
-    def groups(self) -> tuple[_Group, ...]:
+    def groups(self) -> tuple[PathGroup, ...]:
         """The observations, grouped by pair of frames."""
         rows: dict[tuple[str, str], list[int]] = {}
         pairs = zip(self.observations.observers, self.observations.observed, strict=True)
         for at, pair in enumerate(pairs):
             rows.setdefault(pair, []).append(at)
-        return tuple(_Group(np.array(at), self.tree.path(*pair)) for pair, at in rows.items())
+        return tuple(PathGroup(np.array(at), self.tree.path(*pair)) for pair, at in rows.items())
 
     def observations_through(self, frame: str) -> Mask:
         """(n,) mask of the observations whose path contains a frame's edge (or robot flange)."""
@@ -288,31 +223,7 @@ class Problem:
         """
         if self.is_combined:  # each observation is its own unit
             return np.arange(len(self)), np.zeros((len(self), 1), dtype=np.int64)
-        count, joined = len(self.robots), []
-        first = np.full(len(self), -1, dtype=np.int64)
-        for group in self.groups:
-            mine = [self.robots.index(step.robot) for step in group.path if step.robot]
-            keys = self.observations.stops[group.rows] * count
-            if mine:
-                first[group.rows] = keys + mine[0]
-                joined += [np.stack([keys + mine[0], keys + index], axis=1) for index in mine]
-        if not joined:
-            return first, np.zeros((0, 1), dtype=np.int64)
-        used, pairs = np.unique(np.concatenate(joined), return_inverse=True)
-        pairs = pairs.reshape(-1, 2)
-        units, of_key = len(used), np.arange(len(used))
-        if np.any(pairs[:, 0] != pairs[:, 1]):  # some paths contain several robots
-            from scipy.sparse import coo_array
-            from scipy.sparse.csgraph import connected_components
-
-            links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
-            units, of_key = connected_components(links, directed=False)
-        order = np.lexsort((used % count, of_key))
-        rows, sizes = of_key[order], np.bincount(of_key)
-        robots = np.full((units, sizes.max()), -1, dtype=np.int64)
-        robots[rows, np.arange(len(rows)) - (np.cumsum(sizes) - sizes)[rows]] = used[order] % count
-        of = np.where(first < 0, -1, of_key[np.searchsorted(used, np.maximum(first, used[0]))])
-        return of, robots
+        return units_of(self.groups, self.observations.stops, self.robots)
 
     @cached_property
     def by_sensor(self) -> FloatArray:
@@ -371,7 +282,7 @@ class Problem:
             moves, change = self.flange_jacobian.get(step.robot), state.values - self.start_values
             if moves is None or not change.any():
                 return poses
-            return np.asarray(poses @ exp(_rows_of(moves, rows) @ change))
+            return np.asarray(poses @ exp(rows_of(moves, rows) @ change))
         known = self.tree.branches[step.frame].known
         return state.edges[self.unknown[step.frame]] if known is None else known
 
@@ -423,14 +334,14 @@ class Problem:
         return before[1]
 
     @cached_property
-    def _moved_groups(self) -> tuple[_MovedGroup, ...]:
+    def _moved_groups(self) -> tuple[MovedGroup, ...]:
         """Effect Jacobians of each group."""
         moved_groups = []
         for group in self.groups:
-            by_sensor = _rows_of(self.by_sensor, group.rows)
+            by_sensor = rows_of(self.by_sensor, group.rows)
             flanges = [self.flange_jacobian.get(step.robot) for step in group.path]
             by_steps = [
-                None if flange is None else _rows_of(flange, group.rows) for flange in flanges
+                None if flange is None else rows_of(flange, group.rows) for flange in flanges
             ]
             parts = [by_sensor, *(by_step for by_step in by_steps if by_step is not None)]
             moved = np.any([part.any(axis=(0, 1)) for part in parts], axis=0)
@@ -443,7 +354,7 @@ class Problem:
             places = np.flatnonzero(moves_sensor[values])
             if not moves_sensor.all():
                 by_sensor = by_sensor[:, :, values[places]]
-            moved_groups.append(_MovedGroup(values, places, by_sensor, steps))
+            moved_groups.append(MovedGroup(values, places, by_sensor, steps))
         return tuple(moved_groups)
 
     def _moved(self, state: State) -> tuple[FloatArray, FloatArray, tuple[JacobianBlock, ...]]:
@@ -492,10 +403,10 @@ class Problem:
         residuals, by_measured = np.zeros((len(self), 6)), np.empty((len(self), 6, 6))
         residuals[rotation], residuals[places, 3:] = log(error[rotation]), error[places, :3, 3]
         by_measured[rotation] = inverse_right_jacobian(residuals[rotation])
-        by_measured[places] = _place_slope(error[places])
+        by_measured[places] = place_slope(error[places])
         by_predicted = np.empty_like(by_measured)
         by_predicted[rotation] = -by_measured[rotation] @ adjoint(invert(error[rotation]))
-        by_predicted[places] = -_place_slope(np.broadcast_to(np.eye(4), error[places].shape))
+        by_predicted[places] = -place_slope(np.broadcast_to(np.eye(4), error[places].shape))
         blocks = []
         for block, group in zip(moved, self._moved_groups, strict=True):
             jacobian = by_predicted[block.rows] @ block.jacobian
@@ -584,15 +495,3 @@ class Problem:
         variances = np.full((len(members), members.shape[1], 6), ANYTHING)
         variances[members >= 0] = levels[members[members >= 0]]
         return np.asarray(variances.reshape(len(members), width)[:, :, None] * np.eye(width))
-
-
-def _rows_of(array: FloatArray, rows: IntArray) -> FloatArray:
-    """Selects rows in ascending order; avoids a copy of a large array if that is all of them."""
-    return array if len(rows) == len(array) else array[rows]
-
-
-def _place_slope(error: FloatArray) -> FloatArray:
-    """Jacobian (n, 6, 6) of a position with respect to its frame's right perturbation."""
-    jacobian = np.zeros((len(error), 6, 6))
-    jacobian[:, 3:, 3:] = error[:, :3, :3]
-    return jacobian

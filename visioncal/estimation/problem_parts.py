@@ -1,6 +1,6 @@
-"""Parts of a cell's problem: observations, effects, priors, state and noise."""
+"""Parts of a cell's problem: observations, effects, priors, state, noise, Jacobians."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -11,6 +11,7 @@ import numpy as np
 from visioncal.core.transforms import exp, inverse_right_jacobian, log
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.mixed import PriorInformation
+from visioncal.estimation.tree import PathStep
 
 # Name of the only robot of a cell.
 ROBOT = "robot"
@@ -220,3 +221,121 @@ class Noise:
         robots = self.robots.copy()
         robots[at] = level
         return replace(self, robots=robots)
+
+
+@dataclass(frozen=True, eq=False)
+class PathGroup:
+    """The observations of one pair of frames, and the path between the two."""
+
+    rows: IntArray
+    path: tuple[PathStep, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MovedGroup:
+    """Jacobians of a group's m observations with respect to the effects' values."""
+
+    values: IntArray  # (c,) indices of the effects' values that the group depends on.
+    places: IntArray  # (s,) indices, among these, of the values that move the measured poses.
+    by_sensor: FloatArray  # (m, 6, s) Jacobian of the measured poses with respect to those.
+    # (m, 6, c) Jacobian of each path step's flange; None where no effect moves it.
+    by_steps: tuple[FloatArray | None, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class JacobianBlock:
+    """Nonzero block (m, 6, c) of the Jacobian: m rows by the c columns they depend on."""
+
+    rows: IntArray
+    columns: IntArray
+    jacobian: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """All residuals, linearised."""
+
+    residuals: FloatArray  # (n, 6).
+    # Jacobian with respect to the p unknowns, one block for each pair of frames.
+    blocks: tuple[JacobianBlock, ...]
+    # (n, 6, 6 w) Jacobian with respect to the flange errors, in the slots of the robots of the
+    # observation's unit; see `Problem.units`.
+    by_errors: FloatArray
+    # (n, 6, 6 w) Jacobian with respect to the flange poses; equals `by_errors` unless errors are
+    # those of the observed frame, see `Problem.is_combined`.
+    by_flanges: FloatArray
+    size: int  # Number of unknowns p.
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """Dense Jacobian (n, 6, p)."""
+        return self.jacobian_of(np.arange(len(self.residuals)))
+
+    def jacobian_of(self, rows: IntArray) -> FloatArray:
+        """Dense Jacobian (m, 6, p) of m selected rows."""
+        places = np.full(len(self.residuals), -1)
+        places[rows] = np.arange(len(rows))
+        jacobian = np.zeros((len(rows), 6, self.size))
+        for block in self.blocks:
+            selected_rows = places[block.rows]
+            chosen = selected_rows >= 0
+            jacobian[np.ix_(selected_rows[chosen], np.arange(6), block.columns)] = block.jacobian[
+                chosen
+            ]
+        return jacobian
+
+    def covariance(self, covariance: FloatArray) -> FloatArray:
+        """Covariances (n, 6, 6) of the residuals, propagated from the unknowns' (p, p)."""
+        predicted = np.zeros((len(self.residuals), 6, 6))
+        for block in self.blocks:
+            block_covariance = covariance[np.ix_(block.columns, block.columns)]
+            predicted[block.rows] = (
+                block.jacobian @ block_covariance @ np.swapaxes(block.jacobian, 1, 2)
+            )
+        return predicted
+
+
+def units_of(
+    groups: Sequence[PathGroup], stops: IntArray, robots: Sequence[str]
+) -> tuple[IntArray, IntArray]:
+    """Unit (n,) of each observation at a stop (n,), those that share errors of flanges there.
+
+    It is -1 for none. And (u, w) the indices of each unit's robots, padded with -1.
+    """
+    count, joined = len(robots), []
+    first = np.full(len(stops), -1, dtype=np.int64)
+    for group in groups:
+        mine = [robots.index(step.robot) for step in group.path if step.robot]
+        keys = stops[group.rows] * count
+        if mine:
+            first[group.rows] = keys + mine[0]
+            joined += [np.stack([keys + mine[0], keys + index], axis=1) for index in mine]
+    if not joined:
+        return first, np.zeros((0, 1), dtype=np.int64)
+    used, pairs = np.unique(np.concatenate(joined), return_inverse=True)
+    pairs = pairs.reshape(-1, 2)
+    units, of_key = len(used), np.arange(len(used))
+    if np.any(pairs[:, 0] != pairs[:, 1]):  # some paths contain several robots
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
+        units, of_key = connected_components(links, directed=False)
+    order = np.lexsort((used % count, of_key))
+    rows, sizes = of_key[order], np.bincount(of_key)
+    members = np.full((units, sizes.max()), -1, dtype=np.int64)
+    members[rows, np.arange(len(rows)) - (np.cumsum(sizes) - sizes)[rows]] = used[order] % count
+    of = np.where(first < 0, -1, of_key[np.searchsorted(used, np.maximum(first, used[0]))])
+    return of, members
+
+
+def rows_of(array: FloatArray, rows: IntArray) -> FloatArray:
+    """Selects rows in ascending order; avoids a copy of a large array if that is all of them."""
+    return array if len(rows) == len(array) else array[rows]
+
+
+def place_slope(error: FloatArray) -> FloatArray:
+    """Jacobian (n, 6, 6) of a position with respect to its frame's right perturbation."""
+    jacobian = np.zeros((len(error), 6, 6))
+    jacobian[:, 3:, 3:] = error[:, :3, :3]
+    return jacobian

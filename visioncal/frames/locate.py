@@ -1,8 +1,7 @@
 """Picks: position in the base of a feature in an image, with its uncertainty."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import numpy as np
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
-from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import apply, invert
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.estimation.observability import SIGMA_LIMIT_M
@@ -22,6 +20,7 @@ from visioncal.frames.camera_chain import (
     checked_point,
     point_jacobian,
 )
+from visioncal.frames.located import Located
 from visioncal.results import Calibration
 from visioncal.results.depth import DepthResult
 from visioncal.session.selecting import EYE, Choice
@@ -31,57 +30,6 @@ from visioncal.vision.targets import load_target
 # Factor beyond the distances of the views that is named: a board of a third of the image reaches
 # that much nearer or farther than its middle where it is steeply tilted.
 _BEYOND = 1.5
-
-
-@dataclass(frozen=True, eq=False)
-class Located:
-    """Position in the base with its covariance."""
-
-    p_base: FloatArray  # (3,) [m].
-    # (3, 3) covariance by source [m^2]: `pixels`, `calibration` (the camera's transform and its
-    # lens and depth together), `robot` (at this stop), `arm`, `plane`, `depth` (its noise),
-    # `target`, `focus` (a pixel's, by the
-    # change of the focal length at this view).
-    parts: Mapping[str, FloatArray]
-    freedom: float  # Effective degrees of freedom of the covariance.
-    warnings: tuple[str, ...] = ()  # Sentences to read before a robot is sent there.
-
-    @cached_property
-    def covariance(self) -> FloatArray:
-        """(3, 3) sum of the independent parts [m^2]."""
-        return np.asarray(np.sum(list(self.parts.values()), axis=0))
-
-    @property
-    def sigma_mm(self) -> FloatArray:
-        """(3,) standard deviations along the base's axes [mm]."""
-        return np.asarray(1e3 * np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
-
-    @property
-    def budget_mm(self) -> dict[str, float]:
-        """Standard deviation by source, and their `total` [mm]."""
-        every = {**self.parts, "total": self.covariance}
-        squares = {name: max(np.trace(covariance), 0.0) for name, covariance in every.items()}
-        return {name: float(1e3 * np.sqrt(square)) for name, square in squares.items()}
-
-    @property
-    def largest(self) -> str:
-        """Source of the largest variance."""
-        return max(self.parts, key=lambda name: float(np.trace(self.parts[name])))
-
-    @property
-    def radius95_mm(self) -> float:
-        """Radius of the ball around `p_base` that holds the true position in 95 % of cases [mm].
-
-        The squared distance is a sum of squares weighted by the covariance's eigenvalues:
-        approximately chi-square (Box 1954, section 3), or F where noise levels are estimated.
-        """
-        values = np.maximum(np.linalg.eigvalsh(self.covariance), 0.0)
-        total = float(values.sum())
-        if not total > 0.0:
-            return 0.0
-        count = total**2 / float(np.sum(values**2))
-        # Beyond the limit, F does not differ from chi-square, and its series lose digits.
-        return float(1e3 * np.sqrt(total * f_limit(0.05, count, min(self.freedom, 1e6))))
 
 
 @typed

@@ -12,7 +12,8 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Progress, Target
 from visioncal.frames.camera_chain import CalibratedCamera, checked_point
-from visioncal.frames.locate import Located, locate_target
+from visioncal.frames.locate import locate_target
+from visioncal.frames.located import Located
 from visioncal.frames.target_pose import Parent, Sight, needs_robot
 from visioncal.results import HELD_BACK, Calibration, select_matching
 from visioncal.results.picking import check_mount, check_resolution

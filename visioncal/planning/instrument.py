@@ -19,8 +19,8 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import TWIST_UNITS
 from visioncal.estimation.chain import chain
-from visioncal.estimation.problem import ANYTHING, Linear, Problem
-from visioncal.estimation.problem_parts import State
+from visioncal.estimation.problem import ANYTHING, Problem
+from visioncal.estimation.problem_parts import Linear, State
 from visioncal.planning.candidates import unwound
 from visioncal.planning.cell import InstrumentCell
 from visioncal.planning.design import Accuracy, Design, choose_stops

@@ -41,7 +41,7 @@ from visioncal.session.frames import CELL, frames_of_kind, object_name
 from visioncal.session.selecting import PARTS, Choice, Part
 
 if TYPE_CHECKING:
-    from visioncal.frames.locate import Located
+    from visioncal.frames.located import Located
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,12 +8,11 @@ angles or poses stand in the same rows, or in a table of their own beside it.
 """
 
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
@@ -23,14 +22,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, figure, known_name, some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.assemble import pose_cells
-from visioncal.interchange.formats.fields import (
-    HOW,
-    Fields,
-    Keys,
-    is_headerless,
-    matched,
-    unit_by_size,
-)
+from visioncal.interchange.formats.fields import HOW, Keys, matched
 from visioncal.interchange.formats.file_search import files_in, groups_in, head
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -40,47 +32,28 @@ from visioncal.interchange.formats.foreign import (
     Unstated,
     rows_of,
 )
-from visioncal.interchange.formats.joints import joint_names, joints_from
-from visioncal.interchange.formats.poses import pose_names, poses_from
+from visioncal.interchange.formats.joints import joints_from
+from visioncal.interchange.formats.point_tables import (
+    CENTRE,
+    FORCE,
+    MEASURED,
+    OTHER,
+    PAYLOAD,
+    TURNS,
+    UNCERTAIN,
+    Heading,
+    PointTable,
+    word_set,
+)
+from visioncal.interchange.formats.poses import poses_from
 from visioncal.interchange.formats.reading import ENDINGS, read_rows
 from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION
 from visioncal.session.kinds import known_instruments
 
-_Words: TypeAlias = frozenset[str]
-
-
-def _set(words: str) -> _Words:
-    return frozenset(words.split())
-
-
-# Words of headings, in small letters.
-_MEASURED = _set("meas measured act actual ist gemessen tracker probe medido mesuré")
-_UNCERTAIN = _set("u u95 u99 unc uncertainty unsicherheit sigma std stdev sd s incertidumbre")
-_TURNS, _FORCE = _set("r rot rotation"), _set("f force kraft fuerza")
-_PAYLOAD = _set("payload load last nutzlast mass masse weight gewicht carga")
-_CENTRE = _set("cog com centre center schwerpunkt")
-_OTHER = _TURNS | _FORCE | _UNCERTAIN | _PAYLOAD | _CENTRE
-_OTHER |= _set("robot roboter tcp flange base programmed prog cmd commanded controller")
-_OTHER |= _set("nom nominal soll ref reference design cad d dev deviation delta diff error tol")
-_OTHER |= _set("tolerance upper lower n normal rms offset abweichung")
 # Names of rows, the outermost first, and of the stops of the robot.
 _TARGETS = "target point name label feature object frame punkt messpunkt punto"
-_LEVELS = (_set("collection"), _set("group gruppe grupo"), _set(_TARGETS))
-_STOP = _set("stop pose station posture stelle")
-# An axis in one word with what is measured, as in Ux, ActX, Rx.
-_PREFIX = re.compile(r"(u|u95|unc|s|sd|std|sigma|d|dev|nom|act|meas|r|f|n)([xyz])")
-_UNITS = {name: name for name in (*UNITS_M, "deg", "rad", "kg", "n")} | {
-    word: name
-    for name, words in {
-        "inch": "in inches zoll",
-        "deg": "° º degree degrees",
-        "mm": "millimeter millimeters millimetre millimetres",
-        "m": "meter meters metre metres",
-        "um": "µm μm micron microns",
-    }.items()
-    for word in words.split()
-}
-_UNIT_LINE = re.compile(r"\b(?:units?|length|einheit(?:en)?)\b[\W_]*([^\W_]+)", re.IGNORECASE)
+_LEVELS = (word_set("collection"), word_set("group gruppe grupo"), word_set(_TARGETS))
+_STOP = word_set("stop pose station posture stelle")
 _LOAD = re.compile(r"(?<![0-9.,])(\d+(?:[.,]\d+)?)[ _]?(kg|N)(?![^\W_])")
 _COVERED = {
     2.0: re.compile(r"u95|\b95(?:[.,]\d+)? ?%|k ?= ?2\b|2 ?sigma|expanded|erweitert", re.I),
@@ -90,159 +63,14 @@ _COVERED = {
 _OF_AN_AXIS = {"xl80": "XL-80 reads a length", "xr20": "XR20-W reads the angle of one axis"}
 
 
-@dataclass(frozen=True)
-class _Heading:
-    """A column's name, taken apart."""
-
-    words: _Words  # Without axis and unit.
-    axis: str  # x, y or z; else empty.
-    unit: str  # Empty where it states none.
-
-    @classmethod
-    def of(cls, name: str) -> "_Heading":
-        spaced = re.sub(r"(?<=[a-z0-9])(?=[XYZ]\b)|(?<=[XYZ])(?=[A-Z][a-z])", " ", name)
-        words = list[str]()
-        for word in re.split(r"[\s_.,;:/()\[\]{}=%-]+", spaced.lower()):
-            joined = _PREFIX.fullmatch(word)
-            words += joined.groups() if joined else [word] * bool(word)
-        axes = [word for word in words if word in ("x", "y", "z")]
-        unit = _UNITS.get(words[-1], "") if len(words) > 1 else ""
-        others = words[: len(words) - bool(unit)]
-        return cls(frozenset(others) - {*axes}, axes[0] if len(axes) == 1 else "", unit)
-
-
-@dataclass(frozen=True, eq=False)
-class _Table:
-    """Rows of a file by their headings, and what the robot did in them."""
-
-    fields: Fields
-    title: str = ""  # Comments and lines above the rows.
-    file: str = ""
-    joints: tuple[str, ...] = ()  # Columns of joint angles.
-    poses: tuple[str, ...] = ()  # Columns of the robot's poses.
-
-    @classmethod
-    def of(cls, fields: Fields, file: Path, requested: ImportOptions) -> "_Table":
-        lines = head(file).splitlines()[:60]
-        sizes = [sum(map(is_number, re.split(r"[\s,;]+", line))) for line in lines]
-        first = next((at for at, size in enumerate(sizes) if size > 2), len(lines))
-        title = "\n".join(text for at, text in enumerate(lines) if at < first or text[:1] in "/#%")
-        fields = _side_by_side(_by_axis(_with_headings(fields)))
-        own = {*fields.numbers, *fields.texts}
-        table = cls(fields, title, file.name)
-        taken = tuple(name for name in requested.camera.names if name in own)
-        taken = taken or next(iter(table.points().values()), ())
-        joints = tuple(name for name in requested.joints if name in own)
-        joints = joints or joint_names(fields, taken)
-        if is_headerless(fields) and "joint" in fields.name.lower():
-            joints = joints or tuple(fields.numbers)
-        given = tuple(name for name in requested.robot.names if name in own)
-        others = (*joints, *(taken if joints or table.is_measured else ()))
-        poses = pose_names(fields, given, "robot", others, by_shape=False)
-        return replace(table, joints=joints, poses=poses)
-
-    def triples(self) -> dict[_Words, tuple[str, ...]]:
-        """Columns of x, y and z that share all other words, by these."""
-        found = defaultdict[_Words, dict[str, str]](dict)
-        for name in self.fields.numbers:
-            if (heading := _Heading.of(name)).axis:
-                found[heading.words].setdefault(heading.axis, name)
-        return {words: tuple(g[a] for a in "xyz") for words, g in found.items() if len(g) == 3}
-
-    def points(self) -> dict[_Words, tuple[str, ...]]:
-        """Columns of measured places by their words, the likeliest alone where one is."""
-        free = {words: names for words, names in self.triples().items() if not words & _OTHER}
-        best = {words: names for words, names in free.items() if words & _MEASURED}
-        return best or ({_set(""): free[_set("")]} if _set("") in free else free)
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether a heading says that places are measured."""
-        return any(words & _MEASURED for words in self.points())
-
-    def named(self, kind: _Words) -> str:
-        """The first column of a kind of names or texts; empty without."""
-        return next((n for n in self.fields.texts if _Heading.of(n).words & kind), "")
-
-    def unit(self, names: Sequence[str], requested: str | None) -> tuple[str, tuple[str, ...]]:
-        """Unit of lengths in some columns, and a note where nothing states it."""
-        stated = {_Heading.of(name).unit for name in names} & {*UNITS_M}
-        above = {_UNITS.get(word.lower(), "") for word in _UNIT_LINE.findall(self.title)}
-        if requested or len(stated) == 1 or len(stated := above & {*UNITS_M}) == 1:
-            return requested or stated.pop(), ()
-        unit = unit_by_size(np.hstack([self.fields.column(name) for name in names]))
-        note = f"{', '.join(names)} are taken for {unit}; --camera-unit names another unit."
-        return unit, (note,)
-
-
-def _with_headings(fields: Fields) -> Fields:
-    """Rows of names, x, y, z and uncertainties without headings, with these."""
-    columns = [*fields.texts]
-    names = [name for name in columns if name not in fields.numbers]
-    if not names and len(columns) in (4, 7) and not (fields.column(columns[0]) % 1).any():
-        names = columns[:1]
-    numbers = columns[len(names) :]
-    is_list = is_headerless(fields) and [*fields.numbers][-len(numbers) :] == numbers
-    if not is_list or len(names) > 3 or len(numbers) not in ((3, 6) if names else (3,)):
-        return fields
-    headings = [*["collection", "group", "target"][3 - len(names) :], *"xyz"]
-    if len(numbers) == 6:
-        # PolyWorks writes normals behind places, which are of unit length.
-        last = np.hstack([fields.column(name) for name in numbers[3:]])
-        is_normal = np.allclose(np.linalg.norm(last, axis=1), 1.0, atol=1e-3)
-        headings += [f"{'n' if is_normal else 'u'}{axis}" for axis in "xyz"]
-    known = dict(zip(columns, headings, strict=True))
-    arrays = {known[name]: fields.numbers[name] for name in numbers}
-    texts = {known[name]: cells for name, cells in fields.texts.items()}
-    return replace(fields, numbers=arrays, texts=texts)
-
-
-def _by_axis(fields: Fields) -> Fields:
-    """Rows of a report with a row an axis, with a row a point."""
-    measured = [name for name in fields.numbers if _Heading.of(name).words & _MEASURED]
-    axes = [cells for cells in fields.texts.values() if {*map(str.lower, cells)} == {*"xyz"}]
-    if len(measured) != 1 or len(axes) != 1:
-        return fields
-    places, heads = fields.column(measured[0])[:, 0], np.char.lower(axes[0])
-    starts = np.flatnonzero(heads == "x")
-    triples = starts[:, None] + np.arange(3)
-    if 3 * len(starts) != len(fields) or (heads[triples] != [*"xyz"]).any():
-        return fields
-    numbers = {
-        measured[0].replace(" ", "_") + f" {a}": places[starts + at] for at, a in enumerate("xyz")
-    }
-    return replace(fields.rows(starts.tolist()), numbers=numbers)
-
-
-def _side_by_side(fields: Fields) -> Fields:
-    """Rows of several points side by side, with a row a point."""
-    measured = _Table(fields).points()
-    if len(measured) < 2:
-        return fields
-    long = fields.rows(np.repeat(np.arange(len(fields)), len(measured)).tolist())
-    columns = [name for names in measured.values() for name in names]
-    places = np.hstack([fields.column(name) for name in columns]).reshape(-1, 3)
-    units = {_Heading.of(name).unit for name in columns}
-    end = f" [{units.pop()}]" if len(units) == 1 and "" not in units else ""
-    arrays = {name: numbers for name, numbers in long.numbers.items() if name not in columns}
-    texts = {name: cells for name, cells in long.texts.items() if name not in columns}
-    labels = tuple(" ".join(sorted(words)) for words in measured) * len(fields)
-    return replace(
-        long,
-        numbers=arrays | {f"{axis}{end}": places[:, at] for at, axis in enumerate("XYZ")},
-        texts={name: cells for name, cells in texts.items() if name != "target"}
-        | {"target": labels},
-    )
-
-
 def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads a table of points with the robot's state, or two tables; raises DataError."""
     files = [file for group in groups_in(path) if group.is_data for file in group.files]
-    tables = list[_Table]()
+    tables = list[PointTable]()
     for file in [*files, *filter(None, [requested.camera_file])]:
         with suppress(DataError) if path.is_dir() else nullcontext():
             rows = read_rows(file, requested.robot.form)
-            tables += [_Table.of(fields, file, requested) for fields in rows]
+            tables += [PointTable.of(fields, file, requested) for fields in rows]
     given = {*requested.camera.names}
     of_points = [t for t in tables if t.points() or (given and given <= {*t.fields.numbers})]
     # Poses beside joint angles are of what was measured.
@@ -271,7 +99,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     return _recording(points if state is points else replace(points, poses=()), state, requested)
 
 
-def _recording(points: _Table, state: _Table, requested: ImportOptions) -> ForeignRecording:
+def _recording(points: PointTable, state: PointTable, requested: ImportOptions) -> ForeignRecording:
     """The recording of a table of points and of the robot's state at each; raises DataError."""
     fields, robot = points.fields, state.fields
     places, notes = _places(points, requested)
@@ -317,14 +145,14 @@ def _recording(points: _Table, state: _Table, requested: ImportOptions) -> Forei
 
 
 def _places(
-    points: _Table, requested: ImportOptions
+    points: PointTable, requested: ImportOptions
 ) -> tuple[list[dict[str, str]], tuple[str, ...]]:
     """Cells of readings by row, of places or of a probe's poses, and notes; raises DataError."""
     fields, given = points.fields, requested.camera
-    words, names = next(iter(points.points().items()), (_set(""), ()))
+    words, names = next(iter(points.points().items()), (word_set(""), ()))
     names = tuple(map(fields.find, given.names)) or names
     unit, notes = points.unit(names[:3], given.unit)
-    angles = {w - _TURNS: n for w, n in points.triples().items() if w & _TURNS}
+    angles = {w - TURNS: n for w, n in points.triples().items() if w & TURNS}
     turns = angles.get(words) or (next(iter(angles.values())) if len(angles) == 1 else ())
     lower = {name.lower(): name for name in fields.numbers}
     for quaternion in (("qx", "qy", "qz", "qw"), ("q0", "q1", "q2", "q3")):
@@ -339,7 +167,7 @@ def _places(
         return [{} if "nan" in row.values() else row for row in cells], notes
     form = given.form
     if form is None and len(turns) == 3:
-        form = f"euler-xyz-{'rad' if _Heading.of(turns[0]).unit == 'rad' else 'deg'}"
+        form = f"euler-xyz-{'rad' if Heading.of(turns[0]).unit == 'rad' else 'deg'}"
         notes += (
             f"{', '.join(turns)} are taken for turns about the fixed axes x, y, z, as "
             "SpatialAnalyzer writes them; --camera-form names another form.",
@@ -349,7 +177,7 @@ def _places(
     return pose_cells(numbers, INSTRUMENT_POSITION + INSTRUMENT_QUATERNION), (*notes, *more)
 
 
-def _levels(points: _Table) -> list[tuple[str, ...]]:
+def _levels(points: PointTable) -> list[tuple[str, ...]]:
     """Names of the rows: of collections, groups and targets, those in one cell (A::B::C) apart."""
     texts = points.fields.texts
     columns = [texts[name] for kind in _LEVELS if (name := points.named(kind))]
@@ -359,7 +187,7 @@ def _levels(points: _Table) -> list[tuple[str, ...]]:
 
 
 def _stops(
-    points: _Table, loads: Mapping[str, Sequence[str]], held: Sequence[str]
+    points: PointTable, loads: Mapping[str, Sequence[str]], held: Sequence[str]
 ) -> tuple[list[object], list[str]]:
     """The stop of each row as its load and its name, and the name of its point on the flange.
 
@@ -391,7 +219,7 @@ def _stops(
     return (keys, [*map(str, times)]) if held else ([*zip(load, times, strict=True)], [*names])
 
 
-def _paired(points: _Table, stops: Sequence[object], state: _Table) -> tuple[IntArray, str]:
+def _paired(points: PointTable, stops: Sequence[object], state: PointTable) -> tuple[IntArray, str]:
     """The robot's row of each point, -1 for none, and how it was found; raises DataError."""
     robot, keys = state.fields, [*dict.fromkeys(stops)]
     names = [str(key[1]) for key in keys if isinstance(key, tuple) and isinstance(key[1], str)]
@@ -414,23 +242,23 @@ def _paired(points: _Table, stops: Sequence[object], state: _Table) -> tuple[Int
     return np.array([place[stop] for stop in stops]), how
 
 
-def _loads(table: _Table) -> dict[str, tuple[str, ...]]:
+def _loads(table: PointTable) -> dict[str, tuple[str, ...]]:
     """Columns of payloads [kg], their centres [m] and forces [N], by headings or by names of rows.
 
     A force without axes pulls downwards.
     """
     found = dict[str, FloatArray]()
     for name in table.fields.numbers:
-        heading = _Heading.of(name)
+        heading = Heading.of(name)
         axis, unit, column = heading.axis, heading.unit, table.fields.column(name)[:, 0]
-        if axis and heading.words & _CENTRE and unit in UNITS_M:
+        if axis and heading.words & CENTRE and unit in UNITS_M:
             found[f"payload_{axis}_m"] = UNITS_M[unit] * column
-        elif axis and heading.words & _FORCE:
+        elif axis and heading.words & FORCE:
             found[f"force_{axis}_n"] = column
-        elif not axis and (unit == "n" or (heading.words & _FORCE and not unit)):
+        elif not axis and (unit == "n" or (heading.words & FORCE and not unit)):
             found |= dict.fromkeys(("force_x_n", "force_y_n"), 0 * column)
             found["force_z_n"] = -np.abs(column)
-        elif not axis and (unit == "kg" or (heading.words & _PAYLOAD and not unit)):
+        elif not axis and (unit == "kg" or (heading.words & PAYLOAD and not unit)):
             found["payload_kg"] = column
     for cells in [] if found else _levels(table):
         tags = [_LOAD.search(cell) for cell in cells]
@@ -446,10 +274,10 @@ def _loads(table: _Table) -> dict[str, tuple[str, ...]]:
 
 
 def _instrument(
-    points: _Table, requested: ImportOptions
+    points: PointTable, requested: ImportOptions
 ) -> tuple[dict[str, object], tuple[str, ...]]:
     """The content of [instrument], and notes on it; raises DataError."""
-    column = points.named(_set("instrument device gerät messgerät"))
+    column = points.named(word_set("instrument device gerät messgerät"))
     said = requested.instrument or " ".join(
         (*points.fields.texts.get(column, ())[:1], points.title)
     )
@@ -468,7 +296,7 @@ def _instrument(
     stated = (
         names
         for words, names in points.triples().items()
-        if words & _UNCERTAIN or {"standard", "deviation"} <= words
+        if words & UNCERTAIN or {"standard", "deviation"} <= words
     )
     if not (names := next(stated, ())):
         if name:
@@ -477,7 +305,7 @@ def _instrument(
         step = "Say --instrument NAME, or its sigma in mm, or add [instrument] to session.toml."
         return found, () if found else (f"How good the readings are is not said. {step}",)
     places = next(iter(points.points().values()), ())
-    unit = _Heading.of(names[0]).unit or points.unit(places, requested.camera.unit)[0]
+    unit = Heading.of(names[0]).unit or points.unit(places, requested.camera.unit)[0]
     text = "\n".join((*names, points.title))
     factor = next((k for k, pattern in _COVERED.items() if pattern.search(text)), 1.0)
     sigmas = UNITS_M[unit] / factor * np.hstack([points.fields.column(each) for each in names])
@@ -495,10 +323,10 @@ def _is_of_points(path: Path) -> bool:
     """Whether a text file begins with names or headings of such programs."""
     for line in head(path).splitlines()[:60]:
         cells = re.split(r"[;,\t]", line)
-        headings = [_Heading.of(cell) for cell in cells]
-        axes = {heading.axis for heading in headings if not heading.words & _OTHER}
-        words = _set("").union(*(heading.words for heading in headings))
-        if {*"xyz"} <= axes and words & (_MEASURED | _UNCERTAIN | _LEVELS[0] | _LEVELS[1]):
+        headings = [Heading.of(cell) for cell in cells]
+        axes = {heading.axis for heading in headings if not heading.words & OTHER}
+        words = word_set("").union(*(heading.words for heading in headings))
+        if {*"xyz"} <= axes and words & (MEASURED | UNCERTAIN | _LEVELS[0] | _LEVELS[1]):
             return not any(map(is_number, cells))
         if re.search(r"\w::\w.*\d", line):
             return True

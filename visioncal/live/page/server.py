@@ -20,7 +20,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
 from visioncal.live.page.access import Admission, Connection, refuse_malformed
 from visioncal.live.page.outcome import Outcome
-from visioncal.live.page.station import PageText, Snapshot, Station, Visitor
+from visioncal.live.page.state import PageText, Snapshot, Visitor
+from visioncal.live.page.station import Station
 from visioncal.live.page.table import VIEWS, ViewTable, read_as
 
 _COLOURS = {"green": "#2e9e2e", "yellow": "#e0a800", "red": "#c62828", "grey": "#777777"}

@@ -4,24 +4,21 @@ import queue
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field, replace
+from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial, wraps
-from pathlib import Path
 from threading import Thread
-from typing import Concatenate, Literal, ParamSpec
+from typing import Concatenate, ParamSpec
 
 import numpy as np
 
 from visioncal.calibration.stages.detect import find_corners
-from visioncal.core.conventions import POSE_FORMS, PoseForm
-from visioncal.core.documents.pendants import PendantPose, pendant_words
+from visioncal.core.conventions import POSE_FORMS
+from visioncal.core.documents.pendants import PendantPose
 from visioncal.core.errors import DataError, DriverError, VisioncalError
 from visioncal.core.number_format import counted, figure
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Rejection
-from visioncal.live.capture.cell import LiveCell
-from visioncal.live.capture.journal import Journal, RecordedCell, picture_name, posed, state_of
-from visioncal.live.capture.options import CaptureOptions
+from visioncal.live.capture.journal import picture_name, posed, state_of
 from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
 from visioncal.live.capture.take import Missed, TakenView, image_motion_px
 from visioncal.live.drivers.manual import ManualArm
@@ -33,129 +30,28 @@ from visioncal.live.drivers.protocols import (
     StoredPictures,
 )
 from visioncal.live.page.drawing import coverage_svg, live_picture
-from visioncal.live.page.outcome import Light, Outcome, ask_command
-from visioncal.live.page.suggestion import NextPose, near, next_view
-from visioncal.planning.cell import PlanCell, flange_at
+from visioncal.live.page.outcome import Outcome, ask_command
+from visioncal.live.page.state import (
+    Fault,
+    Row,
+    Setup,
+    Snapshot,
+    Task,
+    Visitor,
+    table_rows,
+    why_same,
+)
+from visioncal.live.page.suggestion import NextPose, suggested_pose
+from visioncal.planning.cell import flange_at
 from visioncal.session import View
 from visioncal.vision.boards.imaging import decode_image, grey_of
 
 _P = ParamSpec("_P")
-# Possible faults of a view of the table. Where its picture has no pose, or its pose no picture,
-# those from it on are one apart.
-Fault = Literal["not wanted", "exchanged", "no pose", "no picture"]
 # Why a request is refused.
 _CHANGED = (
     "Another browser, or the arm, changed the table meanwhile: look at it, and press again. "
     "Nothing was done."
 )
-
-
-@dataclass(frozen=True)
-class Setup:
-    """Questions of a page before a recording begins, in the words of the command line."""
-
-    target: str = "charuco_9x6_30mm"  # The board.
-    mount: str = "eye-in-hand"
-    robot: str = ""  # The arm's model; empty where it has none.
-    arm: str = "manual"
-    camera: str = "uvc:0"
-    pose_form: str = ""  # How poses are typed; empty to recognise it.
-    against: str = ""  # The calibration to verify.
-
-
-@dataclass(frozen=True)
-class PageText:
-    """Questions and words of a page."""
-
-    title: str
-    # Fields of the setup that are asked for, by their names: label, and what may be chosen.
-    fields: Mapping[str, tuple[str, Sequence[str]]]
-    finish: str  # Label of the button that judges the views.
-    # Earlier results, the newest first: light, name and words.
-    history: Callable[[], Sequence[tuple[Light, str, str]]] = lambda: ()
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """A recording to make, and the command that judges it."""
-
-    # Opens the devices, and begins or resumes the session.
-    begin: Callable[[], AbstractContextManager[tuple[LiveCell, Journal]]]
-    recorded: RecordedCell | PlanCell
-    lens: Camera | None  # Intrinsics; None where they are not known.
-    stops: tuple[NextPose, ...]  # Planned poses; none where coverage decides.
-    count: int  # Number of views after which it is judged; 0 where the person decides.
-    options: CaptureOptions
-    command: Sequence[str]  # The command's words, without the folder that it writes.
-    result: Path  # The folder.
-    usual: PoseForm | None = None  # The form of its controller's poses, where it is known.
-
-
-@dataclass(frozen=True)
-class Row:
-    """A view in the table of a page."""
-
-    number: int
-    picture: str  # Name of the picture in its folder; empty where it has none.
-    version: str  # Differs for each picture that the view has had.
-    pose: str  # As it was typed, else as the pendant shows it.
-    is_typed: bool  # Whether its pose may be typed anew.
-    state: str  # The board in the picture, in words.
-    residual: str = ""  # Of the newest trial; empty where that is of another picture or pose.
-    is_odd: bool = False  # Whether that left it out.
-
-
-@dataclass(eq=False)
-class Visitor:
-    """A browser: what it shows, and what became of its requests."""
-
-    seen: "Snapshot"
-    answers: int = 0  # Number of its requests that were answered.
-    refusal: str = ""  # Why the last of them was refused; empty where it was done.
-    lines: tuple[str, ...] = ()  # The lines of poses that were taken last.
-    returned: str = ""  # The line of the view that was taken back last.
-
-
-@dataclass(frozen=True, eq=False)
-class Snapshot:
-    """Content of the pages."""
-
-    phase: Literal["setup", "opening", "live", "stopped"] = "setup"
-    setup: Setup = field(default_factory=Setup)
-    problem: str = ""  # The fault and its remedy.
-    picture: bytes = b""  # The live picture, a JPEG.
-    pictures: int = 0  # Number of pictures so far.
-    sees: str = ""  # The board in it, in words.
-    is_still: bool | None = None  # None where pictures are no stream.
-    arm: str = ""  # The arm's name.
-    takes_typed: bool = False  # Whether poses are typed.
-    views: tuple[Row, ...] = ()
-    revision: int = 0  # Number of changes of the table so far.
-    again: int | None = None  # Number of the view that the next one replaces.
-    is_stored: bool = False  # Whether pictures are those of a folder.
-    due: str = ""  # Name of the folder's picture that belongs to the next pose.
-    waiting: tuple[str, ...] = ()  # Names of its pictures that have no pose yet.
-    left_out: tuple[str, ...] = ()  # Names of those that are to have none.
-    note: str = ""  # How views are requested.
-    missed: str = ""  # Why the last try gave no view.
-    coverage: str = ""  # The coverage, as SVG.
-    advice: str = ""
-    next_pose: NextPose | None = None
-    pose_form: str = ""  # The form in which poses are shown.
-    trial: Outcome | None = None  # Result of the views so far.
-    outcome: Outcome | None = None  # Result at the end.
-    outdated: str = ""  # The change since the newer of the two.
-    is_judging: bool = False
-
-
-def _why_same(state: ArmState, others: Sequence[View | ArmState]) -> str:
-    """Says which of other rows, or of the lines before, has the same pose; empty for none."""
-    for other in others:
-        taken = state_of(other) if isinstance(other, View) else other
-        if taken and np.abs(taken.base_from_flange - state.base_from_flange).max() < 1e-9:
-            where = f"View {other.number}" if isinstance(other, View) else "A line before"
-            return f"{where} has this very pose: type that of this picture, or drive to another."
-    return ""
 
 
 def _request(
@@ -242,7 +138,7 @@ class Station:
         ]
         others = [view for view in journal.views if view.number != again]
         for at, state in enumerate(states):
-            if reason := _why_same(state, [*others, *states[:at]]):
+            if reason := why_same(state, [*others, *states[:at]]):
                 return reason
         number, place = capture.next_numbers()
         numbers = [*([] if again is None else [again]), *range(number, number + len(states))]
@@ -296,7 +192,7 @@ class Station:
             return "Only the pose of a view without joints can be typed: take it again."
         state = ArmState(0.0, pose.pose, typed=line, pose_form=pose.form.name)
         others = [view for view in rows.values() if view.number != number]
-        return _why_same(state, others) or self._repair(visitor, {**rows, number: state})
+        return why_same(state, others) or self._repair(visitor, {**rows, number: state})
 
     @_request
     def mend(self, visitor: Visitor, fault: Fault, number: int = 0, other: int = 0) -> str:
@@ -554,20 +450,9 @@ class Station:
         self._after_change()
 
     def _rows(self) -> tuple[Row, ...]:
-        now, rows = self.snapshot, list[Row]()
-        outcome, corners = now.outcome or now.trial, self._capture.coach.corners
-        for view in self._capture.journal.views:
-            state, found = state_of(view), corners.get(view.number)
-            pose = view.text.get("typed", "")
-            if not pose and state is not None:
-                pose = pendant_words(state.base_from_flange, POSE_FORMS[now.pose_form])
-            seen = "no board" if found is None else f"{len(found.ids)} corners, edges "
-            seen += "" if found is None else f"{figure(found.blur_px)} px"
-            residual = ("", False) if outcome is None else outcome.residual(view)
-            version, is_typed = f"{view.stamp_s}", view.joints_rad is None
-            name = picture_name(view)
-            rows.append(Row(view.number, name, version, pose, is_typed, seen, *residual))
-        return tuple(rows)
+        now, capture = self.snapshot, self._capture
+        outcome, form = now.outcome or now.trial, POSE_FORMS[now.pose_form]
+        return table_rows(capture.journal.views, capture.coach.corners, outcome, form)
 
     def _outdated(self) -> str:
         """The change since the newest outcome, in words."""
@@ -630,33 +515,15 @@ class Station:
             at = taken + len(self._rejected)
             pose = task.stops[at] if at < len(task.stops) else None
         else:
-            pose = self._suggested()
+            recorded, trial = self._task.recorded, self.snapshot.trial
+            good = {} if trial is None or trial.light == "red" else trial.document
+            edges = [np.array(edge["matrix"]) for edge in good.get("transforms", {}).values()]
+            states = map(state_of, self._capture.journal.views)
+            stood = [state.base_from_flange for state in states if state is not None]
+            place = partial(flange_at, recorded.mount, *edges) if edges else None
+            pose = suggested_pose(coach, self._rejected, place, stood)
         self._publish(
             coverage=coverage_svg(coach.covered, coach.poses),
             advice=f"{coach.words()}{f'; the board was hardly in the {unseen}' if unseen else ''}",
             next_pose=pose,
         )
-
-    def _suggested(self) -> NextPose:
-        """The next view by coverage, and where a trial says it, the pose of the flange."""
-        coach, trial = self._capture.coach, self.snapshot.trial
-        if not coach.poses:
-            return NextPose("Begin with the whole board large in the picture.")
-        avoid, flange, view = [*coach.poses, *self._rejected], None, None
-        if trial is not None and trial.light != "red" and trial.document:
-            edges = trial.document["transforms"].values()
-            x, z = (np.array(edge["matrix"]) for edge in edges)
-            place = partial(flange_at, self._task.recorded.mount, x, z)
-            states = map(state_of, self._capture.journal.views)
-            taken = np.array([state.base_from_flange for state in states if state is not None])
-            view = next_view(coach.target, coach.lens, avoid, lambda at: near(place(at), taken))
-            flange = None if view is None else place(view)
-        view = next_view(coach.target, coach.lens, avoid) if view is None else view
-        if view is None:
-            return NextPose("Another place, with the whole board in the picture.")
-        tilt = np.rad2deg(np.arccos(np.clip(view[2, 2], -1.0, 1.0)))
-        words = (
-            "Move until the board fills the orange outline, its first corner in the ring; it is "
-            f"tilted by {tilt:.0f} degrees there."
-        )
-        return NextPose(words, view, flange)

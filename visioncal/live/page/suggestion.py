@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import apply, compose, distances, invert, rotation_angle
 from visioncal.core.types import Camera, FloatArray, Mask, Target
+from visioncal.live.capture.assessment import Coach
 from visioncal.planning.visibility import FieldOfView
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import extent_m, outline
@@ -88,7 +89,7 @@ def _apart(views: FloatArray, view: FloatArray, centre: FloatArray, lens: Camera
     return np.asarray(np.array(steps).T @ (1.0 / _APART))
 
 
-def near(flanges: FloatArray, taken: FloatArray) -> Mask:
+def _near(flanges: FloatArray, taken: FloatArray) -> Mask:
     """Whether poses of the flange (k, 4, 4) are near those taken (n, 4, 4), and no farther out [m].
 
     Where an arm has stood it can stand; what it reaches beyond, and what stands there, only its
@@ -99,3 +100,35 @@ def near(flanges: FloatArray, taken: FloatArray) -> Mask:
     out, low = np.linalg.norm(taken[:, :3, 3], axis=1).max(), taken[:, 2, 3].min()
     is_inside = (np.linalg.norm(flanges[:, :3, 3], axis=1) <= out) & (flanges[:, 2, 3] >= low)
     return np.asarray(np.any(beside, axis=0) & is_inside)
+
+
+def suggested_pose(
+    coach: Coach,
+    rejected: Sequence[FloatArray],
+    flange_of: Callable[[FloatArray], FloatArray] | None,
+    taken: Sequence[FloatArray],
+) -> NextPose:
+    """The next view by coverage, and where a trial says it, the pose of the flange.
+
+    Args:
+        coach: The views so far.
+        rejected: (4, 4) `cam_from_target` of suggestions that were skipped [m].
+        flange_of: The flange's poses (k, 4, 4) at views, by a trial; None without one.
+        taken: (4, 4) poses of the flange so far [m].
+    """
+    if not coach.poses:
+        return NextPose("Begin with the whole board large in the picture.")
+    avoid, flange, view = [*coach.poses, *rejected], None, None
+    if flange_of is not None:
+        stood = np.array(taken)
+        view = next_view(coach.target, coach.lens, avoid, lambda at: _near(flange_of(at), stood))
+        flange = None if view is None else flange_of(view)
+    view = next_view(coach.target, coach.lens, avoid) if view is None else view
+    if view is None:
+        return NextPose("Another place, with the whole board in the picture.")
+    tilt = np.rad2deg(np.arccos(np.clip(view[2, 2], -1.0, 1.0)))
+    words = (
+        "Move until the board fills the orange outline, its first corner in the ring; it is "
+        f"tilted by {tilt:.0f} degrees there."
+    )
+    return NextPose(words, view, flange)

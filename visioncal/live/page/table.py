@@ -6,7 +6,8 @@ from nicegui import ui
 
 from visioncal.core.documents.pendants import PendantPose
 from visioncal.live.drivers.manual import pose_words
-from visioncal.live.page.station import Row, Snapshot, Station, Visitor
+from visioncal.live.page.state import Row, Snapshot, Visitor
+from visioncal.live.page.station import Station
 
 # Where the pictures of views are served.
 VIEWS = "/view"

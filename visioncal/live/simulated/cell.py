@@ -15,7 +15,8 @@ from visioncal.live.capture.recording import CaptureEvent
 from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.protocols import Frame
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.simulated.controller import ControllerOptions, TrueState, spawn
+from visioncal.live.simulated.controller import spawn
+from visioncal.live.simulated.machine import ControllerOptions, TrueState
 from visioncal.planning.cell import TYPICAL_NOISE, TYPICAL_PX, Limits, PlanCell
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
