@@ -22,7 +22,7 @@ EXAMPLES = {
 }
 
 PAGES = sorted(set(FOLDER.glob("*.md")) - {FOLDER / "README.md"})
-QUICK = ("an_arm_with_a_urdf", "samples_of_easy_handeye", "weekly_check_by_cron")
+QUICK = ("samples_of_easy_handeye", "weekly_check_by_cron")
 
 
 # The quicker ones are run each time.

@@ -225,7 +225,7 @@ def planted_history(path, hostile):
     return path
 
 
-@pytest.mark.parametrize("hostile", [VIEW, TRIGGER, "CREATE TABLE more (x)"])
+@pytest.mark.parametrize("hostile", [slow(VIEW), TRIGGER, slow("CREATE TABLE more (x)")])
 def test_a_history_with_code_in_it_is_refused_before_it_is_read(hostile, tmp_path, inputs):
     path = planted_history(tmp_path / SITE_FILE, hostile)
     visioncal("history", path).refused("other tables, views or triggers")
@@ -337,6 +337,7 @@ def test_no_table_for_other_programs_carries_formulas(tmp_path, inputs):
     )
 
 
+@pytest.mark.slow
 def test_what_a_tracker_measured_cannot_be_recovered_by_a_camera(tmp_path):
     visioncal("simulate", tmp_path / "s", "--instrument", "points").good()
     visioncal("calibrate", tmp_path / "s", "-o", tmp_path / "out", "--no-report").good()

@@ -333,7 +333,6 @@ def test_a_board_too_blurred_for_its_markers_is_no_other_board():
     assert "sharp, near enough and not mirrored" in found.do.words
 
 
-@pytest.mark.slow
 def test_a_board_of_another_kind_is_named():
     found = first_of_blurred(circles(4, 7, asymmetric=True), 0.0)
     assert "another board than declared: asymmetric grid of 4 x 7 circles" in found.words
@@ -382,7 +381,7 @@ def test_a_motion_that_determines_too_little_is_named_as_calibrate_names_it(moun
     assert str(found.do) == refused.next_step
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", ["[cam] for [camera]", slow("images turned clockwise")])
 def test_what_cannot_be_read_is_refused_with_what_to_type(tmp_path, name):
     folder = broken_session(tmp_path / "session", BROKEN[name])
     refused = command("doctor", folder)

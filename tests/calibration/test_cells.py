@@ -151,7 +151,6 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert away_m < 2.5e-4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["cam_right", slow("target_floor")])
 def test_a_frame_that_creeps_was_not_bumped_again_and_again(frame):
     cell = simulate(replace(PLAIN, moved=(Moved(frame, creeps=True, shift_m=0.012),), seed=3))
@@ -252,6 +251,7 @@ POINTS = (
 TRACKERS = (InstrumentAt("t1", (0.0, -3.0, 1.2)), InstrumentAt("t2", (0.5, 3.0, 1.2), 2.5))
 
 
+@pytest.mark.slow
 def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera():
     cell = simulate(NetworkOptions(cameras=(), instruments=TRACKERS, points=POINTS, stops=12))
     # The second stands alone but for the points in the cell.
@@ -274,6 +274,7 @@ def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_
     assert "read points on a robot's flange" in remedy
 
 
+@pytest.mark.slow
 def test_a_camera_and_a_board_that_see_each_other_alone_are_told_what_would_tie_them():
     cell = simulate(replace(PLAIN, stops=8))
     kept = [one for one in cell.sights if (one.camera == "left") == (one.board == "floor")]

@@ -276,7 +276,7 @@ def test_the_offset_is_told_by_a_sweep():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "how"), [slow(0, SHORT), (1, HURRIED)], ids=["global", "rolling"])
+@pytest.mark.parametrize(("seed", "how"), [(0, SHORT), (1, HURRIED)], ids=["global", "rolling"])
 def test_images_are_placed_in_time_by_their_corners_and_their_readout_is_found(seed, how):
     cell = swept(seed, how=how)
     known = calibrated_sweep(cell)
@@ -309,6 +309,7 @@ def test_corners_move_with_the_readout_as_differences_say():
     np.testing.assert_allclose(delayed(0.0)[1][:, :, 0], difference, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_at_rest_the_clocks_do_not_matter():
     resting = dwelling(0.2)
     result = calibrate(resting)

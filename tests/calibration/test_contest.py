@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 from support.cells import calibrated, pairs_session, reporting
-from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
 from support.sound_findings import SOUND, changed, directions
@@ -63,7 +62,7 @@ def pairs(seed, mount, views=18, step=None, farther_m=0.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [121, *map(slow, (115, 123, 138, *range(20, 30)))])
+@pytest.mark.parametrize("seed", [121, 115, 123, 138, *range(20, 30)])
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_uneven_noise_is_no_step(mount, seed):
     """Views far away have more of it; in the first sessions several are on one side."""
@@ -72,7 +71,7 @@ def test_uneven_noise_is_no_step(mount, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_distances_that_change_at_once_are_no_noise(mount):
     """As noise along the sight, which has a size of its own, they would be let pass."""
     verdict = visioncal.calibrate(pairs(20, mount, farther_m=4e-3)).verdict
@@ -138,7 +137,7 @@ def test_what_no_cure_was_applied_of_is_not_sure():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *map(slow, range(1, 4))])
+@pytest.mark.parametrize("seed", range(4))
 def test_creeping_is_not_sure_where_a_step_does_as_well(seed):
     """A target that moved by 1.1 mm midway."""
     step = [0.0, 0.0, 0.0, 1e-3, 5e-4, 0.0]
@@ -213,10 +212,10 @@ def moving(kind, mount, count=16):
 @pytest.mark.parametrize(
     ("kind", "mount", "name", "keys"),
     [
-        slow("gantry", MOUNTS[0], "base_from_target", "xyz"),
+        ("gantry", MOUNTS[0], "base_from_target", "xyz"),
         ("gantry", MOUNTS[1], "flange_from_target", "xyz"),
-        slow("scara", MOUNTS[0], "flange_from_cam", "z"),
-        slow("scara", MOUNTS[1], "base_from_cam", "z"),
+        ("scara", MOUNTS[0], "flange_from_cam", "z"),
+        ("scara", MOUNTS[1], "base_from_cam", "z"),
     ],
 )
 def test_a_machine_that_cannot_tilt_hears_what_to_measure(kind, mount, name, keys):

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import visioncal as command
-from support.marks import slow
 from support.refusals import raised
 from support.tracked import errors_of, known_of
 
@@ -42,7 +41,7 @@ WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3, "offset_sigma_rad": 1e-3}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [PROBE, slow(POINT)], ids=["probe", "point"])
+@pytest.mark.parametrize("options", [PROBE, POINT], ids=["probe", "point"])
 def test_errors_follow_their_covariance(options):
     kept = np.arange(12) if options.poses else np.r_[:6, 9:12]
     squares = 0.0
@@ -57,6 +56,7 @@ def test_errors_follow_their_covariance(options):
     assert low < squares < high
 
 
+@pytest.mark.slow
 def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace():
     shop = tracked(replace(PROBE, **WRONG, stops=40))
     known = known_of(session_of(shop))

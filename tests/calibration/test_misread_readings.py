@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.marks import crossed
+from support.marks import crossed, slow
 from support.refusals import raised
 
 from visioncal.calibration.run import calibrate
@@ -70,8 +70,8 @@ def of_other_order(poses):
     ("options", "change", "words"),
     [
         (POINT, mirrored, "The instrument's readings are in a left-handed frame"),
-        (PROBE, mirrored, "The instrument's readings are in a left-handed frame"),
-        (PROBE, invert, "With the instrument's poses inverse, robot and instrument agree"),
+        slow(PROBE, mirrored, "The instrument's readings are in a left-handed frame"),
+        slow(PROBE, invert, "With the instrument's poses inverse, robot and instrument agree"),
         (PROBE, of_other_order, "With the instrument's rotations as a quaternion w, x, y, z"),
     ],
 )

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from support.boards import any_page, printed
 from support.commands import visioncal
 from support.edited import changed
-from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
 from support.rendered import line_kernel
@@ -339,11 +338,12 @@ def test_a_board_in_millimetres_is_read_so(tmp_path):
     assert read.warnings[0].endswith("30 is read as 30 mm.")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "mount", "words"),
     [
         (CHECKERS, TO_HAND, "numbers the corners of the board as if it was"),
-        slow(load_target("aruco_4x4_50_id0_120mm"), IN_HAND, "counterclockwise"),
+        (load_target("aruco_4x4_50_id0_120mm"), IN_HAND, "counterclockwise"),
     ],
     ids=["bottom up", "marker"],
 )
@@ -449,9 +449,10 @@ def test_dense_corners_bring_in_refused_views_and_leave_sharp_ones_alone():
     np.testing.assert_array_equal(found.matrix, known.matrix)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stated", "status", "said", "level"),
-    [slow(1.1, "good", "", 1.1 * NOISE_PX), (0.4, "check", "corners.csv states 0.08 px", NOISE_PX)],
+    [(1.1, "good", "", 1.1 * NOISE_PX), (0.4, "check", "corners.csv states 0.08 px", NOISE_PX)],
 )
 def test_the_verdict_says_where_the_corners_contradict_what_is_stated(stated, status, said, level):
     result = calibrate(seen(CHARUCO, stated=stated)[1])

@@ -41,6 +41,7 @@ def rokae(data: Path) -> Session:
     return Session.assemble(document, columns, cells, MemoryImages({}), robot_document=robot)
 
 
+@pytest.mark.slow
 def test_charuco_before_a_fixed_camera(real_data):
     result = visioncal.calibrate(real_data / "sessions/ric_charuco_eye_to_hand")
     unused = [view for view in result.views if not view.used]

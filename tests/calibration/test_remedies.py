@@ -241,7 +241,6 @@ def test_turns_that_are_wrong_each_in_its_way_are_no_other_frame(tmp_path):
     assert (cause.kind, cause.views) == ("wrong_views", (3, 9, 14))
 
 
-@pytest.mark.slow
 def test_another_distortion_is_no_picture_of_another_size(tmp_path):
     cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
     k1, k2, *_ = SOUND.camera.distortion

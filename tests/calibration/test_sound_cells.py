@@ -152,6 +152,7 @@ def test_an_odd_but_sound_cell_is_accused_of_nothing(name):
     assert not accused(session_of(*CELLS[name]()))
 
 
+@pytest.mark.slow
 def test_an_accusation_of_a_sound_cell_is_found(monkeypatch):
     # Round numbers alone, whatever the residuals show.
     monkeypatch.setattr(rounded_poses, "_SHOWN", 1e-9)

@@ -101,7 +101,7 @@ def learnt():
 # Over 8 worlds the median share was 0.10 and 0.18, the worst of each 0.14 and 0.34; this world is
 # not the worst. The limits are those that are promised of the median.
 @pytest.mark.slow
-@pytest.mark.parametrize(("told", "limit"), [("temperatures", 0.2), slow("currents", 0.25)])
+@pytest.mark.parametrize(("told", "limit"), [("temperatures", 0.2), ("currents", 0.25)])
 def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
     """All over the workspace, between the training and the fifth hour."""
     found = learnt(told)

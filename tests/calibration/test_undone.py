@@ -325,7 +325,7 @@ def test_a_rail_that_is_in_no_pose_is_named_and_added_from_its_column(
 @pytest.mark.parametrize(
     ("scaled", "mount"),
     [
-        slow(("z", "mm", 1e3), MOUNTS[0]),
+        (("z", "mm", 1e3), MOUNTS[0]),
         (("y", "another unit", 10.0), MOUNTS[1]),
         *(slow(("x", "inch", 1 / 0.0254), mount) for mount in MOUNTS),
     ],
@@ -401,7 +401,7 @@ def test_rows_are_any_few_apart(by):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("first", "last", "by"), [slow(6, 14, 1), (10, 16, -2), slow(4, 9, 1)])
+@pytest.mark.parametrize(("first", "last", "by"), [(6, 14, 1), (10, 16, -2), (4, 9, 1)])
 def test_rows_amid_the_table_that_are_apart_are_one_command(tmp_path, monkeypatch, first, last, by):
     monkeypatch.chdir(tmp_path)
     robot, boards = poses_of(MOUNTS[0])
@@ -450,8 +450,8 @@ def located(session):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seeds", [3, slow(6)])
-@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+@pytest.mark.parametrize("seeds", [3, 6])
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_sound_and_otherwise_wrong_sessions_are_not_accused(mount, seeds):
     rng = np.random.default_rng(3)
     for seed in range(seeds):
@@ -473,7 +473,7 @@ def test_of_long_sessions_every_row_is_named():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_corners_that_are_numbered_a_column_on_get_their_own_numbers(tmp_path, monkeypatch, mount):
     monkeypatch.chdir(tmp_path)
     (robot, seen), wrong = corners_of(mount), (1, 6, 12, 15)
@@ -558,8 +558,8 @@ def test_views_without_pictures_are_not_said_to_be_turned_back():
 @pytest.mark.parametrize(
     ("part", "columns", "mount"),
     [
-        slow(np.s_[:, 0, 3], "x_m", MOUNTS[0]),
-        slow(np.s_[:, :2, 3], "x_m and y_m", MOUNTS[1]),
+        (np.s_[:, 0, 3], "x_m", MOUNTS[0]),
+        (np.s_[:, :2, 3], "x_m and y_m", MOUNTS[1]),
         (np.s_[:, :3, :3], "qx to qw", MOUNTS[0]),
     ],
 )
@@ -576,7 +576,8 @@ def test_columns_that_stand_in_other_rows_are_no_rail(part, columns, mount):
     assert sum(view.used for view in mended.views) == len(boards) - 1
 
 
-@pytest.mark.parametrize("mount", [slow(MOUNTS[0]), MOUNTS[1]])
+@pytest.mark.slow
+@pytest.mark.parametrize("mount", MOUNTS)
 def test_a_column_in_other_rows_is_named_where_it_hardly_varies(mount):
     edges, (flat, _) = calibrated(mount).edges, poses_of(mount)
     flat[:, 2, 3] = 0.5 + 0.1 * (flat[:, 2, 3] - 0.5)
@@ -598,7 +599,7 @@ def test_a_column_that_was_sorted_by_itself_is_no_rail(mount):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("when", "degrees"), [slow("from view 12 on", 90.0), ("in all of these", 180.0)]
+    ("when", "degrees"), [("from view 12 on", 90.0), ("in all of these", 180.0)]
 )
 def test_a_base_that_turned_is_no_board_that_was_read_turned(when, degrees):
     some = slice(12, None) if when == "from view 12 on" else slice(1, None, 2)
@@ -612,6 +613,7 @@ def test_a_base_that_turned_is_no_board_that_was_read_turned(when, degrees):
     assert f"mm and {degrees:.0f} deg" in cause.words
 
 
+@pytest.mark.slow
 def test_rows_in_reverse_order_are_mended_by_one_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     robot, boards = poses_of("eye-in-hand")
@@ -631,6 +633,7 @@ def test_rows_in_reverse_order_are_mended_by_one_command(tmp_path, monkeypatch):
     assert "Views 23 and 14 must be exchanged once" in again.refused("--exchange").err
 
 
+@pytest.mark.slow
 def test_rows_exchanged_among_stops_that_are_alike_have_one_partner_each():
     """Each of two pairs of rows fits those of the other, as where a programme ran twice."""
     rng, count = np.random.default_rng(3), 12
@@ -650,6 +653,7 @@ def test_rows_exchanged_among_stops_that_are_alike_have_one_partner_each():
     assert (np.sort(pairs % count, axis=1) == [2, 7]).all()
 
 
+@pytest.mark.slow
 def test_views_that_a_symmetric_board_lets_read_turned_are_said_and_turned_back(
     tmp_path, monkeypatch
 ):

@@ -838,12 +838,13 @@ def test_repeated_readings_are_a_hint_and_no_doubt(need) -> None:
 SHUFFLED = CellOptions(mount="eye-to-hand", views=18, seed=4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "order", "status", "words"),
     [
-        slow(SHUFFLED, lambda rng: rng.permutation(18), "bad", "poses are not those of the images"),
+        (SHUFFLED, lambda rng: rng.permutation(18), "bad", "poses are not those of the images"),
         # Where the other half is as it should be, that is not said.
-        slow(
+        (
             replace(SHUFFLED, mount="eye-in-hand"),
             lambda rng: [*rng.permutation(9), *range(9, 18)],
             "check",

@@ -627,7 +627,7 @@ HAS_FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is n
         (full, io.StringIO, ["--json"], 2, "stdout cannot be written: No space left on device."),
         slow(io.StringIO, full, [], 0, None),
         # A reader that has gone ends the command quietly.
-        (unread, io.StringIO, ["--json"], 141, ""),
+        slow(unread, io.StringIO, ["--json"], 141, ""),
         # Streams that were closed before are no error.
         (nullcontext, nullcontext, ["--json"], 0, None),
     ],

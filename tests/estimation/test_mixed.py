@@ -267,7 +267,7 @@ def test_a_focus_that_is_fixed_neither_breathes_nor_jitters():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draws", [range(2, 3), slow(range(2, 9))], ids=str)
+@pytest.mark.parametrize("draws", [range(2, 3), range(2, 9)], ids=str)
 def test_a_focus_that_chance_explains_leaves_the_flange_its_noise(draws):
     """Else errors along the lens's axis alone shrink the noise of all directions."""
     for seed in draws:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.marks import seeds, slow
+from support.marks import seeds
 
 from visioncal.core.transforms import invert, log
 from visioncal.fit.solve import solve
@@ -65,7 +65,8 @@ def test_moments_without_a_time_are_as_warm_as_the_last_sample():
     assert np.abs(cold).max() < 1e-9
 
 
-@pytest.mark.parametrize("temperatures", [True, slow(False)])
+@pytest.mark.slow
+@pytest.mark.parametrize("temperatures", [True, False])
 @pytest.mark.parametrize("draws", seeds(1, 8))
 def test_growth_and_drift_are_found_within_their_covariance(temperatures, draws):
     squares = []

@@ -66,6 +66,7 @@ def lasting(seed, share):
     return replace(small, cell=replace(small.cell, arms=arms, moments=moments))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draws", seeds(10, 30))
 def test_errors_that_last_move_the_estimate_and_are_in_the_covariance(draws):
     squares, lengths = {True: [], False: []}, {True: [], False: []}

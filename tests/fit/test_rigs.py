@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.marks import seeds, slow
+from support.marks import seeds
 from support.small_cells import PX, ROBOT_RAD, made
 from support.whole_cells import FLOOR, OPTIONS, PLATE, recorded
 
@@ -50,7 +50,7 @@ def test_arms_that_no_sighting_connects_are_eliminated_apart():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("in_hand", [True, slow(False)])
+@pytest.mark.parametrize("in_hand", [True, False])
 def test_swaying_cameras_are_separated_from_corners_noise_and_from_the_arm(in_hand):
     squares, views, errors, used = [], [], [], []
     for seed in range(4):

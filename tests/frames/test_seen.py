@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.cells import exact
 from support.imaged import Shot, calibrated_cell, session_of, shots
-from support.marks import seeds, slow
+from support.marks import seeds
 from support.misfits import misfit
 from support.picks import calibration_of, really, seen_corners
 from support.refusals import raised
@@ -71,7 +71,7 @@ def sights_of(cell, parent, place, rng, count=6, target=BOARD):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mount", "parent"), [(IN_HAND, "base"), slow(TO_HAND, "flange")])
+@pytest.mark.parametrize(("mount", "parent"), [(IN_HAND, "base"), (TO_HAND, "flange")])
 def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
     cell = simulate(exact(CellOptions(mount=mount, views=8, seed=1)))
     eye, rng = CalibratedCamera.of(calibration_of(cell)), np.random.default_rng(0)

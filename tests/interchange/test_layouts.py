@@ -1491,7 +1491,7 @@ def test_files_that_are_each_a_recording_are_named_at_once(tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("is_listed", [slow(False), True])
+@pytest.mark.parametrize("is_listed", [False, True])
 def test_files_of_a_recording_each_that_differ_in_numbers_are_named(tmp_path, is_listed):
     poses, _, session = world()
     for name, count in (("run_1", 6), ("run_2", 9)):

@@ -14,7 +14,6 @@ from scipy.io.matlab import MatlabOpaque
 from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.fuzz.mistakes import numbers
-from support.marks import slow
 from support.samples import made_up
 
 from visioncal.calibration.guess.search import Recording, turns_alike
@@ -297,7 +296,7 @@ def turning(count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fails", [slow(False), True])
+@pytest.mark.parametrize("fails", [False, True])
 def test_angles_come_first_where_some_rows_have_no_corners(fails, tmp_path, monkeypatch):
     """Rows are compared with those that have corners; an error of one reading ends nothing."""
 

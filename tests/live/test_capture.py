@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 from support.live_cell import FakeArm, fake_devices, fake_plan
-from support.marks import slow
 from support.mjpeg import NetworkCamera, number_of, served
 from support.recorded import QUICK, REPEATABILITY_M, facts_of, recorded
 from support.refusals import raised
@@ -81,9 +80,7 @@ def test_a_recording_is_a_session_that_calibrates(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "hidden", [False, slow(True)], ids=["told by the arm", "seen in the image"]
-)
+@pytest.mark.parametrize("hidden", [False, True], ids=["told by the arm", "seen in the image"])
 def test_a_moving_arm_gives_no_view(plan, tmp_path, hidden):
     arm, camera = fake_devices(plan, trembling_s=0.8, tremble_rad=4e-3, hidden=hidden)
     recorded(tmp_path / "live", plan, arm, camera, CaptureOptions())

@@ -498,9 +498,10 @@ def test_a_robot_program_of_each_maker_records_a_good_session(
         assert max(map(len, sent)) <= longest
         return sent
 
-    session, plan = tmp_path / "live", cell[0]
-    assert str(CLIENTS) in _recorded(cell, pieces, session, 12).err
-    for view, stop in zip(Session.load(session).views, plan.stops, strict=True):
+    # The same poses are the same session, whoever sent them: one is calibrated.
+    session, plan, count = tmp_path / "live", cell[0], 12 if say is said_by_krl else 3
+    assert str(CLIENTS) in _recorded(cell, pieces, session, count).err
+    for view, stop in zip(Session.load(session).views, plan.stops[:count], strict=True):
         shift, turn = pose_difference(
             np.asarray(view.base_from_flange().as_matrix()),
             plan.cell.robot.base_from_flange(stop.q[None])[0],
@@ -508,8 +509,7 @@ def test_a_robot_program_of_each_maker_records_a_good_session(
         # Micrometres and ten-thousandths of a degree are what the programs send.
         assert shift < 1e-3
         assert turn < 2e-4
-    # The same poses are the same session, whoever sent them.
-    if program == "visioncal.src":
+    if say is said_by_krl:
         found = visioncal("calibrate", session, "-o", tmp_path / "out").good()
         assert "good" in found.said.splitlines()[0]
 

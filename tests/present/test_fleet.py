@@ -33,7 +33,7 @@ def test_five_stories_are_the_first_five_rows(seed, tmp_path):
     # Nothing is said of a board that was put elsewhere.
     assert "base_from_target" not in page.words
     assert text.count("<figure") == 12
-    if browser.CHROMIUM is not None and seed == 0:
+    if browser.CHROMIUM is not None and seed == 2:
         file = tmp_path / "page.html"
         file.write_text(text)
         browser.picture(file, 800, 1600, tmp_path / "page.png")

@@ -142,7 +142,7 @@ def test_figures_are_drawn_and_their_identifiers_stay_apart(sample):
     )
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand", slow("two arms")])
+@pytest.mark.parametrize("mount", ["eye-in-hand", slow("eye-to-hand"), slow("two arms")])
 def test_the_cell_is_pictured_with_each_place_of_camera_and_board(mount):
     options = two_arms.OPTIONS if mount == "two arms" else CellOptions(views=10, mount=mount)
     session = cell_session(simulate(options), "cell", seen="corners")

@@ -135,7 +135,7 @@ def test_another_recording_of_a_whole_cell_is_that_of_a_cell_whose_camera_was_kn
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("read", ["points", slow("probe")])
+@pytest.mark.parametrize("read", ["points", "probe"])
 def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
     folder, out = place / f"cell-{read}", place / f"cell-{read}-out"
     done(
@@ -253,7 +253,7 @@ def test_depth_is_off_by_what_was_asked_for(place):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mount", [slow("eye-in-hand"), slow("eye-to-hand"), "instrument"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand", "instrument"])
 def test_an_arm_of_four_axes_is_simulated_with_a_measured_height(mount, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     how = ("--instrument", "points") if mount == "instrument" else ("--no-images", "--mount", mount)

@@ -79,7 +79,8 @@ def test_the_rows_of_a_look_are_what_changes_of_the_cell_do_to_it(mount):
         np.testing.assert_allclose(getattr(by_corners, name), getattr(rows, name), atol=5e-3)
 
 
-@pytest.mark.parametrize("count", [500, slow(3000)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [500, 3000])
 def test_false_alarms_are_as_rare_as_stated(count):
     guard = Guard(usual("eye-in-hand").calibration, false_alarm_looks=100.0)
     rng, alarms = np.random.default_rng(0), 0
@@ -98,7 +99,7 @@ def test_false_alarms_are_as_rare_as_stated(count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tail", [0.6, slow(1.2)])
+@pytest.mark.parametrize("tail", [0.6, 1.2])
 def test_the_limit_follows_the_tail_of_the_statistic(tail):
     rng, count = np.random.default_rng(3), 40_000
     state = Detector.of(np.eye(12), 1e-5, np.zeros(0))

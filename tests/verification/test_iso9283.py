@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import visioncal as command
-from support.marks import slow
 from support.refusals import raised
 
 from visioncal.calibration.run import calibrate
@@ -153,7 +152,7 @@ def test_too_few_rows_are_refused(measuring):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arm", ["ur10e", slow("generic-6r-1800")])
+@pytest.mark.parametrize("arm", ["ur10e", "generic-6r-1800"])
 def test_the_cube_is_reached_and_has_the_standards_proportions(arm):
     robot = load_robot(arm)
     cube = largest_cube(robot, Limits())

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import visioncal as command
-from support.marks import slow
 from support.refusals import raised
 
 from visioncal.calibration.run import calibrate
@@ -105,7 +104,7 @@ def test_what_is_no_load_is_said(unloaded):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("compensated", [True, slow(False)])
+@pytest.mark.parametrize("compensated", [True, False])
 def test_the_loads_tell_whether_the_arms_own_weight_bends_it(compensated):
     """Controllers of KUKA and ABB compensate it: its stiffness was once denied there."""
     q = np.repeat(random_postures(arm_named(ARM), 20, np.random.default_rng(5)), 2, axis=0)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support.commands import visioncal
 from support.lerobot import KEY
-from support.marks import slow
 from support.scenes import CAMERA, Scene, disturbed, texture, turned
 
 from visioncal.verification.scene_audit import Episode, assumed_camera, scene_moves
@@ -60,7 +59,7 @@ def test_a_camera_that_stands_is_not_accused(lights):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("at", [0, slow(5), slow(LENGTH - 1)])
+@pytest.mark.parametrize("at", [0, 5, LENGTH - 1])
 def test_a_move_is_named_by_its_frame(lights, at):
     courses = [[0] * LENGTH, [0] * at + [1] * (LENGTH - at), [1] * LENGTH, [1] * LENGTH]
     assert moves(episodes(lights, courses)) == [(1, at, True)]

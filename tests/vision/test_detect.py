@@ -18,7 +18,7 @@ from support.commands import visioncal
 from support.marks import slow
 from support.refusals import raised
 
-from visioncal.calibration.stages.detect import detect, unshown_rows
+from visioncal.calibration.stages.detect import detect, other_sizes, unshown_rows
 from visioncal.cli.target import to_toml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
@@ -200,7 +200,17 @@ def test_another_layout_than_declared_is_named(charuco, declared, correction):
     assert caught.next_step.startswith(correction)
 
 
-@pytest.mark.slow
+def test_images_of_another_size_are_named(charuco):
+    cell, images = charuco
+    images = [*images[:3], cv2.resize(images[3], (640, 400))]
+    session = session_of(
+        {f"{at}.png": encoded(it) for at, it in enumerate(images)}, cell.options.target
+    )
+    (found,) = other_sizes(detect(session))
+    assert (found.kind, found.views) == ("image_sizes", (3,))
+    assert "1 of 4 images are turned or scaled: view 3, such as 640 x 400 px" in found.words
+
+
 def test_negatives_are_named(charuco):
     cell, images = charuco
     # One small image is searched for a second alone.
@@ -211,7 +221,7 @@ def test_negatives_are_named(charuco):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("described", "kind"), [(4, "aprilgrid"), slow(6, "aprilgrid"), slow(8, "charuco")]
+    ("described", "kind"), [(4, "aprilgrid"), (6, "aprilgrid"), (8, "charuco")]
 )
 def test_an_aprilgrid_with_more_rows_than_printed_is_named(described, kind):
     cell, images = images_of(CellOptions(views=6, target=BOARDS[kind], cut_views=0.0, seed=3), 6)
@@ -238,7 +248,7 @@ def seen_by_a_fisheye(target, turn, depth_m, resolution, *matrix):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("declared", [slow({}), {"columns": 18}, slow({"legacy": True})])
+@pytest.mark.parametrize("declared", [{}, {"columns": 18}, {"legacy": True}])
 def test_a_large_board_that_a_wide_lens_bends_is_judged_by_neighbours(declared):
     target = Target("wide", "charuco", 20, 10, 0.03, 3e-5, 0.02, "DICT_5X5_250")
     image, exact = seen_by_a_fisheye(target, [0.5, 0.4, 0.6], 0.35, (1024, 768), 520, 519, 503, 378)
@@ -401,7 +411,7 @@ def test_a_board_that_the_image_cuts_is_at_least_so_large():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sigma_px", [slow(0.0), slow(3.0), 12.0])
+@pytest.mark.parametrize("sigma_px", [0.0, 3.0, 12.0])
 def test_an_image_without_a_board_is_refused(sigma_px):
     noise = np.random.default_rng(1).normal(0.0, 1.0, (600, 800))
     if sigma_px:

@@ -95,14 +95,14 @@ def test_no_sound_board_is_accused(kind, hard):
     ("seed", "kind", "hard"),
     [
         # Detectors' corners make gaps look wider; a single tag is read by chance.
-        slow([404, 6, 3], "gridboard", "blurred"),
-        slow([404, 8, 7], "gridboard", "steep"),
+        ([404, 6, 3], "gridboard", "blurred"),
+        ([404, 8, 7], "gridboard", "steep"),
         ([404, 11, 3], "aprilgrid", "blurred"),
         # 16 bits are read by chance in a tag of 36.
-        slow([606, 5, 3], "aprilgrid", "blurred"),
-        slow([404, 11, 4], "gridboard", "very blurred"),
+        ([606, 5, 3], "aprilgrid", "blurred"),
+        ([404, 11, 4], "gridboard", "very blurred"),
         # From the side its rows are columns.
-        slow([9, 4], "circles", "hidden in part"),
+        ([9, 4], "circles", "hidden in part"),
     ],
 )
 def test_sound_boards_that_look_like_others_are_not_accused(seed, kind, hard):
@@ -125,7 +125,7 @@ def test_a_board_whose_first_rows_are_covered_begins_at_no_other_id():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("off", [-0.04, slow(0.04)])
+@pytest.mark.parametrize("off", [-0.04, 0.04])
 def test_a_grid_of_markers_with_other_gaps_is_named(off):
     rng = np.random.default_rng(5)
     board = print_of("gridboard", rng, first=0)
@@ -196,7 +196,7 @@ def case(name, folder):
 @pytest.mark.parametrize(
     ("name", "said", "written"),
     [
-        slow("aprilgrid-spacing-metres", "looks like metres", "spacing = 0.3"),
+        ("aprilgrid-spacing-metres", "looks like metres", "spacing = 0.3"),
         ("charuco-legacy", "8 x 6 squares, DICT_4X4_50, legacy layout", "legacy = true"),
     ],
 )
@@ -210,6 +210,7 @@ def test_a_board_of_a_field_case_is_named_and_mended(tmp_path, monkeypatch, name
     assert (tmp_path / "out/calibration.json").is_file()
 
 
+@pytest.mark.slow
 def test_a_grid_of_aruco_markers_is_named_and_written_with_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = case("aruco-grid-board", tmp_path / "cell")

@@ -92,7 +92,7 @@ def test_a_simulated_cell_shows_the_picture(target):
     "look",
     [
         Look(disc_px=12.0),
-        slow(Look(twist=(0.012, 0.006, 0.002, 0.001, 0.002, 0.005), covered=0.1)),
+        Look(twist=(0.012, 0.006, 0.002, 0.001, 0.002, 0.005), covered=0.1),
     ],
     ids=["defocus", "motion"],
 )
@@ -131,7 +131,7 @@ def test_a_picture_calibrates_a_lens_that_nobody_states(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("disc_px", [4.0, slow(8.0)])
+@pytest.mark.parametrize("disc_px", [4.0, 8.0])
 def test_pictures_out_of_focus_are_registered_by_a_disc(target, disc_px):
     pose = pose_at(0.45, 20.0, np.array([0.15, 0.11, 0.0]), np.random.default_rng(2))
     found = find_target(photographed(poster(), 0.3, CAMERA, pose, Look(disc_px=disc_px)), target)
@@ -143,7 +143,7 @@ def test_pictures_out_of_focus_are_registered_by_a_disc(target, disc_px):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("views", [[1], slow([1, 6])])
+@pytest.mark.parametrize("views", [[1], [1, 6]])
 def test_small_prints_of_alike_letters_are_found(tmp_path, views):
     cell = simulate(CellOptions(views=8, seed=0, camera=CAMERA))
     cv2.imwrite(str(tmp_path / "print.png"), label())

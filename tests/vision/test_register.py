@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.marks import seeds, slow
+from support.marks import seeds
 from support.printed import PICTURES, Look, photographed, pose_at
 
 from visioncal.core.types import Target
@@ -69,7 +69,7 @@ def away(found, pose, flat):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("disc_px", "twist"),
-    [slow(0.0, ()), slow(6.0, ()), (0.0, (0.004, 0.002, 0.001, 0.002, 0.001, 0.004))],
+    [(0.0, ()), (6.0, ()), (0.0, (0.004, 0.002, 0.001, 0.002, 0.001, 0.004))],
 )
 def test_derivatives_are_those_of_differences(disc_px, twist):
     flat, image, pose, _ = view(1, Look())
@@ -99,7 +99,7 @@ def test_derivatives_are_those_of_differences(disc_px, twist):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [slow("poster"), "board"])
+@pytest.mark.parametrize("kind", ["poster", "board"])
 @pytest.mark.parametrize("views", seeds(4, 8))
 def test_covariances_of_poses_are_true_where_half_of_the_views_are_covered(kind, views):
     squares = []
@@ -126,6 +126,7 @@ def test_prints_whose_ends_are_at_other_distances_bias_no_pose():
     assert np.mean(squares) < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", seeds(2, 6))
 def test_a_lens_that_is_off_counts_in_the_covariance(views):
     # By what a calibration of few views leaves: the pose is off by far more than its noise.
@@ -147,7 +148,7 @@ def test_a_lens_that_is_off_counts_in_the_covariance(views):
 @pytest.mark.parametrize(
     ("look", "most"),
     [
-        slow(Look(disc_px=5.0, covered=0.1), (0.1, 0.05)),
+        (Look(disc_px=5.0, covered=0.1), (0.1, 0.05)),
         (Look(twist=(0.007, -0.003, 0.002, 0.001, 0.002, 0.005)), (0.03, 0.02)),
     ],
 )
@@ -174,7 +175,7 @@ def test_blurred_prints_are_found_from_a_start_by_the_robot(look, most, views):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lens_px", "within"), [(0.3, 0.1), slow(0.5, 0.02)])
+@pytest.mark.parametrize(("lens_px", "within"), [(0.3, 0.1), (0.5, 0.02)])
 @pytest.mark.parametrize("views", seeds(1, 2))
 def test_the_blur_of_a_small_covered_board_is_found_from_sharper_and_wider_ones(
     lens_px, within, views

@@ -337,18 +337,18 @@ def test_the_turns_are_those_that_leave_the_page_as_it_is(target, count):
 EXACT = [
     slow(TAG_GRID, SHOT, 0.01),
     slow(TAG_GRID, replace(SHOT, square_px=25), 0.015),
-    (TAG_GRID, replace(SHOT, disc_px=2), 0.015),
+    slow(TAG_GRID, replace(SHOT, disc_px=2), 0.015),
     (TAG_GRID, replace(SHOT, tilt_deg=60), 0.015),
     slow(TAG_GRID, replace(SHOT, gamma=0.45, bend=0.1), 0.015),
-    (TAG_GRID, replace(SHOT, bayer=True), 0.03),
+    slow(TAG_GRID, replace(SHOT, bayer=True), 0.03),
 ]
 for board in (SHIFTED, EVEN):
     EXACT += [
-        (board, CIRCLES_SHOT, 0.008),
+        slow(board, CIRCLES_SHOT, 0.008),
         slow(board, replace(CIRCLES_SHOT, disc_px=3), 0.015),
         (board, replace(CIRCLES_SHOT, tilt_deg=60, square_px=40), 0.01),
         slow(board, replace(CIRCLES_SHOT, bend=0.15, ink_px=1), 0.01),
-        (board, replace(CIRCLES_SHOT, bayer=True), 0.025),
+        slow(board, replace(CIRCLES_SHOT, bayer=True), 0.025),
     ]
 
 
@@ -500,7 +500,7 @@ def test_a_board_is_what_its_files_say(dots):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("camera", ["wide", slow("fisheye")])
+@pytest.mark.parametrize("camera", ["wide", "fisheye"])
 def test_centres_are_exact_and_rightly_numbered(dots, camera):
     cell = simulate(
         CellOptions(target=dots, camera=CAMERAS[camera], views=4, cut_views=0.0, seed=1)
