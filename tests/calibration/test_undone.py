@@ -232,23 +232,33 @@ def test_positions_that_lost_a_sign_get_it_back_by_the_printed_command(
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "mount"),
-    [("unit", MOUNTS[0]), ("inverse", MOUNTS[1]), *(("sign", mount) for mount in MOUNTS)],
+    ("kind", "mount", "start"),
+    [
+        slow("unit", MOUNTS[0], 10),
+        slow("inverse", MOUNTS[1], 10),
+        *(slow("sign", mount, 10) for mount in MOUNTS),
+        # Fewer than half of the rows are right.
+        ("w first", MOUNTS[0], 8),
+        slow("unit", MOUNTS[1], 8),
+    ],
 )
 def test_poses_that_are_misread_and_rows_apart_are_mended_one_after_the_other(
-    tmp_path, monkeypatch, mount, kind
+    tmp_path, monkeypatch, mount, kind, start
 ):
     monkeypatch.chdir(tmp_path)
     sound = calibrated(mount)
-    robot, boards = shifted(*poses_of(mount))
+    robot, boards = shifted(*poses_of(mount), start=start)
     if kind == "inverse":
         robot = invert(robot)
-    robot[:, :3, 3] *= {"sign": [1.0, -1.0, 1.0], "unit": 39.3701, "inverse": 1.0}[kind]
+    if kind == "w first":
+        w_first = np.roll(Rotation.from_matrix(robot[:, :3, :3]).as_quat(), 1, axis=1)
+        robot = compose(Rotation.from_quat(w_first).as_matrix(), robot[:, :3, 3])
+    robot[:, :3, 3] *= {"sign": [1.0, -1.0, 1.0], "unit": 39.3701}.get(kind, 1.0)
     pairs_session(mount, robot, boards).save(tmp_path / "cell")
     cause, found = followed("cell")
     assert cause.kind == "misread_poses"
+    assert ("So it is from view 0 to view 8: the other rows have" in cause.words) == (start < 10)
     assert cause.do.command.startswith("visioncal convert cell cell-fixed --guess")
     assert (tmp_path / "cell-fixed-fixed").is_dir()
     if kind == "inverse" and found.mount != mount:

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -410,6 +411,26 @@ def test_poses_with_too_few_digits_are_the_cause(step_mm, step_deg, noise_mm, wo
     assert (ids(verdict)[:1] == ["rounded_poses"]) == bool(words)
     assert words in verdict.top[0]
     assert ("rounded_poses" in [found.kind for found in doctor(session).findings]) == bool(words)
+
+
+@pytest.mark.parametrize("form", ["quaternions", slow("rotation vectors")])
+def test_rotations_of_three_decimals_are_the_cause(form) -> None:
+    cell = simulate(CellOptions(views=20, robot_sigma_m=3e-5, robot_sigma_rad=5e-5))
+    flanges = cell.robot.base_from_flange.copy()
+    words = "rotations (quaternions of 3 decimals) to 0.11 deg: this alone"
+    if form == "rotation vectors":
+        turns = Rotation.from_matrix(flanges[:, :3, :3]).as_rotvec().round(3)
+        flanges[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+        words = "rotation vectors to 0.057 deg: this alone"
+    session = session_of(cell, flanges)
+    cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
+    if form == "quaternions":
+        for row, name in product(cells, ("qx", "qy", "qz", "qw")):
+            row[name] = f"{float(row[name]):.3f}"
+    rows = [[*row.values()] for row in cells]
+    verdict = calibrate(session.with_content(document=session.document, cells=rows)).verdict
+    assert ids(verdict)[:1] == ["rounded_poses"]
+    assert words in verdict.top[0]
 
 
 @pytest.mark.slow

@@ -130,6 +130,12 @@ def view_words(views: Sequence[int]) -> str:
     return f"view{'s' * (len(views) > 1)} {some_of([*map(str, views)])}"
 
 
+def row_words(views: Sequence[int]) -> str:
+    """All rows of views in a sentence: `the row of view 3`, or `the rows of views 3 and 6`."""
+    s = "s" * (len(views) > 1)
+    return f"the row{s} of view{s} {listed([*map(str, views)])}"
+
+
 def known_name(
     what: str, name: str, known: Collection[_Name], culprit: str = "", next_step: str = ""
 ) -> _Name:

@@ -22,6 +22,7 @@ from visioncal.calibration.guess.search import (
     fitted,
     search,
     search_by_half,
+    search_ends,
     thinned,
 )
 from visioncal.core.conventions import PoseNumbers
@@ -122,8 +123,7 @@ def guess_reading(
     with one_blas_thread():
         found = [_likeliest(search(recording)) for recording in recordings]
         if mount is not None and not found[0][1].fit.closes:
-            tried, best = _likeliest(search_by_half(recordings[0]))
-            found = [(tried, best)] if best is not tried[0] and best.fit.closes else found
+            found = _of_some_rows(recordings[0]) or found
         if mount is None:
             # A reading of another mount is that mount's, as it is declared there.
             own = [item for item in found if item[1].hypothesis.mount == item[1].recording.mount]
@@ -133,6 +133,16 @@ def guess_reading(
         tried = [best, *(item for item in (declared, *others) if item is not best)]
         notes = tuple(_notes(best, is_mount_given=mount is not None))
         return Guess(declared, tuple(tried), best, _sentence(declared, best, tried), notes)
+
+
+def _of_some_rows(recording: Recording) -> list[tuple[list[Candidate], Candidate]]:
+    """The readings that close the chain of half of the rows, or of one end; empty for none."""
+    for searched in (map(search_by_half, [recording]), search_ends(recording)):
+        likely = map(_likeliest, searched)
+        found = [item for item in likely if item[1] is not item[0][0] and item[1].fit.closes]
+        if found:
+            return [min(found, key=lambda item: item[1].hypothesis.cost)]
+    return []
 
 
 def _likeliest(tried: list[Candidate]) -> tuple[list[Candidate], Candidate]:
@@ -260,7 +270,11 @@ def _sentence(declared: Candidate, best: Candidate, ranked: Sequence[Candidate])
     closes = f"robot and camera agree to {_figures(best)}"
     if best is not declared:
         otherwise = f"to {_figures(declared)}" if declared.fit.agreeing else "in no view"
-        return f"With {best.words}, {closes}; as first read, {otherwise}."
+        of_end, places = "", best.recording.robot.places
+        if best.recording.is_end:
+            of_end = f" So it is from {places[0]} to {places[-1]}: the other rows have another "
+            of_end += "mistake beside it, which comes next."
+        return f"With {best.words}, {closes}; as first read, {otherwise}.{of_end}"
     if not declared.fit.is_readable:
         return (
             "As first read, the rotations of the robot or of the camera are none, and no other "

@@ -37,13 +37,16 @@ from visioncal.calibration.guess.readings import (
 )
 from visioncal.calibration.guess.unwrapping import unwrapped
 from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers
-from visioncal.core.limits import CLEAR_RATIO
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.estimation.closed_form import upper_pairs
 
 # With fewer views too many readings agree; more than the second add time and no certainty.
 FEWEST_ROWS, _FITTED_ROWS = 4, 30
+# Share of the rows at either end in which a reading may be right alone: beside rows that are apart
+# from fewer than these on, most of the others agree in another order.
+_END_SHARE = 0.4
 # Share of the log-likelihood that counts: the errors of an arm, a lens and a board are common to
 # the views, which count as half as many independent ones.
 EVIDENCE = 0.5
@@ -77,6 +80,7 @@ class Recording:
     mount: Mount
     is_measured: bool  # Whether the camera's poses were measured from images.
     chain: FloatArray | None = None  # (n, 4, 4) the robot's poses by its joints; NaN without.
+    is_end: bool = False  # Whether it is one end of a longer one.
 
     @cached_property
     def declared(self) -> Hypothesis:
@@ -95,6 +99,25 @@ class Recording:
         changed = np.any(np.diff(numbers, axis=0) != 0.0, axis=1)
         others = rows[np.append(np.ones(min(len(rows), 1), dtype=bool), changed)]
         return others if len(others) >= FEWEST_ROWS else rows
+
+    @cached_property
+    def changes(self) -> tuple[Change, ...]:
+        """All mistakes that are tried but rewritten rotations; an end keeps the order of rows."""
+        count = 0 if self.is_end else len(self.robot)
+        return (*changes(self.declared, self.is_measured, count),)
+
+    @property
+    def ends(self) -> "Iterator[Recording]":
+        """Its first and its last rows, where these suffice to compare readings."""
+        rows = self.common_rows
+        count = int(np.ceil(_END_SHARE * len(rows)))
+        if count < FEWEST_STOPS:
+            return
+        for some in (slice(0, rows[count - 1] + 1), slice(rows[-count], len(self.robot))):
+            at = np.arange(len(self.robot))[some]
+            sides = self.robot.rows(at), self.camera.rows(at)
+            chain = None if self.chain is None else self.chain[at]
+            yield Recording(*sides, self.mount, self.is_measured, chain, is_end=True)
 
     def is_likely(self, tried: Hypothesis) -> bool:
         """Whether the unit of the camera's positions puts the target at a likely distance."""
@@ -259,7 +282,7 @@ def search(recording: Recording) -> list[Candidate]:
     """
     rows, declared = thinned(recording.common_rows), recording.declared
     mismatch = _mismatch(recording, rows)
-    plain = [*changes(declared, recording.is_measured, len(recording.robot))]
+    plain = recording.changes
     near = list[Hypothesis]()
     # One maker's angles in reverse order, taken for another's, are the inverse in a mirrored frame,
     # as is a quaternion in another order with two signs of positions: the former is likelier. Other
@@ -302,6 +325,18 @@ def search(recording: Recording) -> list[Candidate]:
     return [first, *others]
 
 
+def search_ends(recording: Recording) -> Iterator[list[Candidate]]:
+    """Finds the readings that close the chain of the first rows, and of the last, as `search`.
+
+    The others have a mistake of their own, so that fewer than half of the rows are right. Nothing
+    where one end closes as declared.
+    """
+    ends = [*recording.ends]
+    as_read = (fitted(end, [end.declared], end.common_rows, STARTS)[0].fit for end in ends)
+    if not any(fit.closes for fit in as_read):
+        yield from map(search, ends)
+
+
 def turns_alike(recording: Recording) -> bool:
     """Whether robot and camera may turn alike under a reading of `search` or `search_by_half`.
 
@@ -311,8 +346,7 @@ def turns_alike(recording: Recording) -> bool:
     rows, declared = thinned(recording.common_rows), recording.declared
     if len(rows) < FEWEST_ROWS:
         return True
-    plain = changes(declared, recording.is_measured, len(recording.robot))
-    turning = [each for each in plain if not _TURNING.isdisjoint(each.fields)]
+    turning = [each for each in recording.changes if not _TURNING.isdisjoint(each.fields)]
     some = recording.robot.rows(rows)
     pairs = [*product((None, *turning), rewritten(some)), *product((None,), turning)]
     pairs += [*combinations(turning, 2)]

@@ -26,7 +26,7 @@ from visioncal.calibration.suspects.rounded_poses import rounded
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DegenerateError, VisioncalError
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import counted, mm_and_deg, some_of
+from visioncal.core.number_format import counted, mm_and_deg, row_words, some_of, view_words
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, of_cell, with_paths
@@ -178,11 +178,11 @@ def _motion(run: RunState) -> Iterator[Finding]:
     if views:
         yield Finding(
             "wrong_views",
-            f"View {some_of([*map(str, views)])}: the others disagree. A pose or an image is "
-            "wrong, or something moved.",
+            f"{view_words(views).capitalize()}: the others disagree. A pose or an image is wrong, "
+            "or something moved.",
             Remedy(
-                "Look at images and poses: repeat these views, or in views.csv, delete the rows of "
-                f"view {', '.join(map(str, views))}; or calibrate, which names what moved.",
+                "Look at images and poses: repeat these views, or in views.csv, delete "
+                f"{row_words(views)}; or calibrate, which names what moved.",
                 CALIBRATE,
             ),
             views,

@@ -6,7 +6,7 @@ from visioncal.calibration.stages.detect import image_of
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.other_board import other_board, spread
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import some_of
+from visioncal.core.number_format import row_words, some_of
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
@@ -23,8 +23,7 @@ def missing_images(session: Session) -> Finding | None:
         return None
     images = some_of([view.image for view in missing])
     views = tuple(view.number for view in missing)
-    listed = ", ".join(map(str, views))
-    do = f"Copy them there; or in views.csv, delete the rows of view {listed}."
+    do = f"Copy them there; or in views.csv, delete {row_words(views)}."
     if len(missing) == len(searched):
         do = "Copy them there; or in views.csv, correct their folder and names."
         if other := _namesake(session, missing[0]):

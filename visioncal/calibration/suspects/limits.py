@@ -11,7 +11,7 @@ from visioncal.calibration.suspects.ranking import MEASURE_BOARD, add_views_reme
 from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.calibration.suspects.suspect import UNEXPLAINED
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import counted, figure, mm_and_deg, sigma_words
+from visioncal.core.number_format import counted, figure, mm_and_deg, row_words, sigma_words
 from visioncal.core.verdict import (
     CALIBRATE,
     LEAST_NEED_MM,
@@ -138,12 +138,12 @@ def _left_out(pair: JudgedPair) -> Iterator[Finding]:
     if not pair.outliers:
         return
     views, reason = tuple(rejection.view for rejection in pair.outliers), pair.outliers[0].reason
-    listed = ", ".join(map(str, views))
-    words = f"View {listed} was left out. It {reason}."
+    words = f"View {views[0]} was left out. It {reason}."
     if len(views) > 1:
-        words = f"Views {listed} were left out. View {views[0]} {reason}."
+        each = ", ".join(map(str, views))
+        words = f"Views {each} were left out. View {views[0]} {reason}."
     step = Remedy(
-        f"Compare images and poses: repeat, or in views.csv, delete the rows of view {listed}.",
+        f"Compare images and poses: repeat, or in views.csv, delete {row_words(views)}.",
         look_at(views[0]),
     )
     yield Finding("wrong_views", words, step, views, without_it=without(views, pair.held_out.words))

@@ -17,6 +17,8 @@ from visioncal.session.columns import POSE
 # Share of a rounding's standard deviation that residuals show at least: commanded poses may be
 # round numbers, and exact.
 _SHOWN = 0.7
+# Decimals of quaternions that turn a flange by more than arms repeat.
+_MOST_DIGITS = 3
 
 
 def _found(run: RunState) -> Iterator[Finding]:
@@ -70,17 +72,24 @@ def _step(numbers: FloatArray) -> float:
 
 
 def _angle_step(quaternions: FloatArray) -> tuple[float, str]:
-    """The same of angles [deg] as makers write them, and how these are called."""
+    """The same of angles [deg] as they were written, and how these are called."""
+    for digits in range(1, _MOST_DIGITS + 1):
+        if (quaternions == np.round(quaternions, digits)).all():
+            # A part of a quaternion is half of an angle in radians.
+            step = 2.0 * float(np.rad2deg(0.1**digits))
+            return step, f"rotations (quaternions of {digits} decimals)"
     rotations = ROTATION_FORMS["quaternion-xyzw"].read(quaternions)
     names = {
         form.rotation.split("-")[1] for form in POSE_FORMS.values() if "euler" in form.rotation
     }
-    for name in sorted(names):
-        angles = ROTATION_FORMS[f"euler-{name}-deg"].write(rotations)
+    forms = {f"euler-{name}-deg": "angles" for name in sorted(names)}
+    for form, called in (forms | {"rotation-vector-deg": "rotation vectors"}).items():
+        angles = ROTATION_FORMS[form].write(rotations)
         if step := _step(angles):
-            return step, "angles"
-    step = _step(ROTATION_FORMS["rotation-vector-deg"].write(rotations))
-    return step, "rotation vectors"
+            return step, called
+        if step := _step(1e3 * np.deg2rad(angles)):
+            return float(np.rad2deg(1e-3 * step)), called
+    return 0.0, ""
 
 
 ROUNDED_POSES = Suspect(
