@@ -339,7 +339,9 @@ def test_a_board_of_another_kind_is_named():
     assert 'write target = "seen.toml"' in found.do.words
 
 
-@pytest.mark.parametrize("name", [slow(name) if name == "no turns" else name for name in NAMED])
+@pytest.mark.parametrize(
+    "name", [slow(name) if name in ("no turns", "one pose typed wrong") else name for name in NAMED]
+)
 def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
     folder = broken_session(tmp_path / "session", BROKEN[name])
     found = visioncal.doctor(folder)

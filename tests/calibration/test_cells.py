@@ -392,6 +392,7 @@ def turned(tilt_deg, stops=14, noise=1.0, turn_deg=35.0, prior=None):
     return cell, Session.assemble(document, list(rows[0]), cells, MemoryImages({}))
 
 
+@pytest.mark.slow
 def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
     words = "offset along the cell's z has a predicted"
     caught = raised(DegenerateError, words, calibrate, turned(0.3)[1])

@@ -36,6 +36,7 @@ NOISE = Noise.of_robot(1e-3, 5e-4)
 FLAT = {"tilt_rad": (0.0, 0.002), "distance_m": (0.5, 0.505), "roll_rad": 0.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draws", seeds(2, 8))
 def test_the_whole_chain_states_its_errors_honestly(draws):
     surprises, noises, sigmas = [], [], np.array([5e-5, 3e-5])

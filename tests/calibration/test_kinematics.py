@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.cells import arm_found, calibrated, known_of, reporting
 from support.live_cell import postures_in_view, true_cell
+from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
 from support.slopes import jacobian, twists
@@ -216,6 +217,7 @@ def wrong():
     return cell, calibrated(cell, session=replace(session, views=tuple(views)))
 
 
+@pytest.mark.slow
 def test_predictions_move_as_their_derivatives_say(wrong):
     cell, known = wrong
     mount, edges = cell.options.mount, known.assessment.fit.state.edges
@@ -296,7 +298,7 @@ def test_the_result_is_in_the_convention_that_is_asked_for(wrong, convention):
     assert counts["condition"] == pytest.approx(1.0 / counts["o2"])
 
 
-@pytest.mark.parametrize("name", ["ur5e", "irb120", "panda"])
+@pytest.mark.parametrize("name", ["ur5e", slow("irb120"), slow("panda")])
 def test_readings_of_one_point_tell_three_values_less(name):
     """A point of the tool has a place and no direction."""
     robot = load_robot(name)

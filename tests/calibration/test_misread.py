@@ -356,6 +356,7 @@ def test_sound_poses_are_not_accused(world, mount):
         assert "cannot distinguish readings" in guess.sentence
 
 
+@pytest.mark.slow
 def test_what_is_advised_runs_as_it_is_printed_and_mends_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     planted = plant("the other mount", cell_poses())

@@ -149,6 +149,7 @@ def test_a_stated_prior_that_does_not_suffice_is_named(axis, said, step):
         assert "caliper" not in weak.do.words
 
 
+@pytest.mark.slow
 def test_each_image_is_searched_for_its_own_board(tmp_path):
     cell = simulate(replace(TWO, camera=CAMERAS["wide"], views=4, seed=11))
     session = Session.load(write_session(cell, tmp_path / "session"))
@@ -352,7 +353,7 @@ BENT = [-0.28, 0.09, 0.0012, -0.0009, -0.015]
     [
         (BENT, (0, 0, 0, 0), [*BENT[:2], BENT[4], *BENT[2:4]], f"write distortion = {BENT}"),
         slow([0.0] * 5, (0, 0, 0, 0), BENT, "The pictures are rectified"),
-        (BENT, (0, 0, 80, 60), BENT, "begins 80 px to the right and 60 px below"),
+        slow(BENT, (0, 0, 80, 60), BENT, "begins 80 px to the right and 60 px below"),
     ],
     ids=["another order", "rectified", "cropped"],
 )
@@ -404,6 +405,7 @@ def test_a_fisheye_lens_that_is_taken_for_another_is_named():
     assert "lens_model" not in {found.kind for found in verdict.findings}
 
 
+@pytest.mark.slow
 def test_boards_have_names_and_a_common_covariance_that_holds():
     cell = simulate(replace(TWO, seed=3))
     known = calibrated(cell)

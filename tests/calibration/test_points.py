@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.boards import any_page, printed
 from support.commands import visioncal
 from support.edited import changed
+from support.marks import slow
 from support.misfits import misfit
 from support.refusals import raised
 from support.rendered import line_kernel
@@ -338,12 +339,11 @@ def test_a_board_in_millimetres_is_read_so(tmp_path):
     assert read.warnings[0].endswith("30 is read as 30 mm.")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "mount", "words"),
     [
         (CHECKERS, TO_HAND, "numbers the corners of the board as if it was"),
-        (load_target("aruco_4x4_50_id0_120mm"), IN_HAND, "counterclockwise"),
+        slow(load_target("aruco_4x4_50_id0_120mm"), IN_HAND, "counterclockwise"),
     ],
     ids=["bottom up", "marker"],
 )
@@ -465,6 +465,7 @@ def test_the_verdict_says_where_the_corners_contradict_what_is_stated(stated, st
     assert result.noise["pixel_px"] == pytest.approx(level, rel=0.06)
 
 
+@pytest.mark.slow
 def test_every_storage_of_it_is_the_same_session(tmp_path):
     seen(stated=1.0)[1].save(tmp_path / "cell")
     session = Session.load(tmp_path / "cell")

@@ -663,7 +663,6 @@ def test_rows_exchanged_among_stops_that_are_alike_have_one_partner_each():
     assert (np.sort(pairs % count, axis=1) == [2, 7]).all()
 
 
-@pytest.mark.slow
 def test_views_that_a_symmetric_board_lets_read_turned_are_said_and_turned_back(
     tmp_path, monkeypatch
 ):

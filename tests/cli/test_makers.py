@@ -76,7 +76,7 @@ def in_words(maker, name, text):
     return pose_of(maker, [*place.split(","), *turn.split(",")], 1e-3)
 
 
-@pytest.mark.parametrize("maker", MAKERS)
+@pytest.mark.parametrize("maker", BY_FORM)
 def test_the_maker_is_kept_from_the_table_to_the_export(cell, maker, tmp_path):
     session, out = converted(cell, maker, tmp_path), tmp_path / "out"
     assert tomllib.loads((session / "session.toml").read_text())["robot"] == {"form": maker}

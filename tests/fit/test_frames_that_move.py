@@ -156,7 +156,7 @@ def slow(seed, kinds=(), walks=False):
 @pytest.mark.parametrize(
     ("kinds", "walks"),
     [
-        (("creeps",), False),
+        pytest.param(("creeps",), False, marks=pytest.mark.slow),
         pytest.param(("creeps", "slips"), False, marks=pytest.mark.slow),
         ((), True),
     ],

@@ -205,6 +205,7 @@ def test_a_calibrated_positioner_predicts_views_that_no_fit_has_seen(real_data, 
     assert np.mean([view.residual_deg for view in away]) < 1.2 * 0.046
 
 
+@pytest.mark.slow
 def test_a_ur10_from_its_joints(real_data, calibrated):
     joints = "shoulder_pan_joint,shoulder_lift_joint,elbow_joint,wrist_1_joint,wrist_2_joint"
     result, _ = calibrated(

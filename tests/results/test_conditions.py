@@ -139,6 +139,7 @@ def tilted(tilted_cell):
     return result_of(calibrated(tilted_cell, joints=False))
 
 
+@pytest.mark.slow
 def test_a_tilted_sensor_is_a_condition_with_its_size(tilted_cell, tilted):
     (condition,) = tilted.conditions
     assert condition.kind == "own-lens"

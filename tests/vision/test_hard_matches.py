@@ -152,6 +152,7 @@ def test_a_picture_is_found_by_other_matches_where_its_own_fail(monkeypatch):
     assert np.median(np.linalg.norm(off, axis=1)) < 2.0
 
 
+@pytest.mark.slow
 def test_nothing_of_it_is_imported_without_a_picture():
     code = (
         "import sys, visioncal.calibration.run, visioncal.vision.boards; "

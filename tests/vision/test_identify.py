@@ -363,6 +363,7 @@ def test_a_board_whose_first_pictures_are_cut_is_identified_by_others():
         identify(images[::2], declared)
 
 
+@pytest.mark.slow
 def test_a_board_that_is_never_seen_is_no_other_one_of_the_session():
     board = cv2.aruco.CharucoBoard(
         (7, 5), 0.03, 0.022, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

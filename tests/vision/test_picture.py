@@ -224,6 +224,7 @@ def test_pictures_by_which_no_pose_is_known_are_refused():
     assert "turned by a" in unfit(np.ascontiguousarray(square))
 
 
+@pytest.mark.slow
 def test_a_picture_is_printed_at_its_size_and_read_again(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cv2.imwrite("flyer.png", poster())
