@@ -13,8 +13,10 @@ from scipy.spatial.transform import Rotation
 from support.commands import visioncal
 from support.depth_cells import SMALL, TRUE, calibrated, picks
 from support.marks import slow
+from support.samples import made_up
 
 from visioncal import simulation
+from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.depth import with_depth
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
@@ -174,6 +176,22 @@ def test_an_empty_picture_and_one_of_another_size_are_named_and_left_out():
     assert re.search("view 2: depth has 640 x 50 distances, and the image 640 x 400 pixels", said)
     _, depth = again(lambda raw, _: np.zeros_like(raw))
     assert depth is None
+
+
+def test_depth_beside_measured_poses_without_a_board_is_named():
+    session = made_up(9, images=False).session
+    depth = cv2.imencode(".png", np.full((40, 64), 500, np.uint16))[1].tobytes()
+    names = [f"depth_{view.number}.png" for view in session.views]
+    rows = zip(session.views, names, strict=True)
+    boardless = session.with_content(
+        document={key: value for key, value in session.document.items() if key != "target"},
+        target_document=None,
+        columns=(*session.columns, "depth"),
+        cells=[[*(view.cell(column) for column in session.columns), name] for view, name in rows],
+        images=MemoryImages(dict.fromkeys(names, depth)),
+    )
+    said = {found.kind: found.words for found in calibrate(boardless).verdict.findings}
+    assert "needs a camera and a flat board" in said["depth_unread"]
 
 
 @pytest.mark.slow

@@ -127,8 +127,37 @@ def copied(folder):
     write(folder / "transforms.json", both)
 
 
+def called_by_an_equation(folder):
+    """Matrices as CamOdoCal keeps them, beside its settings."""
+    poses, seen, _ = world()
+    pairs = enumerate(zip(poses, seen, strict=True))
+    text = "".join(
+        listed(f"T{n}_{at}", each) for at, pair in pairs for n, each in enumerate(pair, 1)
+    )
+    write(folder / "pairs.yml", f"%YAML:1.0\nframeCount: {len(poses)}\n{text}")
+    write(folder / "config.json", {"load": "./pairs.yml", "summary": 1})
+
+
+def called_by_initials(folder):
+    """Columns of the hand and of the eye."""
+    names = [f"{side}_{each}" for side in "he" for each in ("x", "y", "z", "rx", "ry", "rz")]
+    poses, seen, _ = world()
+    rows = np.column_stack([np.arange(len(poses)), *halves(poses), *halves(seen)])
+    lines = (",".join(map(repr, row)) for row in rows.tolist())
+    write(folder / "run.csv", "\n".join([",".join(["id", *names]), *lines]))
+
+
 @pytest.mark.parametrize(
-    "make", [copied, opencv_s_calibration, counted_rows, vectors_by_name, in_turn_above_a_result]
+    "make",
+    [
+        called_by_an_equation,
+        called_by_initials,
+        copied,
+        opencv_s_calibration,
+        counted_rows,
+        vectors_by_name,
+        in_turn_above_a_result,
+    ],
 )
 def test_poses_of_the_target_come_in_as_programs_store_them(make, tmp_path):
     poses, seen, mount = world()
@@ -412,6 +441,54 @@ def test_a_file_called_joints_without_a_header_has_no_poses(tmp_path):
     fields = read_fields(tmp_path / "joints_tool.txt")
     assert not possible_poses(fields)
     assert joint_names(fields, ()) == tuple(f"joint_{at}" for at in range(1, 7))
+
+
+def readings_beside_joints(path):
+    """A table of joint angles and of the poses that an instrument read there, named behind."""
+    session, seen = made_up(9, images=False).session, world()[1]
+    names = [f"{each}_r" for each in ("px", "py", "pz", "rx", "ry", "rz")]
+    joints = [view.joints_rad for view in session.views]
+    rows = np.hstack([joints, *halves(seen)]).tolist()
+    header = ",".join([*(f"q{at}" for at in range(1, 7)), *names])
+    write(path, "\n".join([header, *(",".join(map(repr, row)) for row in rows)]))
+    return seen
+
+
+def test_poses_beside_joints_are_those_that_were_seen(tmp_path):
+    seen = readings_beside_joints(tmp_path / "in/data.csv")
+    said = ["--mount", world()[2], "--robot-model", "ur10e"]
+    visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    # Joints that the user names change nothing.
+    said += ["--joint-columns", ",".join(f"q{at}" for at in range(1, 7))]
+    visioncal("convert", tmp_path / "in", tmp_path / "again", *said).good()
+    for folder in ("out", "again"):
+        last = Session.load(tmp_path / folder).views[-1]
+        np.testing.assert_allclose(last.cam_from_target().as_matrix(), seen[-1], atol=1e-9)
+    readings_beside_joints(tmp_path / "in/data_old.csv")
+    done = visioncal("convert", tmp_path / "in", tmp_path / "third", *said)
+    assert "data.csv" in done.refused("2 files that are each a recording").err.splitlines()[-1]
+
+
+def test_a_pose_of_a_frame_is_not_taken_for_a_recording(tmp_path):
+    rows = np.random.default_rng(1).uniform(-900, 900, (20, 21))
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=",")
+    write(tmp_path / "reference.csv", "950.252 6.944 649.166 -178.998 -50.508 0.790\n")
+    refused = visioncal("convert", tmp_path, tmp_path / "out", "--mount", "eye-to-hand")
+    last = refused.refused("run.csv: 20 rows", "is not known").err.splitlines()[-1]
+    assert last.startswith("Name them with --robot-columns, or the joint angles")
+
+
+def test_points_beside_pictures_need_no_board(tmp_path):
+    """A ball's centre in records beside a picture each, and the arm before and after it."""
+    for at, pose in enumerate(world()[0]):
+        arm = {"before": {"O_T_EE": pose.T.ravel().tolist()}}
+        arm["after"] = {"O_T_EE": (pose.T + np.eye(4)[3:] * [1e-6, 0, 0, 0]).ravel().tolist()}
+        centre = (invert(pose[None])[0] @ [0.1, 0.2, 0.3, 1.0])[:3].tolist()
+        write(tmp_path / f"in/p{at}/record.json", {"robot": arm, "ball": {"centre_m": centre}})
+        cv2.imwrite(str(tmp_path / f"in/p{at}/view.png"), np.full((40, 60), 9 * at, np.uint8))
+    said = ["--mount", "eye-in-hand", "--camera-key", "ball.centre_m"]
+    visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    assert Session.load(tmp_path / "out").cameras[""].seeing == "points"
 
 
 def test_files_of_objects_say_how_to_write_them(tmp_path, monkeypatch):

@@ -78,8 +78,9 @@ class Sensor:
     @classmethod
     def of(cls, pair: Calibration, session: Session, camera: str, board: str) -> "Sensor":
         """The depth beside a camera's images of a board; raises DataError."""
-        own, target, lens = session.declaration.depth, session.boards[board], pair.camera
-        if lens is None or np.ptp(corner_positions(target)[:, 2]) > 0.0:
+        own, target, lens = session.declaration.depth, session.boards.get(board), pair.camera
+        # Measured poses of the target need neither.
+        if lens is None or target is None or np.ptp(corner_positions(target)[:, 2]) > 0.0:
             raise DataError("it needs a camera and a flat board.")
         table = session.cameras[camera] if own is None else own
         corners = corner_positions(target) if pair.board is None else pair.board.corners(target)

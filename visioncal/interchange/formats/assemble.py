@@ -239,7 +239,8 @@ def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
 
 def lacks_target(foreign: ForeignRecording) -> bool:
     """Whether there are images or corners alone, and nothing says what they show."""
-    is_seen = bool(foreign.images or foreign.corners)
+    is_of_points = (foreign.lens or {}).get("model") == "points"
+    is_seen = bool(foreign.images or foreign.corners) and not is_of_points
     return is_seen and foreign.target is None and foreign.camera is None
 
 

@@ -92,6 +92,11 @@ class Source:
         groups = (part.group for part in self.parts)
         return tuple(group for group in groups if group.is_images or group.is_clouds)
 
+    @property
+    def longest(self) -> int:
+        """The most rows of a part."""
+        return max((len(each) for part in self.parts for each in part.rows), default=0)
+
     def lens(self) -> tuple[Mapping[str, Any] | None, tuple[str, ...]]:
         """The only lens, or that of the colour camera, and where it is from; None without."""
         found = {place: lens for part in self.parts for place, lens in part.lenses.items()}
@@ -256,12 +261,12 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
         later += 8 * (len(fields) < FEWEST_ROWS)
         asked = _with_joints(fields, requested)
         joints = asked.joints or joint_names(fields, ())
-        is_given = bool(requested.robot.names or requested.joints) or not _has(fields, given)
+        is_given = bool(requested.robot.names) or not _has(fields, given)
         camera = () if is_given else pose_names(fields, requested.camera.names, "camera", joints)
         others = (*joints, *camera) if requested.camera.names else joints
         groups = [] if is_given else ranked_poses(fields, "robot", others)
         named = pose_names(fields, (), "robot", others) if is_seen or not joints else ()
-        if is_given or named or (joints and (is_seen or not groups)):
+        if is_given or named or requested.joints or (joints and (is_seen or not groups)):
             found.append((later + len(groups) * (not named), fields, asked))
         for rank, item in ((rank, item) for rank, group in enumerate(groups) for item in group):
             # Beside joint angles the pose is what was seen.
@@ -269,9 +274,12 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
                 of_item = replace(asked, camera=replace(requested.camera, names=item.names))
             else:
                 of_item = replace(asked, robot=replace(requested.robot, names=item.names))
-            if item.names != named:
+            if item.names != named and not (named and rank == 0 and item.is_like(named, fields)):
                 found.append((later + rank, fields, of_item))
     faults = [part.fault for part in source.parts if part.fault and not part.lenses]
+    if all(len(fields) < FEWEST_ROWS <= source.longest for _, fields, _ in found):
+        # A pose or two beside rows without a name are those of a frame.
+        found = []
     if not rows and len(faults) == 1:
         raise faults[0]
     if not found:
@@ -333,8 +341,11 @@ def _has(fields: Fields, given: Sequence[str]) -> bool:
 
 def unknown(source: Source, requested: ImportOptions, rows: Sequence[Fields] = ()) -> DataError:
     """The error of a source whose poses are not known, with a command that reads it."""
+    enough = [each for each in rows if len(each) >= FEWEST_ROWS or source.longest < FEWEST_ROWS]
     possible = [
-        (fields, item) for fields in rows for item in without_copies(fields, possible_poses(fields))
+        (fields, item)
+        for fields in enough
+        for item in without_copies(fields, possible_poses(fields))
     ]
     possible.sort(
         key=lambda of: (
@@ -381,7 +392,11 @@ def several_recordings(source: Source, requested: ImportOptions) -> DataError | 
     alike: dict[tuple[str, ...], list[tuple[Path, int]]] = {}
     for part in source.parts:
         for fields in part.rows if len(part.group.files) == 1 else ():
-            both = sum(item.is_named for item in possible_poses(fields)) > 1
+            poses = [item for item in possible_poses(fields) if item.is_named]
+            # An instrument's poses or points beside joint angles.
+            is_of_joints = not source.images and bool(joint_names(fields, ()))
+            is_of_joints &= bool(poses or columns_named(fields, ("x", "y", "z")))
+            both = len(poses) > 1 or is_of_joints
             if _is_whole(fields) if part.kin else both:
                 own = alike.setdefault(
                     (part.kin,) if part.kin else tuple(sorted(fields.numbers)), []
