@@ -500,8 +500,8 @@ CELL = replace(CellOptions(), views=12, seed=21)
 def proved(tmp_path_factory):
     """A calibrated cell, new images of its board, and where its corners really are."""
     folder = tmp_path_factory.mktemp("touched")
-    session = write_session(simulate(CELL), folder / "session")
-    assert visioncal("calibrate", session, "-o", folder / "out").status == 0
+    cell_session(simulate(CELL), "session", seen="corners").save(folder / "session")
+    assert visioncal("calibrate", folder / "session", "-o", folder / "out").status == 0
     later = simulate(replace(CELL, views=3, recording=1))
     look = write_session(later, folder / "look")
     place = later.transforms["base_from_target"]
