@@ -18,7 +18,7 @@ from support.result_schema import faults_below
 from support.searched import SEARCHES
 
 from visioncal.live.drivers import ur, ur_net
-from visioncal.simulation import CellOptions, simulate, write_session
+from visioncal.simulation import CAMERAS, CellOptions, simulate, write_session
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 # Whose tests read a report's words, if anything: figures are described and not drawn, which takes
@@ -67,9 +67,14 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory) -> Path:
-    """A rendered session of 12 views without intrinsics, its truth beside it. Read only."""
+    """A rendered session of 12 views without intrinsics, its truth beside it. Read only.
+
+    Its pictures have a quarter of the pixels: to draw, store and search them takes most of a test.
+    """
     folder = tmp_path_factory.mktemp("rendered sessions, größer") / "cell"
-    options = replace(CellOptions(), views=12, state_intrinsics=False, seed=11)
+    wide = CAMERAS["wide"]
+    small = replace(wide, resolution=(640, 400), matrix=wide.matrix / 2)
+    options = CellOptions(camera=small, blur_px=0.5, views=12, state_intrinsics=False, seed=11)
     return write_session(simulate(options), folder)
 
 

@@ -196,7 +196,7 @@ def test_a_rendered_session_gives_the_truth_within_its_sigma(result, rendered):
     # The length of an error of three components exceeds three roots of its variance rarely.
     assert away_mm < 3 * edge.sigma_mm
     assert away_deg < 3 * edge.sigma_deg
-    # 12 sharp views of 1280 x 800 with an unknown lens reach some tenths of a millimetre.
+    # 12 sharp views of 640 x 400 with an unknown lens reach some tenths of a millimetre.
     assert edge.sigma_mm < 0.5
     assert result.verdict.status == "good"
     assert result.camera.estimated
@@ -228,7 +228,7 @@ def test_missing_cut_and_empty_images_are_named_and_left_out(session_copy, resul
     calibration = visioncal.calibrate(session_copy)
     unused = {view.view: view.reason for view in calibration.views if not view.used}
     assert set(unused) == {1, 4, 7, 9}
-    assert "640 x 400 px, and the camera's images are 1280 x 800" in unused[9]
+    assert "320 x 200 px, and the camera's images are 640 x 400" in unused[9]
     assert "missing" in unused[1]
     assert "cut short" in unused[4]
     assert "empty" in unused[7]
@@ -239,9 +239,7 @@ def test_missing_cut_and_empty_images_are_named_and_left_out(session_copy, resul
 def test_two_views_and_no_board_are_refused(rendered):
     few = Session.load(rendered).only(range(3))
     files = {view.image: few.images.read(view.image) for view in few.views}
-    files[few.views[2].image] = cv2.imencode(".png", np.full((800, 1280), 90, np.uint8))[
-        1
-    ].tobytes()
+    files[few.views[2].image] = cv2.imencode(".png", np.full((400, 640), 90, np.uint8))[1].tobytes()
     two = few.with_content(images=MemoryImages(files))
     raised(DataError, "intrinsics: 2 views show the target", visioncal.calibrate, two)
     blank = [np.full((200, 320), 90, np.uint8)] * 3

@@ -33,7 +33,7 @@ from visioncal.session.depth import read_depth
 from visioncal.simulation import CAMERAS, CellOptions, DepthOptions
 
 BOARD = ImportOptions(target="charuco_9x6_30mm")
-LENS = {"matrix": [914.2, 913.6, 645.3, 396.8], "distortion": [-0.1, 0.06, 0.0, 0.0, 0.0]}
+LENS = {"matrix": [457.1, 456.8, 322.65, 198.4], "distortion": [-0.1, 0.06, 0.0, 0.0, 0.0]}
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +196,7 @@ def test_cameras_of_a_bag_are_a_whole_cell(source, rendered, tmp_path):
     unknown = convert(path, tmp_path / "lens", requested=replace(BOARD, intrinsics="estimate"))
     assert all(one.matrix is None for one in unknown.declaration.cameras.values())
     with pytest.raises(DataError, match="several cameras") as caught:
-        convert(path, tmp_path / "none", requested=replace(BOARD, resolution=(1280, 800)))
+        convert(path, tmp_path / "none", requested=replace(BOARD, resolution=(640, 400)))
     assert "--image-key" in caught.value.next_step
 
 
