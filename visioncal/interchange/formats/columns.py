@@ -14,8 +14,6 @@ from visioncal.estimation.trajectory import LONGEST_GAP_S, Samples
 from visioncal.interchange.formats.fields import (
     Fields,
     corners_in,
-    in_seconds,
-    is_image_name,
     named_by,
     stamp_name,
     unit_by_size,
@@ -42,6 +40,7 @@ from visioncal.interchange.formats.foreign import (
     Unstated,
 )
 from visioncal.interchange.formats.joints import joint_names, joints_from
+from visioncal.interchange.formats.keys import in_seconds, is_image_name
 from visioncal.interchange.formats.poses import (
     columns_named,
     makers_of,

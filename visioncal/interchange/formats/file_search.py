@@ -18,16 +18,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, is_inside, natural, read_bytes
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import IntArray
-from visioncal.interchange.formats.fields import (
-    HOW,
-    Fields,
-    Keys,
-    Match,
-    is_image_name,
-    matched,
-    named_by,
-    number_in,
-)
+from visioncal.interchange.formats.fields import Fields, named_by
+from visioncal.interchange.formats.keys import HOW, Keys, Match, is_image_name, matched, number_in
 from visioncal.interchange.formats.reading import ENDINGS, SOURCES
 from visioncal.session.images import CLOUD_ENDINGS, IMAGE_ENDINGS
 

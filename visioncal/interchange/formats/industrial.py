@@ -16,7 +16,7 @@ from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.columns import foreign_from
-from visioncal.interchange.formats.fields import fields_of_records, number_in
+from visioncal.interchange.formats.fields import fields_of_records
 from visioncal.interchange.formats.file_search import files_in, head, path_inside
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -25,6 +25,7 @@ from visioncal.interchange.formats.foreign import (
     PoseImportOptions,
 )
 from visioncal.interchange.formats.intrinsics import intrinsics_from
+from visioncal.interchange.formats.keys import number_in
 from visioncal.interchange.formats.reading import (
     fields_of_document,
     flattened,

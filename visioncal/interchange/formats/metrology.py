@@ -22,7 +22,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, figure, known_name, some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.assemble import pose_cells
-from visioncal.interchange.formats.fields import HOW, Keys, matched
 from visioncal.interchange.formats.file_search import files_in, groups_in, head
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -33,6 +32,7 @@ from visioncal.interchange.formats.foreign import (
     rows_of,
 )
 from visioncal.interchange.formats.joints import joints_from
+from visioncal.interchange.formats.keys import HOW, Keys, matched
 from visioncal.interchange.formats.point_tables import (
     CENTRE,
     FORCE,

@@ -37,11 +37,11 @@ from visioncal.interchange.formats.fields import (
     arrays_in_texts,
     fields_of_records,
     holds_pose,
-    is_image_name,
     is_small,
     joined,
     separate,
 )
+from visioncal.interchange.formats.keys import is_image_name
 from visioncal.interchange.formats.lines import (
     COMMENTS,
     IMAGE,

@@ -19,7 +19,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
-    HOW,
     Fields,
     appearance,
     fields_of_records,
@@ -35,6 +34,7 @@ from visioncal.interchange.formats.intrinsics import (
     read_target_description,
 )
 from visioncal.interchange.formats.joints import joint_names
+from visioncal.interchange.formats.keys import HOW
 from visioncal.interchange.formats.poses import (
     PoseFields,
     column_groups,

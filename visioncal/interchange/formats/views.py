@@ -9,7 +9,7 @@ from visioncal.core.documents.structured import read_yaml
 from visioncal.core.documents.values import as_numbers, mapping, read_plain_text
 from visioncal.core.types import MOUNTS
 from visioncal.interchange.formats.columns import VIEWS, foreign_from
-from visioncal.interchange.formats.fields import fields_of_records, number_in
+from visioncal.interchange.formats.fields import fields_of_records
 from visioncal.interchange.formats.file_search import files_in, head, images_of
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -18,6 +18,7 @@ from visioncal.interchange.formats.foreign import (
     PoseImportOptions,
 )
 from visioncal.interchange.formats.intrinsics import read_intrinsics
+from visioncal.interchange.formats.keys import number_in
 
 # `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame; `pose_cPo_3.yaml`: the
 # object in the camera.
