@@ -1,11 +1,8 @@
 """Session: the recording of a cell, read from a folder and written to one."""
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -15,7 +12,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.documents.tables import TextTable
 from visioncal.core.documents.toml import parse_toml
 from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_TOML_BYTES, one_line, read_text_inside
+from visioncal.core.files import one_line, read_text_inside
 from visioncal.core.summaries import html_card, text_card
 from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, Target
 from visioncal.session import columns as cols
@@ -36,7 +33,7 @@ from visioncal.session.document import (
     read_declaration,
 )
 from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
-from visioncal.session.images import IMAGE_ENDINGS, FolderImages, ImageStore, MemoryImages
+from visioncal.session.images import FolderImages, ImageStore, MemoryImages
 from visioncal.session.kinds import (
     COLUMN,
     check_images_can_be_used,
@@ -53,32 +50,12 @@ from visioncal.session.observations import (
     robot_rows_at_stops,
     stop_warnings,
 )
+from visioncal.session.reading import session_text
 from visioncal.session.saving import digest_of, save_session
 from visioncal.session.selecting import Choice, keep_views, select
 from visioncal.session.streams import Stream, check_stream, gap_warnings, read_streams
 from visioncal.session.table import View, check_times, parse_csv, read_views
 from visioncal.vision.boards.picture import with_weights
-
-
-def _conversion_of(path: Path) -> str:
-    """Advice for pictures and poses that are no session yet: a folder of both, or either alone."""
-    named = path.parent if path.suffix.lower() in IMAGE_ENDINGS else path
-    named = named if named.name.strip(".") else named.resolve()
-    made = shlex.quote(f"{named.with_suffix('') if named.is_file() else named}-session")
-    what, source, images = "A folder's pictures and poses", shlex.quote(str(named)), ""
-    endings = {file.suffix.lower() for file in islice(named.rglob("*.*"), 999) if file.is_file()}
-    if named.is_file():
-        what, images = "A table of poses and a folder of pictures", " --images PICTURES"
-    elif endings and endings.issubset(IMAGE_ENDINGS):
-        what, images = "A folder of pictures and a table of their poses", f" --images {source}"
-        source = "TABLE"
-    return (
-        f"{what} become a session by the name of their board (instead of charuco_9x6_30mm) and "
-        "the camera's mount (eye-to-hand where it is fixed). Run: visioncal convert "
-        f"{source} {made}{images} --target charuco_9x6_30mm --mount eye-in-hand && "
-        f"visioncal doctor {made}"
-    )
-
 
 _NO_VIEWS = TextTable("", ("view",), (), ())
 
@@ -135,34 +112,7 @@ class Session:
 
             content, streams = session_content(path)
             return cls.assemble(**content).with_streams(streams)
-        # calibration.json stands for the output folder that contains it.
-        folder = path.parent if path.name == "calibration.json" else path
-        recording = folder / "recording.rrd"
-        if recording.is_file() and not (folder / "session.toml").exists():
-            raise DataError(
-                f"{path} must be a session, but is a result.",
-                culprits=[str(path)],
-                next_step=f"Its recording is the session: name {recording}.",
-            )
-        try:
-            text = read_text_inside(path, "session.toml", MOST_TOML_BYTES)
-        except DataError as error:
-            # The session's folder above, below, or beside it under a similar name.
-            found = [path.parent / "session.toml", *sorted(path.glob("*/session.toml"))]
-            if not path.exists():
-                beside = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
-                found += [beside[name] for name in get_close_matches(path.name, beside, 1)]
-            near = next((file.parent for file in found if file.is_file()), None)
-            if near is None and not (path.exists() and error.message.endswith("does not exist.")):
-                raise
-            step = (
-                f"Name the session's folder: {shlex.quote(str(near))}"
-                if near is not None
-                else _conversion_of(path)
-            )
-            message = error.message if path.is_dir() else f"{path} must be the folder of a session."
-            raise DataError(message, culprits=error.culprits, next_step=step) from error
-        document = parse_toml(text, "session.toml")
+        document = parse_toml(session_text(path), "session.toml")
         streams = read_streams(path)
         # Streams are enough for identifying an arm's dynamics.
         if table is None and (not streams or (path / "views.csv").exists()):

@@ -134,6 +134,29 @@ def why_same(state: ArmState, others: Sequence[View | ArmState]) -> str:
     return ""
 
 
+def sight_words(corners: Corners) -> str:
+    """Corners that were found in a picture, in words."""
+    return f"{len(corners.ids)} corners, edges {figure(corners.blur_px)} px"
+
+
+def mended_poses(
+    poses: Mapping[int, View | ArmState], fault: Fault, first: int, other: int
+) -> dict[int, View | ArmState]:
+    """The poses of views by their numbers, with a fault of the first or from it on mended."""
+    mended, numbers = {**poses}, [at for at in poses if at >= first]
+    moved = [poses[at] for at in numbers]
+    if fault == "exchanged":
+        mended[first], mended[other] = poses[other], poses[first]
+    elif fault == "no picture":
+        mended.update(zip(numbers, moved[1:], strict=False))
+        del mended[numbers[-1]]
+    else:
+        if fault == "no pose":
+            mended.update(zip(numbers[1:], moved, strict=False))
+        del mended[first]
+    return mended
+
+
 def table_rows(
     views: Sequence[View], found: Mapping[int, Corners], outcome: Outcome | None, form: PoseForm
 ) -> tuple[Row, ...]:
@@ -144,8 +167,7 @@ def table_rows(
         pose = view.text.get("typed", "")
         if not pose and state is not None:
             pose = pendant_words(state.base_from_flange, form)
-        seen = "no board" if corners is None else f"{len(corners.ids)} corners, edges "
-        seen += "" if corners is None else f"{figure(corners.blur_px)} px"
+        seen = "no board" if corners is None else sight_words(corners)
         residual = ("", False) if outcome is None else outcome.residual(view)
         version, is_typed = f"{view.stamp_s}", view.joints_rad is None
         name = picture_name(view)

@@ -16,7 +16,7 @@ from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.documents.pendants import PendantPose
 from visioncal.core.errors import DataError, DriverError, VisioncalError
-from visioncal.core.number_format import counted, figure
+from visioncal.core.number_format import counted
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Rejection
 from visioncal.live.capture.journal import picture_name, posed, state_of
 from visioncal.live.capture.recording import Capture, CaptureEvent, RestWatch, take_requested
@@ -38,6 +38,8 @@ from visioncal.live.page.state import (
     Snapshot,
     Task,
     Visitor,
+    mended_poses,
+    sight_words,
     table_rows,
     why_same,
 )
@@ -203,20 +205,9 @@ class Station:
         first = number or max(poses, default=0)
         if first not in poses or (fault == "exchanged" and other not in poses):
             return "Choose a view that is there."
-        numbers = [at for at in poses if at >= first]
-        moved = [poses[at] for at in numbers]
-        if fault == "exchanged":
-            poses[first], poses[other] = poses[other], poses[first]
-        elif fault == "no picture":
-            poses.update(zip(numbers, moved[1:], strict=False))
-            del poses[numbers[-1]]
-        else:
-            if fault == "no pose":
-                poses.update(zip(numbers[1:], moved, strict=False))
-            if fault == "no pose" or not number:
-                visitor.returned = self.snapshot.views[-1].pose
-            del poses[first]
-        return self._repair(visitor, poses)
+        if fault == "no pose" or (fault == "not wanted" and not number):
+            visitor.returned = self.snapshot.views[-1].pose
+        return self._repair(visitor, mended_poses(poses, fault, first, other))
 
     def _repair(self, visitor: Visitor, poses: Mapping[int, View | ArmState]) -> str:
         """Gives the pictures of views these poses; the others are no longer in the table."""
@@ -421,11 +412,7 @@ class Station:
         pose = self.snapshot.next_pose
         # A picture of a folder is not where the next one is to be.
         wanted = None if pose is None or self.snapshot.is_stored else pose.cam_from_target
-        sees = (
-            f"{len(found.ids)} corners, edges {figure(found.blur_px)} px"
-            if isinstance(found, Corners)
-            else found.reason
-        )
+        sees = sight_words(found) if isinstance(found, Corners) else found.reason
         coach = self._capture.coach
         picture = live_picture(image, coach.target, corners, coach.lens, wanted)
         self._publish(picture=picture, pictures=self.snapshot.pictures + 1, sees=sees)

@@ -1,0 +1,65 @@
+"""The document of a session's folder, and what is near where there is none."""
+
+import shlex
+from difflib import get_close_matches
+from itertools import islice
+from pathlib import Path
+
+from visioncal.core.errors import DataError
+from visioncal.core.files import MOST_TOML_BYTES, read_text_inside
+from visioncal.session.images import IMAGE_ENDINGS
+
+
+def session_text(path: Path) -> str:
+    """Content of a folder's session.toml.
+
+    Raises:
+        DataError: The folder has none; the step names a session near it, or how to convert.
+    """
+    # calibration.json stands for the output folder that contains it.
+    folder = path.parent if path.name == "calibration.json" else path
+    recording = folder / "recording.rrd"
+    if recording.is_file() and not (folder / "session.toml").exists():
+        raise DataError(
+            f"{path} must be a session, but is a result.",
+            culprits=[str(path)],
+            next_step=f"Its recording is the session: name {recording}.",
+        )
+    try:
+        return read_text_inside(path, "session.toml", MOST_TOML_BYTES)
+    except DataError as error:
+        # The session's folder above, below, or beside it under a similar name.
+        found = [path.parent / "session.toml", *sorted(path.glob("*/session.toml"))]
+        if not path.exists():
+            beside = {file.parent.name: file for file in path.parent.glob("*/session.toml")}
+            found += [beside[name] for name in get_close_matches(path.name, beside, 1)]
+        near = next((file.parent for file in found if file.is_file()), None)
+        if near is None and not (path.exists() and error.message.endswith("does not exist.")):
+            raise
+        step = (
+            f"Name the session's folder: {shlex.quote(str(near))}"
+            if near is not None
+            else _conversion_of(path)
+        )
+        message = error.message if path.is_dir() else f"{path} must be the folder of a session."
+        raise DataError(message, culprits=error.culprits, next_step=step) from error
+
+
+def _conversion_of(path: Path) -> str:
+    """Advice for pictures and poses that are no session yet: a folder of both, or either alone."""
+    named = path.parent if path.suffix.lower() in IMAGE_ENDINGS else path
+    named = named if named.name.strip(".") else named.resolve()
+    made = shlex.quote(f"{named.with_suffix('') if named.is_file() else named}-session")
+    what, source, images = "A folder's pictures and poses", shlex.quote(str(named)), ""
+    endings = {file.suffix.lower() for file in islice(named.rglob("*.*"), 999) if file.is_file()}
+    if named.is_file():
+        what, images = "A table of poses and a folder of pictures", " --images PICTURES"
+    elif endings and endings.issubset(IMAGE_ENDINGS):
+        what, images = "A folder of pictures and a table of their poses", f" --images {source}"
+        source = "TABLE"
+    return (
+        f"{what} become a session by the name of their board (instead of charuco_9x6_30mm) and "
+        "the camera's mount (eye-to-hand where it is fixed). Run: visioncal convert "
+        f"{source} {made}{images} --target charuco_9x6_30mm --mount eye-in-hand && "
+        f"visioncal doctor {made}"
+    )
