@@ -14,7 +14,7 @@ from support.cells import exact
 from support.commands import visioncal as command
 from support.edited import rewritten
 from support.following import follow
-from support.fuzz.broken_sessions import BROKEN, Mistake, broken_session, edit, sound_session
+from support.fuzz.broken_sessions import BROKEN, SMALL, Mistake, broken_session, edit, sound_session
 from support.marks import slow
 from support.refusals import raised
 from support.rendered import Shot, photograph
@@ -271,7 +271,15 @@ REFUSED = {
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
-    return sound_session(tmp_path_factory.mktemp("doctor") / "sound")
+    return sound_session(tmp_path_factory.mktemp("doctor") / "sound", SMALL)
+
+
+def broken(folder, name):
+    """A broken session, its pictures small where the mistake asks for no cell of its own."""
+    mistake = BROKEN[name]
+    if mistake.options == Mistake().options:
+        mistake = replace(mistake, options=SMALL.options)
+    return broken_session(folder, mistake)
 
 
 def test_nothing_is_wrong_with_a_sound_session(sound):
@@ -341,7 +349,7 @@ def test_a_board_of_another_kind_is_named():
     "name", [slow(name) if name in ("no turns", "one pose typed wrong") else name for name in NAMED]
 )
 def test_what_is_wrong_is_named_first(tmp_path, monkeypatch, name):
-    folder = broken_session(tmp_path / "session", BROKEN[name])
+    folder = broken(tmp_path / "session", name)
     found = visioncal.doctor(folder)
     assert found.findings[0].kind == NAMED[name]
     assert found.findings[0].do is not None
@@ -383,7 +391,7 @@ def test_a_motion_that_determines_too_little_is_named_as_calibrate_names_it(moun
 
 @pytest.mark.parametrize("name", ["[cam] for [camera]", slow("images turned clockwise")])
 def test_what_cannot_be_read_is_refused_with_what_to_type(tmp_path, name):
-    folder = broken_session(tmp_path / "session", BROKEN[name])
+    folder = broken(tmp_path / "session", name)
     refused = command("doctor", folder)
     assert refused.status in (2, 3)
     assert REFUSED[name] in refused.said
