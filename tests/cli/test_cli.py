@@ -407,6 +407,10 @@ def test_what_is_no_session_yet_is_told_how_to_become_one(rendered, tmp_path):
     visioncal("doctor", pictures).refused(f"convert TABLE {pictures}-session --images {pictures}")
     shutil.copy(table, pictures)
     visioncal("doctor", pictures).refused(f"convert {pictures} {pictures}-session --target")
+    # Poses of both sides need no board.
+    (tmp_path / "both").mkdir()
+    (tmp_path / "both/pairs.csv").write_text("x,y\n1,2\n")
+    visioncal("doctor", tmp_path / "both").refused("both-session --mount eye-in-hand &&")
 
 
 RECORDS = """

@@ -1518,7 +1518,7 @@ def test_files_of_a_recording_each_that_differ_in_numbers_are_named(tmp_path, is
     np.testing.assert_allclose(found, poses, atol=1e-9)
 
 
-@pytest.mark.parametrize("ending", ["toml", "yaml"])
+@pytest.mark.parametrize("ending", ["toml", "yaml", "json"])
 def test_a_board_that_a_file_beside_describes_need_not_be_named(tmp_path, ending):
     poses, _, session = world()
     table_of(folder_of(tmp_path / "in"))
@@ -1538,6 +1538,20 @@ def test_a_board_that_a_file_beside_describes_need_not_be_named(tmp_path, ending
     read = Session.load(tmp_path / "out")
     assert replace(read.target, name="") == replace(session.target, name="")
     assert len(read.views) == len(poses)
+
+
+def test_stored_poses_of_the_target_are_read_where_the_images_are_of_another_motion(tmp_path):
+    poses, _, session = world()
+    seen = [view.cam_from_target().as_matrix() for view in session.views]
+    for at, pose in enumerate(poses):
+        rows = {"T_gripper2base": pose.tolist(), "T_target2cam": seen[at].tolist()}
+        write(tmp_path / f"in/{at}.json", rows)
+        shoot_one(tmp_path / f"in/{at}.png", (0, 5, 7, 2, 8, 1, 3, 6, 4)[at])
+    said = ("--mount", session.mount, "--target", session.document["target"])
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said).good()
+    assert "The images are left aside: no reading" in done.err
+    last = Session.load(tmp_path / "out").views[-1]
+    np.testing.assert_allclose(last.cam_from_target().as_matrix(), seen[-1], atol=1e-9)
 
 
 def test_a_result_of_one_pose_is_no_recording_beside_rows(tmp_path):

@@ -300,6 +300,19 @@ def test_the_settings_of_a_program_describe_a_charuco_board(tmp_path, text):
     raised(DataError, "target_type", load_target, tmp_path / "board.yaml")
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[{"view": 1, "chessboard_size": [11, 8], "square_size_mm": 20, "pose": null}]',
+        '{"trial": "a", "pattern_size": [11, 8], "chessboard_square_size": 0.02}',
+    ],
+)
+def test_records_describe_a_checkerboard(tmp_path, text):
+    (tmp_path / "board.json").write_text(text)
+    stated = target_named("checkerboard_11x8_20mm")
+    assert replace(load_target(tmp_path / "board.json"), name=stated.name) == stated
+
+
 def test_the_grid_of_a_kalibr_target_in_one_word():
     expected = {"kind": "aprilgrid", "columns": 6, "rows": 5, "size_m": 0.088, "spacing": 0.3}
     assert read_target_description("aprilgrid_6x5_88mm_0.3") == expected

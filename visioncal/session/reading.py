@@ -45,21 +45,28 @@ def session_text(path: Path) -> str:
         raise DataError(message, culprits=error.culprits, next_step=step) from error
 
 
+# Files of other programs that may hold images, too.
+_HOLDING_IMAGES = (".bag", ".mcap", ".db3", ".parquet", ".npz", ".mp4", ".zdf")
+
+
 def _conversion_of(path: Path) -> str:
     """Advice for pictures and poses that are no session yet: a folder of both, or either alone."""
     named = path.parent if path.suffix.lower() in IMAGE_ENDINGS else path
     named = named if named.name.strip(".") else named.resolve()
     made = shlex.quote(f"{named.with_suffix('') if named.is_file() else named}-session")
     what, source, images = "A folder's pictures and poses", shlex.quote(str(named)), ""
+    by, board = "the name of their board (instead of charuco_9x6_30mm) and ", "charuco_9x6_30mm"
     endings = {file.suffix.lower() for file in islice(named.rglob("*.*"), 999) if file.is_file()}
     if named.is_file():
         what, images = "A table of poses and a folder of pictures", " --images PICTURES"
     elif endings and endings.issubset(IMAGE_ENDINGS):
         what, images = "A folder of pictures and a table of their poses", f" --images {source}"
         source = "TABLE"
+    elif endings and endings.isdisjoint((*IMAGE_ENDINGS, *_HOLDING_IMAGES)):
+        what, by, board = "A folder's poses of robot and target", "", ""
     return (
-        f"{what} become a session by the name of their board (instead of charuco_9x6_30mm) and "
+        f"{what} become a session by {by}"
         "the camera's mount (eye-to-hand where it is fixed). Run: visioncal convert "
-        f"{source} {made}{images} --target charuco_9x6_30mm --mount eye-in-hand && "
+        f"{source} {made}{images}{f' --target {board}' if board else ''} --mount eye-in-hand && "
         f"visioncal doctor {made}"
     )

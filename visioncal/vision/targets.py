@@ -84,7 +84,7 @@ def read_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[st
         name_or_path,
         what="target",
         shipped=_shipped(),
-        suffixes=(".toml", ".yaml", ".yml"),
+        suffixes=(".toml", ".yaml", ".yml", ".json"),
         folder=folder,
     )
     document = read_toml(path, path.name) if path.suffix == ".toml" else _of_kalibr(path)
@@ -101,25 +101,35 @@ _IN_SETTINGS = {
     "marker_m": r".*(?:(?:len|size|side).*marker|marker.*(?:len|size|side)).*",
     "dictionary": r".*dict(?:ionary)?(?:_?id|_?name)?",
 }
+# Keys of both counts of a checkerboard's inner corners: `chessboard_size`, `pattern_size`.
+_COUNTS = re.compile(r".*(?:chess|checker|pattern|board).*(?:size|shape|corners)", re.IGNORECASE)
 
 
 def _of_settings(stated: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The content of a `.toml` of a ChArUco board by a program's settings; None of others.
+    """The content of a `.toml` of a board by a program's settings; None of others.
 
-    Lengths are in metres, from one on in millimetres; a number is a dictionary of OpenCV's.
+    Lengths are in metres, from one on in millimetres; a number is a dictionary of OpenCV's. A
+    checkerboard has its counts in a list, and neither markers nor a dictionary.
     """
     found: dict[str, Any] = {"kind": "charuco"}
     for own, pattern in _IN_SETTINGS.items():
         keys = [key for key in stated if re.fullmatch(pattern, str(key), re.IGNORECASE)]
-        if len(keys) != 1:
-            return None
-        value = stated[keys[0]]
-        if own.endswith("_m") and isinstance(value, int | float):
-            value = value if value < 1.0 else value / 1e3
-        if own == "dictionary" and isinstance(value, int):
-            value = dictionary_numbered(value)
-        found[own] = value
-    return found
+        numbers = [key for key in keys if isinstance(stated[key], int | float)]
+        keys = numbers if own.endswith("_m") else keys
+        if len(keys) == 1:
+            value = stated[keys[0]]
+            if own.endswith("_m"):
+                value = value if value < 1.0 else value / 1e3
+            if own == "dictionary" and isinstance(value, int):
+                value = dictionary_numbered(value)
+            found[own] = value
+    if len(found) > len(_IN_SETTINGS):
+        return found
+    lists = [value for key, value in stated.items() if _COUNTS.fullmatch(str(key))]
+    counts = [each for each in lists if isinstance(each, list) and [*map(type, each)] == [int, int]]
+    is_plain = found.keys() == {"kind", "square_m"} and len(counts) == 1
+    columns, rows = counts[0] if is_plain else (0, 0)
+    return {**found, "kind": "checkerboard", "columns": columns, "rows": rows} if columns else None
 
 
 def _of_kalibr(path: Path) -> dict[str, Any]:
@@ -131,6 +141,8 @@ def _of_kalibr(path: Path) -> dict[str, Any]:
     from visioncal.core.documents.structured import read_yaml
 
     stated = read_yaml(path)
+    # Records of views, each with its board.
+    stated = stated[0] if isinstance(stated, list) and stated else stated
     settings = _of_settings(stated) if isinstance(stated, Mapping) else None
     if settings is not None:
         return settings

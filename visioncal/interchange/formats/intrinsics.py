@@ -50,7 +50,7 @@ def read_target_description(words: str) -> Mapping[str, Any]:
             read = {name: _READ[name](text) for name, text in groups if text is not None}
             document = {"kind": kind, **read}
     if document is None:
-        is_file = words.lower().endswith((".toml", ".yaml", ".yml"))
+        is_file = words.lower().endswith((".toml", ".yaml", ".yml", ".json"))
         if not is_file and words not in target_names():
             raise DataError(
                 f"There is no target {words[:80]!r}: it must be a name "

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from pathlib import Path
@@ -32,7 +33,7 @@ from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.documents.toml import read_toml
-from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.errors import DataError, DegenerateError, VisioncalError
 from visioncal.core.files import read_text_inside
 from visioncal.core.number_format import some_of
 from visioncal.core.types import MOUNTS, FloatArray, IntArray, Progress, Searched, evenly
@@ -172,7 +173,27 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
             if why.startswith(ONE_AXIS):
                 # No order of the numbers closes the chain better than others.
                 break
-    return _untested(foreign, why, fault)
+    is_clear = bool(searches) and fault is None
+    stored = _by_stored_poses(foreign, progress) if is_clear else None
+    return stored or _untested(foreign, why, fault)
+
+
+def _by_stored_poses(
+    foreign: ForeignRecording, progress: Progress | None
+) -> ForeignRecording | None:
+    """The reading by poses of the target beside images of another motion; None without any."""
+    if foreign.camera is None or foreign.target is None:
+        return None
+    stored = replace(foreign, images=(), corners=(), target=None, rivals=())
+    with suppress(DegenerateError):
+        found, _ = _tested([(0, stored)], _Seen.of(stored, _TESTED[-1], progress, {}), is_last=True)
+        if found is not None:
+            note = (
+                "The images are left aside: no reading of the robot's poses fits them, but one "
+                "fits the stored poses of the target."
+            )
+            return replace(found, notes=(*found.notes, note))
+    return None
 
 
 def _check_sides(foreign: ForeignRecording) -> None:

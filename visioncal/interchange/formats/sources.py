@@ -55,7 +55,7 @@ from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 
 # Files that describe boards, and the most bytes of one.
-_OF_BOARDS, _MOST_OF_BOARD = (".toml", ".yaml", ".yml"), 10_000
+_OF_BOARDS, _MOST_OF_BOARD = (".toml", ".yaml", ".yml", ".json"), 10_000
 # Files without poses that are listed one by one.
 _LISTED = 6
 # Files of numbers that are not read, and how to write them.
