@@ -38,6 +38,7 @@ from visioncal.vision.targets import corner_positions, load_target
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 HALF_TURN = compose(np.diag([-1.0, -1.0, 1.0]), np.array([0.16, 0.12, 0.0]))
 BOARD = "charuco_9x6_30mm"
+SIZE = (1280, 960)
 POINTS = corner_positions(load_target(BOARD))
 CASES = Path(__file__).parents[3] / "shared/data/field/cases"
 
@@ -501,6 +502,48 @@ def test_corners_that_are_numbered_a_column_on_get_their_own_numbers(tmp_path, m
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("share", "some"), [(0.5, range(9, 15)), slow(0.75, range(14, 24)), slow(0.5, [2, 7, 11])]
+)
+def test_corners_of_smaller_pictures_are_scaled_by_the_printed_command(
+    tmp_path, monkeypatch, share, some
+):
+    monkeypatch.chdir(tmp_path)
+    robot, seen = corners_of(MOUNTS[0])
+    sound = visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
+    for view in some:
+        seen[view] = (seen[view][0], share * (seen[view][1] + 0.5) - 0.5)
+    Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]).save(tmp_path / "cell")
+    cause, mended = followed("cell")
+    assert cause.kind == "image_sizes"
+    assert sorted(cause.views) == sorted(some)
+    assert mended.verdict.status == "good"
+    for name, edge in sound.edges.items():
+        # Their noise is as much larger as they were smaller.
+        np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
+
+
+@pytest.mark.parametrize("beyond", [True, slow(False)])
+def test_exchanged_columns_of_corners_are_exchanged_back_by_the_printed_command(
+    tmp_path, monkeypatch, beyond
+):
+    monkeypatch.chdir(tmp_path)
+    robot, seen = corners_of(MOUNTS[0])
+    if not beyond:
+        # All would be in the picture, too; the lens's centre is not in its middle.
+        inside = [(px > 0).all(axis=1) & (px < SIZE[1]).all(axis=1) for _, px in seen]
+        seen = [(ids[at], px[at]) for (ids, px), at in zip(seen, inside, strict=True)]
+    sound = visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
+    seen = [(ids, px[:, ::-1]) for ids, px in seen]
+    Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]).save(tmp_path / "cell")
+    found = follow("calibrate", "cell", "-o", "out")
+    said = found.runs[0].said.replace("\n", " ")
+    assert "In corners.csv, u_px and v_px are exchanged" in said
+    assert found.last.status == 0
+    for name, edge in Calibration.load("out").edges.items():
+        np.testing.assert_allclose(edge.matrix, sound.edges[name].matrix, atol=1e-6)
+
+
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_pictures_that_are_turned_from_a_view_on_are_no_other_camera(mount):
     robot, boards = poses_of(mount)

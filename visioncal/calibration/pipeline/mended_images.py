@@ -12,13 +12,17 @@ import numpy as np
 from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
+from visioncal.calibration.stages.cameras import exchanged_columns
+from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
+from visioncal.calibration.stages.corner_sizes import scaled_px, scaled_views
 from visioncal.calibration.stages.detect import is_scaled
-from visioncal.calibration.stages.other_board import LOOKED_AT_LAST, spread
+from visioncal.calibration.stages.other_board import LOOKED_AT_LAST, OtherBoardError, spread
 from visioncal.calibration.suspects.undoing import likeliest, undone
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import ranges
 from visioncal.core.types import Image, Progress
 from visioncal.session import MemoryImages, Session, View
+from visioncal.session.corners import CornerTable
 from visioncal.vision.boards.identify import identify
 from visioncal.vision.boards.imaging import decode_image, encode_png, exif_turn, grey_of
 
@@ -33,12 +37,15 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
 
     Args:
         session: The session; images of views with rows in corners.csv are left alone, unless the
-            robot's motion shows that all are mirrored, and the corners with them.
+            robot's motion shows that all are mirrored, and the corners with them. Corners whose
+            columns are exchanged, or that are of pictures of another size, come first.
         progress: Called with the progress of long work.
 
     Raises:
         DataError: There is nothing to mend, or it has depth pictures, which would have to follow.
     """
+    if (mended := _with_mended_corners(session)) is not None:
+        return mended
     views = [view for view in session.views if view.image and not view.has_corners]
     present = [view for view in views if session.images.exists(view.image)]
     files = {view.image: session.images.read(view.image) for view in present}
@@ -67,7 +74,7 @@ def mend_images(session: Session, progress: Progress | None = None) -> Session:
         images[name] = np.ascontiguousarray(np.rot90(images[name], quarters))
         done[name].append(_TURNED[quarters])
     if not any(done.values()) and _is_mirrored(located):
-        return _mirrored_back(session)
+        return _mirrored_back(session, located)
     if not any(done.values()):
         raise DataError(
             f"session {session.name!r}: nothing was written, as no image is mirrored, turned, a "
@@ -122,12 +129,58 @@ def _is_mirrored(state: RunState | None) -> bool:
     return False
 
 
-def _mirrored_back(session: Session) -> Session:
+def _with_mended_corners(session: Session) -> Session | None:
+    """The session with corners of one kind; None where all are, or their columns are as known."""
+    table = session.corner_table
+    if table is None:
+        return None
+    try:
+        found = run_stages(RunState(session), [each for each in STAGES if each.name == "detect"])
+    except OtherBoardError as error:
+        is_exchanged = error.finding is not None and error.finding.do == EXCHANGE_COLUMNS
+        return _exchanged_back(session) if is_exchanged else None
+    except VisioncalError:
+        return None
+    px, notes, targets = table.px.copy(), list[str](), tuple(session.boards.values())
+    for look in found.cameras.values():
+        lens = look.table.model if look.table.stated is None else look.table.stated
+        if look.resolution is None:
+            continue
+        if scaled := scaled_views(look.corners, targets, look.resolution, lens):
+            own = np.isin(table.views, scaled.views)
+            px[own] = scaled_px(px[own], 1.0 / scaled.share)
+            notes.append(
+                f"the corners of view {ranges(scaled.views)} were scaled by {1.0 / scaled.share:g}"
+            )
+    return _with_corners(session, replace(table, px=px), notes) if notes else None
+
+
+def _exchanged_back(session: Session) -> Session:
+    """The session with u and v of its corners exchanged."""
+    corners = session.corner_table
+    if corners is not None:
+        corners = replace(corners, px=corners.px[:, ::-1].copy())
+    return _with_corners(session, corners, ["u_px and v_px of all corners were exchanged"])
+
+
+def _with_corners(session: Session, corners: CornerTable | None, notes: Sequence[str]) -> Session:
+    """The session with other corners, which notes why in `corrected`."""
+    cells = [[view.cell(key) for key in session.columns] for view in session.views]
+    corrected = [*session.declaration.corrected, *notes]
+    document = {**session.document, "corrected": corrected}
+    return session.with_content(document=document, cells=cells, corners=corners)
+
+
+def _mirrored_back(session: Session, state: RunState | None) -> Session:
     """The session of one camera with all images and corners mirrored left to right.
+
+    Or with u and v of its corners exchanged, where the lens of a run shows that.
 
     Raises:
         DataError: It has corners of pictures of unknown width.
     """
+    if state is not None and exchanged_columns(state):
+        return _exchanged_back(session)
     corners = session.corner_table
     if corners is None and not any(view.image for view in session.views):
         raise DataError(
@@ -143,11 +196,7 @@ def _mirrored_back(session: Session) -> Session:
                 next_step="Write resolution = [width, height] in [camera].",
             )
         corners = replace(corners, px=corners.px * [-1.0, 1.0] + [size[0] - 1.0, 0.0])
-        note = "the corners of all views were mirrored back"
-        corrected = [*session.declaration.corrected, note]
-        cells = [[view.cell(key) for key in session.columns] for view in session.views]
-        document = {**session.document, "corrected": corrected}
-        session = session.with_content(document=document, cells=cells, corners=corners)
+        session = _with_corners(session, corners, ["the corners of all views were mirrored back"])
     names = {view.image for view in session.views if view.image}
     files = {name: session.images.read(name) for name in names if session.images.exists(name)}
     read = {name: decode_image(data, colour=True) for name, data in files.items()}

@@ -7,6 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from visioncal.calibration.stages.corner_numbers import are_exchanged
+from visioncal.calibration.stages.corner_sizes import scaled_views
 from visioncal.calibration.stages.detect import (
     Detections,
     detect,
@@ -23,7 +25,7 @@ from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
 from visioncal.core.verdict import Finding, mending
-from visioncal.estimation.intrinsics import estimate_intrinsics
+from visioncal.estimation.intrinsics import Intrinsics, estimate_intrinsics
 from visioncal.results import CameraResult
 from visioncal.results.compare import intrinsics_names
 from visioncal.session import Session, View, frame_name
@@ -207,6 +209,9 @@ def estimate_lenses(seen: T) -> T:
             with _naming(seen, frame):
                 try:
                     fit = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
+                    seen, alike = _of_one_size(seen, frame, fitted, fit)
+                    if len(alike) < len(fitted):
+                        fit = estimate_intrinsics(alike, targets, look.resolution, look.table.model)
                     lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
                     seen = seen.noting(fit.rejections)
                 except (ConvergenceError, DegenerateError) as error:
@@ -217,6 +222,42 @@ def estimate_lenses(seen: T) -> T:
                     seen = replace(seen, notes=(*seen.notes, words))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
+
+
+def _of_one_size(
+    seen: T, frame: str, corners: Mapping[int, Corners], fit: Intrinsics | Poses
+) -> tuple[T, Mapping[int, Corners]]:
+    """The run and some of its corners, without those of corners.csv of pictures of another size.
+
+    These are looked for where a fit of all rejects views, or views scatter unequally.
+    """
+    look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
+    lens = look.table.model if look.table.stated is None else look.table.stated
+    if seen.session.corner_table is None or look.resolution is None:
+        return seen, corners
+    by_all = fit.camera if isinstance(fit, Intrinsics) else look.table.stated
+    if by_all is None:
+        # Of the estimated lens, they were found before.
+        return seen, corners
+    scaled = scaled_views(corners, targets, look.resolution, lens, by_all)
+    if scaled is None:
+        return seen, corners
+    why = "its corners are those of a smaller picture"
+    seen = seen.noting((Rejection(view, why) for view in scaled.views), (scaled.finding,))
+    return seen, {view: at for view, at in corners.items() if view not in scaled.views}
+
+
+def exchanged_columns(seen: Observed) -> bool:
+    """Whether u and v are exchanged in the corners.csv of one camera, as its lens shows."""
+    boards = seen.session.boards
+    if seen.session.corner_table is None or len(seen.cameras) != 1:
+        return False
+    (look,) = seen.cameras.values()
+    views = [view for view in seen.session.views if view.number in look.corners]
+    both = [(look.corners[view.number], boards[seen.session.board_of(view)]) for view in views]
+    if look.lens is None or look.resolution is None or len(boards) != 1:
+        return False
+    return are_exchanged(both, look.resolution, look.lens.camera.matrix[2:])
 
 
 def _by_motion(seen: Observed, frame: str, error: VisioncalError) -> CameraResult:
@@ -251,6 +292,9 @@ def locate_targets(seen: T) -> T:
         with _naming(seen, frame):
             free = 0 if lens.covariance is None else len(lens.covariance)
             fit = estimate_poses(fitted, targets, lens.camera, free)
+            seen, alike = _of_one_size(seen, frame, fitted, fit)
+            if len(alike) < len(fitted):
+                fit = estimate_poses(alike, targets, lens.camera, free)
         if fit.sigma_px > CalibrationLimits().pixel_px[0] and not lens.estimated:
             other = _other_lens(look, targets, fitted, fit.sigma_px)
             if other is not None:

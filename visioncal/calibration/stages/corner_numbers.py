@@ -12,14 +12,20 @@ import cv2
 import numpy as np
 import tomli_w
 
-from visioncal.calibration.stages.other_board import OtherBoardError, board_correction
+from visioncal.calibration.stages.other_board import MEND_IMAGES, OtherBoardError, board_correction
 from visioncal.core.errors import DataError
+from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.types import Corners, FloatArray, Mask, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.poses import FEWEST_CORNERS, determines_pose
 from visioncal.session import Session, View
 from visioncal.vision.targets import corner_positions, otherwise, point_numbers
 
+EXCHANGE_COLUMNS = Remedy(
+    "Write a copy of the session in which u_px is counted to the right and v_px down, and "
+    "calibrate it.",
+    MEND_IMAGES,
+)
 # Largest homography residual as a share of the corners' spread.
 _MOST_LEFT = 0.3
 # Such a share of a board with the right counts, and columns and rows that are tried.
@@ -43,6 +49,18 @@ def usable_corners(
     """
     corners = {view.number: session.corners[view.number] for view in views}
     outside = {view: far_outside(at.px, resolution) for view, at in corners.items()}
+    both = [(corners[view.number], session.boards[session.board_of(view)]) for view in views]
+    if are_exchanged(both, resolution):
+        raise OtherBoardError.of(
+            Finding(
+                "corner_numbers",
+                "In corners.csv, u_px and v_px are exchanged: as they are, the board is seen from "
+                f"behind and beyond the image of {resolution[0]} x {resolution[1]} px, and "
+                "exchanged it is not.",
+                EXCHANGE_COLUMNS,
+                (*corners,),
+            )
+        )
     lost = [f"view {view}" for view, mask in outside.items() if mask.any()]
     if 2 * len(lost) > len(views):
         px = np.concatenate([at.px for at in corners.values()])
@@ -66,6 +84,26 @@ def usable_corners(
                 view, "its corners in corners.csv do not lie as the target's drawing numbers them"
             )
     return usable
+
+
+def are_exchanged(
+    views: Sequence[tuple[Corners, Target]],
+    resolution: tuple[int, int],
+    centre_px: FloatArray | None = None,
+) -> bool:
+    """Whether u and v of corners are exchanged.
+
+    Boards are seen from behind, and beyond the (width, height) of the picture unless exchanged; or
+    all are within it, and the (2,) centre of the lens is in the picture's middle when exchanged.
+    """
+    size = np.array(resolution, dtype=float)
+    px = np.concatenate([np.zeros((0, 2)), *(at.px for at, _ in views)])
+    if (px[:, ::-1] > size).any() or not are_from_behind(views):
+        return False
+    if centre_px is None or (px > size).any():
+        return bool((px > size).any())
+    here, there = (np.linalg.norm(at - size / 2) for at in (centre_px, centre_px[::-1]))
+    return bool(CLEAR_RATIO * there < here)
 
 
 def far_outside(px: FloatArray, resolution: tuple[int, int]) -> Mask:

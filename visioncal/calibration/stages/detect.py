@@ -17,7 +17,7 @@ from visioncal.calibration.stages.corner_numbers import lack_of_corners, usable_
 from visioncal.calibration.stages.other_board import (
     LOOKED_AT,
     LOOKED_AT_LAST,
-    MEND_IMAGES,
+    MADE_ALIKE,
     OtherBoardError,
     board_correction,
     other_board,
@@ -41,8 +41,6 @@ from visioncal.vision.boards.imaging import (
 from visioncal.vision.targets import corner_positions
 
 Size = tuple[int, int]
-# Remedy where some images are turned or scaled.
-_MADE_ALIKE = Remedy("Write a copy of the session in which all are alike.", MEND_IMAGES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +184,7 @@ def _resolution(session: Session, views: Sequence[View], found: Mapping[int, Sea
         raise DataError(
             f"{len(culprits)} of {len(sizes)} images are turned or scaled: {of_sizes}",
             culprits=culprits,
-            next_step=str(_MADE_ALIKE),
+            next_step=str(MADE_ALIKE),
         )
     lens = (
         ""
@@ -213,7 +211,7 @@ def other_sizes(detections: Detections) -> Iterator[Finding]:
             "image_sizes",
             f"{len(odd)} of {len(sizes)} images are turned or scaled: view {ranges(odd)}, such as "
             f"{width} x {height} px, and the camera's are {usual[0]} x {usual[1]}.",
-            _MADE_ALIKE,
+            MADE_ALIKE,
             tuple(odd),
         )
 

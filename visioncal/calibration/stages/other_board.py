@@ -38,6 +38,8 @@ _SAME_SPACING = 0.05
 MEND_IMAGES = (
     f"visioncal convert SESSION FIXED --mend-images && {CALIBRATE.replace('SESSION', 'FIXED')}"
 )
+# Remedy where some images are turned or scaled.
+MADE_ALIKE = Remedy("Write a copy of the session in which all are alike.", MEND_IMAGES)
 
 
 class OtherBoardError(DataError):

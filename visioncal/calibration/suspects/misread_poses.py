@@ -14,7 +14,8 @@ from visioncal.calibration.guess.fit import robust_fits
 from visioncal.calibration.guess.search import FEWEST_ROWS, PAIRS_SHARE, relative_angles, thinned
 from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.corner_numbers import are_from_behind
+from visioncal.calibration.stages.cameras import exchanged_columns
+from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
 from visioncal.calibration.stages.other_board import MEND_IMAGES
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
@@ -166,9 +167,15 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
     if guess.stands_out and all(hint.do in (UNRECORDED, _LOG_ANEW) for hint in unknown):
         robot = guess.best.hypothesis.robot
         step = _LOST_TURNS if robot.has_lost_turns else READ_AGAIN
+        words = guess.sentence
         if robot.mirrored:
             step = _MIRRORED if run.cameras else replace(_MIRRORED, command="")
-        yield Finding("misread_poses", guess.sentence, step)
+        if robot.mirrored and exchanged_columns(run):
+            step = EXCHANGE_COLUMNS
+            words = (
+                f"In corners.csv, u_px and v_px are exchanged, as the lens's centre shows. {words}"
+            )
+        yield Finding("misread_poses", words, step)
     elif guess.is_open:
         step = Remedy(_WHICH)
         if guess.positions:
