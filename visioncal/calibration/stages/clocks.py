@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from visioncal.calibration.stages.cameras import locate_targets
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.clock_offset import (
     LARGEST_SIGMA_S,
@@ -49,9 +50,11 @@ from visioncal.estimation.effects.rolling_shutter import (
     delayed_points,
     target_twists,
 )
+from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
+from visioncal.results import CameraResult
 from visioncal.results.sections import ClockResult
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
@@ -63,6 +66,8 @@ T = TypeVar("T", bound=Observed)
 _SHOW_OFFSET = Remedy(
     "Take the views at rest, or record a sweep that turns fast enough to show the clocks' offset."
 )
+# Most rounds of lens and readout, and the change of the readout, over its sigma, that ends them.
+_ROUNDS, _SETTLED = 5, 0.3
 # Up to this number all views are used; of more, slow ones.
 _MANY_VIEWS = 60
 
@@ -82,8 +87,38 @@ def set_clocks(seen: T) -> T:
             stated, and too few views were taken at rest.
     """
     for pair, rows in _waiting(seen.session).items():
-        seen = _with_clock(seen, pair, rows)
+        seen = _beside_shutter(seen, pair, rows)
     return seen
+
+
+def _beside_shutter(seen: T, pair: ClockPair, rows: list[View]) -> T:
+    """Adds the clock of a pair, with an estimated lens by corners where they were at the stamp.
+
+    By images whose rows are apart in time, a lens takes some of the motion for its own, and leaves
+    less of it to the shutter.
+    """
+    found, targets = _with_clock(seen, pair, rows), tuple(seen.session.boards.values())
+    for _ in range(_ROUNDS):
+        look, clocked = seen.cameras.get(pair.camera), found.clocks.get(pair)
+        shutter = None if clocked is None else clocked.clock.shutter
+        is_open = look is not None and look.lens is not None and look.lens.estimated
+        if clocked is None or look is None or look.resolution is None or not is_open:
+            break
+        if shutter is None or not shutter.is_rolling:
+            break
+        free = (at for at in clocked.poses.items() if at[0] not in seen.held_back)
+        at_stamp = {view: pose.corners for view, pose in free if pose.corners is not None}
+        try:
+            fit = estimate_intrinsics(at_stamp, targets, look.resolution, look.table.model)
+        except VisioncalError:
+            break
+        lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
+        seen = locate_targets(seen.with_camera(pair.camera, replace(look, lens=lens)))
+        found = _with_clock(seen, pair, rows)
+        now = found.clocks[pair].clock.shutter if pair in found.clocks else None
+        if now is None or abs(now.readout_s - shutter.readout_s) < _SETTLED * now.readout_sigma_s:
+            break
+    return found
 
 
 def _waiting(session: Session) -> dict[ClockPair, list[View]]:
