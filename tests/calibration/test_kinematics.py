@@ -29,7 +29,12 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.identifiability import observability_indices
+from visioncal.estimation.identifiability import (
+    joint_words,
+    observability_indices,
+    parameter_words,
+)
+from visioncal.estimation.parameters import Parameter
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.estimation.solve import Solution
 from visioncal.estimation.workspace import postures
@@ -613,3 +618,11 @@ def test_errors_of_links_count_though_no_stop_shows_them():
     assert hidden
     # The prior of the size is within a factor of e, and so of seven in the variance.
     assert np.mean(found) < 7.0
+
+
+def test_where_a_linear_axis_counts_from_is_a_zero_and_no_length():
+    robot = load_robot("generic-scara-600")
+    place = int(np.flatnonzero(robot.chain.prismatic)[0])
+    joint = joint_words(place, robot)
+    assert parameter_words(Parameter(place, "d", place + 1), robot) == f"the zero of {joint}"
+    assert parameter_words(Parameter(place, "a", place + 1), robot) == f"the length a of {joint}"

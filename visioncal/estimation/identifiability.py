@@ -133,7 +133,10 @@ def joint_words(joint: int, robot: Robot) -> str:
 
 def parameter_words(parameter: Parameter, robot: Robot) -> str:
     """A parameter of an arm's table by its kind and joint."""
-    return f"the {_WORDS[parameter.kind]} of {joint_words(parameter.joint, robot)}"
+    # Along a linear axis d is where it counts from.
+    is_zero = parameter.kind == "d" and bool(robot.chain.prismatic[parameter.joint])
+    words = "zero" if is_zero else _WORDS[parameter.kind]
+    return f"the {words} of {joint_words(parameter.joint, robot)}"
 
 
 def undetermined(

@@ -224,6 +224,8 @@ def _off(parameter: Parameter, found: FarParameter, table: DHTable, robot: Robot
     stated, size = parameter.value(table), abs(found.change)
     if parameter.kind == "ratio":
         by = f"is off by {figure(100.0 * size)} % (sigma {figure(100.0 * found.sigma)} %)"
+    elif parameter.is_length and parameter_words(parameter, robot).startswith("the zero"):
+        by = f"is off by {figure(1e3 * size)} mm (sigma {figure(1e3 * found.sigma)} mm)"
     elif parameter.is_length:
         longer = "longer" if abs(stated + found.change) > abs(stated) else "shorter"
         by = (
