@@ -11,7 +11,8 @@ from support.whole_cells import OPTIONS, recorded
 
 from visioncal.core.transforms import invert, log
 from visioncal.fit.assemble import mixed_model
-from visioncal.fit.processes import _alone, _boards, _tried_of, consider, judged, processes
+from visioncal.fit.kernels import processes
+from visioncal.fit.processes import _alone, _boards, _tried_of, consider, judged
 from visioncal.fit.search import Search
 from visioncal.fit.solve import solve
 from visioncal.fit.unknowns import State

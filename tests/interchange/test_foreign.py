@@ -41,8 +41,9 @@ from visioncal.interchange.formats import (
     convert,
     read_foreign,
 )
-from visioncal.interchange.formats.file_search import files_in, head, images_named
+from visioncal.interchange.formats.file_search import files_in, head
 from visioncal.interchange.formats.intrinsics import read_intrinsics
+from visioncal.interchange.formats.pairing import images_named
 from visioncal.session import Session
 from visioncal.session.columns import POSE
 

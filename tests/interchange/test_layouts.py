@@ -24,7 +24,8 @@ from visioncal.core.errors import DataError
 from visioncal.interchange.formats import file_search, reading, rereading
 from visioncal.interchange.formats.columns import foreign_from
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
-from visioncal.interchange.formats.poses import pose_names, poses_from
+from visioncal.interchange.formats.pose_forms import poses_from
+from visioncal.interchange.formats.poses import pose_names
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.registry import read_foreign
 from visioncal.interchange.formats.sources import describe, proposed

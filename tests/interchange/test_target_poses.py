@@ -16,7 +16,8 @@ from support.commands import visioncal
 from support.fuzz.mistakes import numbers
 from support.samples import made_up
 
-from visioncal.calibration.guess.search import Recording, turns_alike
+from visioncal.calibration.guess.recording import Recording
+from visioncal.calibration.guess.search import turns_alike
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert
 from visioncal.interchange.formats import rereading

@@ -8,4 +8,4 @@ from visioncal.calibration.guess.decide import (
     guess_reading,
 )
 from visioncal.calibration.guess.readings import Hypothesis
-from visioncal.calibration.guess.search import CLEAR, FEWEST_ROWS, Candidate
+from visioncal.calibration.guess.recording import CLEAR, FEWEST_ROWS, Candidate

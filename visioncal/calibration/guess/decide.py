@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration.guess.fit import STARTS, Fit, is_about_one_axis, robust_fits
-from visioncal.calibration.guess.search import (
+from visioncal.calibration.guess.recording import (
     CLEAR,
     EVIDENCE,
     FEWEST_ROWS,
@@ -20,11 +20,9 @@ from visioncal.calibration.guess.search import (
     Recording,
     chains,
     fitted,
-    search,
-    search_by_half,
-    search_ends,
     thinned,
 )
+from visioncal.calibration.guess.search import search, search_by_half, search_ends
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.limits import CLEAR_RATIO

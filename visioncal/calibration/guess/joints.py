@@ -20,7 +20,7 @@ from visioncal.calibration.guess.fit import (
     mounting_fits,
     robust_fits,
 )
-from visioncal.calibration.guess.search import thinned
+from visioncal.calibration.guess.recording import thinned
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline.explaining import more_views
+from visioncal.calibration.pipeline.inliers import initial_inliers
 from visioncal.calibration.pipeline.judging import poor_motion, words_of
 from visioncal.calibration.pipeline.run_state import RunState, initial_state
-from visioncal.calibration.pipeline.solving import initial_inliers
 from visioncal.calibration.pipeline.starting import find_start
 from visioncal.calibration.run import STAGES
 from visioncal.calibration.stages.cell import read_cell

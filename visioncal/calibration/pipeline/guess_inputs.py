@@ -6,7 +6,8 @@ import numpy as np
 
 from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.guess.readings import SideReading
-from visioncal.calibration.guess.search import Recording, in_one_turn, turns_alike
+from visioncal.calibration.guess.recording import Recording
+from visioncal.calibration.guess.search import in_one_turn, turns_alike
 from visioncal.calibration.guess.unwrapping import in_one_place
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.pnp import ViewPoses

@@ -19,7 +19,8 @@ from visioncal.estimation.mixed import LEAST_SIGMA
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robot_likelihood import robot_likelihood
-from visioncal.fit.processes import Process, StopErrors, processes, weigh
+from visioncal.fit.kernels import Process, StopErrors, processes
+from visioncal.fit.processes import weigh
 
 # Least share of a model's evidence, and most columns that represent the errors of all stops; the
 # remainder counts as noise.

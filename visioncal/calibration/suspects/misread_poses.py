@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess.decide import POSE_OPTIONS
 from visioncal.calibration.guess.fit import robust_fits
-from visioncal.calibration.guess.search import FEWEST_ROWS, PAIRS_SHARE, relative_angles, thinned
+from visioncal.calibration.guess.recording import FEWEST_ROWS, thinned
+from visioncal.calibration.guess.search import PAIRS_SHARE, relative_angles
 from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import exchanged_columns

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from visioncal.calibration.guess.fit import STARTS, mounting_fits
-from visioncal.calibration.guess.search import thinned
+from visioncal.calibration.guess.recording import thinned
 from visioncal.calibration.pipeline.guess_inputs import guess_from_camera_poses, numbers_in
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.readings import places_of_one_point

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import STARTS, Fit, robust_fits
 from visioncal.calibration.guess.readings import shifted
-from visioncal.calibration.guess.search import CLEAR, EVIDENCE, FEWEST_ROWS
+from visioncal.calibration.guess.recording import CLEAR, EVIDENCE, FEWEST_ROWS
 from visioncal.calibration.pipeline.guess_inputs import alike_turning
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.limits import CLEAR_RATIO

@@ -19,17 +19,7 @@ from visioncal.interchange.formats.fields import (
     unit_by_size,
     without_unit,
 )
-from visioncal.interchange.formats.file_search import (
-    FileGroup,
-    Pairing,
-    UnpairedError,
-    groups_in,
-    image_groups,
-    images_named,
-    images_of,
-    paired,
-    with_depth,
-)
+from visioncal.interchange.formats.file_search import FileGroup, groups_in, image_groups, images_of
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
     ForeignRecording,
@@ -41,13 +31,15 @@ from visioncal.interchange.formats.foreign import (
 )
 from visioncal.interchange.formats.joints import joint_names, joints_from
 from visioncal.interchange.formats.keys import in_seconds, is_image_name
-from visioncal.interchange.formats.poses import (
-    columns_named,
-    makers_of,
-    pose_names,
-    poses_from,
-    possible_poses,
+from visioncal.interchange.formats.pairing import (
+    Pairing,
+    UnpairedError,
+    images_named,
+    paired,
+    with_depth,
 )
+from visioncal.interchange.formats.pose_forms import makers_of, poses_from
+from visioncal.interchange.formats.poses import columns_named, pose_names, possible_poses
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.sources import (
     Source,

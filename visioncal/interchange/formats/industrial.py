@@ -16,6 +16,7 @@ from visioncal.core.documents.values import mapping
 from visioncal.core.errors import DataError
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.columns import foreign_from
+from visioncal.interchange.formats.documents import read_document
 from visioncal.interchange.formats.fields import fields_of_records
 from visioncal.interchange.formats.file_search import files_in, head, path_inside
 from visioncal.interchange.formats.foreign import (
@@ -26,11 +27,7 @@ from visioncal.interchange.formats.foreign import (
 )
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 from visioncal.interchange.formats.keys import number_in
-from visioncal.interchange.formats.reading import (
-    fields_of_document,
-    flattened,
-    read_document,
-)
+from visioncal.interchange.formats.reading import fields_of_document, flattened
 
 _NONE = PoseImportOptions()
 # easy_handeye's lists of the robot's poses and of the marker's.

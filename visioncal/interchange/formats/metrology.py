@@ -45,7 +45,7 @@ from visioncal.interchange.formats.point_tables import (
     PointTable,
     word_set,
 )
-from visioncal.interchange.formats.poses import poses_from
+from visioncal.interchange.formats.pose_forms import poses_from
 from visioncal.interchange.formats.reading import ENDINGS, read_rows
 from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION
 from visioncal.session.kinds import known_instruments

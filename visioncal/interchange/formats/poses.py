@@ -9,23 +9,19 @@ from itertools import combinations, product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, PoseNumbers, Reading
-from visioncal.core.documents.pendants import forms_named
+from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
-    ANGLES,
-    DEGREES,
     Fields,
     appearance,
     is_headerless,
     named_by,
     position_first,
     split_matrices,
-    unit_by_size,
     without_unit,
 )
-from visioncal.interchange.formats.foreign import PoseImportOptions, Side, Unstated
+from visioncal.interchange.formats.foreign import Side
 from visioncal.interchange.formats.joints import joint_names
 
 
@@ -398,7 +394,7 @@ def _are_one(fields: Fields, items: Sequence[PoseFields]) -> bool:
         if sum(sizes) in (12, 16) and 9 not in sizes:
             places.append(split_matrices(np.hstack(blocks))[0])
         else:
-            places.append(_split(fields, item.names, blocks, "robot")[0])
+            places.append(split_pose(fields, item.names, blocks, "robot")[0])
     # Read before and after a picture, they differ by less than arms repeat: 0.1 mm at 1 m.
     away = [np.linalg.norm(places[0] - other, axis=1) for other in places]
     sizes = 1e-9 + 1e-4 * np.linalg.norm(places[0], axis=1)
@@ -439,7 +435,6 @@ def ranked_poses(
 # Vectors that a calibration of the camera gives.
 _SEEN = re.compile("[rt]vecs?$|(rotation|translation)(al)?_?vectors$", re.IGNORECASE)
 _ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)R(_|$)")
-_ANGLES_NAME = re.compile(r"rpy|roll|euler")
 
 
 def columns_named(fields: Fields, wanted: Sequence[str]) -> tuple[str, ...]:
@@ -449,72 +444,7 @@ def columns_named(fields: Fields, wanted: Sequence[str]) -> tuple[str, ...]:
     return tuple(group[name] for name in wanted) if group else ()
 
 
-def poses_from(
-    fields: Fields, names: Sequence[str], requested: PoseImportOptions, whose: Side
-) -> tuple[PoseNumbers, tuple[str, ...], Unstated]:
-    """Reads the poses of the `robot` or `camera` from fields: (poses, notes, what is assumed).
-
-    16 numbers are a matrix, by rows or by columns as its last row of 0, 0, 0, 1 shows; 12 are its
-    upper three rows, or a position and a rotation by rows, whichever gives rotations; otherwise a
-    position of three numbers and a rotation, ordered as names such as rvec and tvec show. Raises
-    DataError.
-    """
-    if whose == "robot":
-        requested = _stated_form(fields, names, requested)
-    if not requested.names and len(names) == 7 and requested.rotation == "quaternion-wxyz":
-        # --form refers to the columns in their order in the file, and these were found by their
-        # names.
-        order = {name: at for at, name in enumerate(fields.numbers)}
-        names = (*names[:3], *sorted(names[3:], key=lambda name: order.get(name, 0)))
-    blocks = [fields.column(name) for name in names]
-    sizes, units = [block.shape[1] for block in blocks], {without_unit(name)[1] for name in names}
-    notes, unstated = list[str](), set[str]() if requested.inverse is not None else {"inverse"}
-    if sum(sizes) in (12, 16) and 9 not in sizes:
-        positions, rotations = split_matrices(np.hstack(blocks))
-        rotation = "matrix"
-        requested = _by_rows(requested, sum(sizes))
-    else:
-        positions, rotations, of_rotation = _split(fields, names, blocks, whose)
-        rotation, doubt = _likely_rotation(
-            rotations, of_rotation, requested, whose, degrees=bool(units & {*DEGREES})
-        )
-        notes += [doubt] * bool(doubt)
-        unstated |= {"angles"} if requested.form is None and rotations.shape[1] == 3 else set()
-        unstated |= {"rotation"} if "does not say" in doubt else set()
-    lengths = units - {"", *ANGLES}
-    unit = requested.unit or (lengths.pop() if len(lengths) == 1 else None)
-    form = POSE_FORMS.get(requested.form or "")
-    # So far no arm reaches, whatever the unit of a maker's form is.
-    is_far = unit_by_size(positions) == "mm" and (form is None or form.unit == "m")
-    if unit is None and (form is None or is_far):
-        unstated.add("unit")
-        unit, farthest = ("mm" if is_far else None), np.nanmax(np.abs(positions), initial=0.0)
-        words = f"millimetres, as {farthest:.0f} m is far," if unit else "metres,"
-        notes.append(
-            f"The {whose}'s positions are taken for {words} as the source does not say; "
-            f"--{whose}-unit names another unit."
-        )
-    reading = replace(requested, unit=unit).reading(Reading(rotation))
-    numbers = PoseNumbers(positions, rotations, reading, fields.places)
-    return numbers, tuple(notes), frozenset(unstated)
-
-
-def _stated_form(
-    fields: Fields, names: Sequence[str], requested: PoseImportOptions
-) -> PoseImportOptions:
-    """The robot's options with the form that its own or the rows state; raises DataError."""
-    if requested.form is None:
-        requested = replace(requested, form=_usual_form(names, requested.usual))
-    if fields.form and requested.form not in (None, fields.form):
-        raise DataError(
-            f"{fields.places[0]}: the pose is written as {POSE_FORMS[fields.form].words}, not "
-            f"as {requested.form}.",
-            culprits=["--robot-form"],
-        )
-    return replace(requested, form=fields.form or requested.form)
-
-
-def _split(
+def split_pose(
     fields: Fields, names: Sequence[str], blocks: Sequence[FloatArray], whose: Side
 ) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     """Positions, rotations, and the names of the rotations' fields; raises DataError."""
@@ -553,115 +483,3 @@ def _is_rotation_first(flat: FloatArray) -> bool:
     filled = np.abs(flat[np.isfinite(flat).all(axis=1)])
     turns, places = filled[:, :3], filled[:, 3:]
     return bool(turns.max(initial=0.0) <= 2.0 * np.pi and (places > 360.0).sum() > len(filled) / 2)
-
-
-def _by_rows(requested: PoseImportOptions, count: int) -> PoseImportOptions:
-    """Options of matrices: whether 16 numbers are by rows or by columns is known."""
-    form = POSE_FORMS.get(requested.form or "")
-    if count == 12 or not requested.rotation.startswith("matrix"):
-        return requested
-    return replace(requested, form=None, unit=requested.unit or (form.unit if form else None))
-
-
-def makers_of(names: Sequence[str]) -> tuple[str, ...]:
-    """Forms of poses whose rotations have the names of a pose's fields, position first."""
-    return tuple(forms_named([without_unit(name)[0].lower() for name in names[3:]]))
-
-
-def _usual_form(names: Sequence[str], usual: str | None) -> str | None:
-    """The robot's own form, where names of a pose's numbers fit it; raises DataError."""
-    units = [without_unit(name)[1] for name in names]
-    form, makers = POSE_FORMS.get(usual or ""), makers_of(names)
-    if form is None or "ros" in makers:
-        return None
-    if makers and form.name not in makers:
-        raise DataError(
-            f"{', '.join(names)} are not {form.words}, the form of this robot's poses.",
-            culprits=names,
-            next_step=f"Say whose they are, as --robot-form {makers[0]}.",
-        )
-    fits = len(names) == 3 + ROTATION_FORMS[form.rotation].size
-    fits &= {*units[3:]} <= {"", *(DEGREES if form.rotation.endswith("-deg") else ("rad",))}
-    return form.name if fits and (makers or all(map(str.isdecimal, names))) else None
-
-
-def check_radians(
-    poses: PoseNumbers, requested: PoseImportOptions, whose: str, *, guesses: bool = True
-) -> None:
-    """Checks that angles of unstated unit can be radians; raises DataError.
-
-    `guesses` says whether the command can try other readings, which the message then suggests.
-    """
-    there, rotation = poses.present, poses.reading.rotation
-    radians = rotation == "rotation-vector" or rotation.endswith("-rad")
-    is_degrees = rotation == "rotation-vector-deg" and requested.form is None
-    if not (radians or is_degrees) or not there.any():
-        return
-    largest = np.abs(np.where(there[:, None], poses.rotations, 0.0)).max(axis=1)
-    row = int(largest.argmax())
-    if not is_degrees and largest[row] <= 2 * np.pi + 0.01:
-        return
-    size = "in degrees" if is_degrees else "too large for radians"
-    needed = "it needs its form"
-    makers = defaultdict[str, list[str]](list)
-    for form in POSE_FORMS.values():
-        if form.models and form.rotation.endswith("-deg"):
-            makers[form.words.partition("Z, ")[2]].append(form.name)
-    listed = (f"{' or '.join(forms)} for {names}" for names, forms in makers.items())
-    next_step = f"Say --{whose}-form: {'; '.join(listed)}; rotation-vector-deg, euler-ZYX-deg ..."
-    if requested.form is not None:
-        needed = f"poses of the form {requested.form} are in radians"
-        degrees = f"{rotation.removesuffix('-rad')}-deg"
-        degrees = f"{requested.form}-deg" if f"{requested.form}-deg" in POSE_FORMS else degrees
-        next_step = f"Say --{whose}-form {degrees}, where these are degrees"
-    raise DataError(
-        f"{poses.places[row]}: the {whose}'s rotation has an angle of {largest[row]:.4g}, "
-        f"{size}, and {needed}.",
-        culprits=[poses.places[row]],
-        next_step=next_step + ("; or let --guess find it." if guesses else "."),
-    )
-
-
-def _likely_rotation(
-    rotations: FloatArray,
-    names: Sequence[str],
-    requested: PoseImportOptions,
-    whose: Side,
-    *,
-    degrees: bool,
-) -> tuple[str, str]:
-    """The likely form of (n, k) numbers of rotations, and a note on what is assumed, or none."""
-    size = rotations.shape[1]
-    if size == 9:
-        return "matrix", ""
-    if size == 4:
-        plain = [without_unit(name)[0].lower() for name in names]
-        ends = plain[0][-4:] if len(names) == 1 else "".join(name[-1] for name in plain)
-        # ABB numbers q1 to q4 from the scalar on, trackers q0 to q3.
-        is_abb = "".join(name[-2:] for name in plain) in ("q1q2q3q4", "q0q1q2q3")
-        rotation = f"quaternion-{'wxyz' if is_abb or ends == 'wxyz' else 'xyzw'}"
-        # Of a mapping, whose numbers were joined by their names.
-        is_mapping = len(names) > 1 and "." in names[0] and {*ends} == {*"xyzw"}
-        if is_mapping or requested.form is not None or is_abb or ends in ("xyzw", "wxyz"):
-            return "quaternion-xyzw" if is_mapping else rotation, ""
-        return rotation, (
-            f"The {whose}'s quaternions are taken for x, y, z, w, as the source does not say; "
-            f"--{whose}-form quaternion-wxyz names the other order."
-        )
-    joined = " ".join(names).lower()
-    largest = float(np.nanmax(np.abs(rotations), initial=0.0))
-    if _ANGLES_NAME.search(joined):
-        is_large = not degrees and largest > 2 * np.pi + 0.01 and requested.form is None
-        note = (
-            f"The {whose}'s angles up to {largest:.0f} are no radians, and are taken for degrees."
-        )
-        return f"euler-xyz-{'deg' if degrees or is_large else 'rad'}", note * is_large
-    if degrees:
-        # Angle units are checked later, unless the user states them.
-        return "rotation-vector-deg", ""
-    if requested.form is None and not re.search(r"rvec|rot\w*vec", joined):
-        return "rotation-vector", (
-            f"The {whose}'s rotations ({', '.join(names)}) are taken for rotation vectors in "
-            f"radians, as the source does not say; --{whose}-form names another form."
-        )
-    return "rotation-vector", ""

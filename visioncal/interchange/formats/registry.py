@@ -31,13 +31,9 @@ from visioncal.interchange.formats.mending import (
     write_positions,
 )
 from visioncal.interchange.formats.metrology import METROLOGY
-from visioncal.interchange.formats.poses import check_radians
-from visioncal.interchange.formats.rereading import (
-    DoubtfulSession,
-    load_for_rereading,
-    reread,
-    settled,
-)
+from visioncal.interchange.formats.pose_forms import check_radians
+from visioncal.interchange.formats.rereading import DoubtfulSession, load_for_rereading, reread
+from visioncal.interchange.formats.settling import settled
 from visioncal.interchange.formats.sources import describe, unknown
 from visioncal.interchange.formats.views import VISP, ZIVID
 from visioncal.session import Session

@@ -1,20 +1,13 @@
 """Finds another reading of a recording's poses, and applies it."""
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from visioncal.calibration.guess import (
-    CLEAR,
-    FEWEST_ROWS,
-    NO_READING,
-    ONE_AXIS,
     Candidate,
     Guess,
     Hypothesis,
@@ -22,33 +15,29 @@ from visioncal.calibration.guess import (
 from visioncal.calibration.pipeline.guess_inputs import (
     chain_poses,
     guess_from_camera_poses,
-    may_agree,
     numbers_in,
 )
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.clocks import waits_for_clock
-from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents.tables import TextTable, is_number
 from visioncal.core.documents.toml import read_toml
-from visioncal.core.errors import DataError, DegenerateError, VisioncalError
+from visioncal.core.errors import DataError
 from visioncal.core.files import read_text_inside
 from visioncal.core.number_format import some_of
-from visioncal.core.types import MOUNTS, FloatArray, IntArray, Progress, Searched, evenly
+from visioncal.core.types import MOUNTS, FloatArray, Progress
 from visioncal.interchange.formats.assemble import (
-    FileImages,
     assemble,
-    lacks_target,
     pose_cells,
-    unknown_target,
     with_observations_only,
 )
 from visioncal.interchange.formats.fields import fields_of_records
-from visioncal.interchange.formats.foreign import ForeignRecording, Side, rows_of
+from visioncal.interchange.formats.foreign import ForeignRecording
 from visioncal.interchange.formats.mending import noting, scaled_board
-from visioncal.interchange.formats.poses import makers_of, pose_names
+from visioncal.interchange.formats.pose_forms import makers_of
+from visioncal.interchange.formats.poses import pose_names
 from visioncal.session import Session, Stream
 from visioncal.session.columns import (
     MEASURED_CAM_POSE,
@@ -59,13 +48,6 @@ from visioncal.session.table import parse_csv
 from visioncal.vision.boards.kind import LARGEST_M
 
 _IDENTITY = ("0.0", "0.0", "0.0", "1.0")
-# Advice where the motion determines neither the calibration nor the form of the poses.
-_MOVE = (
-    "First add 3 or more views in which the flange is tilted by 20 to 40 degrees about different "
-    "axes: it takes them for any result, and they show the form, too. Or "
-)
-# The beginning of the reason where the robot's rotations do not differ, of whatever unit.
-_STILL, _SAME = "the robot does not turn: its rotations are the same", 1e-3
 # Sigma of a board's size, as a share of it, that the distances of some poses gave: nobody measured
 # it, and the fit finds it better.
 _BY_POSES = 0.01
@@ -105,11 +87,11 @@ class DoubtfulSession:
             DegenerateError: Too few views have both poses.
             ConvergenceError: The intrinsics do not converge.
         """
-        run = _measured(self.session, progress)
+        run = measured_run(self.session, progress)
         return guess_from_camera_poses(run, self.robot, self.camera, knows_mount=self.knows_mount)
 
 
-def _measured(session: Session, progress: Progress | None) -> RunState:
+def measured_run(session: Session, progress: Progress | None) -> RunState:
     """The turn of the camera's poses, for any of the robot's; raises as `DoubtfulSession.guess`."""
     # The offset of a stream's clock is found by rotation angles, which no reading changes.
     by_clock = {"robot", "clock"} if waits_for_clock(session) else set()
@@ -117,254 +99,7 @@ def _measured(session: Session, progress: Progress | None) -> RunState:
     return run_stages(RunState(session, progress), [each for each in STAGES if each.name in names])
 
 
-# Rows by which readings are tested, evenly spread: few first, more where these do not decide. Every
-# third of the more is one of the few, whose images are searched once.
-_TESTED = (12, 34)
-
-
-def settled(foreign: ForeignRecording, progress: Progress | None = None) -> ForeignRecording:
-    """Finds what a source does not say of its poses by what agrees with its images or target poses.
-
-    All readings of the source are tested, then those with the six numbers of a pose in another
-    order.
-
-    Raises:
-        DataError: Nothing determines which fields are poses, or a form of rotations that is not
-            said; the images show another board than declared, or the camera is mounted otherwise;
-            or the poses of one side serve as both's.
-    """
-    unstated = frozenset[str]().union(*foreign.unstated.values())
-    is_known = foreign.stream is not None or not (unstated - {"inverse"} or foreign.doubt)
-    if is_known or foreign.mount is None:
-        return foreign
-    _check_sides(foreign)
-    # Other images make no difference where the stored poses of the target are used.
-    by_images = foreign.camera is None or foreign.target is not None
-    rivals = (each for each in foreign.rivals if by_images or each[1].robot is not foreign.robot)
-    readings = [(0, foreign), *rivals]
-    other_orders = [(rank, each) for rank, item in readings for each in _reordered(item)]
-    why, fault = "too few rows have a pose and what the camera saw", None
-    searches = dict[Path, Searched]()
-    if _is_still(foreign):
-        # No image need be searched for what no reading can change.
-        return _untested(foreign, f"{_STILL} in all {len(foreign.robot)} rows")
-    for least, most in pairwise((FEWEST_ROWS - 1, *_TESTED)):
-        try:
-            seen = _Seen.of(foreign, most, progress, searches)
-        except VisioncalError as error:
-            why, fault = error.message.rstrip("."), error
-            # Where a dozen images show nothing, the others of a short recording will not.
-            if isinstance(error, DataError) and len(foreign.robot) <= _TESTED[-1]:
-                break
-            continue
-        if seen.count <= least:
-            break
-        fault = None
-        searches |= seen.searches
-        # Rows that turn otherwise are another motion's, whatever more rows add.
-        readings = [*readings[:1], *filter(seen.may_agree, readings[1:])]
-        other_orders = [*filter(seen.may_agree, other_orders)]
-        is_last = most == _TESTED[-1] or seen.count < most
-        for tried in (readings, other_orders):
-            found, reason = _tested(tried, seen, is_last=is_last)
-            why = reason if tried is readings else why
-            if found is not None:
-                return found
-            if why.startswith(ONE_AXIS):
-                # No order of the numbers closes the chain better than others.
-                break
-    is_clear = bool(searches) and fault is None
-    stored = _by_stored_poses(foreign, progress) if is_clear else None
-    return stored or _untested(foreign, why, fault)
-
-
-def _by_stored_poses(
-    foreign: ForeignRecording, progress: Progress | None
-) -> ForeignRecording | None:
-    """The reading by poses of the target beside images of another motion; None without any."""
-    if foreign.camera is None or foreign.target is None:
-        return None
-    stored = replace(foreign, images=(), corners=(), target=None, rivals=())
-    with suppress(DegenerateError):
-        found, _ = _tested([(0, stored)], _Seen.of(stored, _TESTED[-1], progress, {}), is_last=True)
-        if found is not None:
-            note = (
-                "The images are left aside: no reading of the robot's poses fits them, but one "
-                "fits the stored poses of the target."
-            )
-            return replace(found, notes=(*found.notes, note))
-    return None
-
-
-def _check_sides(foreign: ForeignRecording) -> None:
-    """Raises DataError where nothing says what images show, or one side's numbers are both's."""
-    if lacks_target(foreign):
-        then = " Forms of poses that are not stated are then found by the images."
-        raise unknown_target(foreign, "--target", then)
-    if foreign.camera is not None or foreign.corners:
-        # Of the same numbers any reading agrees; corners need the size of their images.
-        assemble(replace(foreign, images=()))
-
-
-def _is_still(foreign: ForeignRecording) -> bool:
-    """Whether all rows have one rotation of the robot."""
-    turns = foreign.robot.rotations[foreign.robot.present]
-    return bool(turns.size) and float(np.ptp(turns, axis=0).max()) < _SAME
-
-
-def _tested(
-    readings: Sequence[tuple[int, ForeignRecording]], seen: "_Seen", *, is_last: bool
-) -> tuple[ForeignRecording | None, str]:
-    """The reading that agrees best with what was seen, or why the first does not.
-
-    Raises DataError where several agree alike, are not the same, and no more rows can tell.
-    """
-    found: list[tuple[float, int, ForeignRecording]] = []
-    why, others = "", list[Guess]()
-    for rank, item in readings:
-        try:
-            guess = seen.guess(item)
-        except VisioncalError as error:
-            why = why or error.message.rstrip(".")
-            continue
-        why = why or guess.sentence.rstrip(".")
-        if guess.stands_out or guess.declared.fit.closes:
-            done = _applied(item, guess, is_measured=seen.run is not None)
-            score = guess.best.log_posterior - CLEAR * rank
-            found += [] if done is None else [(score, rank, done)]
-            is_other = guess.stands_out and guess.best.hypothesis.mount != item.mount
-            others += [guess] if done is None and is_other else []
-    if others and not found:
-        raise DataError(
-            f"{readings[0][1].name}: the camera is not mounted as stated. {others[0].sentence}",
-            culprits=["--mount"],
-            next_step=f"Say --mount {others[0].best.hypothesis.mount}.",
-        )
-    if not found:
-        return None, why
-    score, rank, best = max(found, key=lambda each: each[0])
-    alike = (each for at, same, each in found if same == rank and at > score - CLEAR)
-    doubt = next((item.doubt for _, item in readings), None)
-    if doubt is not None and not all(_are_same(best, each) for each in alike):
-        if not is_last:
-            return None, why
-        raise doubt
-    return best, ""
-
-
-def _are_same(first: ForeignRecording, second: ForeignRecording) -> bool:
-    """Whether two readings have the same poses, but for what is written with fewer digits."""
-    if first.images != second.images:
-        return False
-    if len(first.robot) != len(second.robot):
-        return True
-    away = np.abs(first.robot.poses() - second.robot.poses())
-    return bool(np.nanmax(away, initial=0.0) < 1e-3)
-
-
-def _reordered(foreign: ForeignRecording) -> Iterator[ForeignRecording]:
-    """The recording with the six numbers of the robot's poses in other orders.
-
-    Either half is the position; with all forms of Euler angles, the orders of three angles with
-    another one in the middle are all products of three turns.
-    """
-    if "angles" not in foreign.unstated.get("robot", frozenset()):
-        return
-    flat = np.hstack([foreign.robot.positions, foreign.robot.rotations])
-    for first, turn in product((0, 3), ((0, 1, 2), (1, 0, 2), (0, 2, 1))):
-        order = [*range(first, first + 3), *(3 - first + at for at in turn)]
-        robot = replace(foreign.robot, positions=flat[:, order[:3]], rotations=flat[:, order[3:]])
-        if order != [*range(6)]:
-            words = ", ".join(str(1 + at) for at in order)
-            note = f"The numbers of the robot's poses are taken in the order {words}."
-            yield replace(foreign, robot=robot, notes=(*foreign.notes, note))
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Corners in some rows of a source, by which its readings are tested."""
-
-    run: RunState | None  # With the board's poses by the images; None for poses of the target.
-    rows: IntArray  # These rows of the recording.
-    images: tuple[Path | None, ...]  # Their images; empty where corners were given.
-    count: int  # The number of rows.
-    progress: Progress | None
-
-    @classmethod
-    def of(
-        cls,
-        foreign: ForeignRecording,
-        most: int,
-        progress: Progress | None,
-        searches: Mapping[Path, Searched],
-    ) -> Self:
-        """The corners in at most so many rows; raises VisioncalError.
-
-        `searches` has what was found in images before.
-        """
-        seen = with_observations_only(foreign)
-        if not (seen.images or seen.corners):
-            return cls(None, np.arange(0), (), min(len(seen.robot), most), progress)
-        there = [at for at, image in enumerate(seen.images) if image and image.is_file()]
-        there = there or [at for at, px in enumerate(seen.corners) if px is not None]
-        rows = np.array(there, dtype=int)[evenly(len(there), most)]
-        run = None
-        if len(rows) >= FEWEST_ROWS:
-            session = assemble(rows_of(replace(seen, rivals=()), rows), mount=MOUNTS[0])
-            if isinstance(session.images, FileImages):
-                images = replace(session.images, searches=searches)
-                session = replace(session, images=images)
-            run = _measured(session, progress)
-        shown = tuple(seen.images[at] for at in rows) if seen.images else ()
-        return cls(run, rows, shown, len(rows), progress)
-
-    @property
-    def searches(self) -> dict[Path, Searched]:
-        """The corners found in the images, by file."""
-        if self.run is None or not isinstance(images := self.run.session.images, FileImages):
-            return {}
-        views, found = self.run.session.views, self.run.searches
-        return {
-            images.files[view.image]: found[view.number] for view in views if view.number in found
-        }
-
-    def may_agree(self, reading: tuple[int, ForeignRecording]) -> bool:
-        """Whether the robot's rows of a reading, with its rank, may turn as the boards do."""
-        try:
-            item = with_observations_only(replace(reading[1], rivals=()))
-            return self.run is None or may_agree(self.run, self._robot(item))
-        except VisioncalError:
-            # Its test says why.
-            return True
-
-    def guess(self, foreign: ForeignRecording) -> Guess:
-        """Tries the readings of one recording's poses; raises VisioncalError."""
-        item = with_observations_only(replace(foreign, rivals=()))
-        if self.run is None:
-            here = (
-                item.robot.present if item.robot.present.any() else np.full(len(item.robot), True)
-            )
-            here &= np.full(len(here), True) if item.camera is None else item.camera.present
-            rows = np.flatnonzero(here)
-            rows = rows[evenly(len(rows), self.count)]
-            return DoubtfulSession.of(rows_of(item, rows)).guess(self.progress)
-        knows_mount = foreign.mount is not None
-        return guess_from_camera_poses(self.run, self._robot(item), knows_mount=knows_mount)
-
-    def _robot(self, foreign: ForeignRecording) -> PoseNumbers:
-        """The robot's numbers of what was seen; NaN where a recording has none."""
-        row = {image: at for at, image in enumerate(foreign.images)}
-        rows = np.array([row.get(image, -1) for image in self.images] or self.rows)
-        robot = foreign.robot
-        if not robot.present.any():
-            chain = chain_poses(assemble(foreign))
-            robot = robot if chain is None else PoseNumbers.of_poses(chain, robot.places)
-        robot = robot.rows(np.maximum(rows, 0))
-        robot.positions[rows < 0] = np.nan
-        return robot
-
-
-def _applied(
+def applied_reading(
     foreign: ForeignRecording, guess: Guess, *, is_measured: bool
 ) -> ForeignRecording | None:
     """The recording as its best reading has it; None where that changes what is stated."""
@@ -424,85 +159,6 @@ def _applied(
         notes=(*kept, *notes),
         unstated={},
         rivals=(),
-    )
-
-
-def _untested(
-    foreign: ForeignRecording, why: str, fault: VisioncalError | None = None
-) -> ForeignRecording:
-    """Asks for a form of rotations that nothing determines, or for the board that would.
-
-    `fault` is what kept the images from being used. Else notes that nothing was tested.
-    """
-    other = fault.finding if isinstance(fault, OtherBoardError) else None
-    is_asked = foreign.doubt or any("rotation" in free for free in foreign.unstated.values())
-    if is_asked and other is not None and other.kind == "other_board":
-        raise DataError(
-            other.words,
-            culprits=["--target"],
-            next_step="Name this board with --target, by its kind, its columns x rows and the "
-            "measured side (as checkerboard_9x6_25mm), or by its .toml.",
-        )
-    if foreign.doubt is not None:
-        raise foreign.doubt
-    is_armless = foreign.arm is None and foreign.robot_document is None
-    is_armless &= foreign.joints_rad is not None and not foreign.robot.present.any()
-    if is_asked and is_armless:
-        raise DataError(
-            f"{foreign.name}: there are joint angles and no poses of the robot, and which arm they "
-            "belong to is not said.",
-            culprits=["--robot-model"],
-            next_step="Name the arm with --robot-model: a built-in robot, its .urdf or a DH table.",
-        )
-    for whose, free in foreign.unstated.items():
-        if "rotation" in free:
-            raise _unsaid(foreign, whose, why, fault)
-    note = f"The form of the poses stays as first read: {why}."
-    note += " Convert with --guess --yes to read them so." if why.startswith("With ") else ""
-    return replace(foreign, notes=(*foreign.notes, note))
-
-
-def _unsaid(
-    foreign: ForeignRecording, whose: Side, why: str, fault: VisioncalError | None
-) -> DataError:
-    """The error of a form of rotations that is not said, and what kept the images from telling."""
-    joints = (
-        " Where the numbers are joint angles, name them with --joint-columns, and the arm with "
-        "--robot-model."
-    )
-    numbers = foreign.robot if whose == "robot" else foreign.camera
-    size = 0 if numbers is None else numbers.rotations.shape[1]
-    forms = (
-        "quaternion-xyzw, or quaternion-wxyz"
-        if size == 4
-        else "rotation-vector, euler-xyz-rad, euler-ZYX-deg or another, or whose they are, as kuka"
-    )
-    by_names = [name for name in foreign.makers if POSE_FORMS[name].likely]
-    if whose == "robot" and len(by_names) == 1:
-        forms = f"{by_names[0]}, as the columns' names suggest, or {forms}"
-    if why.startswith("With "):
-        joints += (
-            " What else this reading changes is done to the session that is then written: "
-            "visioncal convert SESSION NEW --guess --yes."
-        )
-    unsaid = f"the form of the {whose}'s rotations is not said"
-    # A fault of the images comes first: while it lasts, no form helps.
-    words = f"{unsaid}, and nothing determines it: {why}"
-    step = f"{_MOVE}say" if why.startswith((ONE_AXIS, _STILL)) else "Say"
-    if why.startswith(_STILL):
-        words = f"{why}. No calibration is determined so, and no form of these rotations"
-    elif why.startswith(NO_READING):
-        step = "Look whether these rows are those of these images or poses of the target. Else say"
-        if foreign.images and foreign.target is None:
-            board = "Name the board that the images show with --target: its corners determine more."
-            step = f"{board} {step}"
-    elif fault is not None:
-        words = f"{re.sub('^session .*?: ', '', why)}. Beside that, {unsaid}"
-        step = f"{fault.next_step} Else say".strip()
-    return DataError(
-        f"{foreign.name}: {words}.",
-        culprits=[*(fault.culprits if fault else ()), f"--{whose}-form"],
-        next_step=f"{step} --{whose}-form {forms}.{joints if whose == 'robot' else ''}",
     )
 
 

@@ -18,6 +18,7 @@ from visioncal.calibration.guess import FEWEST_ROWS
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import FloatArray
+from visioncal.interchange.formats.documents import read_document
 from visioncal.interchange.formats.fields import (
     Fields,
     appearance,
@@ -45,12 +46,7 @@ from visioncal.interchange.formats.poses import (
     without_copies,
     words_of,
 )
-from visioncal.interchange.formats.reading import (
-    DOCUMENTS,
-    read_document,
-    read_record,
-    read_rows,
-)
+from visioncal.interchange.formats.reading import DOCUMENTS, read_record, read_rows
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 

@@ -14,7 +14,8 @@ from visioncal.frames.touches import NominalPoints, TouchRows, touches_of
 from visioncal.interchange.formats.columns import foreign_from, view_numbers
 from visioncal.interchange.formats.fields import Fields, named_by, without_unit
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
-from visioncal.interchange.formats.poses import check_radians, columns_named, pose_names, poses_from
+from visioncal.interchange.formats.pose_forms import check_radians, poses_from
+from visioncal.interchange.formats.poses import columns_named, pose_names
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.session import Session
 from visioncal.session.columns import POSE, joint_columns

@@ -1,0 +1,394 @@
+"""Mistakes of rows of the record: copies, signs, units and orders, with what they explain."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import gammaln
+
+from visioncal.calibration.guess.fit import CLOSING_SCORE
+from visioncal.calibration.guess.readings import ROW_ORDERS
+from visioncal.calibration.guess.recording import EVIDENCE
+from visioncal.calibration.suspects.record import LEAST, Edges, Record, evidence
+from visioncal.core.conventions import ROTATION_FORMS
+from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.number_format import counted, ranges, some_of, view_words
+from visioncal.core.transforms import apply, compose, exp, invert, rotation_angle
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.verdict import Finding, mending, or_alone
+from visioncal.estimation.chain import robot_part
+
+# Rows that images and poses are apart, from none on: some lost or doubled pictures.
+SHIFTS = (0, *(sign * by for by in range(1, 7) for sign in (1, -1)))
+# Of more views, fewer rows apart are tried: each takes as long as the fit.
+MANY, FEW_APART = 200, 3
+# The prior of a mistake of the record; the probability that a robot reports one pose twice to the
+# last digit though it moved.
+MISTAKE, _EQUAL = float(np.log(0.01)), 1e-4
+# A turn of a board differs by less from a quarter or half one, and one of a picture whose lens has
+# its centre off the middle [rad].
+_NEAR_RAD, NEAR_TURN_RAD = 0.1, 0.3
+# Of so few views, one that is wrong bends the fit of all.
+FEW_VIEWS = 7
+# Views are alike within so many medians; log-ratios of squares count as one so clear at most.
+UNEVEN = 7.0
+_CLIPPED = -2.0 * float(np.log(UNEVEN)), 2.0 * float(np.log(UNEVEN))
+# A flange is nearer to the base than this, and farther from its origin [m]; other positions are in
+# another unit.
+_FARTHEST_M, _NEAREST_M = 20.0, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Undoing:
+    """A mistake of the record that explains views."""
+
+    odds: float  # Its log odds against views that are wrong for no known reason.
+    found: Finding  # The finding; its views are left out.
+    short: str  # The same as a clause, for each of the views.
+    quarters: int = 0  # By how many the views' pictures are turned clockwise.
+
+
+def copied_rows(
+    record: Record, apart: FloatArray, own: IntArray, agrees: Mask
+) -> Iterator[Undoing]:
+    """Poses of the robot, or of the target, that are there once more though the other moved."""
+    closes = apart[agrees].mean() < CLOSING_SCORE**2
+    for copies, pose, but in (
+        (
+            record.copies,
+            "the robot's pose",
+            f"the {record.shows}s differ: the log repeated a pose that was read before",
+        ),
+        (
+            record.lingering,
+            "the target's pose" if record.shows == "image" else "the reading",
+            "the robot moved: the last that was seen lingered",
+        ),
+    ):
+        copied = copies & ~agrees & (own >= 0)
+        if not copied.any() or not closes:
+            continue
+        # Where the robot stands still between views, equal poses say little.
+        chance = max(float((copies & agrees).mean()), _EQUAL)
+        views = tuple(record.views[record.rows[copied]].tolist())
+        others = record.views[record.rows[~copied]].tolist()
+        whose = f"{view_words(views).capitalize()} {'have' if len(views) > 1 else 'has'}"
+        yield Undoing(
+            MISTAKE - len(views) * float(np.log(chance)),
+            Finding(
+                "copied_poses",
+                f"{whose} {pose} of the row before once more, to the last digit, though {but}. "
+                "Left out.",
+                or_alone("Record them anew, or calibrate the other views alone.", others),
+                views,
+            ),
+            f"{pose} is that of the row before, once more",
+        )
+
+
+def chosen_views(
+    own: IntArray, apart: FloatArray, other: FloatArray, base: float
+) -> tuple[float, Mask]:
+    """Log odds that some views are otherwise, with other squares (m, 2), and the views (m,).
+
+    Any number of them is as likely, and any choice: they are those that it helps most.
+    """
+    there, here = (np.where(own < 0, 1.0, at.sum(axis=1)) for at in (other, apart))
+    order = np.argsort((there + LEAST**2) / (here + LEAST**2), kind="stable")
+    number = np.arange(1, len(own) + 1)
+    some = np.argsort(order) < number[:, None]
+    squares = np.where(some[..., None], other, apart)
+    logs, agrees = evidence(squares)
+    choices = gammaln(len(own) + 2) - gammaln(number + 1) - gammaln(len(own) - number + 1)
+    odds = EVIDENCE * (logs - base) + MISTAKE - choices
+    at = int(odds.argmax())
+    closes = squares[at][agrees[at]].mean() < CLOSING_SCORE**2
+    return float(odds[at]), some[at] & agrees[at] & closes
+
+
+def other_signs(
+    record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
+) -> Iterator[Undoing]:
+    """Views whose position lost the sign of one axis."""
+    for axis, name in enumerate("xyz"):
+        flanges = robot_part(record.robot, record.mount).copy()
+        flanges[:, axis, 3] *= -1.0
+        signed = replace(record, robot=robot_part(flanges, record.mount))
+        odds, wrong = chosen_views(own, apart, replace(edges, record=signed).of(own), base)
+        views = tuple(record.views[record.rows[wrong]].tolist())
+        if not views:
+            continue
+        short = f"{name} of the robot's position has the other sign"
+        axes = ",".join(f"-{each}" if each == name else each for each in "xyz")
+        yield Undoing(
+            odds - float(np.log(3.0)),
+            Finding(
+                "lost_sign",
+                f"In {view_words(views)} {short}: with its own, they agree with the others. They "
+                "were left out.",
+                mending("it has its own", f"--positions {ranges(views)}:{axes}"),
+                views,
+            ),
+            short,
+        )
+
+
+def mixed_unit_rows(record: Record, own: IntArray, base: float) -> Iterator[Undoing]:
+    """Views whose position is in millimetres where the others' are in metres, or the reverse.
+
+    The sizes of the positions, or of one axis, tell the rows of either unit, however many they are.
+    """
+    flanges = robot_part(record.robot, record.mount)
+    sizes_m, large = np.linalg.norm(flanges[:, :3, 3], axis=1), "a thousand times as large"
+    single = ((1e-3, np.abs(flanges[:, at, 3]) > _FARTHEST_M, large, "xyz"[at]) for at in range(3))
+    for factor, wrong, unit, part in (
+        (1e-3, sizes_m > _FARTHEST_M, large, "xyz"),
+        (1e3, sizes_m < _NEAREST_M, "a thousandth as large", "xyz"),
+        *single,
+    ):
+        is_scaled = wrong[:, None] & np.array([name in part for name in "xyz"])
+        scaled = compose(flanges[:, :3, :3], flanges[:, :3, 3] * np.where(is_scaled, factor, 1.0))
+        log = _of_changed(record, own, wrong, scaled)
+        if log is None:
+            continue
+        views = tuple(record.views[record.rows[wrong[own] & (own >= 0)]].tolist())
+        whose = "the robot's position" if part == "xyz" else f"{part} of the robot's position"
+        short = f"{whose} is {unit} as in the others, as where it is in another unit"
+        axes = ",".join(f"{factor:g}*{at}_m" if at in part else at for at in "xyz")
+        yield Undoing(
+            EVIDENCE * float(log - base) + MISTAKE,
+            Finding(
+                "mixed_units",
+                f"In {view_words(views)} {short}: in the same one, they agree with the others. "
+                "They were left out.",
+                mending("all have one unit", f"--positions {ranges(views)}:{axes}"),
+                views,
+            ),
+            short,
+        )
+
+
+def _of_changed(record: Record, own: IntArray, wrong: Mask, flanges: FloatArray) -> float | None:
+    """Log evidence of other poses of the robot in (n,) some rows; None where most disagree."""
+    rows = wrong[own] & (own >= 0)
+    if np.sum(rows) < 1 or np.sum(~rows & (own >= 0)) < 1:
+        return None
+    edges = Edges.by(replace(record, robot=robot_part(flanges, record.mount)), own, own >= 0)
+    if edges is None:
+        return None
+    squares = edges.of(own)
+    (log,), (agrees,) = evidence(squares[None])
+    is_close = squares[agrees].mean() < CLOSING_SCORE**2
+    return float(log) if is_close and np.sum(agrees & rows) > 0.6 * np.sum(rows) else None
+
+
+def mixed_angle_rows(record: Record, own: IntArray, base: float) -> Iterator[Undoing]:
+    """Views whose angles are in radians where the others' are in degrees.
+
+    Read as degrees, they are of a robot that hardly turns.
+    """
+    flanges = robot_part(record.robot, record.mount)
+    angles = np.where(np.isfinite(flanges[:, 0, 0]), rotation_angle(flanges), np.inf)
+    wrong = angles < np.deg2rad(np.pi * np.sqrt(3.0))
+    if not wrong.any() or wrong[own].all():
+        return
+    turned = flanges.copy()
+    for form in (
+        "rotation-vector",
+        *(f"euler-{each}-rad" for each in ("ZYX", "xyz", "ZYZ", "XYZ")),
+    ):
+        numbers = ROTATION_FORMS[f"{form.removesuffix('-rad')}-deg"].write(flanges[wrong, :3, :3])
+        turned[wrong, :3, :3] = ROTATION_FORMS[form].read(numbers)
+        log = _of_changed(record, own, wrong, turned)
+        if log is None:
+            continue
+        rows = wrong[own] & (own >= 0)
+        views = tuple(record.views[record.rows[rows]].tolist())
+        short = "the robot's angles are in radians, and were taken for degrees"
+        words = (
+            "In the log, write their angles in degrees (times 57.29578) as the others' are, and "
+        )
+        yield Undoing(
+            EVIDENCE * float(log - base) + MISTAKE,
+            Finding(
+                "mixed_units",
+                f"In {view_words(views)} {short}: in the same unit, they agree with the others. "
+                "They were left out.",
+                or_alone(
+                    f"{words}convert it anew; or calibrate the other views alone.",
+                    record.views[record.rows[~rows]].tolist(),
+                ),
+                views,
+            ),
+            short,
+        )
+
+
+def turned_rows(
+    record: Record, edges: Edges, own: IntArray, apart: FloatArray, base: float
+) -> Iterator[Undoing]:
+    """Boards that were read as if they were turned in their plane, or some squares on in it."""
+    known = np.flatnonzero(own >= 0)
+    turned = edges.turned(own)
+    for degrees in (180.0, 90.0, 270.0, 0.0):
+        angle = np.deg2rad(degrees)
+        turn = exp(np.array([0.0, 0.0, angle, 0.0, 0.0, 0.0]))[:3, :3]
+        near = known[rotation_angle(turn.T @ turned[known, :3, :3]) < _NEAR_RAD]
+        middle = np.median(turned[near, :2, 3], axis=0) if len(near) else np.zeros(2)
+        if not degrees:
+            by_squares, middle = _squares_on(record.marks, turned[near, :2, 3])
+            near = near[by_squares]
+        whole = compose(turn, np.array([*middle, 0.0]))
+        if len(near) < (1 if degrees else 2):
+            continue
+        if degrees and not _is_reading(record, whole, edges.lever):
+            continue
+        squares = apart.copy()
+        squares[near] = edges.squares(invert(whole) @ turned[near])
+        (there,), (agrees,) = evidence(squares[None])
+        wrong = near[agrees[near]]
+        if not len(wrong) or squares[agrees].mean() > CLOSING_SCORE**2:
+            continue
+        # The middle is known by these views themselves, in two directions of their six.
+        noise = float(np.sqrt(squares[agrees, 0].mean() / 3.0 + LEAST**2))
+        odds = EVIDENCE * (float(there - base) - 2.0 * float(np.log(2.0 / noise)))
+        odds += MISTAKE - float(np.log(4.0))
+        views = tuple(record.views[record.rows[wrong]].tolist())
+        centre = np.linalg.solve(np.eye(2) - turn[:2, :2], middle) if degrees else middle
+        centre = np.round(1e3 * centre, 2) + 0.0
+        about = ",".join(f"{value:g}" for value in (degrees, *centre.tolist()))
+        point = f"({centre[0]:.1f}, {centre[1]:.1f}) mm"
+        short = f"the board was read turned by {degrees:.0f} deg"
+        where, back = "in its plane, about", "it is turned back"
+        if not degrees:
+            short, where = "the board's corners are numbered some squares on", "by"
+            back = "they have their own numbers"
+        yield Undoing(
+            odds,
+            Finding(
+                "turned_board",
+                f"In {view_words(views)} {short} {where} {point}. They were left out.",
+                mending(back, f"--turned {ranges(views)}:{about}"),
+                views,
+            ),
+            short,
+        )
+
+
+def _is_reading(record: Record, turn: FloatArray, lever: float) -> bool:
+    """Whether a board may be read so: where its corners were numbered, they are others of its own.
+
+    Else its own middle is in the picture. A turn about another place is that of another frame.
+    """
+    if not record.is_numbered:
+        centre = np.linalg.solve(np.eye(2) - turn[:2, :2], turn[:2, 3])
+        return float(np.linalg.norm(centre)) < lever
+    between = np.linalg.norm(record.marks[:, None] - record.marks, axis=2)
+    away = np.linalg.norm(apply(turn, record.marks)[:, None] - record.marks, axis=2)
+    near = 0.2 * float(between[between > 0.0].min(initial=np.inf))
+    return float(away.min(axis=1).max()) < near
+
+
+def _squares_on(marks: FloatArray, shifts: FloatArray) -> tuple[Mask, FloatArray]:
+    """(k,) mask of (k, 2) shifts in a board's plane that are by the same squares, and this shift.
+
+    It brings most of the (n, 3) marks onto others.
+    """
+    between = (marks[:, None] - marks).reshape(-1, 3)[:, :2]
+    steps, counts = np.unique(np.round(between, 6), axis=0, return_counts=True)
+    steps = steps[(counts > 0.5 * len(marks)) & np.any(steps != 0.0, axis=1)]
+    if not len(steps):
+        return np.zeros(len(shifts), dtype=bool), np.zeros(2)
+    near_m = 0.2 * float(np.linalg.norm(steps, axis=1).min())
+    near = np.linalg.norm(shifts[:, None] - steps, axis=2) < near_m
+    most = int(near.sum(axis=0).argmax())
+    return np.asarray(near[:, most]), np.asarray(steps[most])
+
+
+def rows_apart(
+    record: Record, every: list[Edges], pairs: dict[int, IntArray], base: float
+) -> Iterator[Undoing]:
+    """The likeliest rows at an end of the record, or amid it, in which images and poses are apart.
+
+    By rows.
+    """
+    count = len(record.rows)
+    behind = np.arange(count) >= np.arange(count)[:, None]
+    ends = np.concatenate([behind, ~behind[FEWEST_VIEWS:]])
+    orders = [record.paired(order(len(record.views))) for order in ROW_ORDERS.values()]
+    found = list[tuple[float, int, Mask]]()
+    for edges in every:
+        squares = {by: edges.of(pair) for by, pair in pairs.items()}
+        for by in [*pairs][1:]:
+            amid = _apart_amid(record, squares[0], squares[by], by)
+            sides = np.concatenate([ends, amid])
+            mixed = np.where(sides[..., None], squares[by], squares[0])
+            # A pose is of one image: those of rows that stay are their own.
+            first = record.rows[sides.argmax(axis=1), None]
+            last = record.rows[-1 - sides[:, ::-1].argmax(axis=1), None]
+            partnered = sides & (pairs[by] >= first) & (pairs[by] <= last)
+            mixed[sides & ~partnered] = np.inf
+            logs, agrees = evidence(mixed)
+            # Both ends are a free choice.
+            logs[len(ends) :] -= float(np.log(count)) / EVIDENCE
+            # Of several runs that are apart, one at a time explains its own views.
+            explained = np.sum(agrees & partnered, axis=1)
+            explains = explained >= np.maximum(2.0, 0.6 * partnered.sum(axis=1))
+            # A view that no run explains is in none.
+            at = int(np.where(explains, logs - LEAST * sides.sum(axis=1), -np.inf).argmax())
+            if explains[at] and mixed[at][agrees[at]].mean() < CLOSING_SCORE**2:
+                found.append((float(logs[at]), by, sides[at]))
+        # Other orders of the rows are readings of the whole recording.
+        for order in orders:
+            rival = edges.of(order)
+            found.append((float(evidence(rival[None])[0][0]), 0, behind[0]))
+    log, by, side = max(found, key=lambda item: item[0])
+    if not by:
+        return
+    # One row, in all views, is a reading of the whole recording, which is tried of images.
+    if side.all() and abs(by) == 1 and record.shows == "image":
+        return
+    views = record.views[record.rows[side]].tolist()
+    first, last = views[0], views[-1]
+    apart = counted(abs(by), "row")
+    rows = f"{apart} {'later' if by > 0 else 'earlier'}"
+    when = f"From view {first} on" if side[-1] else f"Up to view {last}"
+    when = when if side[-1] or side[0] else f"From view {first} to view {last}"
+    when, left = ("In all views", "") if side.all() else (when, " They were left out.")
+    # A pose is of one image.
+    partners = set(record.rows[side].tolist())
+    both = zip(views, pairs[by][side].tolist(), strict=True)
+    lost = [str(view) for view, pair in both if pair not in partners]
+    dropped = f" No row is left for view {some_of(lost)}." if lost else ""
+    yield Undoing(
+        EVIDENCE * (log - base) + MISTAKE - float(np.log(2.0 * count * len(SHIFTS))),
+        Finding(
+            "shifted_rows",
+            f"{when}, {record.shows}s and poses are {apart} apart: the {record.shows} of each row "
+            f"belongs to the robot's pose {rows}.{left}{dropped}",
+            mending("each has its own pose", f"--shift {first}-{last}:{by}"),
+            tuple(views),
+        ),
+        f"its {record.shows} belongs to the robot's pose {rows}",
+    )
+
+
+def _apart_amid(record: Record, own: FloatArray, other: FloatArray, by: int) -> Mask:
+    """(2, m) the run of views that other poses explain best, and with those whose pose these have.
+
+    Args:
+        record: The record.
+        own: (m, 2) squares by the poses of their own rows.
+        other: The same by those of the rows apart.
+        by: By how many rows.
+    """
+    here, there = (np.where(np.isfinite(at), at, 1.0).sum(axis=1) for at in (own, other))
+    gains = np.log((here + LEAST**2) / (there + LEAST**2))
+    # A view that neither explains ends the run.
+    sums = np.append(0.0, np.cumsum(np.clip(gains, *_CLIPPED) - 1.0))
+    last = int(np.argmax(sums - np.minimum.accumulate(sums)))
+    rows = record.rows[int(np.argmin(sums[: last + 1])) : last]
+    if not len(rows):
+        return np.zeros((2, len(own)), dtype=bool)
+    first, last = rows[0] + np.array([[0], [min(by, 0)]]), rows[-1] + np.array([[0], [max(by, 0)]])
+    return np.asarray((record.rows >= first) & (record.rows <= last))
