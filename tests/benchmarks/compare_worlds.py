@@ -23,8 +23,8 @@ from support.commands import visioncal, write_poses, write_table
 from support.fuzz import mistakes, varied
 from support.paired import Outcome
 
-from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
+from visioncal.robot.workspace import postures
 from visioncal.session.columns import POSE
 from visioncal.simulation import (
     BOARDS,

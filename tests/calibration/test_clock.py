@@ -18,7 +18,6 @@ from visioncal.calibration.stages.pnp import stated_poses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
-from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.effects.rolling_shutter import delayed_points, target_twists
 from visioncal.present.recording import write_recording
 from visioncal.present.report.content import method_facts
@@ -35,6 +34,7 @@ from visioncal.simulation import (
     simulate,
     sweep,
 )
+from visioncal.vision.corners import CornerStack
 from visioncal.vision.targets import numbered_positions
 
 AHEAD_S = 0.0372

@@ -12,9 +12,9 @@ import visioncal
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses
 from visioncal.calibration.stages.error_sizes import error_sizes, solve_session
 from visioncal.core.transforms import invert, log
-from visioncal.estimation.lens_field import LensLevels, displacements
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
+from visioncal.vision.lens_field import LensLevels, displacements
 
 
 def square_of(path, edge):

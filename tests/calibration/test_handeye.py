@@ -24,12 +24,12 @@ from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import fit_problem, solve_problem
 from visioncal.session import Session
 from visioncal.simulation import BOARDS, CAMERAS, CellOptions, measured_poses, project, simulate
 from visioncal.vision.camera import intrinsics
+from visioncal.vision.intrinsics import estimate_intrinsics
 from visioncal.vision.targets import corner_positions, rotations
 
 NOISE = Noise.of_robot(1e-3, 5e-4)

@@ -16,8 +16,8 @@ from visioncal.calibration.run import STAGES, calibrate, run_stages
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert
-from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
+from visioncal.robot.workspace import postures
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
 from visioncal.session.document import InstrumentTable

@@ -37,7 +37,6 @@ from visioncal.estimation.identifiability import (
 from visioncal.estimation.parameters import Parameter
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.estimation.solve import Solution
-from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports import document
 from visioncal.model.arm import sides_of_motion
 from visioncal.planning.information import stop_factors
@@ -46,6 +45,7 @@ from visioncal.results import to_document
 from visioncal.results.arm import FUNCTIONS, ArmLevel, ArmResult
 from visioncal.robot import Loads, Robot, load_robot
 from visioncal.robot.elasticity import WeightFunctions
+from visioncal.robot.workspace import postures
 from visioncal.simulation import CellOptions, Payload, cell_session, simulate
 from visioncal.simulation.arms import forward
 from visioncal.simulation.instrument_session import (

@@ -17,11 +17,11 @@ from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.thermal import inputs_of
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert, log
-from visioncal.estimation.workspace import postures
 from visioncal.present.report.page import render
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.robot.thermal import Heating, Inputs, OnlineCompensator, ThermalModel
+from visioncal.robot.workspace import postures
 from visioncal.session import Session
 from visioncal.session.columns import pose_row
 from visioncal.session.streams import Stream

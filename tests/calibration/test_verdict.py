@@ -30,6 +30,7 @@ from visioncal.calibration.suspects.ranking import MEASURE_BOARD, correcting
 from visioncal.core.codec import read, write
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.quantiles import chi2_limit
+from visioncal.core.tolerance_probability import chance_within, radius_within
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import MOUNTS, Need, Rejection
 from visioncal.core.verdict import (
@@ -47,7 +48,6 @@ from visioncal.core.verdict import (
 )
 from visioncal.estimation.arm import ArmErrors, pose_basis
 from visioncal.estimation.joint import MeasuredScale
-from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.model.effects import Window
 from visioncal.present.report.content import need_facts
 from visioncal.results import Calibration, Rms, to_document

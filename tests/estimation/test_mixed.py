@@ -14,6 +14,7 @@ from support.slopes import jacobian
 from visioncal.calibration.pipeline.arm_results import misfit_covariance
 from visioncal.calibration.run import calibrate
 from visioncal.calibration.stages.pose_errors import find_pose_errors
+from visioncal.core.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
@@ -27,12 +28,7 @@ from visioncal.estimation.arm import (
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.estimation.chain import chain
-from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.field_modes import field_modes
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.gating import gate
-from visioncal.estimation.lens_field import LensLevels, displacements, distances
-from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.mixed import (
     MixedModel,
     PriorInformation,
@@ -40,14 +36,18 @@ from visioncal.estimation.mixed import (
     Units,
     profile_interval,
 )
-from visioncal.estimation.poses import determines_pose
 from visioncal.estimation.problem_parts import ROBOT
 from visioncal.estimation.solve import covariance_of, fit_problem
-from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.robot import load_robot
 from visioncal.simulation import CAMERAS, CellOptions, cell_session, simulate
 from visioncal.vision.camera import intrinsics
+from visioncal.vision.corners import CornerStack, reproject
+from visioncal.vision.field_modes import field_modes
+from visioncal.vision.gating import gate
+from visioncal.vision.lens_field import LensLevels, displacements, distances
+from visioncal.vision.poses import determines_pose
 from visioncal.vision.targets import corner_positions
+from visioncal.vision.viewnoise import weights_by_view
 
 # Sizes: the noise of units, two of their errors, and of two groups of common unknowns, of which one
 # has a share of the other, too.

@@ -13,6 +13,7 @@ from support.problems import ROBOT_SIGMAS, away, observed, pose, swung, true_sta
 from support.slopes import jacobian
 
 from visioncal.core.errors import ConvergenceError
+from visioncal.core.linalg import covariance_from, damped_step, eigenvalue_shares
 from visioncal.core.transforms import adjoint, compose, exp, invert, log
 from visioncal.estimation import joint
 from visioncal.estimation.appearance import SCALE
@@ -22,7 +23,6 @@ from visioncal.estimation.clock import clock_problem
 from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import expected_levels
-from visioncal.estimation.linalg import covariance_from, damped_step, eigenvalue_shares
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import Whitening, normal_equations
 from visioncal.estimation.outliers import distances, inliers_and_moves, refine_inliers
@@ -37,9 +37,9 @@ from visioncal.estimation.solve import (
     solve_problem,
 )
 from visioncal.estimation.steps import find_steps, frames_of
-from visioncal.estimation.trajectory import Trajectory
 from visioncal.fit.consensus import Candidates
 from visioncal.fit.joining import Network
+from visioncal.robot.trajectory import Trajectory
 from visioncal.simulation import CAMERAS, CellOptions, simulate
 from visioncal.verification.model_evidence import (
     CalibrationPosterior,

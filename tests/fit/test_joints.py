@@ -10,13 +10,13 @@ from support.marks import seeds, slow
 from support.wrong_arms import CARRIED, GOOD, SAGGING, WRONG_LINKS, away_m
 
 from visioncal.core.transforms import invert, log
-from visioncal.estimation.workspace import postures
 from visioncal.fit.candidates import effects_of_arms
 from visioncal.fit.linearise import predicted
 from visioncal.fit.solve import solve
 from visioncal.model import Moments, read_cell
 from visioncal.model.effects import Play, Springs, Weight, Zeros
 from visioncal.robot import Loads, Robot, load_robot
+from visioncal.robot.workspace import postures
 from visioncal.simulation import CellOptions, Payload, cell_session, simulate
 from visioncal.simulation.arms import forward
 

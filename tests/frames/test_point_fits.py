@@ -15,11 +15,11 @@ from support.touched import POINTS, TIP, TURN, Job, error_of, relabelled, slippe
 from support.touched import touched as touches_of
 
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.robust import small_sets
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.estimation.points import Groups, Placement, fit_groups
 from visioncal.estimation.problem_parts import Noise
-from visioncal.estimation.robust import small_sets
 from visioncal.frames.group_outliers import distances, find_inlier_groups
 from visioncal.frames.pivot import fit_pivot, tool_problem
 from visioncal.frames.pointfit import PointPairs, fit_features, fit_points, fixture_problem

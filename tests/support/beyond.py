@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.transforms import exp
-from visioncal.estimation.lens_field import displacements
 from visioncal.results import Calibration
 from visioncal.results.lens import LensField
 from visioncal.vision.camera import intrinsics, with_intrinsics
+from visioncal.vision.lens_field import displacements
 
 
 def with_field(calibration: Calibration, seed: int = 0) -> Calibration:

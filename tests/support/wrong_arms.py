@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.transforms import exp, invert
-from visioncal.estimation.workspace import postures
+from visioncal.robot.workspace import postures
 from visioncal.simulation import CAMERAS, CellOptions, Payload
 from visioncal.simulation.boards import centre_m, corners_m
 

@@ -19,12 +19,12 @@ from scipy.linalg import block_diag, cholesky, qr, solve_triangular
 from scipy.special import logsumexp, softmax
 
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import DynamicModel, JointMotion
 from visioncal.dynamics.regression import NoiseBlock
-from visioncal.estimation.linalg import covariance_from
 from visioncal.robot.inertia import Inertias, LogCholesky
 
 # A column is dependent where less than this share of it is left, and has no effect where its norm

@@ -11,7 +11,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows, interpolated
-from visioncal.estimation.trajectory import GAP_RATIO, SHORT_GAP_S
+from visioncal.robot.trajectory import GAP_RATIO, SHORT_GAP_S
 from visioncal.session import Stream, too_far_apart
 
 _NUMBERED = re.compile(r"(q|tau|current|dq)([1-9][0-9]*)_(rad|nm|a|rad_s)", re.ASCII)

@@ -17,16 +17,16 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import block_diag
 
+from visioncal.core.linalg import covariance_from
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
-from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
-from visioncal.estimation.field_modes import FieldModes, field_modes
-from visioncal.estimation.lens_field import Coefficients, LensLevels, breathing_columns, lens_part
-from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import PriorInformation
-from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem_parts import Effect
 from visioncal.vision.camera import intrinsics, with_intrinsics
+from visioncal.vision.corners import CornerStack, WithoutPoses, reproject
+from visioncal.vision.field_modes import FieldModes, field_modes
+from visioncal.vision.lens_field import Coefficients, LensLevels, breathing_columns, lens_part
+from visioncal.vision.poses import fit_poses
 from visioncal.vision.targets import corner_positions
 
 # The effect's name in a problem.

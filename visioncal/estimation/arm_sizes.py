@@ -23,10 +23,10 @@ import numpy as np
 from scipy.linalg import LinAlgError
 from scipy.special import ive
 
+from visioncal.core.linalg import gram
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT, JointFunctions
-from visioncal.estimation.linalg import gram
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedEstimate
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State

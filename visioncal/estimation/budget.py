@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from visioncal.core.linalg import covariance_among, gram
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.linalg import covariance_among, gram
 from visioncal.estimation.normal_equations import Whitening, fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State

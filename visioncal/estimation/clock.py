@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from visioncal.core.linalg import covariance_from, gram
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, evenly
@@ -24,7 +25,6 @@ from visioncal.estimation.clock_correlation import (
     ImageTimes,
 )
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.rolling_shutter import (
     READOUT_SIGMA_S,
@@ -32,13 +32,13 @@ from visioncal.estimation.effects.rolling_shutter import (
     compress_delayed,
     target_twists,
 )
-from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, Effect, State
 from visioncal.estimation.solve import Solution, fit_problem
-from visioncal.estimation.trajectory import Trajectory
+from visioncal.robot.trajectory import Trajectory
+from visioncal.vision.corners import floored_sigma_px
 
 # Frames beyond this multiple of the typical residual are outliers.
 _OUTLYING = 4.0

@@ -10,8 +10,8 @@ import numpy as np
 
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, chosen_rows, evenly
-from visioncal.estimation.corners import CornerStack
-from visioncal.estimation.trajectory import Trajectory
+from visioncal.robot.trajectory import Trajectory
+from visioncal.vision.corners import CornerStack
 
 # Widest offset searched; clocks farther apart are not on one network [s].
 WIDEST_OFFSET_S = 5.0

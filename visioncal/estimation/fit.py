@@ -21,18 +21,18 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.linalg import covariance_among
 from visioncal.core.transforms import adjoint
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
-from visioncal.estimation.lens_field import LensLevels
-from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Linear, Noise, Observations, State
 from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.estimation.tree import Tree
 from visioncal.estimation.unknowns import BOARD, EDGE, LENS, LENS_ERRORS, SIZE, Unknown, Unknowns
+from visioncal.vision.lens_field import LensLevels
 
 
 @dataclass(frozen=True, eq=False)

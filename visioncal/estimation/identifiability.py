@@ -13,10 +13,10 @@ import numpy as np
 from scipy.linalg import svd
 
 from visioncal.core.limits import DETERMINED
+from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armpair import ArmData
-from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.parameters import Parameter
 from visioncal.robot import Robot

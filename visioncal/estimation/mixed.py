@@ -17,9 +17,9 @@ from typing import Protocol, TypeVar
 import numpy as np
 from scipy.linalg import block_diag
 
+from visioncal.core.linalg import NULL_SHARE, covariance_root, gram, inverse_roots, times_root
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import NULL_SHARE, covariance_root, gram, inverse_roots, times_root
 
 # Typical translation to rotation noise of arms and cameras [m/rad]: median, and standard deviation
 # of its logarithm, a factor of five.

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.linalg import NULL_SHARE, gram
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.linalg import NULL_SHARE, gram
 from visioncal.estimation.problem import ANYTHING, Problem
 from visioncal.estimation.problem_parts import Linear, Noise, State
 

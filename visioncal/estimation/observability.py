@@ -9,15 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DegenerateError
 from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.linalg import covariance_among
 from visioncal.core.number_format import counted, figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import edge_names, robot_part
-from visioncal.estimation.corners import floored_sigma_px
-from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
+from visioncal.vision.corners import floored_sigma_px
 
 # Largest predicted sigmas at a typical noise with which stops can calibrate.
 SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))

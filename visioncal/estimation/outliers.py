@@ -17,6 +17,7 @@ import numpy as np
 
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_STOPS
 from visioncal.core.quantiles import FALSE_REJECTION, f_limit
+from visioncal.core.robust import ROUNDS, Distances, half_of, nearest, settled, widened
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import LEVER_M
@@ -34,7 +35,6 @@ from visioncal.estimation.moves import (
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import UNEVEN, Noise, State
-from visioncal.estimation.robust import ROUNDS, Distances, half_of, nearest, settled, widened
 from visioncal.estimation.solve import (
     Solution,
     estimate_noise,

@@ -19,19 +19,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from visioncal.core.transforms import apply_each, exp, skew
-from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
-from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
-from visioncal.estimation.linalg import (
+from visioncal.core.levenberg_marquardt import Linearised, levenberg_marquardt
+from visioncal.core.linalg import (
     NULL_SHARE,
     covariance_from,
     damped_step,
     eigenvalue_shares,
     gram,
 )
+from visioncal.core.robust import ROUNDS
+from visioncal.core.transforms import apply_each, exp, skew
+from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.mixed import LEAST_SIGMA, MOST_SIGMA, MixedModel, PriorInformation, Units
 from visioncal.estimation.robot_likelihood import START_SIGMA
-from visioncal.estimation.robust import ROUNDS
 
 # Fewest points of a frame, and fewest touches of a point.
 FEWEST_POINTS = 3

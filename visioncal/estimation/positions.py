@@ -10,10 +10,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from visioncal.core.procrustes import align
+from visioncal.core.robust import half_of, small_sets, trimmed_start
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.points import Placement, PointProblem, descended
-from visioncal.estimation.procrustes import align
-from visioncal.estimation.robust import half_of, small_sets, trimmed_start
 
 # Stops in a start set: with 30 % of the stops wrong, all sixty sets contain a wrong one with
 # probability 1e-5.

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.linalg import covariance_from
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.appearance import (
     BOARD_NAMES,
@@ -14,9 +15,8 @@ from visioncal.estimation.appearance import (
     shape_slices,
     stated_board_sigma,
 )
-from visioncal.estimation.corners import CornerStack, floored_sigma_px
-from visioncal.estimation.lens_field import LensLevels, row_motions, zooms
-from visioncal.estimation.linalg import covariance_from
+from visioncal.vision.corners import CornerStack, floored_sigma_px
+from visioncal.vision.lens_field import LensLevels, row_motions, zooms
 from visioncal.vision.targets import numbered_positions
 
 # Frame of a single camera.

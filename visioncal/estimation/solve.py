@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.levenberg_marquardt import (
+from visioncal.core.levenberg_marquardt import (
     ITERATIONS,
     NEAR_DAMPING,
     SETTLED,
@@ -16,13 +15,14 @@ from visioncal.estimation.levenberg_marquardt import (
     Linearised,
     levenberg_marquardt,
 )
-from visioncal.estimation.linalg import (
+from visioncal.core.linalg import (
     covariance_among,
     covariance_from,
     damped_step,
     gram,
     squared_lengths,
 )
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.mixed import LEAST_SIGMA
 from visioncal.estimation.normal_equations import Whitening, fisher_information, normal_equations
 from visioncal.estimation.problem import Problem

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.linalg import ROUNDING, covariance_from
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import SIZES_M, TURN_PER_M, rows_of, stops_of
-from visioncal.estimation.linalg import ROUNDING, covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.moves import CREEP, Creep, fitted_change, moved
 from visioncal.estimation.problem import Problem

@@ -10,12 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.limits import FEWEST_COMPARED, FEWEST_VIEWS
+from visioncal.core.linalg import NULL_SHARE, covariance_from, eigenvalue_shares
+from visioncal.core.robust import REFINED, nearest, trimmed_start, trimmed_sum
 from visioncal.core.transforms import adjoint, compose, invert, mean_transform, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
-from visioncal.estimation.linalg import NULL_SHARE, covariance_from, eigenvalue_shares
-from visioncal.estimation.robust import REFINED, nearest, trimmed_start, trimmed_sum
 
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
 # probability (1 - 1/8)^40 = 0.5 %.

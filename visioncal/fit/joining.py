@@ -17,10 +17,10 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS
+from visioncal.core.procrustes import align, spreads
 from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.positions import find_mounting, mounting_problem
-from visioncal.estimation.procrustes import align, spreads
 from visioncal.estimation.tree import PathStep, Tree
 from visioncal.fit.consensus import (
     AGREE_M,

@@ -21,8 +21,6 @@ from visioncal.core.types import (
     Target,
     evenly,
 )
-from visioncal.estimation.intrinsics import estimate_intrinsics
-from visioncal.estimation.poses import closed_form_poses, determines_pose
 from visioncal.fit.consensus import Candidates, distances_m
 from visioncal.fit.joining import Network, Relation
 from visioncal.fit.weights import first_weighed, on_planes
@@ -30,6 +28,8 @@ from visioncal.model import Cell, MeasuredPlace, MeasuredPose
 from visioncal.model.sightings import Evidence
 from visioncal.session.document import CameraTable
 from visioncal.vision.camera import project
+from visioncal.vision.intrinsics import estimate_intrinsics
+from visioncal.vision.poses import closed_form_poses, determines_pose
 from visioncal.vision.targets import corner_positions, first_corners, rotation_transforms, rotations
 
 # Most images of which a lens is estimated.

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 
 from visioncal.core.types import Camera, FloatArray, Mask
-from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.fit.linearise import corner_rows, predicted_sightings
 from visioncal.fit.pairs import Pair
 from visioncal.fit.unknowns import State, Unknowns
 from visioncal.model import Cell
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import corner_positions
+from visioncal.vision.viewnoise import weights_by_view
 
 # Lens and board leave residuals that differ by four within a view, and views differ in noise by two
 # or three: a wrong corner is off by a good part of a square, and wrong views are off by more.

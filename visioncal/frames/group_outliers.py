@@ -5,9 +5,10 @@ from math import comb
 
 import numpy as np
 
+from visioncal.core.linalg import squared_lengths
 from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit, f_limit
+from visioncal.core.robust import Distances, half_of, settled, trimmed_start, widened
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.linalg import squared_lengths
 from visioncal.estimation.points import (
     GroupFit,
     Groups,
@@ -16,7 +17,6 @@ from visioncal.estimation.points import (
     descended,
     fit_groups,
 )
-from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,15 +21,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
+from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import figure
+from visioncal.core.robust import small_sets
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply, apply_each, compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
-from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import Direction, Turning
 from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem
 from visioncal.estimation.problem_parts import Noise
-from visioncal.estimation.robust import small_sets
 from visioncal.frames.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.frames.placing import (
     LEAST_NOISE_M,

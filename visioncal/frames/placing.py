@@ -5,10 +5,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
 from visioncal.estimation.points import GroupFit
 

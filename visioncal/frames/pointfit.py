@@ -19,13 +19,13 @@ from scipy.optimize import linear_sum_assignment
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.number_format import figure, some_of
+from visioncal.core.procrustes import align, spreads
 from visioncal.core.quantiles import FALSE_REJECTION, t_chance
+from visioncal.core.robust import SETS, small_sets
 from visioncal.core.transforms import apply, compose, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem, fit_groups
-from visioncal.estimation.procrustes import align, spreads
-from visioncal.estimation.robust import SETS, small_sets
 from visioncal.frames.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.frames.placing import TOUCH_NOISE_M, check_sides, refuse_poor, worst_of
 

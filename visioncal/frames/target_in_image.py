@@ -8,19 +8,19 @@ from visioncal.calibration.stages.detect import corners_in
 from visioncal.calibration.stages.pnp import ViewPoses, measure_poses
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
+from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Target
 from visioncal.estimation.appearance import SCALE, Appearance, Compressed, compress, shape_basis
-from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.gating import gate
-from visioncal.estimation.lens_field import depths_m, zooms
-from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.poses import determines_pose
 from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.vision.boards import NotFound
 from visioncal.vision.boards.imaging import GREY, poor_image_reason
+from visioncal.vision.corners import CornerStack, reproject
+from visioncal.vision.gating import gate
+from visioncal.vision.lens_field import depths_m, zooms
+from visioncal.vision.poses import determines_pose
 from visioncal.vision.targets import corner_positions, rotations
 
 

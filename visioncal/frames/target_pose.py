@@ -21,12 +21,12 @@ from scipy.linalg import block_diag
 
 from visioncal.core.arguments import check_fields, typed
 from visioncal.core.errors import DataError
+from visioncal.core.linalg import covariance_from, squared_lengths
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.quantiles import FALSE_REJECTION, chi2_limit, f_limit
+from visioncal.core.robust import Distances, nearest, settled, trimmed_sum
 from visioncal.core.transforms import adjoint, compose, exp, invert, log, pose_difference
 from visioncal.core.types import Corners, FloatArray, Image, IntArray, Mask, Target
-from visioncal.estimation.linalg import covariance_from, squared_lengths
-from visioncal.estimation.robust import Distances, nearest, settled, trimmed_sum
 from visioncal.frames.camera_chain import CalibratedCamera, checked_pose
 from visioncal.frames.target_in_image import PoseCandidates, target_pose_candidates
 from visioncal.results import Calibration, Edge

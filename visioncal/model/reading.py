@@ -7,7 +7,6 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
 from visioncal.core.types import Corners, FloatArray
-from visioncal.estimation.poses import FEWEST_CORNERS
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.model.arm import Arm, Moments, Reported, Swept, even_progress
 from visioncal.model.cell import Cell
@@ -20,6 +19,7 @@ from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.session.frames import CELL
 from visioncal.session.kinds import name_of, stated_instrument
 from visioncal.session.table import loads_of
+from visioncal.vision.poses import FEWEST_CORNERS
 
 
 def read_cell(

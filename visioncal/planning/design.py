@@ -16,10 +16,10 @@ import numpy as np
 
 from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
+from visioncal.core.linalg import covariance_root, gram
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.linalg import covariance_root, gram
 from visioncal.planning.information import WEAK_SIGMA, World
 
 # A sigma above this comes from the weak prior alone: no data determine it [rad or m].

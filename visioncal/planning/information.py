@@ -11,6 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
+from visioncal.core.linalg import covariance_from, gram
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -26,18 +27,17 @@ from visioncal.estimation.arm import ArmErrors, link_basis
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel, block_size
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
-from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
-from visioncal.estimation.workspace import postures
 from visioncal.planning.cell import AnyCell, PlanCell, seen_from
 from visioncal.planning.purposes import Purpose
 from visioncal.robot import Robot
+from visioncal.robot.workspace import postures
 from visioncal.vision.camera import project
+from visioncal.vision.corners import CornerStack, floored_sigma_px
 from visioncal.vision.targets import corner_positions, is_seen_in_part
 
 # Number of cells over which a plan is averaged: the guess, and draws from its uncertainty.

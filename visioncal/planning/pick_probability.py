@@ -15,9 +15,9 @@ from scipy.linalg import block_diag
 from visioncal.core.errors import DataError
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent
+from visioncal.core.tolerance_probability import chance_within
 from visioncal.core.transforms import adjoint, compose
 from visioncal.core.types import FloatArray, IntArray, Need
-from visioncal.estimation.tolerance_probability import chance_within
 from visioncal.planning.cell import PlanCell
 from visioncal.planning.information import World
 from visioncal.vision.targets import corner_positions

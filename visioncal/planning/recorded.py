@@ -10,12 +10,12 @@ from visioncal.calibration.stages.cell_fit import CellFit
 from visioncal.calibration.stages.refine import free_parameters_of_camera
 from visioncal.core.conventions import controller_form
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.linalg import covariance_among
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mount, Progress
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise
 from visioncal.estimation.solve import Solution

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.codec import INLINE, Array, Matrix, Section, Vector, WrittenForm
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, CameraKind, FloatArray
-from visioncal.estimation.lens_field import LensLevels, displacements
 from visioncal.results.depth import DepthResult
 from visioncal.results.edge import Covariance, Edge, StoredEdge, StoredPose
 from visioncal.session.document import check_coefficients
 from visioncal.vision.camera import intrinsics, normalise, project_with_jacobian, with_intrinsics
+from visioncal.vision.lens_field import LensLevels, displacements
 
 # Places of p1 and p2 among Brown's intrinsics.
 _DECENTRING = (6, 7)
@@ -35,7 +35,7 @@ class LensField(Section):
     """Displacement field beyond the lens model: `field` of a camera in calibration.json.
 
     A pixel's displacement is linear in m coefficients with unit prior variance, those of the smooth
-    field first, then that of breathing: see `estimation.lens_field`.
+    field first, then that of breathing: see `vision.lens_field`.
     """
 
     field_px: float  # Prior standard deviation of the smooth field, per axis [px].

@@ -10,11 +10,11 @@ from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import TURN_PER_M
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.corners import CornerStack
-from visioncal.estimation.poses import fit_poses
 from visioncal.verification.calibration_prior import CalibrationPrior
 from visioncal.verification.model_evidence import ChangeHypothesis
 from visioncal.verification.prediction import PredictedStops, board_changes
+from visioncal.vision.corners import CornerStack
+from visioncal.vision.poses import fit_poses
 
 CAMERA, LENS, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW, PAIRING = (
     "camera",

@@ -18,8 +18,6 @@ from visioncal.core.types import Corners, FloatArray
 from visioncal.estimation.arm import TURN_PER_M, ArmErrors, link_basis, posture_features
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import chain, robot_part
-from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.poses import determines_pose
 from visioncal.estimation.problem_parts import ROBOT, Effect
 from visioncal.results import Calibration
 from visioncal.verification.calibration_prior import CalibrationPrior
@@ -36,6 +34,8 @@ from visioncal.verification.guard_detector import (
     step,
     weighed,
 )
+from visioncal.vision.corners import CornerStack, reproject
+from visioncal.vision.poses import determines_pose
 from visioncal.vision.targets import first_corners
 
 NONE = "none of these"

@@ -16,8 +16,6 @@ from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray, Progress, Rejection, Target
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.chain import robot_part
-from visioncal.estimation.corners import CornerStack, reproject
-from visioncal.estimation.lens_field import depths_m
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.results import CameraResult
@@ -26,6 +24,8 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.kinds import COLUMN
 from visioncal.verification.calibration_prior import CalibrationPrior
+from visioncal.vision.corners import CornerStack, reproject
+from visioncal.vision.lens_field import depths_m
 from visioncal.vision.targets import numbered_positions, target_document
 
 # Models whose flanges move alike to this [m and rad] are of the same robot: tables have six digits.

@@ -34,12 +34,10 @@ from visioncal.calibration.suspects.outliers import (
 from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import scatter
-from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.joint import BOARD_OR_ARM, between_boards_and_arm
 from visioncal.estimation.moves import Creep, creep_effects
-from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import fit_problem
@@ -47,6 +45,8 @@ from visioncal.estimation.steps import Step
 from visioncal.estimation.unknowns import EDGE, LENS, Unknown
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
 from visioncal.results.sections import ClockResult, Intervals
+from visioncal.vision.corners import CornerStack
+from visioncal.vision.poses import fit_poses
 
 _T = TypeVar("_T")
 

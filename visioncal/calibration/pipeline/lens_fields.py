@@ -3,11 +3,11 @@
 import numpy as np
 
 from visioncal.core.types import Camera, FloatArray
-from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.lens_field import LensLevels, depths_m, displacements
 from visioncal.estimation.unknowns import BOARD, LENS, LENS_ERRORS
 from visioncal.results.lens import LensField
+from visioncal.vision.corners import floored_sigma_px
+from visioncal.vision.lens_field import LensLevels, depths_m, displacements
 
 # Variance of displacements that is negligible beside that of corners; grid points per image axis.
 _NEGLIGIBLE, _GRID = 1e-4, 12

@@ -24,7 +24,6 @@ from visioncal.estimation.identifiability import (
 )
 from visioncal.estimation.one_parameter import FarParameter, far_parameters
 from visioncal.estimation.parameters import Parameter, free_parameters, parameter_moves
-from visioncal.estimation.workspace import postures
 from visioncal.results.arm import (
     ArmParameter,
     ArmResult,
@@ -37,6 +36,7 @@ from visioncal.results.arm import (
 from visioncal.robot import Robot
 from visioncal.robot.conversion import convert_table, parallel_axes, table_of
 from visioncal.robot.tables import DHTable, table_from_document
+from visioncal.robot.workspace import postures
 
 # Number of postures of a map of the accuracy.
 _PLACES = 200

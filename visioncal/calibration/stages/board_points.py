@@ -20,16 +20,16 @@ from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Target, evenly
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.appearance import SCALE, board_basis
-from visioncal.estimation.corners import (
+from visioncal.fit.lens_field import orders_of_waves, waves
+from visioncal.vision.corners import (
     CornerStack,
     Reprojection,
     WithoutPoses,
     mean_square_by_view,
     reproject,
 )
-from visioncal.estimation.lens_field import row_motions, zooms
-from visioncal.estimation.poses import fit_poses
-from visioncal.fit.lens_field import orders_of_waves, waves
+from visioncal.vision.lens_field import row_motions, zooms
+from visioncal.vision.poses import fit_poses
 from visioncal.vision.targets import corner_positions, first_corners
 
 T = TypeVar("T", bound=Observed)

@@ -25,12 +25,12 @@ from visioncal.core.limits import CLEAR_RATIO, CalibrationLimits
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
 from visioncal.core.verdict import Finding, mending
-from visioncal.estimation.intrinsics import Intrinsics, estimate_intrinsics
 from visioncal.results import CameraResult
 from visioncal.results.compare import intrinsics_names
 from visioncal.session import Session, View, frame_name
 from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
+from visioncal.vision.intrinsics import Intrinsics, estimate_intrinsics
 from visioncal.vision.targets import first_corners
 
 T = TypeVar("T", bound=Observed)

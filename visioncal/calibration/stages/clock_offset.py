@@ -14,8 +14,8 @@ from visioncal.core.types import FloatArray, Mask, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.clock import ClockChange, ClockFit
 from visioncal.estimation.clock_correlation import Match
-from visioncal.estimation.trajectory import LONGEST_GAP_S
 from visioncal.results.sections import ClockResult
+from visioncal.robot.trajectory import LONGEST_GAP_S
 from visioncal.session import View, too_far_apart
 
 # Least correlation of turning angles of the same motion; largest sigma of a usable offset [s].

@@ -37,21 +37,19 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.linalg import covariance_from
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.clock import ClockFit, clear_fit, clock_change, fit_offset, fit_readout
 from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
-from visioncal.estimation.corners import CornerStack, floored_sigma_px, reproject
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.rolling_shutter import (
     compress_delayed,
     delayed_points,
     target_twists,
 )
-from visioncal.estimation.intrinsics import estimate_intrinsics
-from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.results import CameraResult
@@ -59,6 +57,8 @@ from visioncal.results.sections import ClockResult
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import is_camera_observation
+from visioncal.vision.corners import CornerStack, floored_sigma_px, reproject
+from visioncal.vision.intrinsics import estimate_intrinsics
 from visioncal.vision.targets import numbered_positions
 
 T = TypeVar("T", bound=Observed)

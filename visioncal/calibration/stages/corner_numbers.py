@@ -17,8 +17,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.types import Corners, FloatArray, Mask, Rejection, Target
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.poses import FEWEST_CORNERS, determines_pose
 from visioncal.session import Session, View
+from visioncal.vision.poses import FEWEST_CORNERS, determines_pose
 from visioncal.vision.targets import corner_positions, otherwise, point_numbers
 
 EXCHANGE_COLUMNS = Remedy(

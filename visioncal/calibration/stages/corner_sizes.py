@@ -13,9 +13,9 @@ from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED, CalibrationLimit
 from visioncal.core.number_format import figure, ranges
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Target
 from visioncal.core.verdict import Finding
-from visioncal.estimation.corners import CornerStack, floored_sigma_px, mean_square_by_view
-from visioncal.estimation.intrinsics import estimate_intrinsics
-from visioncal.estimation.poses import fit_poses, planar_poses
+from visioncal.vision.corners import CornerStack, floored_sigma_px, mean_square_by_view
+from visioncal.vision.intrinsics import estimate_intrinsics
+from visioncal.vision.poses import fit_poses, planar_poses
 from visioncal.vision.targets import numbered_positions
 
 # Sizes of pictures, previews and scaled copies, as shares of the camera's.

@@ -12,8 +12,6 @@ from visioncal.core.number_format import counted
 from visioncal.core.transforms import adjoint, apply, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Mask, chosen_rows
 from visioncal.estimation.appearance import shape_basis
-from visioncal.estimation.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
-from visioncal.estimation.lens_field import depths_m, zooms
 from visioncal.results import Calibration, CameraResult
 from visioncal.results.depth import DepthCamera, bending
 from visioncal.results.evidence import ViewEvidence
@@ -21,6 +19,8 @@ from visioncal.session import Session, View
 from visioncal.session.depth import read_depth
 from visioncal.vision.boards.imaging import decode_image
 from visioncal.vision.camera import normalise, project
+from visioncal.vision.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
+from visioncal.vision.lens_field import depths_m, zooms
 from visioncal.vision.targets import corner_positions
 
 # Cells along the board's longer side in the image, and the fewest pixels of one.

@@ -7,7 +7,6 @@ import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.types import Camera, Corners, FloatArray
-from visioncal.estimation.lens_field import LensLevels, lens_part
 from visioncal.estimation.outliers import EARLY_SHARE
 from visioncal.estimation.scene import BoardSizes
 from visioncal.fit.fit import Fit
@@ -28,6 +27,7 @@ from visioncal.model.effects import (
 )
 from visioncal.session import frame_name
 from visioncal.vision.camera import intrinsics, project
+from visioncal.vision.lens_field import LensLevels, lens_part
 from visioncal.vision.targets import corner_positions, first_corners
 
 

@@ -9,8 +9,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.trajectory import Samples, Trajectory, is_repeated
 from visioncal.robot import Robot
+from visioncal.robot.trajectory import Samples, Trajectory, is_repeated
 from visioncal.session import Session, View
 from visioncal.session.columns import POSE
 

@@ -40,11 +40,11 @@ from visioncal.calibration.stages.validate import HeldOutResiduals
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.quantiles import chi2_limit
+from visioncal.core.tolerance_probability import chance_within, radius_within
 from visioncal.core.transforms import adjoint, apply_each, compose, invert, log
 from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.fit import Closure, Fit
-from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.estimation.unknowns import BOARD, SIZE
 from visioncal.results import NeedMet, Picker
 from visioncal.session.frames import object_name

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.errors import DataError
+from visioncal.core.linalg import covariance_from
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Rejection, Target
-from visioncal.estimation.corners import CornerStack, floored_sigma_px, mean_square_by_view
-from visioncal.estimation.gating import gate
-from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.poses import PoseFit, fit_poses, planar_poses
 from visioncal.fit.consensus import distances_m
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE
+from visioncal.vision.corners import CornerStack, floored_sigma_px, mean_square_by_view
+from visioncal.vision.gating import gate
+from visioncal.vision.poses import PoseFit, fit_poses, planar_poses
 from visioncal.vision.targets import (
     first_corners,
     numbered_positions,

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.limits import FEWEST_STOPS
+from visioncal.core.linalg import ROUNDING, gram
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import ArmErrors, stops_of
-from visioncal.estimation.linalg import ROUNDING, gram
 from visioncal.estimation.mixed import LEAST_SIGMA
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State

@@ -10,8 +10,8 @@ from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted, did_you_mean, some_of
+from visioncal.core.procrustes import align
 from visioncal.core.types import FloatArray, Rejection
-from visioncal.estimation.procrustes import align
 from visioncal.session import Session, View
 from visioncal.session.kinds import (
     Instrument,

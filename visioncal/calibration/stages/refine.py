@@ -11,13 +11,13 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.threads import one_blas_thread
 from visioncal.estimation.appearance import Appearance, LensBoardParameters, compress
-from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import (
     diverging,
     fit_jointly,
     others_of,
 )
+from visioncal.vision.corners import CornerStack, floored_sigma_px
 
 # Prior sigma of a printed board's scale, as a share: prints are scaled to fit a page.
 PRINTED_SCALE = 0.03

@@ -14,12 +14,12 @@ import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.limits import DETERMINED
+from visioncal.core.linalg import covariance_among
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.linalg import covariance_among
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem

@@ -19,7 +19,6 @@ from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation import unknowns
 from visioncal.estimation.fit import Fit
-from visioncal.estimation.intrinsics import estimate_intrinsics
 from visioncal.estimation.joint import moved_mahalanobis_sq
 from visioncal.estimation.scene import ONLY_CAMERA
 from visioncal.model.effects.board_sags import BoardSags
@@ -27,6 +26,7 @@ from visioncal.model.effects.effect import SIGNIFICANT
 from visioncal.model.effects.window import Window, nearer
 from visioncal.results.compare import intrinsics_names
 from visioncal.vision.camera import intrinsics, normalise, project, with_intrinsics
+from visioncal.vision.intrinsics import estimate_intrinsics
 
 # Changes of intrinsics or corners below this show in no image, and in no pick [px].
 _LEAST_MOVE_PX = 0.1

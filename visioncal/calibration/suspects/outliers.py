@@ -13,6 +13,7 @@ from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, listed, mm_and_deg, ranges, some_of, view_words
+from visioncal.core.procrustes import align
 from visioncal.core.transforms import (
     apply,
     compose,
@@ -30,7 +31,6 @@ from visioncal.estimation.moves import creep_effects
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.procrustes import align
 from visioncal.results import Moved
 from visioncal.robot import Robot
 from visioncal.session.frames import frame_name

@@ -13,12 +13,12 @@ from scipy.linalg import block_diag
 
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress, shape_slices
-from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.scene import CornerProblem
 from visioncal.estimation.unknowns import BOARD, LENS
 from visioncal.vision.camera import intrinsics, with_intrinsics
+from visioncal.vision.corners import floored_sigma_px
 
 # The effect's name in a problem.
 LENSES = "lenses and boards"

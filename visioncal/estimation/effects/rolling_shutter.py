@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.transforms import adjoint, apply_each, exp, invert
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.appearance import Compressed, compress_points
-from visioncal.estimation.corners import CornerStack
+from visioncal.vision.corners import CornerStack
 
 # Prior of the readout time of an image, about zero [s].
 READOUT_SIGMA_S = 0.02

@@ -15,12 +15,12 @@ from visioncal.core.files import json_text
 from visioncal.core.number_format import figure, known_name
 from visioncal.core.transforms import log
 from visioncal.dynamics import ArmDynamics, Identified
-from visioncal.estimation.workspace import postures
 from visioncal.interchange.exports.content import Format, Selection, Source
 from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.robot.conversion import parallel_axes, table_of
 from visioncal.robot.tables import DHTable, table_from_document
+from visioncal.robot.workspace import postures
 from visioncal.robot.writing import (
     corrected_tip,
     corrected_urdf,

@@ -22,7 +22,6 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.estimation.trajectory import Trajectory
 from visioncal.interchange.formats.bag_messages import BagContents, BagImages, contents_of
 from visioncal.interchange.formats.foreign import (
     ForeignFormat,
@@ -33,6 +32,7 @@ from visioncal.interchange.formats.foreign import (
 )
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 from visioncal.robot import Robot
+from visioncal.robot.trajectory import Trajectory
 
 _ENDINGS = (".bag", ".mcap", ".db3")
 # Frames of a robot that are preferred where TF has several, by what they are.

@@ -10,7 +10,6 @@ from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
-from visioncal.estimation.trajectory import LONGEST_GAP_S, Samples
 from visioncal.interchange.formats.fields import (
     Fields,
     corners_in,
@@ -51,6 +50,7 @@ from visioncal.interchange.formats.sources import (
 )
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
+from visioncal.robot.trajectory import LONGEST_GAP_S, Samples
 from visioncal.session.columns import INSTRUMENT_POSITION
 
 # Most joints of a gripper that stand behind the arm's in one list.

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.types import Camera, FloatArray, IntArray, evenly
-from visioncal.estimation.lens_field import row_motions
 from visioncal.model.arm import Moments
 from visioncal.model.effects.effect import Effect
+from visioncal.vision.lens_field import row_motions
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.linalg import gram
 from visioncal.core.types import Camera, FloatArray
-from visioncal.estimation.corners import CornerStack
-from visioncal.estimation.field_modes import field_modes
-from visioncal.estimation.linalg import gram
 from visioncal.vision.camera import normalise, project_with_jacobian
+from visioncal.vision.corners import CornerStack
+from visioncal.vision.field_modes import field_modes
 
 # Grid points per axis of the image over which the intrinsics' part is removed, and the relative
 # singular value below which a combination of intrinsics is undetermined there.

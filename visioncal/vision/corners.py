@@ -12,12 +12,12 @@ from typing import Self
 
 import numpy as np
 
+from visioncal.core.linalg import covariance_from, gram
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask, chosen_rows
-from visioncal.estimation.field_modes import FieldModes
-from visioncal.estimation.linalg import covariance_from, gram
-from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.vision.camera import project_with_jacobian
+from visioncal.vision.field_modes import FieldModes
+from visioncal.vision.viewnoise import weights_by_view
 
 # Least ratio of noise to what is stated that counts: the rounding of a statement of one digit.
 _ROUNDED = 1.3

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from visioncal.core.levenberg_marquardt import NEAR_DAMPING, START_DAMPING
+from visioncal.core.linalg import damped_step
 from visioncal.core.transforms import compose, exp, skew
 from visioncal.core.types import Camera, FloatArray, Mask
-from visioncal.estimation.corners import CornerStack, Reprojection, reproject
-from visioncal.estimation.levenberg_marquardt import NEAR_DAMPING, START_DAMPING
-from visioncal.estimation.linalg import damped_step
 from visioncal.vision.camera import normalise
+from visioncal.vision.corners import CornerStack, Reprojection, reproject
 
 # Least points of a homography; relative distance from a line below which points are collinear.
 FEWEST_CORNERS, _ON_LINE = 4, 1e-6

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.corners import CornerStack, mean_square_by_view
-from visioncal.estimation.poses import determines_pose
+from visioncal.vision.corners import CornerStack, mean_square_by_view
+from visioncal.vision.poses import determines_pose
 
 # Views differ in noise by a factor of two or so: eight sigma of all are four of the noisiest. A
 # wrong corner is off by a good part of a square.

@@ -13,17 +13,17 @@ import cv2
 import numpy as np
 
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
+from visioncal.core.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.linalg import covariance_from, damped_step, gram
 from visioncal.core.number_format import counted, percent
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
-from visioncal.estimation.corners import CornerStack, Reprojection, reproject
-from visioncal.estimation.gating import gate
-from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
-from visioncal.estimation.linalg import covariance_from, damped_step, gram
-from visioncal.estimation.poses import planar_poses
 from visioncal.vision.camera import intrinsics, with_intrinsics
+from visioncal.vision.corners import CornerStack, Reprojection, reproject
+from visioncal.vision.gating import gate
+from visioncal.vision.poses import planar_poses
 from visioncal.vision.targets import numbered_positions
 
 # The intrinsics (4 + k,) and the poses (v, 4, 4).
