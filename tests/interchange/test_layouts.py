@@ -21,7 +21,7 @@ from support.urdf_arm import URDF, of_urdf
 from visioncal.calibration.stages import detect
 from visioncal.core.documents import tables
 from visioncal.core.errors import DataError
-from visioncal.interchange.formats import file_search, reading, rereading
+from visioncal.interchange.formats import file_search, reading, settling
 from visioncal.interchange.formats.columns import foreign_from
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.pose_forms import poses_from
@@ -1140,7 +1140,7 @@ def test_an_unknown_folder_is_described_with_the_command_that_takes_it(tmp_path,
 @pytest.mark.parametrize(("names", "pictures"), [("", "{}.png"), ("P", "P{}.png")])
 def test_poses_are_never_paired_by_count_alone(tmp_path, monkeypatch, names, pictures):
     """Poses of another robot beside one picture less: nothing says which one has none."""
-    monkeypatch.setattr(rereading, "_TESTED", (6,))
+    monkeypatch.setattr(settling, "_TESTED", (6,))
     shoot(tmp_path / "in", pictures)
     poses = [np.array(pose) for pose in with_others(1, 1)]
     for at, pose in enumerate(poses):
@@ -1154,6 +1154,22 @@ def test_poses_are_never_paired_by_count_alone(tmp_path, monkeypatch, names, pic
     done = visioncal("convert", tmp_path / "in", tmp_path / "out", *said)
     done.refused("9 images", "11 poses", "neither names nor numbers", "--image-column")
     assert "remove the last" not in done.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_motions_between_poses_are_no_poses(tmp_path, mount):
+    """Of motions, a fit to hand has the camera's place on the flange twice, with a good verdict."""
+    poses, _, session = world()
+    seen = np.array([view.cam_from_target().as_matrix() for view in session.views])
+    robot = np.linalg.inv(poses[:-1]) @ poses[1:]
+    camera = seen[:-1] @ np.linalg.inv(seen[1:])
+    names = [f"{side}_{name}" for side in "AB" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    rows = [[*seven(a), *seven(b)] for a, b in zip(robot, camera, strict=True)]
+    lines = [",".join(names), *(",".join(map(repr, map(float, row))) for row in rows)]
+    write(tmp_path / "motions.csv", "\n".join(lines))
+    done = visioncal("convert", tmp_path / "motions.csv", tmp_path / "out", "--mount", mount)
+    done.refused("motions between two poses", "must be poses", "at each stop")
     assert not (tmp_path / "out").exists()
 
 
@@ -1717,8 +1733,8 @@ def test_images_are_searched_once_where_few_rows_cannot_tell(tmp_path, monkeypat
 
     monkeypatch.setattr(detect, "find_corners", counted)
     # However many readings are tried, and whatever each of them takes.
-    monkeypatch.setattr(rereading, "guess_from_camera_poses", undecided)
-    monkeypatch.setattr(rereading, "_TESTED", (6, 9))
+    monkeypatch.setattr(settling, "guess_from_camera_poses", undecided)
+    monkeypatch.setattr(settling, "_TESTED", (6, 9))
     options = ("--target", tmp_path / "board.toml", "--mount", "eye-in-hand")
     assert visioncal("convert", tmp_path / "in", tmp_path / "out", *options).status == 2
     assert len(searched) == 9

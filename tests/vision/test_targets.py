@@ -313,6 +313,20 @@ def test_records_describe_a_checkerboard(tmp_path, text):
     assert replace(load_target(tmp_path / "board.json"), name=stated.name) == stated
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"board_size": [7, 5], "square_size": 0.03, "marker_size_px": 20}',
+        '{"pattern_size": [4, 11], "pattern_type": "asymmetric_circles", "square_size": 0.02}',
+        '{"board_size": [6, 6], "square_size": 0.02, "tag_size": 0.088}',
+        '{"pattern_size": [9, 6], "square_size": true}',
+    ],
+)
+def test_records_of_other_boards_are_no_checkerboard(tmp_path, text):
+    (tmp_path / "board.json").write_text(text)
+    raised(DataError, "target_type", load_target, tmp_path / "board.json")
+
+
 def test_the_grid_of_a_kalibr_target_in_one_word():
     expected = {"kind": "aprilgrid", "columns": 6, "rows": 5, "size_m": 0.088, "spacing": 0.3}
     assert read_target_description("aprilgrid_6x5_88mm_0.3") == expected

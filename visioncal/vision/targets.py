@@ -104,6 +104,9 @@ _IN_SETTINGS = {
 # Keys of both counts of a checkerboard's inner corners: `chessboard_size`, `pattern_size`.
 _COUNTS = re.compile(r".*(?:chess|checker|pattern|board).*(?:size|shape|corners)", re.IGNORECASE)
 
+# Words of settings of boards that are no checkerboard.
+_NO_CHECKERBOARD = re.compile(r"marker|aruco|tag|dict|circle|charuco", re.IGNORECASE)
+
 
 def _of_settings(stated: Mapping[str, Any]) -> dict[str, Any] | None:
     """The content of a `.toml` of a board by a program's settings; None of others.
@@ -114,7 +117,7 @@ def _of_settings(stated: Mapping[str, Any]) -> dict[str, Any] | None:
     found: dict[str, Any] = {"kind": "charuco"}
     for own, pattern in _IN_SETTINGS.items():
         keys = [key for key in stated if re.fullmatch(pattern, str(key), re.IGNORECASE)]
-        numbers = [key for key in keys if isinstance(stated[key], int | float)]
+        numbers = [key for key in keys if type(stated[key]) in (int, float)]
         keys = numbers if own.endswith("_m") else keys
         if len(keys) == 1:
             value = stated[keys[0]]
@@ -127,7 +130,9 @@ def _of_settings(stated: Mapping[str, Any]) -> dict[str, Any] | None:
         return found
     lists = [value for key, value in stated.items() if _COUNTS.fullmatch(str(key))]
     counts = [each for each in lists if isinstance(each, list) and [*map(type, each)] == [int, int]]
+    words = " ".join(map(str, (*stated, *stated.values())))
     is_plain = found.keys() == {"kind", "square_m"} and len(counts) == 1
+    is_plain = is_plain and _NO_CHECKERBOARD.search(words) is None
     columns, rows = counts[0] if is_plain else (0, 0)
     return {**found, "kind": "checkerboard", "columns": columns, "rows": rows} if columns else None
 

@@ -106,8 +106,13 @@ def _beside_shutter(seen: T, pair: ClockPair, rows: list[View]) -> T:
             break
         if shutter is None or not shutter.is_rolling:
             break
-        free = (at for at in clocked.poses.items() if at[0] not in seen.held_back)
-        at_stamp = {view: pose.corners for view, pose in free if pose.corners is not None}
+        # Beside views at rest, those whose corners were put where they were at the stamp.
+        moving = {row.number for row in rows}
+        at_stamp = {view: corners for view, corners in look.corners.items() if view not in moving}
+        at_stamp |= {
+            view: pose.corners for view, pose in clocked.poses.items() if pose.corners is not None
+        }
+        at_stamp = {view: at for view, at in at_stamp.items() if view not in seen.held_back}
         try:
             fit = estimate_intrinsics(at_stamp, targets, look.resolution, look.table.model)
         except VisioncalError:

@@ -26,7 +26,8 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.core.choices import POSE_FORMS
 from visioncal.core.conventions import PoseNumbers
-from visioncal.core.errors import DataError, DegenerateError, VisioncalError
+from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.transforms import invert, log
 from visioncal.core.types import MOUNTS, IntArray, Progress, Searched, evenly
 from visioncal.interchange.formats.assemble import (
     FileImages,
@@ -45,6 +46,8 @@ _MOVE = (
 )
 # The beginning of the reason where the robot's rotations do not differ, of whatever unit.
 _STILL, _SAME = "the robot does not turn: its rotations are the same", 1e-3
+# Motions turn by more than this [rad], and agree in angle and path along their axis [rad, m rad].
+_TURNING_RAD, _SCREW = 0.05, 0.01
 # Rows by which readings are tested, evenly spread: few first, more where these do not decide. Every
 # third of the more is one of the few, whose images are searched once.
 _TESTED = (12, 34)
@@ -59,9 +62,10 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     Raises:
         DataError: Nothing determines which fields are poses, or a form of rotations that is not
             said; the images show another board than declared, or the camera is mounted otherwise;
-            or the poses of one side serve as both's.
+            or the poses of one side serve as both's, or are motions.
     """
     unstated = frozenset[str]().union(*foreign.unstated.values())
+    _check_motions(foreign)
     is_known = foreign.stream is not None or not (unstated - {"inverse"} or foreign.doubt)
     if is_known or foreign.mount is None:
         return foreign
@@ -113,7 +117,7 @@ def _by_stored_poses(
     if foreign.camera is None or foreign.target is None:
         return None
     stored = replace(foreign, images=(), corners=(), target=None, rivals=())
-    with suppress(DegenerateError):
+    with suppress(VisioncalError):
         found, _ = _tested([(0, stored)], _Seen.of(stored, _TESTED[-1], progress, {}), is_last=True)
         if found is not None:
             note = (
@@ -122,6 +126,38 @@ def _by_stored_poses(
             )
             return replace(found, notes=(*found.notes, note))
     return None
+
+
+def _check_motions(foreign: ForeignRecording) -> None:
+    """Raises DataError where robot and camera have motions between two poses, as in A X = X B.
+
+    One transform makes the one of the other: they turn by the same angle, and as far along their
+    axes. Of poses only those of two frames that are one do so (Chen 1991).
+    """
+    if foreign.camera is None or foreign.stream is not None:
+        return
+    both = [side.poses() for side in (foreign.robot, foreign.camera)]
+    has_both = np.isfinite(both).all(axis=(0, 2, 3))
+    robot, camera = (side[has_both] for side in both)
+    if len(robot) < FEWEST_ROWS:
+        return
+    vectors = np.array([log(side) for side in (robot, camera)])
+    angles = np.linalg.norm(vectors[..., :3], axis=2)
+    # A rotation of so little has no axis.
+    turning = (angles > _TURNING_RAD).all(axis=0)
+    apart = np.ptp(angles, axis=0) + np.ptp(np.sum(vectors[..., :3] * vectors[..., 3:], axis=2), 0)
+    are_one = any(np.median(np.abs(robot - each)) < _SAME for each in (camera, invert(camera)))
+    if turning.sum() < FEWEST_ROWS or are_one or np.median(apart[turning]) > _SCREW:
+        return
+    if float(np.ptp(angles[0, turning])) < 10.0 * _SCREW:
+        return
+    raise DataError(
+        f"{foreign.name}: robot and camera turn by the same angle in each of {len(robot)} rows: "
+        "these are motions between two poses, as A and B of A X = X B, and must be poses.",
+        culprits=[foreign.name],
+        next_step="Give the pose of the flange in the base, and of the target in the camera, at "
+        "each stop, of which the motions were made.",
+    )
 
 
 def _check_sides(foreign: ForeignRecording) -> None:
