@@ -44,6 +44,18 @@ def moved_base(cell, twists):
     return reporting(cell, base_from_flange=exp(twists) @ cell.robot.base_from_flange)
 
 
+def knocked(steps):
+    """A change of cells: their base is elsewhere by shifts (3,), each from a stop on [m]."""
+
+    def change(cell):
+        twists = np.zeros((len(cell.corners), 6))
+        for stop, shift in steps.items():
+            twists[stop:, 3:] += shift
+        return moved_base(cell, twists)
+
+    return change
+
+
 def time_of(cell):
     """(s, 1) from -0.5 to 0.5."""
     return np.linspace(-0.5, 0.5, len(cell.robot.base_from_flange))[:, None]
@@ -405,6 +417,23 @@ WORLDS: dict[str, World] = {
         causes=("moved_at_once",),
         words=(r"The camera moved at once: from view 9 on, it is (\S+) mm",),
         figure=(2.0, 0.3),
+        of=NONE,
+    ),
+    # Which creeps, to one who looks for a single step, and stands between the places otherwise.
+    "knocked twice": World(
+        replace(OPEN, views=26),
+        knocked({8: [1.2e-3, 0.0, 6e-4], 17: [9e-4, 1e-3, 0.0]}),
+        causes=("moved_at_once",),
+        words=("twice: from view 8 on, .* and from view 17 on, .* from where it was in between",),
+        never=GROWING,
+        of=NONE,
+    ),
+    # By five repeatabilities: creep and errors that last explain it nearly as well.
+    "knocked by little": World(
+        replace(OPEN, views=28, robot_sigma_m=8e-5, robot_sigma_rad=1.4e-4),
+        later(15, camera_moved_m=5e-4),
+        causes=("moved_at_once",),
+        words=("The camera moved at once: from view 15 on",),
         of=NONE,
     ),
     "lens zoomed midway": World(

@@ -8,13 +8,14 @@ frames that moved by more than the noise of single observations.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from visioncal.core.limits import FEWEST_VIEWS
 from visioncal.core.linalg import ROUNDING, covariance_from
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
-from visioncal.core.transforms import adjoint, invert
+from visioncal.core.transforms import adjoint, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import SIZES_M, TURN_PER_M, rows_of, stops_of
 from visioncal.estimation.mixed import PriorInformation
@@ -68,6 +69,7 @@ class Step:
     # (p, p) covariance added for it where a fit does not model it: the solution lies between the
     # states before and after, which are equally likely to be needed.
     spread: FloatArray
+    earlier: tuple["Step", ...] = ()  # Of the same frame, beside which it is.
 
     @property
     def kind(self) -> str:
@@ -226,10 +228,13 @@ def find_steps(
 
 
 def with_step(problem: Problem, fit: Solution, step: Step) -> tuple[Problem, Solution]:
-    """The problem with a step from its stop on, and its fit."""
-    effect = step.candidate.effect
+    """The problem with a step from its stop on, and with those before it, and its fit."""
+    effect, frame = step.candidate.effect, step.of
+    for one in step.earlier:
+        problem, fit = with_step(problem, fit, one)
+        frame = [*problem.unknown][-1]
     if effect is None:
-        widened, start, _ = moved(problem, fit, step.of, step.stop, step.value)
+        widened, start, _ = moved(problem, fit, frame, step.stop, step.value)
     else:
         by_sensor, after = effect.by_sensor, problem.observations.stops >= step.stop
         flanges = {name: array.copy() for name, array in effect.flange_jacobian.items()}
@@ -284,6 +289,59 @@ def evidence(problem: Problem, fit: Solution, step: Step) -> tuple[float, Proble
     )
     less = max(float(np.subtract(*(even - uneven))), 0.0)
     return 2.0 * (before - after + prior - less), widened, step_fit
+
+
+def twice(
+    problem: Problem, fit: Solution, step: Step, stepped: tuple[Problem, Solution]
+) -> tuple[Step, Problem, Solution] | None:
+    """A frame's step beside another, of both the later, with the log Bayes factor of both, doubled.
+
+    Each is the likeliest beside the other; None where the rest shows no other.
+
+    Args:
+        problem: The inlier observations.
+        fit: Their converged fit.
+        step: A step of a frame.
+        stepped: The problem with it, and its fit.
+
+    Returns:
+        The step, and the problem with both and its fit.
+    """
+    other = _other(*stepped, step)
+    if other is None:
+        return None
+    again = _other(*with_step(problem, fit, other), step) or step
+    first, last = sorted((again, other), key=lambda one: one.stop)
+    gain, apart, there = evidence(problem, fit, first)
+    frames = [step.of, [*apart.unknown][-1]]
+    beside = replace(last, candidate=replace(last.candidate, of=frames[-1]))
+    more, apart, there = evidence(apart, there, beside)
+    frames.append([*apart.unknown][-1])
+    edges = [there.state.edges[apart.unknown[frame]] for frame in frames]
+    # The fit without them is of one of three states, which are equally likely to be needed.
+    away = np.zeros((3, problem.size))
+    own, all_of = np.array([apart.unknown[name] for name in problem.unknown]), problem.unknown
+    for shift, edge in zip(away, edges, strict=True):
+        now = there.state.edges[own].copy()
+        now[all_of[step.of]] = edge
+        shift[: now.shape[0] * 6] = log(invert(fit.state.edges) @ now).ravel()
+        shift[now.shape[0] * 6 :] = there.state.values - fit.state.values
+    changes = [log(invert(before) @ after) for before, after in pairwise(edges)]
+    both = replace(
+        last,
+        value=changes[1],
+        gain=gain + more,
+        spread=away.T @ away / 3.0,
+        earlier=(replace(first, value=changes[0]),),
+    )
+    return both, apart, there
+
+
+def _other(apart: Problem, there: Solution, step: Step) -> Step | None:
+    """The likeliest step of the same frame, of which a problem has another, as one of its own."""
+    frames = frames_of(apart, [step.of, [*apart.unknown][-1]])
+    found = find_steps(apart, there, frames, kinds=2)
+    return replace(found[0], candidate=step.candidate) if found else None
 
 
 def _log_likelihoods(squares: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """Steps and drifts that the residuals of a fit show."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.solve import Solution, fit_problem
 from visioncal.estimation.steps import (
     DRIFT,
+    FRAME,
     Step,
     drift_of,
     evidence,
@@ -25,6 +26,7 @@ from visioncal.estimation.steps import (
     frames_of,
     joints_of,
     sizes_of,
+    twice,
 )
 from visioncal.estimation.unknowns import BOARD, SIZE
 
@@ -87,7 +89,8 @@ def likely_steps(
 ) -> tuple[Step, ...]:
     """The likeliest step that the residuals show, followed by others about as likely; or a drift.
 
-    The gain of a step is the logarithm, doubled, of its Bayes factor beside the errors of arms.
+    Of a frame that was moved twice it is the later one, with the earlier. Its gain is the
+    logarithm, doubled, of its Bayes factor beside the errors of arms.
 
     Args:
         problem: The inlier observations, with stops in the order of the session.
@@ -106,22 +109,51 @@ def likely_steps(
     found = find_steps(problem, fit, candidates, kinds=2)
     drift = next((step for step in found if step.kind == DRIFT), None)
     penalty = 2.0 * float(np.log(len(problem.unknown) * (1 + problem.observations.stops.max())))
-    likely = []
+    likely = list[_Weighed]()
     for step in found[:_MOST_FITTED]:
-        if step.kind == DRIFT or (drift is not None and step.gain - penalty < drift.gain):
+        if step.kind == DRIFT:
             continue
         gain, apart, there = evidence(problem, fit, step)
-        # A change that errors of an arm, correlated by posture or time, explain as well is none.
-        for robot, arm in errors.items():
-            beside = find_pose_errors(apart, there.state, there.noise, robot)
-            gain += (beside.gain if beside else 0.0) - arm.gain
-        likely.append(replace(step, gain=gain - penalty))
-    likely.sort(key=lambda step: -step.gain)
-    # The kind of an arm's errors is known less well than their presence.
-    needed = 3.0 * _CLEARLY if any(arm.is_significant for arm in errors.values()) else _CLEARLY
-    if likely and likely[0].gain > needed:
-        least = max(needed, likely[0].gain - _CLEARLY)
-        return tuple(step for step in likely if step.gain > least)
+        alone = _weighed(replace(step, gain=gain - penalty), apart, there, errors)
+        both = twice(problem, fit, step, (apart, there)) if step.kind == FRAME else None
+        if both is not None and (drift is None or both[0].gain - 2.0 * penalty > drift.gain):
+            second = replace(both[0], gain=both[0].gain - 2.0 * penalty)
+            of_both = _weighed(second, *both[1:], errors)
+            if of_both.step.gain - alone.step.gain > _CLEARLY:
+                likely.append(of_both)
+                continue
+        if drift is None or step.gain - penalty >= drift.gain:
+            likely.append(alone)
+    clear = sorted(
+        (one.step for one in likely if one.step.gain > one.needed), key=lambda step: -step.gain
+    )
+    if clear:
+        return tuple(step for step in clear if step.gain > clear[0].gain - _CLEARLY)
     if drift is None or (drift.of in errors and drift.gain < errors[drift.of].gain):
         return ()
     return (drift,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighed:
+    """A step with its gain beside the errors of arms."""
+
+    step: Step
+    needed: float  # Its gain, at least, to be clear.
+
+
+def _weighed(
+    step: Step, apart: Problem, there: Solution, errors: Mapping[str, ArmErrors]
+) -> _Weighed:
+    """A step by the fit with it: one that errors of arms explain as well is none."""
+    gain, needed = step.gain, _CLEARLY
+    for robot, arm in errors.items():
+        beside = find_pose_errors(apart, there.state, there.noise, robot)
+        gain += (beside.gain if beside else 0.0) - arm.gain
+        # A frame's step takes six values, and errors that it leaves are others. Of a board's size,
+        # or of a joint, they may be what seems to change.
+        left = beside if step.kind == FRAME else arm
+        if left is not None and left.is_significant:
+            # The kind of an arm's errors is known less well than their presence.
+            needed = 3.0 * _CLEARLY
+    return _Weighed(replace(step, gain=gain), needed)

@@ -94,7 +94,13 @@ def _words(step: Step, run: RunState) -> str:
     on_flange = (mount == "eye-in-hand") == step.of.startswith("cam")
     # Things beside a robot move relative to its base.
     of_base = "" if mount is None or on_flange else ", or the robot's base,"
-    words = f"{thing}{of_base} moved at once: {when}, it is {moved} from where it was{source}"
+    words, since = f"{thing}{of_base} moved at once: ", "it was"
+    for one in step.earlier:
+        by = mm_and_deg(*pose_difference(np.eye(4), exp(one.value)))
+        words = f"{thing}{of_base} moved at once, twice: "
+        words += f"{run.cell_fit.cell.start_words(one.stop)}, it is {by} from where it was, and "
+        since = "it was in between"
+    words += f"{when}, it is {moved} from where {since}{source}"
     if run.cell_fit.may_be_of_arms(exp(step.value)):
         words += OTHER_POSTURE
     if mount is not None and far_mm > _LIMITS.arm_errors[0]:
