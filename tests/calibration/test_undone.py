@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -20,14 +21,19 @@ from support.refusals import raised
 from support.whole_cells import OPTIONS, recorded
 
 import visioncal
+from visioncal.calibration.pipeline import mended_images
 from visioncal.calibration.pipeline.explaining import explained
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
+from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
+from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import ranges
 from visioncal.core.transforms import compose, exp, invert
+from visioncal.core.types import Camera
+from visioncal.core.verdict import Finding
 from visioncal.interchange.formats.mending import remove_tool, shift_views, turn_boards
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
@@ -110,7 +116,7 @@ def flipped(robot, boards, some=(0, 2, 10, 14, 15, 20)):
     return robot, boards
 
 
-def corners_of(mount):
+def corners_of(mount, distortion=None):
     """Poses of the flange, and each view's corners of a board, all in the image of a lens."""
     boards = poses_of(mount)[1]
     boards[:, :2, 3] = 0.3 * boards[:, :2, 3] - 0.1
@@ -119,7 +125,7 @@ def corners_of(mount):
     matrix = np.array([[1100.0, 0.0, 655.0], [0.0, 1100.0, 471.0], [0.0, 0.0, 1.0]])
     rng, seen = np.random.default_rng(2), []
     for pose in boards:
-        px = cv2.projectPoints(POINTS, *split(pose), matrix, None)[0][:, 0]
+        px = cv2.projectPoints(POINTS, *split(pose), matrix, distortion)[0][:, 0]
         seen.append((np.arange(len(POINTS)), px + rng.normal(0, 0.1, px.shape)))
     return robot if mount == "eye-in-hand" else invert(robot), seen
 
@@ -501,7 +507,6 @@ def test_corners_that_are_numbered_a_column_on_get_their_own_numbers(tmp_path, m
     assert not {"turned_board", "lost_views"} & {one.kind for one in mended.verdict.causes}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "some"), [(0.5, range(9, 15)), slow(0.75, range(14, 24)), slow(0.5, [2, 7, 11])]
 )
@@ -511,8 +516,7 @@ def test_corners_of_smaller_pictures_are_scaled_by_the_printed_command(
     monkeypatch.chdir(tmp_path)
     robot, seen = corners_of(MOUNTS[0])
     sound = visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
-    for view in some:
-        seen[view] = (seen[view][0], share * (seen[view][1] + 0.5) - 0.5)
+    seen = scaled_at(some, share, seen)
     Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]).save(tmp_path / "cell")
     cause, mended = followed("cell")
     assert cause.kind == "image_sizes"
@@ -521,6 +525,78 @@ def test_corners_of_smaller_pictures_are_scaled_by_the_printed_command(
     for name, edge in sound.edges.items():
         # Their noise is as much larger as they were smaller.
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
+
+
+def scaled_at(views, share, seen):
+    """The corners, and those of some views as if they were of smaller pictures."""
+    return [
+        (ids, share * (px + 0.5) - 0.5 if view in views else px)
+        for view, (ids, px) in enumerate(seen)
+    ]
+
+
+@pytest.mark.parametrize("focal", [1100.0, slow(1140.0)])
+def test_a_wrong_stated_lens_makes_no_smaller_pictures(focal):
+    """Its misfit is as large with corners that are scaled."""
+    lens = Camera("brown", SIZE, np.array([focal, focal, 655.0, 471.0]), np.zeros(5))
+    robot, seen = corners_of(MOUNTS[0], np.array([-0.12, 0.05, 0.0, 0.0, 0.0]))
+    session = Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0], camera=lens)
+    found = visioncal.calibrate(session)
+    assert "image_sizes" not in {each.kind for each in found.verdict.causes}
+
+
+def test_sizes_that_are_no_listed_share_are_not_named():
+    """800 x 600 px of 1280 x 960: neither 0.6 nor 2/3 of it."""
+    robot, seen = corners_of(MOUNTS[0])
+    seen = scaled_at(range(14, 22), 0.625, seen)
+    found = visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
+    assert "image_sizes" not in {each.kind for each in found.verdict.causes}
+
+
+def test_the_noise_of_scaled_corners_is_scaled_with_them():
+    robot, seen = corners_of(MOUNTS[0])
+    seen = scaled_at(range(9, 15), 0.5, seen)
+    session = Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0])
+    table = session.corner_table
+    table = replace(table, sigmas_px=np.full(len(table), 0.1))
+    mended = mended_images.mend_images(session.with_content(corners=table)).corner_table
+    own = np.isin(mended.views, [*range(9, 15)])
+    np.testing.assert_allclose(mended.sigmas_px, np.where(own, 0.2, 0.1))
+
+
+@pytest.mark.parametrize("views", [1, 24])
+def test_stated_lenses_without_usable_corners_have_nothing_to_mend(views):
+    lens = Camera("brown", SIZE, np.array([1100.0, 1100.0, 655.0, 471.0]), np.zeros(5))
+    robot, seen = corners_of(MOUNTS[0])
+    few = [(ids[:3], px[:3]) for ids, px in seen[:views]]
+    for some in (few, seen[:1]):
+        poses = robot[: len(some)]
+        session = Session.from_corners(some, poses, BOARD, SIZE, mount=MOUNTS[0], camera=lens)
+        raised(DataError, "nothing was written", mended_images.mend_images, session)
+
+
+def test_corners_numbered_from_behind_are_not_exchanged_by_half_a_pixel():
+    robot, seen = corners_of(MOUNTS[0])
+    order = np.argsort(np.lexsort((POINTS[:, 0], -POINTS[:, 1])))
+    inside = [(px > 0).all(axis=1) & (px < SIZE[1]).all(axis=1) for _, px in seen]
+    seen = [(order[ids[at]], px[at]) for (ids, px), at in zip(seen, inside, strict=True)]
+    seen[0][1][np.argmax(seen[0][1][:, 1]), 1] = SIZE[1] + 0.5
+    session = Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0])
+    (cause, *_) = visioncal.calibrate(session).verdict.causes
+    assert cause.kind == "corner_numbers"
+    assert "seen from behind" in cause.words
+    raised(DataError, "nothing was written", mended_images.mend_images, session)
+
+
+def test_exchanged_columns_of_one_camera_of_several_are_exchanged_back_alone(monkeypatch):
+    robot, seen = corners_of(MOUNTS[0])
+    session = Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0])
+    error = OtherBoardError.of(Finding("corner_numbers", "Exchanged.", EXCHANGE_COLUMNS, (3, 4)))
+    stage = Mock(side_effect=error.within("cam_left"))
+    monkeypatch.setattr(mended_images, "run_stages", stage)
+    table, mended = session.corner_table, mended_images.mend_images(session).corner_table
+    own = np.isin(table.views, [3, 4])[:, None]
+    np.testing.assert_array_equal(mended.px, np.where(own, table.px[:, ::-1], table.px))
 
 
 @pytest.mark.parametrize("beyond", [True, slow(False)])
@@ -544,6 +620,7 @@ def test_exchanged_columns_of_corners_are_exchanged_back_by_the_printed_command(
         np.testing.assert_allclose(edge.matrix, sound.edges[name].matrix, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_pictures_that_are_turned_from_a_view_on_are_no_other_camera(mount):
     robot, boards = poses_of(mount)

@@ -1,7 +1,7 @@
 """A session's images as its camera took them: mirrored and turned back, positive, of one size."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import PurePath
@@ -14,7 +14,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.cameras import exchanged_columns
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
-from visioncal.calibration.stages.corner_sizes import scaled_px, scaled_views
+from visioncal.calibration.stages.corner_sizes import scaled_px
 from visioncal.calibration.stages.detect import is_scaled
 from visioncal.calibration.stages.other_board import LOOKED_AT_LAST, OtherBoardError, spread
 from visioncal.calibration.suspects.undoing import likeliest, undone
@@ -26,6 +26,8 @@ from visioncal.session.corners import CornerTable
 from visioncal.vision.boards.identify import identify
 from visioncal.vision.boards.imaging import decode_image, encode_png, exif_turn, grey_of
 
+# Note that is not followed by a mirroring: that would undo half of it.
+_EXCHANGED = "u_px and v_px of the corners"
 # Turns back by quarters, counterclockwise, in words.
 _TURNED = {1: "turned back by a quarter", 2: "turned by a half", 3: "turned on by a quarter"}
 
@@ -122,8 +124,12 @@ def _turned(state: RunState | None, views: Sequence[View]) -> dict[str, int]:
 
 def _is_mirrored(state: RunState | None) -> bool:
     """Whether robot and camera agree only with one of them mirrored."""
+    if state is None or any(
+        note.startswith(_EXCHANGED) for note in state.session.declaration.corrected
+    ):
+        return False
     with suppress(VisioncalError):
-        if state is not None and state.mount is not None:
+        if state.mount is not None:
             guess = guess_from_camera_poses(state)
             return guess.stands_out and guess.best.hypothesis.robot.mirrored
     return False
@@ -135,32 +141,36 @@ def _with_mended_corners(session: Session) -> Session | None:
     if table is None:
         return None
     try:
-        found = run_stages(RunState(session), [each for each in STAGES if each.name == "detect"])
+        names = {"detect", "intrinsics", "pnp"}
+        found = run_stages(RunState(session), [each for each in STAGES if each.name in names])
     except OtherBoardError as error:
-        is_exchanged = error.finding is not None and error.finding.do == EXCHANGE_COLUMNS
-        return _exchanged_back(session) if is_exchanged else None
+        finding = error.finding
+        is_exchanged = finding is not None and finding.do == EXCHANGE_COLUMNS
+        return _exchanged_back(session, finding.views) if finding and is_exchanged else None
     except VisioncalError:
         return None
-    px, notes, targets = table.px.copy(), list[str](), tuple(session.boards.values())
-    for look in found.cameras.values():
-        lens = look.table.model if look.table.stated is None else look.table.stated
-        if look.resolution is None:
-            continue
-        if scaled := scaled_views(look.corners, targets, look.resolution, lens):
-            own = np.isin(table.views, scaled.views)
-            px[own] = scaled_px(px[own], 1.0 / scaled.share)
-            notes.append(
-                f"the corners of view {ranges(scaled.views)} were scaled by {1.0 / scaled.share:g}"
-            )
-    return _with_corners(session, replace(table, px=px), notes) if notes else None
+    px, notes = table.px.copy(), list[str]()
+    sigmas_px = None if table.sigmas_px is None else table.sigmas_px.copy()
+    for share in dict.fromkeys(found.shares.values()):
+        views = [view for view, of in found.shares.items() if of == share]
+        own = np.isin(table.views, views)
+        px[own] = scaled_px(px[own], 1.0 / share)
+        if sigmas_px is not None:
+            sigmas_px[own] /= share
+        notes.append(f"the corners of view {ranges(views)} were scaled by {1.0 / share:g}")
+    mended = replace(table, px=px, sigmas_px=sigmas_px)
+    return _with_corners(session, mended, notes) if notes else None
 
 
-def _exchanged_back(session: Session) -> Session:
-    """The session with u and v of its corners exchanged."""
+def _exchanged_back(session: Session, views: Collection[int]) -> Session:
+    """The session with u and v of the corners of some views exchanged."""
     corners = session.corner_table
     if corners is not None:
-        corners = replace(corners, px=corners.px[:, ::-1].copy())
-    return _with_corners(session, corners, ["u_px and v_px of all corners were exchanged"])
+        own = np.isin(corners.views, [*views])
+        px = np.where(own[:, None], corners.px[:, ::-1], corners.px)
+        corners = replace(corners, px=px)
+    notes = [f"{_EXCHANGED} of view {ranges(views)} were exchanged"]
+    return _with_corners(session, corners, notes)
 
 
 def _with_corners(session: Session, corners: CornerTable | None, notes: Sequence[str]) -> Session:
@@ -180,7 +190,7 @@ def _mirrored_back(session: Session, state: RunState | None) -> Session:
         DataError: It has corners of pictures of unknown width.
     """
     if state is not None and exchanged_columns(state):
-        return _exchanged_back(session)
+        return _exchanged_back(session, [view.number for view in session.views if view.has_corners])
     corners = session.corner_table
     if corners is None and not any(view.image for view in session.views):
         raise DataError(

@@ -7,8 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.calibration.stages.corner_numbers import are_exchanged
-from visioncal.calibration.stages.corner_sizes import scaled_views
+from visioncal.calibration.stages.corner_numbers import are_exchanged, are_from_behind
+from visioncal.calibration.stages.corner_sizes import rms_px, scaled_views
 from visioncal.calibration.stages.detect import (
     Detections,
     detect,
@@ -229,26 +229,31 @@ def _of_one_size(
 ) -> tuple[T, Mapping[int, Corners]]:
     """The run and some of its corners, without those of corners.csv of pictures of another size.
 
-    These are looked for where a fit of all rejects views, or views scatter unequally.
+    These are looked for where views scatter unequally about the lens of the fit, or the stated one.
     """
     look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
-    lens = look.table.model if look.table.stated is None else look.table.stated
     if seen.session.corner_table is None or look.resolution is None:
         return seen, corners
     by_all = fit.camera if isinstance(fit, Intrinsics) else look.table.stated
     if by_all is None:
-        # Of the estimated lens, they were found before.
+        # They were found as the lens was estimated.
         return seen, corners
-    scaled = scaled_views(corners, targets, look.resolution, lens, by_all)
+    given = [view.number for view in seen.session.views if view.has_corners]
+    scaled = scaled_views(corners, targets, look.resolution, by_all, given)
     if scaled is None:
         return seen, corners
     why = "its corners are those of a smaller picture"
-    seen = seen.noting((Rejection(view, why) for view in scaled.views), (scaled.finding,))
+    finding = scaled.finding.of(frame if len(seen.session.cameras) > 1 else "")
+    seen = seen.noting((Rejection(view, why) for view in scaled.views), (finding,))
+    seen = replace(seen, shares={**seen.shares, **dict.fromkeys(scaled.views, scaled.share)})
     return seen, {view: at for view, at in corners.items() if view not in scaled.views}
 
 
 def exchanged_columns(seen: Observed) -> bool:
-    """Whether u and v are exchanged in the corners.csv of one camera, as its lens shows."""
+    """Whether u and v are exchanged in the corners.csv of one camera, as its lens shows.
+
+    An estimated lens shows it by its centre, a stated one by the corners' misfit.
+    """
     boards = seen.session.boards
     if seen.session.corner_table is None or len(seen.cameras) != 1:
         return False
@@ -257,7 +262,17 @@ def exchanged_columns(seen: Observed) -> bool:
     both = [(look.corners[view.number], boards[seen.session.board_of(view)]) for view in views]
     if look.lens is None or look.resolution is None or len(boards) != 1:
         return False
-    return are_exchanged(both, look.resolution, look.lens.camera.matrix[2:])
+    if look.lens.estimated:
+        return are_exchanged(both, look.resolution, look.lens.camera.matrix[2:])
+    if not both or not are_from_behind(both):
+        return False
+    as_given = {at.view: at for at, _ in both}
+    turned = {view: replace(at, px=at.px[:, ::-1]) for view, at in as_given.items()}
+    given_px, turned_px = (
+        float(np.median(rms_px(some, tuple(boards.values()), look.lens.camera)))
+        for some in (as_given, turned)
+    )
+    return CLEAR_RATIO * turned_px < given_px
 
 
 def _by_motion(seen: Observed, frame: str, error: VisioncalError) -> CameraResult:
@@ -296,7 +311,7 @@ def locate_targets(seen: T) -> T:
             if len(alike) < len(fitted):
                 fit = estimate_poses(alike, targets, lens.camera, free)
         if fit.sigma_px > CalibrationLimits().pixel_px[0] and not lens.estimated:
-            other = _other_lens(look, targets, fitted, fit.sigma_px)
+            other = _other_lens(look, targets, alike, fit.sigma_px)
             if other is not None:
                 lens, fit, finding = other
                 seen = seen.noting((), (finding.of(of),))

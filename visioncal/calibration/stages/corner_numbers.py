@@ -32,6 +32,9 @@ _MOST_LEFT = 0.3
 _LIKE, _MOST_COUNT = 0.05, 41
 # Distance outside the image from which on corners are none, as a share of its size.
 _OUTSIDE = 0.1
+# Distance outside the image that neither noise nor the half pixel of another origin explains [px],
+# and the least share of a view's corners so far out.
+_WELL_OUTSIDE_PX, _LEAST_OUTSIDE = 5.0, 0.05
 
 
 def usable_corners(
@@ -93,15 +96,19 @@ def are_exchanged(
 ) -> bool:
     """Whether u and v of corners are exchanged.
 
-    Boards are seen from behind, and beyond the (width, height) of the picture unless exchanged; or
-    all are within it, and the (2,) centre of the lens is in the picture's middle when exchanged.
+    Boards are seen from behind, and in most views well beyond the (width, height) of the picture
+    unless exchanged; or the (2,) centre of the lens is in the picture's middle when exchanged.
     """
     size = np.array(resolution, dtype=float)
     px = np.concatenate([np.zeros((0, 2)), *(at.px for at, _ in views)])
     if (px[:, ::-1] > size).any() or not are_from_behind(views):
         return False
-    if centre_px is None or (px > size).any():
-        return bool((px > size).any())
+    outside = [(at.px > size + _WELL_OUTSIDE_PX).any(axis=1).mean() for at, _ in views]
+    if np.median(outside) > _LEAST_OUTSIDE:
+        # Width and height that are exchanged themselves are an upright picture's, and look alike.
+        return bool(size[0] > size[1])
+    if centre_px is None:
+        return False
     here, there = (np.linalg.norm(at - size / 2) for at in (centre_px, centre_px[::-1]))
     return bool(CLEAR_RATIO * there < here)
 

@@ -1,20 +1,21 @@
 """Corners of some views that another program found in pictures of another size."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 
+import cv2
 import numpy as np
 
 from visioncal.calibration.stages.other_board import MADE_ALIKE
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED, CalibrationLimits
-from visioncal.core.number_format import figure, ranges
+from visioncal.core.number_format import figure, view_words
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Target
 from visioncal.core.verdict import Finding
 from visioncal.vision.corners import CornerStack, floored_sigma_px, mean_square_by_view
-from visioncal.vision.intrinsics import estimate_intrinsics
+from visioncal.vision.intrinsics import Intrinsics, estimate_intrinsics
 from visioncal.vision.poses import fit_poses, planar_poses
 from visioncal.vision.targets import numbered_positions
 
@@ -24,6 +25,12 @@ _SHARES = (1 / 5, 1 / 4, 1 / 3, 2 / 5, 1 / 2, 3 / 5, 2 / 3, 3 / 4, 4 / 5)
 _CLEAR_CHI2 = 36.0
 # Views of one lens and one board scatter by less than so many times those that fit best.
 _UNEVEN = 2.0
+# Ratio of misfits from which on a single view is clearly of another size.
+_CLEAR_ALONE = 5.0
+# Most error of a share, 3 sigma of it: usual sizes beside the listed ones (5/8) are 4 % off.
+_MOST_OFF = 0.015
+# Step by which a share's cost is differentiated.
+_STEP = 0.005
 
 
 @dataclass(frozen=True)
@@ -39,38 +46,36 @@ def scaled_views(
     corners: Mapping[int, Corners],
     targets: Sequence[Target],
     resolution: tuple[int, int],
-    lens: Camera | CameraKind,
-    fitted: Camera | None = None,
+    fitted: Camera,
+    among: Collection[int],
 ) -> ScaledViews | None:
     """Finds views whose corners are those of smaller pictures than the others'.
 
-    Such corners all lie in the upper left part of the picture. By the lens of the other views they
-    fit a pose of the board only once they are scaled, about the outer corner of the first pixel.
+    Such corners all lie in the upper left part of the picture. By a lens that is estimated from
+    the other views they fit a pose of the board only once they are scaled, about the outer corner
+    of the first pixel. A stated lens may be wrong, which scaling of some views hides.
 
     Args:
         corners: The corners by view.
         targets: The targets; the corners of several are numbered through.
         resolution: (width, height) of the camera's pictures [px].
-        lens: The stated intrinsics, or the model by which they are estimated.
-        fitted: Intrinsics by all views, under which unequal noise of views makes the search due;
-            None to search anyway.
+        fitted: Intrinsics as stated or by all views, under which unequal noise of views makes the
+            search due.
+        among: Views that may be of another size.
 
     Returns:
-        The views that the likeliest share explains; None where no share explains any.
+        The views that the likeliest share explains; None where no share clearly explains any.
     """
-    by_all = lens if isinstance(lens, Camera) else fitted
-    if by_all is not None:
-        levels_px = _rms_px(corners, targets, by_all)
-        least_px = float(np.quantile(levels_px, 0.25))
-        if fitted is not None and levels_px.max() < _UNEVEN * least_px:
-            return None
+    if not corners:
+        return None
+    levels_px = rms_px(corners, targets, fitted)
+    if levels_px.max() < _UNEVEN * float(np.quantile(levels_px, 0.25)):
+        return None
 
     @cache
-    def lens_of(views: frozenset[int]) -> tuple[Camera, float] | None:
-        if isinstance(lens, Camera):
-            return lens, floored_sigma_px(least_px)
+    def lens_of(views: frozenset[int]) -> Intrinsics | None:
         some = {view: at for view, at in corners.items() if view in views}
-        return _lens_of(some, targets, resolution, lens)
+        return _lens_of(some, targets, resolution, fitted.model)
 
     every, found = [*corners], list[ScaledViews]()
     ends = {frozenset(every[: len(every) // 2]), frozenset(every[len(every) // 2 :])}
@@ -79,36 +84,66 @@ def scaled_views(
         small = {view: at for view, at in corners.items() if (at.px < box).all()}
         # Where all are small, the views of one end may be of one size.
         beyond = frozenset(every).difference(small)
+        small = {view: at for view, at in small.items() if view in among}
         for views in {beyond} if len(beyond) >= FEWEST_COMPARED else ends:
-            if small and (known := lens_of(views)) is not None:
-                found += _scaled_by(*known, small, targets, share)
+            if small and len(views) >= FEWEST_COMPARED and (known := lens_of(views)) is not None:
+                found += _scaled_by(known, small, targets, share)
     return max(found, key=lambda each: len(each.views), default=None)
 
 
 def _scaled_by(
-    lens: Camera,
-    sigma_px: float,
-    corners: Mapping[int, Corners],
-    targets: Sequence[Target],
-    share: float,
+    known: Intrinsics, corners: Mapping[int, Corners], targets: Sequence[Target], share: float
 ) -> Iterator[ScaledViews]:
-    """The views whose corners fit a lens of some noise once their pictures are the camera's."""
-    given, scaled = (_rms_px(corners, targets, lens, by) for by in (1.0, 1.0 / share))
+    """The views whose corners clearly fit a lens once their pictures are the camera's."""
+    lens, sigma_px = known.camera, floored_sigma_px(known.sigma_px)
+    given, scaled = (rms_px(corners, targets, lens, by) for by in (1.0, 1.0 / share))
     # By the noise of a corner in its own picture.
     own, counts = share * scaled, np.array([len(at.ids) for at in corners.values()])
-    fits = (own < CLEAR_RATIO * sigma_px) & (
-        2.0 * counts * (given**2 - own**2) > _CLEAR_CHI2 * sigma_px**2
+    is_known = np.isfinite(given) & np.isfinite(scaled)
+    excess = np.subtract(given**2, own**2, out=np.zeros(len(given)), where=is_known)
+    fits = is_known & (own < _UNEVEN * sigma_px) & (given > _UNEVEN * scaled)
+    fits &= 2.0 * counts * excess > _CLEAR_CHI2 * sigma_px**2
+    # Clear views determine the share, by which less clear ones are of it, too.
+    clear = fits & (given > (CLEAR_RATIO if fits.sum() > 1 else _CLEAR_ALONE) * scaled)
+    numbers = np.array([*corners])
+    chosen = {view: corners[view] for view in numbers[clear].tolist()}
+    if not chosen or not _is_share(known, chosen, targets, share):
+        return
+    views = tuple(numbers[fits].tolist())
+    size = lens.resolution
+    width, height = (round(share * side) for side in size)
+    words = (
+        f"In {view_words(views)}, the corners of corners.csv are those of pictures of {width} x "
+        f"{height} px, where the camera's are {size[0]} x {size[1]}: scaled to these, they fit a "
+        f"pose of the board to {figure(float(np.median(scaled[fits])))} px, and to "
+        f"{figure(float(np.median(given[fits])))} px as they are. They were left out."
     )
-    if fits.any():
-        views, size = tuple(np.array([*corners])[fits].tolist()), lens.resolution
-        width, height = (round(share * side) for side in size)
-        words = (
-            f"In view {ranges(views)} the corners of corners.csv are those of pictures of {width} "
-            f"x {height} px, where the camera's are {size[0]} x {size[1]}: scaled to these, they "
-            f"fit a pose of the board to {figure(float(np.median(scaled[fits])))} px, and to "
-            f"{figure(float(np.median(given[fits])))} px as they are. They were left out."
-        )
-        yield ScaledViews(views, share, Finding("image_sizes", words, MADE_ALIKE, views))
+    yield ScaledViews(views, share, Finding("image_sizes", words, MADE_ALIKE, views))
+
+
+def _is_share(
+    known: Intrinsics, corners: Mapping[int, Corners], targets: Sequence[Target], share: float
+) -> bool:
+    """Whether the one share that explains views best is this one, and is known well enough.
+
+    It is by least squares, with the curvature of three costs. The lens adds its own error: corners
+    of a share fit a lens of another focal length and centre that are as much smaller.
+    """
+    counts = np.array([len(at.ids) for at in corners.values()])
+    shares = share * (1.0 + _STEP * np.array([-1.0, 0.0, 1.0]))
+    costs = [
+        2.0 * float(counts @ (each * rms_px(corners, targets, known.camera, 1.0 / each)) ** 2)
+        for each in shares
+    ]
+    curvature = costs[0] - 2.0 * costs[1] + costs[2]
+    if not np.isfinite(curvature) or curvature <= 0.0:
+        return False
+    off = 0.5 * _STEP * (costs[0] - costs[2]) / curvature
+    sigma_px = floored_sigma_px(known.sigma_px)
+    of_corners = _STEP * sigma_px * np.sqrt(2.0 / curvature)
+    of_lens = np.sqrt(np.diag(known.covariance)[:4]) / known.camera.matrix
+    most = 3.0 * float(np.hypot(of_corners, of_lens.max()))
+    return bool(abs(off) < most < _MOST_OFF)
 
 
 def scaled_px(px: FloatArray, factor: float) -> FloatArray:
@@ -121,16 +156,17 @@ def _lens_of(
     targets: Sequence[Target],
     resolution: tuple[int, int],
     model: CameraKind,
-) -> tuple[Camera, float] | None:
-    """The lens of some views, and their noise [px]; None where they determine none."""
-    with suppress(VisioncalError):
+) -> Intrinsics | None:
+    """The lens of some views; None where they determine none."""
+    # OpenCV refuses views of nearly one line.
+    with suppress(VisioncalError, cv2.error):
         fit = estimate_intrinsics(corners, targets, resolution, model)
         if fit.sigma_px < CalibrationLimits().pixel_px[0]:
-            return fit.camera, floored_sigma_px(fit.sigma_px)
+            return fit
     return None
 
 
-def _rms_px(
+def rms_px(
     corners: Mapping[int, Corners], targets: Sequence[Target], lens: Camera, factor: float = 1.0
 ) -> FloatArray:
     """(v,) rms residuals of a coordinate [px] of views whose corners are scaled."""

@@ -61,6 +61,8 @@ class Observed:
     # How robots' poses are misread, so that they determine nothing of lenses and boards; None where
     # this was not sought.
     misread: tuple[Finding, ...] | None = None
+    # Sizes of pictures of views in corners.csv, as shares of the camera's, where they are others.
+    shares: Mapping[int, float] = field(default_factory=dict)
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""

@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Self
 
 import cv2
 import numpy as np
@@ -48,10 +49,16 @@ class OtherBoardError(DataError):
     finding: Finding | None = None
 
     @classmethod
-    def of(cls, finding: Finding) -> "OtherBoardError":
+    def of(cls, finding: Finding) -> Self:
         """The error of a finding."""
         error = cls(finding.words, next_step=str(finding.do or ""))
         error.finding = finding
+        return error
+
+    def within(self, label: str) -> Self:
+        """The same error and finding, with its message prefixed by a file or frame, once."""
+        error = super().within(label)
+        error.finding = self.finding
         return error
 
 

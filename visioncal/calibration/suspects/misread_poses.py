@@ -173,9 +173,7 @@ def _misread_poses(run: RunState) -> Iterator[Finding]:
             step = _MIRRORED if run.cameras else replace(_MIRRORED, command="")
         if robot.mirrored and exchanged_columns(run):
             step = EXCHANGE_COLUMNS
-            words = (
-                f"In corners.csv, u_px and v_px are exchanged, as the lens's centre shows. {words}"
-            )
+            words = f"In corners.csv, u_px and v_px are exchanged, as the lens shows. {words}"
         yield Finding("misread_poses", words, step)
     elif guess.is_open:
         step = Remedy(_WHICH)
