@@ -419,7 +419,7 @@ WORLDS: dict[str, World] = {
         figure=(2.0, 0.3),
         of=NONE,
     ),
-    # Which creeps, to one who looks for a single step, and stands between the places otherwise.
+    # By a single step it seems to creep, and it stands between the places otherwise.
     "knocked twice": World(
         replace(OPEN, views=26),
         knocked({8: [1.2e-3, 0.0, 6e-4], 17: [9e-4, 1e-3, 0.0]}),

@@ -15,6 +15,8 @@ from visioncal.core.types import FloatArray
 FALSE_ALARM = 1e-4
 # Probability that noise alone rejects a row, of all that are compared, or an order of points.
 FALSE_REJECTION = 1e-3
+# Standard deviation of normal noise, as a multiple of its median absolute deviation.
+SIGMA_PER_MAD = 1.4826
 
 
 def chi2_limit(chance: npt.ArrayLike, freedom: npt.ArrayLike) -> FloatArray:

@@ -131,11 +131,14 @@ def joint_words(joint: int, robot: Robot) -> str:
     return f"joint {joint + 1} ({robot.joint_names[joint]})"
 
 
+def is_linear_zero(parameter: Parameter, robot: Robot) -> bool:
+    """Whether a parameter is where a linear axis counts from, as d is along it."""
+    return parameter.kind == "d" and bool(robot.chain.prismatic[parameter.joint])
+
+
 def parameter_words(parameter: Parameter, robot: Robot) -> str:
     """A parameter of an arm's table by its kind and joint."""
-    # Along a linear axis d is where it counts from.
-    is_zero = parameter.kind == "d" and bool(robot.chain.prismatic[parameter.joint])
-    words = "zero" if is_zero else _WORDS[parameter.kind]
+    words = "zero" if is_linear_zero(parameter, robot) else _WORDS[parameter.kind]
     return f"the {words} of {joint_words(parameter.joint, robot)}"
 
 

@@ -9,6 +9,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, read_text_inside
 from visioncal.session.images import IMAGE_ENDINGS
 
+# Files of other programs that may hold images, too.
+_HOLDING_IMAGES = (".bag", ".mcap", ".db3", ".parquet", ".npz", ".mp4", ".zdf")
+
 
 def session_text(path: Path) -> str:
     """Content of a folder's session.toml.
@@ -45,17 +48,14 @@ def session_text(path: Path) -> str:
         raise DataError(message, culprits=error.culprits, next_step=step) from error
 
 
-# Files of other programs that may hold images, too.
-_HOLDING_IMAGES = (".bag", ".mcap", ".db3", ".parquet", ".npz", ".mp4", ".zdf")
-
-
 def _conversion_of(path: Path) -> str:
     """Advice for pictures and poses that are no session yet: a folder of both, or either alone."""
     named = path.parent if path.suffix.lower() in IMAGE_ENDINGS else path
     named = named if named.name.strip(".") else named.resolve()
     made = shlex.quote(f"{named.with_suffix('') if named.is_file() else named}-session")
     what, source, images = "A folder's pictures and poses", shlex.quote(str(named)), ""
-    by, board = "the name of their board (instead of charuco_9x6_30mm) and ", "charuco_9x6_30mm"
+    by = "the name of their board (instead of charuco_9x6_30mm) and "
+    board = " --target charuco_9x6_30mm"
     endings = {file.suffix.lower() for file in islice(named.rglob("*.*"), 999) if file.is_file()}
     if named.is_file():
         what, images = "A table of poses and a folder of pictures", " --images PICTURES"
@@ -65,8 +65,7 @@ def _conversion_of(path: Path) -> str:
     elif endings and endings.isdisjoint((*IMAGE_ENDINGS, *_HOLDING_IMAGES)):
         what, by, board = "A folder's poses of robot and target", "", ""
     return (
-        f"{what} become a session by {by}"
-        "the camera's mount (eye-to-hand where it is fixed). Run: visioncal convert "
-        f"{source} {made}{images}{f' --target {board}' if board else ''} --mount eye-in-hand && "
+        f"{what} become a session by {by}the camera's mount (eye-to-hand where it is fixed). Run: "
+        f"visioncal convert {source} {made}{images}{board} --mount eye-in-hand && "
         f"visioncal doctor {made}"
     )

@@ -105,7 +105,7 @@ _IN_SETTINGS = {
 _COUNTS = re.compile(r".*(?:chess|checker|pattern|board).*(?:size|shape|corners)", re.IGNORECASE)
 
 # Words of settings of boards that are no checkerboard.
-_NO_CHECKERBOARD = re.compile(r"marker|aruco|tag|dict|circle|charuco", re.IGNORECASE)
+_NO_CHECKERBOARD = re.compile(r"marker|aruco|tag|dict|circle", re.IGNORECASE)
 
 
 def _of_settings(stated: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -17,6 +17,7 @@ from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.identifiability import (
     Identifiability,
     Jacobians,
+    is_linear_zero,
     joint_words,
     observability_indices,
     parameter_words,
@@ -224,7 +225,7 @@ def _off(parameter: Parameter, found: FarParameter, table: DHTable, robot: Robot
     stated, size = parameter.value(table), abs(found.change)
     if parameter.kind == "ratio":
         by = f"is off by {figure(100.0 * size)} % (sigma {figure(100.0 * found.sigma)} %)"
-    elif parameter.is_length and parameter_words(parameter, robot).startswith("the zero"):
+    elif is_linear_zero(parameter, robot):
         by = f"is off by {figure(1e3 * size)} mm (sigma {figure(1e3 * found.sigma)} mm)"
     elif parameter.is_length:
         longer = "longer" if abs(stated + found.change) > abs(stated) else "shorter"

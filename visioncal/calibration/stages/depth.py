@@ -18,14 +18,13 @@ from scipy.optimize import least_squares, nnls
 from visioncal.calibration.stages.depth_cells import (
     FEWEST_CELLS,
     GATE,
-    SIGMA_PER_MAD,
     Cells,
     Sensor,
 )
 from visioncal.core.errors import DataError
 from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import counted, figure, view_words
-from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
+from visioncal.core.quantiles import FALSE_ALARM, SIGMA_PER_MAD, chi2_limit
 from visioncal.core.transforms import apply
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import DEPTH_CHANGED, NOTE, Finding, Remedy

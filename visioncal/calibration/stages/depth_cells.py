@@ -9,6 +9,7 @@ from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted
+from visioncal.core.quantiles import SIGMA_PER_MAD
 from visioncal.core.transforms import adjoint, apply, invert
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Mask, chosen_rows
 from visioncal.estimation.appearance import shape_basis
@@ -32,8 +33,6 @@ _PIXELS = 60_000
 # Deviation from the median, in its robust standard deviations, from which a cell is of something
 # else, and the greatest curvature of depth over a board, as a share of its distance.
 GATE, _BENT = 4.0, 0.008
-# Robust standard deviation of a median absolute deviation.
-SIGMA_PER_MAD = 1.4826
 # Of a pose's right perturbation, what moves its plane: turns about x and y, and z.
 _OF_PLANE = [0, 1, 5]
 

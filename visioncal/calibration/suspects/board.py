@@ -12,7 +12,7 @@ from visioncal.calibration.suspects.lens import has_changed
 from visioncal.calibration.suspects.suspect import Suspect
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure, ranges
-from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
+from visioncal.core.quantiles import FALSE_ALARM, SIGMA_PER_MAD, chi2_limit
 from visioncal.core.transforms import invert
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.core.verdict import NOTE, Finding, Remedy
@@ -75,7 +75,7 @@ def _of_prints(run: RunState) -> Iterator[Finding]:
         if len(sizes) < _FEWEST_DRAWN or not np.isfinite(sizes).all():
             continue
         size = float(np.median(sizes))
-        sigma = float(1.4826 * np.median(np.abs(sizes - size)) / len(sizes) ** 0.5)
+        sigma = float(SIGMA_PER_MAD * np.median(np.abs(sizes - size)) / len(sizes) ** 0.5)
         off = abs(size - target.diameter_m)
         least = _INK * target.diameter_m + float(np.median([_eroded_m(at, target) for at in seen]))
         if off > max(CONTRADICTION * sigma, least):

@@ -14,6 +14,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from visioncal.core.quantiles import SIGMA_PER_MAD
 from visioncal.core.transforms import skew
 from visioncal.core.types import Camera, FloatArray, Image
 from visioncal.vision.register.image_model import (
@@ -250,7 +251,7 @@ class Fitter:
         taken = look.weights > 0
         if taken.sum() < _FEWEST:
             return look
-        noise = max(1.4826 * float(np.median(np.abs(look.residuals[taken]))), _LEAST_NOISE)
+        noise = max(SIGMA_PER_MAD * float(np.median(np.abs(look.residuals[taken]))), _LEAST_NOISE)
         known = noise**2 + (self.misfit * float(np.median(look.gain))) ** 2
         allowed = 4 * known + slack_px**2 * np.sum(look.by_px**2, axis=0)
         side = (5, 5) if self.level.factor > 2 else (7, 7)
