@@ -62,7 +62,8 @@ def test_what_was_acknowledged_is_there_once(tmp_path, count):
     path, notes = tmp_path / SITE_FILE, [tmp_path / f"notes {at}" for at in range(8)]
 
     def started(at, most):
-        process = FORK.Process(target=writer, args=(path, 100_000 * at, most, notes[at]))
+        numbers = (100_000 * at, most)
+        process = FORK.Process(target=writer, args=(path, *numbers, notes[at]), daemon=True)
         process.start()
         return process
 
@@ -71,6 +72,7 @@ def test_what_was_acknowledged_is_there_once(tmp_path, count):
     for at, process in victims.items():
         # An identity and the line's end are 17 characters.
         while not notes[at].exists() or notes[at].stat().st_size < 17 * (count // 4):
+            assert process.is_alive(), "A writer failed; its error is printed above."
             time.sleep(0.002)
         process.kill()
         process.join()

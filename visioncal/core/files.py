@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from stat import S_ISREG
 from typing import Any, BinaryIO
 
 from visioncal.core.errors import DataError
@@ -231,7 +232,18 @@ def check_journal(database: Path) -> None:
     SQLite follows links to a database, and looks for its journal there. Raises DataError.
     """
     journal = Path(f"{database.resolve()}-journal")
-    end = read_bytes(journal)[-8:] if journal.is_file() else b""
-    if end == bytes.fromhex("d9d505f920a163d7") or (journal.exists() and not journal.is_file()):
+    try:
+        is_regular, end = S_ISREG(journal.stat().st_mode), b""
+        if is_regular:
+            with journal.open("rb") as file:
+                file.seek(max(0, file.seek(0, os.SEEK_END) - 8))
+                end = file.read()
+    except (FileNotFoundError, NotADirectoryError):
+        # There is none, or another process has ended its transaction meanwhile.
+        return
+    except OSError as error:
+        why = f"{journal} cannot be read: {error.strerror or error}."
+        raise DataError(why, culprits=[str(journal)]) from error
+    if end == bytes.fromhex("d9d505f920a163d7") or not is_regular:
         why = f"{journal} is not of visioncal: it names a file, which SQLite would delete."
         raise DataError(why, culprits=[str(journal)], next_step="Remove it, and what it came with.")

@@ -332,7 +332,11 @@ class History:
 
     def _bring_forward(self, file: sqlite3.Connection) -> None:
         """Brings a new file, or one of an older version, into the present form."""
-        if self._version(file) < len(_FORMS):
+        # One state of the file, which others may be creating.
+        file.execute("BEGIN")
+        version = self._version(file)
+        file.execute("COMMIT")
+        if version < len(_FORMS):
             file.execute("BEGIN IMMEDIATE")
             # Another process may have been quicker.
             for statements in _FORMS[self._version(file) :]:
@@ -343,7 +347,6 @@ class History:
             file.execute("COMMIT")
 
     def _version(self, file: sqlite3.Connection) -> int:
-        # In this order: another process that creates it meanwhile has then set the last, too.
         names = ("schema_version", "user_version", "application_id")
         tables, version, application = (
             int(file.execute(f"PRAGMA {name}").fetchone()[0]) for name in names
