@@ -1005,6 +1005,17 @@ def named_with_clouds(folder):
     table_of(folder)
 
 
+def arrays_each(folder):
+    """An array of the pose and one of the joint angles a picture, called as no depth picture is."""
+    shoot(folder, "{}.png")
+    angles = np.random.default_rng(0).uniform(-2, 2, (9, 7))
+    for at, (pose, joints) in enumerate(
+        zip(angles_of("xyz", unit=1, degrees=False), angles, strict=True)
+    ):
+        np.save(folder / f"{at}_xyzrpy.npy", pose)
+        np.save(folder / f"{at}_angles.npy", joints)
+
+
 def axis_first(folder):
     """Names that begin with the axis, sorted by these."""
     keys = ["x_pos", "y_pos", "z_pos", "x_rot", "y_rot", "z_rot", "w_rot"]
@@ -1050,7 +1061,7 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         job, within_braces, elements, nested_elements, sections,
         headings_in_turn, lines_of_lost_pictures, lines_of_few_pictures, letters_of_a_lost_picture,
         letters_of_a_picture_too_many, lines_before_the_first_picture, urscript_with_a_start,
-        named_with_depth, named_with_clouds, axis_first, two_of_a_day,
+        named_with_depth, named_with_clouds, arrays_each, axis_first, two_of_a_day,
     )
 }  # fmt: skip
 
@@ -1096,6 +1107,8 @@ def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
         assert session.images.read(session.views[1].depth).startswith(b"\x89PNG")
         assert "The depth #.png (9 files) is of the same images" in done.err
         assert "Left aside, as rows differ in their shape: joints" in done.err
+    assert make is not arrays_each or len(session.views[0].joints_rad) == 7
+    assert make is not arrays_each or "depth" not in done.err
     if make is two_folders:
         assert "frame_#.png (9 files), Debug/rgb/frame_#_corners.png (9 files)" in done.err
     if make in (named_with_depth, named_with_clouds):

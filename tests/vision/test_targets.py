@@ -289,6 +289,8 @@ def test_kalibrs_own_file_describes_a_board(tmp_path):
         "num_X: 9\nnum_Y: 6\nlen_squares: 0.04\nlen_markers: 0.035\nmarkers_dictionary: 2\n",
         "board_squaresX: 9\nboard_squaresY: 6\nboard_square_size: 40\nboard_marker_size: 35.0\n"
         "aruco_dictionary: DICT_4X4_250\nanimate: false\n",
+        "name: ChArUco\nparameters: {width: 9, height: 6, square_size: 0.04, marker_size: 0.035, "
+        "dictionary_id: 2}\ncamera: {width: 640, height: 480}\n",
     ],
 )
 def test_the_settings_of_a_program_describe_a_charuco_board(tmp_path, text):
@@ -305,6 +307,8 @@ def test_the_settings_of_a_program_describe_a_charuco_board(tmp_path, text):
     [
         '[{"view": 1, "chessboard_size": [11, 8], "square_size_mm": 20, "pose": null}]',
         '{"trial": "a", "pattern_size": [11, 8], "chessboard_square_size": 0.02}',
+        '{"pattern": "plain chessboard", "parameters": '
+        '{"width": 11, "height": 8, "square_size": 0.02}}',
     ],
 )
 def test_records_describe_a_checkerboard(tmp_path, text):
@@ -320,6 +324,7 @@ def test_records_describe_a_checkerboard(tmp_path, text):
         '{"pattern_size": [4, 11], "pattern_type": "asymmetric_circles", "square_size": 0.02}',
         '{"board_size": [6, 6], "square_size": 0.02, "tag_size": 0.088}',
         '{"pattern_size": [9, 6], "square_size": true}',
+        '{"note": "no chessboard", "width": 640, "height": 480, "square_size": 0.02}',
     ],
 )
 def test_records_of_other_boards_are_no_checkerboard(tmp_path, text):

@@ -106,17 +106,22 @@ _COUNTS = re.compile(r".*(?:chess|checker|pattern|board).*(?:size|shape|corners)
 
 # Words of settings of boards that are no checkerboard.
 _NO_CHECKERBOARD = re.compile(r"marker|aruco|tag|dict|circle", re.IGNORECASE)
+_CHECKERBOARD = re.compile(r"chess|checker", re.IGNORECASE)
+# Counts that no other key has; the width and height of a picture are larger.
+_BY_SIZE, _MOST_COUNTED = {"columns": "width", "rows": "height"}, 100
 
 
 def _of_settings(stated: Mapping[str, Any]) -> dict[str, Any] | None:
     """The content of a `.toml` of a board by a program's settings; None of others.
 
     Lengths are in metres, from one on in millimetres; a number is a dictionary of OpenCV's. A
-    checkerboard has its counts in a list, and neither markers nor a dictionary.
+    checkerboard has its counts in a list or is called one, and has neither markers nor a
+    dictionary.
     """
     found: dict[str, Any] = {"kind": "charuco"}
     for own, pattern in _IN_SETTINGS.items():
         keys = [key for key in stated if re.fullmatch(pattern, str(key), re.IGNORECASE)]
+        keys = keys or [key for key in stated if str(key).lower() == _BY_SIZE.get(own)]
         numbers = [key for key in keys if type(stated[key]) in (int, float)]
         keys = numbers if own.endswith("_m") else keys
         if len(keys) == 1:
@@ -125,12 +130,15 @@ def _of_settings(stated: Mapping[str, Any]) -> dict[str, Any] | None:
                 value = value if value < 1.0 else value / 1e3
             if own == "dictionary" and isinstance(value, int):
                 value = dictionary_numbered(value)
-            found[own] = value
+            if own not in ("columns", "rows") or (type(value) is int and value < _MOST_COUNTED):
+                found[own] = value
     if len(found) > len(_IN_SETTINGS):
         return found
     lists = [value for key, value in stated.items() if _COUNTS.fullmatch(str(key))]
     counts = [each for each in lists if isinstance(each, list) and [*map(type, each)] == [int, int]]
     words = " ".join(map(str, (*stated, *stated.values())))
+    if _CHECKERBOARD.search(words) and found.keys() >= {"columns", "rows"}:
+        counts.append([found.pop("columns"), found.pop("rows")])
     is_plain = found.keys() == {"kind", "square_m"} and len(counts) == 1
     is_plain = is_plain and _NO_CHECKERBOARD.search(words) is None
     columns, rows = counts[0] if is_plain else (0, 0)
@@ -148,10 +156,20 @@ def _of_kalibr(path: Path) -> dict[str, Any]:
     stated = read_yaml(path)
     # Records of views, each with its board.
     stated = stated[0] if isinstance(stated, list) and stated else stated
-    settings = _of_settings(stated) if isinstance(stated, Mapping) else None
+    whole = stated if isinstance(stated, Mapping) else {}
+    # The board's may stand below a name, as `parameters`.
+    below = ({**whole, **each} for each in whole.values() if isinstance(each, Mapping))
+    settings = next(filter(None, map(_of_settings, (whole, *below))), None)
     if settings is not None:
         return settings
-    table = DocumentTable(stated if isinstance(stated, Mapping) else {}, str(path))
+    table = DocumentTable(whole, str(path))
+    if "target_type" not in table.content:
+        raise DataError(
+            f"{path} describes no board: it must have its counts and lengths, as columns, rows and "
+            "square_size (of a ChArUco marker_size and dictionary, too), or Kalibr's target_type.",
+            culprits=[str(path)],
+            next_step="Describe the board in a word instead: --target checkerboard_9x6_23.6mm.",
+        )
     kind = table.choice("target_type", ("aprilgrid", "checkerboard"))
     if kind == "aprilgrid":
         keys = {"columns": "tagCols", "rows": "tagRows", "size_m": "tagSize"}

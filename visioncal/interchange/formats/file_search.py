@@ -28,6 +28,8 @@ _NO_DATA = (
 # Folders below a source that are looked through, and the most files in all; a source of more files
 # than a recording in folders has, such as a disk, is looked through less deep.
 _DEPTH, _FEW_FILES, _LESS_DEEP, _MOST_FILES = 8, 5_000, 3, 100_000
+# Bytes of a file that is too small for a cloud or a depth picture.
+_LEAST_OF_CLOUD = 1_000
 # Words of pictures that a program drew: they are no camera's where there are others.
 DRAWN = re.compile(
     r"result|overlay|detect|corner|annot|draw|debug|visual|vis(?![a-z])|axes|axis|mask|plot|"
@@ -109,8 +111,9 @@ class FileGroup:
 
     @property
     def is_clouds(self) -> bool:
-        """Whether they are clouds by their names."""
-        return len(self.files) > 1 and self.label.lower().endswith(CLOUD_ENDINGS)
+        """Whether they are clouds by their names and size: an array of a pose has few numbers."""
+        is_named = len(self.files) > 1 and self.label.lower().endswith(CLOUD_ENDINGS)
+        return is_named and self.files[0].stat().st_size > _LEAST_OF_CLOUD
 
     def taken(self, rows: IntArray) -> tuple[Path | None, ...]:
         """The files of some rows; None of -1."""

@@ -19,6 +19,8 @@ _JOINT_NAME = re.compile(
     r"((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*(?:deg|rad|[°º])[a-z]*\W*)?)",
     re.IGNORECASE,
 )
+# Three angles may be a rotation.
+_ANGLES = re.compile(r"(?:.*[._])?angles")
 # Universal Robots' names, which ROS writes in the order of the alphabet.
 _OF_UR = (
     *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
@@ -39,12 +41,16 @@ def joint_names(
         return columns
     if columns := _joints_called(fields, taken, known):
         return columns
+    plain = {name: without_unit(name)[0].lower() for name in fields.numbers}
     lists = [
         name
         for name, numbers in fields.numbers.items()
         if numbers.ndim > 1
         and name not in taken
-        and _JOINTS.fullmatch(without_unit(name)[0].lower())
+        and (
+            _JOINTS.fullmatch(plain[name])
+            or (numbers[0].size > 4 and _ANGLES.fullmatch(plain[name]))
+        )
     ]
     if len(lists) == 1:
         return (lists[0],)
