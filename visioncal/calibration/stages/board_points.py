@@ -46,7 +46,9 @@ _WAVES = 6.0
 _WRONG = 5.0
 # Chance by which a sound board has a corner that scatters too much, and what does no harm [px].
 _UNSTEADY, _LEAST_PX = 1e-6, 0.1
-_ROUNDS = 12
+# Most rounds of the weights of corners, and the change below which they have converged: one of a
+# hundredth of their noise.
+_ROUNDS, _CONVERGED = 12, 0.01
 # Combinations of what is smooth that corners show by less than this share of the most are none.
 _SHOWN = 1e-5
 # Noise beside what moves in single views, over that without, above which nothing does.
@@ -206,7 +208,9 @@ def _point_errors(
         ratios, scatter = _scatter(stack, left / stack.given_weights[:, None], len(positions))
         if ratios.max() < chi2_limit(0.1 / len(ratios), 2 * views) / (2 * views):
             break
-        weights = 1.0 / np.sqrt(np.maximum(ratios, 1.0))
+        before, weights = weights, 1.0 / np.sqrt(np.maximum(ratios, 1.0))
+        if np.abs(weights - before).max() < _CONVERGED:
+            break
     limit = chi2_limit(_UNSTEADY / len(ratios), 2 * views) / (2 * views)
     wrong = np.flatnonzero((ratios > limit) & (scatter > _LEAST_PX))
     if len(wrong):

@@ -12,7 +12,7 @@ from visioncal.calibration.stages.other_board import MADE_ALIKE
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_COMPARED, CalibrationLimits
 from visioncal.core.number_format import figure, view_words
-from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Target
+from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Target, evenly
 from visioncal.core.verdict import Finding
 from visioncal.vision.corners import CornerStack, floored_sigma_px, mean_square_by_view
 from visioncal.vision.intrinsics import Intrinsics, estimate_intrinsics
@@ -27,6 +27,8 @@ _CLEAR_CHI2 = 36.0
 _UNEVEN = 2.0
 # Ratio of misfits from which on a single view is clearly of another size.
 _CLEAR_ALONE = 5.0
+# Views by whose lens a share is tried before all are fitted, which takes as much longer.
+_FIRST_VIEWS = 8
 # Most error of a share, 3 sigma of it: usual sizes beside the listed ones (5/8) are 4 % off.
 _MOST_OFF = 0.015
 # Step by which a share's cost is differentiated.
@@ -86,9 +88,23 @@ def scaled_views(
         beyond = frozenset(every).difference(small)
         small = {view: at for view, at in small.items() if view in among}
         for views in {beyond} if len(beyond) >= FEWEST_COMPARED else ends:
-            if small and len(views) >= FEWEST_COMPARED and (known := lens_of(views)) is not None:
+            if not small or len(views) < FEWEST_COMPARED:
+                continue
+            some = [sorted(views)[at] for at in evenly(len(views), _FIRST_VIEWS)]
+            first = lens_of(frozenset(some))
+            if first is None or not _fit_better(first, small, targets, share):
+                continue
+            if (known := lens_of(views)) is not None:
                 found += _scaled_by(known, small, targets, share)
     return max(found, key=lambda each: len(each.views), default=None)
+
+
+def _fit_better(
+    known: Intrinsics, corners: Mapping[int, Corners], targets: Sequence[Target], share: float
+) -> bool:
+    """Whether any view fits a lens clearly better once it is scaled."""
+    given, scaled = (rms_px(corners, targets, known.camera, by) for by in (1.0, 1.0 / share))
+    return bool((given > _UNEVEN * scaled).any())
 
 
 def _scaled_by(
