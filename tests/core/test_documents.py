@@ -201,6 +201,7 @@ TABLES = {
     "comment with words before its header": "% of the robot: a, b\n1,2\n3,4\n",
     "mark and line ends of Windows": "\ufeffa,b\r\n1,2\r\n3,4\r\n",
     "quoted": '"a", "b"\n"1", 2\n3,"4"\n',
+    "a comma at the end of the first row": "# a, b\n1,2,\n3,4\n",
     "empty rows and columns": "a;b;;\n1;2;;\n;;;\n3;4;;\n;;;\n",
 }
 

@@ -1442,7 +1442,7 @@ def test_files_of_two_sides_are_told_by_their_names(tmp_path, monkeypatch):
         for side, each, more in (("hand", pose, {}), ("eye", board, {"T": board.tolist()})):
             parts = {"R": each[:3, :3].tolist(), "t": each[:3, 3:].tolist()}
             write(tmp_path / f"in/{side}/{side}_{at}.json", json.dumps(parts | more))
-    tables = {"robotData": poses, "cameraData": np.array(seen)}
+    tables = {"robotData": poses, "Vicon_Points": np.array(seen)}
     for name, each in tables.items():
         turns = Rotation.from_matrix(each[:, :3, :3]).as_euler("xyz")
         rows = np.hstack([1e3 * each[:, :3, 3], turns]).tolist()

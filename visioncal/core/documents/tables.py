@@ -160,7 +160,7 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
         split = _with_points(_split(lines, where, separator, stripped=True), separator)
     if not split or not all(cells for _, cells in split):
         raise DataError(f"{where} has no rows.", culprits=[where])
-    split = _below_titles(_above_results(split))
+    split = _below_titles(_above_results(_within_width(split)))
     numbers, cells = [at for at, _ in split], [cells for _, cells in split]
     rows = _without_margin(cells)
     columns = rows[0] if not any(is_number(cell) for cell in rows[0]) else None
@@ -184,6 +184,12 @@ def read_table(path: Path, text: str | None = None) -> TextTable:
     return TextTable(
         path.name, _named(columns, width, where), tuple(rows), numbers, columns is not None
     )
+
+
+def _within_width(rows: list[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tuple[str, ...]]]:
+    """Rows without empty cells beyond the width of most, as of a comma at a line's end."""
+    width = Counter(len(cells) for _, cells in rows).most_common(1)[0][0]
+    return [(at, cells if any(cells[width:]) else cells[:width]) for at, cells in rows]
 
 
 def _below_titles(rows: list[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tuple[str, ...]]]:

@@ -46,7 +46,7 @@ _FRAMES = {
         | _set("herramienta bride outil 法兰 末端"),
     ),
     "camera": (
-        _set("cam camera eye sensor kamera cámara camara caméra 相机"),
+        _set("cam camera eye sensor kamera cámara camara caméra 相机 vicon optitrack mocap"),
         _set("target board marker tag object tafel brett tablero mire 标定板"),
     ),
 }
