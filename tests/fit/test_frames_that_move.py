@@ -83,7 +83,7 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
         alone = _alone(fit, "flange", [each])
         white = next(_tried_of(fit, "flange", alone, creeps=True))
         # With boards held as the fit has them.
-        _, left, _ = judged(white, [], is_free=False)
+        _, left, _ = judged(white, [], 0.0)
         score = of_effect(fit, effect)
         scale = np.sqrt(np.diag(score.information)) + 1e-9 * np.abs(score.information).max() ** 0.5
         assert np.abs((left[:-1, :-1] - score.information) / np.outer(scale, scale)).max() < 1e-4

@@ -14,7 +14,8 @@ from visioncal.fit.assemble import mixed_model
 from visioncal.fit.kernels import processes
 from visioncal.fit.processes import _alone, _boards, _tried_of, consider, judged
 from visioncal.fit.search import Search
-from visioncal.fit.solve import solve
+from visioncal.fit.solve import _explained, solve, state_of, unknowns_of
+from visioncal.fit.start import start_of
 from visioncal.fit.unknowns import State
 from visioncal.model import read_cell
 from visioncal.simulation import simulate
@@ -97,6 +98,26 @@ def test_boards_that_are_larger_are_found_beside_errors_of_the_arm():
     assert abs(consider(solve(small.cell).fit, "flange").board_odds) < 7.0
 
 
+@pytest.mark.parametrize(("stops", "factor"), [(8, 0.7), (9, 1.4), (12, 0.85), (14, 1.2)])
+def test_boards_of_any_size_are_found_from_eight_stops_on(stops, factor):
+    small = made(stops, stops, in_hand=stops % 2 == 0, given=factor > 1.0)
+    fit = solve(with_board(small.cell, 0.04 / factor, 1e-3)).fit
+    # Five sigmas of so few stops.
+    assert fit.state.values["shape", "target"][0] + 1.0 == pytest.approx(factor, rel=3e-3)
+    assert fit.used.all()
+
+
+def test_views_that_agreed_with_no_half_come_back_with_another_size_of_the_board():
+    small = made(3, stops=12)
+    start = start_of(with_board(small.cell, 0.04 / 1.2, 1e-3))
+    search = Search.of(start.cell, unknowns_of(start, ()), start.sound)
+    # Too few for the arm's lasting errors, beside which a board's size is judged.
+    some = search._sized(state_of(start, ()), np.arange(12) < 7, None)
+    _, fit, _ = _explained(search, some, some.left_out())
+    assert fit.used.all()
+    assert fit.state.values["shape", "target"][0] == pytest.approx(0.2, abs=3e-3)
+
+
 def with_board(cell, square_m, share):
     board = replace(cell.boards["target"], square_m=square_m, square_sigma_m=share * square_m)
     return replace(cell, boards={"target": board})
@@ -112,7 +133,7 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     alone = _alone(fit, "flange")
     (board,) = _boards(fit)
     white = next(_tried_of(fit, "flange", alone, creeps=True))
-    found = [judged(white, [board], is_free=is_free)[0] for is_free in (False, True)]
+    found = [judged(white, [board], off)[0] for off in (0.0, 1e-2)]
     values = []
     for sigma in (3e-4, 1e-2):
         member = fit.unknowns["shape", "target"]
@@ -124,7 +145,7 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     assert abs(board.past) == pytest.approx(1e-4, rel=0.1)
     assert found[1] - found[0] == pytest.approx(values[1] - values[0], abs=1e-3)
     # Of any size, it is off by what the whole likelihood says.
-    (square,) = judged(white, [board], is_free=True)[2]
+    (square,) = judged(white, [board], 1e-2)[2]
     off = best.values[board.column] + board.past
     own = best.covariance[board.column, board.column]
     assert square == pytest.approx(off**2 + own, rel=1e-3)
@@ -173,9 +194,9 @@ def test_what_is_judged_by_combinations_of_many_unknowns_is_the_same():
             full += tried.size**2 * tried.process.covariance(np.arange(8))
         total = rows.T @ np.linalg.solve(full, rows) + alone.rest
         known = replace(tried, total=total, boards=sizes[:, [one.column for one in boards]])
-        for is_free in (False, True):
-            found.append([*judged(tried, boards, is_free=is_free)[::2]])
-            values.append([*judged(known, boards, is_free=is_free)[::2]])
+        for off in (0.0, 0.01, 0.1):
+            found.append([*judged(tried, boards, off)[::2]])
+            values.append([*judged(known, boards, off)[::2]])
     levels = np.array([[one[0] - some[0][0] for one in some] for some in (found, values)])
     assert np.ptp(levels[1]) > 3.0
     # Both have a ridge of a billionth; a twentieth in a log-likelihood decides nothing.

@@ -36,8 +36,9 @@ Judged: TypeAlias = tuple[float, FloatArray, FloatArray]
 # Stops that determine errors of an arm's posture; of more than the most, some stand for all in the
 # likelihood.
 ENOUGH_STOPS, _MOST = 8, 40
-# Size of a board that is not as stated, as a share.
-_LOOSE = 0.01
+# Sizes of what boards that are not as stated are off by, as shares, and how many of them are: most
+# are prints that were scaled, some are not the described ones.
+_LOOSE = {0.01: 0.9, 0.1: 0.1}
 # Shares of evidence that do not count: of a size, of a process where estimates are averaged.
 _LITTLE, _SHARE = 1e-4, 0.01
 # Logarithm below the most evidence from which less is not looked for.
@@ -70,10 +71,12 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     grid, beside = _grid_of(fit, flange, alone, creeps=True)
 
     weighed = partial(_in_all_ways, beside=beside, boards=boards)
+    # Without boards, all are as stated.
+    ways = [*enumerate(_LOOSE.values(), 1)] if boards else [(0, 1.0)]
     for tried, found in _climb(grid, weighed, _logs_of):
         logs.append(tried.prior + found[0][0])
-        free.append(tried.prior + found[-1][0])
-        off.append(found[-1][2])
+        free += [tried.prior + found[at][0] + np.log(share) for at, share in ways]
+        off += [found[at][2] for at, _ in ways]
         levels.append((tried.process, tried.size, tried.white))
     odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs))
     mean_squares = np.exp(free - np.logaddexp.reduce(free)) @ np.array(off)
@@ -114,8 +117,8 @@ def _in_all_ways(
     one: "Tried", beside: Callable[["Tried"], "Tried"], boards: Sequence["_Board"]
 ) -> "tuple[Tried, list[Judged]]":
     """One that is tried beside the stops, judged with boards as stated, and of any size."""
-    seen, ways = beside(one), (False, True) if boards else (False,)
-    return seen, [judged(seen, boards, is_free=is_free) for is_free in ways]
+    seen, sizes = beside(one), (0.0, *_LOOSE) if boards else (0.0,)
+    return seen, [judged(seen, boards, size) for size in sizes]
 
 
 def _logs_of(weighed: "tuple[Tried, list[Judged]]") -> FloatArray:
@@ -149,11 +152,14 @@ def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float
     if alone is None:
         return []
     sizes, logs, lefts = np.geomspace(1e-6, 0.1, 31), list[float](), list[FloatArray]()
+    ways = {0.0: 1.0}
+    if boards:
+        # One board of twenty is of another size.
+        ways = {0.0: 0.95, **{off: 0.05 * share for off, share in _LOOSE.items()}}
     for tried in _tried_of(fit, flange, alone, creeps=False):
-        for is_free in (False, True) if boards else (False,):
-            value, left, _ = judged(tried, boards, is_free=is_free)
-            # One board of twenty is of another size.
-            logs.append(tried.prior + value + np.log(0.05 if is_free else 0.95))
+        for off, share in ways.items():
+            value, left, _ = judged(tried, boards, off)
+            logs.append(tried.prior + value + np.log(share))
             lefts.append(left)
     under = np.array(lefts)
     gains = [
@@ -297,7 +303,7 @@ def _by_groups(
 def _evidence(one: Tried, rows: FloatArray, shared: "Shared") -> tuple[Tried, float]:
     """One that is tried beside more stops, and the logarithm of its evidence, boards as stated."""
     seen = one.beside(rows, shared)
-    return seen, seen.prior + judged(seen, (), is_free=False)[0]
+    return seen, seen.prior + judged(seen, (), 0.0)[0]
 
 
 def _combined(
@@ -440,13 +446,13 @@ def _boards(fit: Fit) -> list[_Board]:
     return [_Board(column, prior, float(past[column])) for column, prior in each]
 
 
-def judged(tried: Tried, boards: Sequence[_Board], *, is_free: bool) -> Judged:
-    """The restricted log-likelihood of a process, with boards as stated or of any size.
+def judged(tried: Tried, boards: Sequence[_Board], off: float) -> Judged:
+    """The restricted log-likelihood of a process, with boards as stated or of other sizes.
 
     Args:
         tried: The process; c columns beside the unknowns are no part of the likelihood.
         boards: Those whose size is held.
-        is_free: Whether the boards are of any size.
+        off: Share by which the boards may be off, where it is more than is stated.
 
     Returns:
         It; what unknowns and errors leave of the information (c + 1, c + 1) of the columns and the
@@ -455,7 +461,7 @@ def judged(tried: Tried, boards: Sequence[_Board], *, is_free: bool) -> Judged:
     own, prior, p = tried.total.copy(), -tried.log_det / 2.0, len(tried.boards)
     diagonal, by_boards = np.arange(p), tried.boards[:, : len(boards)]
     for board, by in zip(boards, by_boards.T, strict=True):
-        sigma = max(_LOOSE, board.held.considered) if is_free else board.held.considered
+        sigma = max(off, board.held.considered)
         row = np.zeros(len(own))
         row[:p], row[-1] = by, -board.past
         own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
@@ -466,6 +472,6 @@ def judged(tried: Tried, boards: Sequence[_Board], *, is_free: bool) -> Judged:
     left = own[p:, p:] - pull.T @ pull
     value = prior - np.log(np.diag(factor)).sum()
     of_boards, _ = lapack.dtrtrs(factor, by_boards, lower=1)
-    off = of_boards.T @ pull[:, -1] + [board.past for board in boards]
-    squares = off**2 + np.sum(of_boards**2, axis=0)
+    found = of_boards.T @ pull[:, -1] + [board.past for board in boards]
+    squares = found**2 + np.sum(of_boards**2, axis=0)
     return float(value - 0.5 * left[-1, -1]), left, squares

@@ -107,16 +107,17 @@ def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit
     """A fit, or that with an effect of arm or lens by which most of many agree that did not.
 
     Play has one of two values at each stop, and neither half of these shows it; nor do the views
-    before and after a lens was zoomed.
+    before and after a lens was zoomed, and nearly any half of few agrees with another board's size.
     """
     lost = int((search.sound & ~fit.used).sum())
-    wider = None
-    if lost > search.sound.sum() / 10:
-        whole = search.with_all(fit)
-        wider = opened(whole, search.pairs, of_stops(whole, search.pairs))
-    if wider is not None:
-        other = search.with_unknowns(wider[0])
-        found, left = other.run(wider[1], search.sound, whole)
+    if lost <= search.sound.sum() / 10:
+        return search, fit, left_out
+    whole = search.with_all(fit)
+    wider = [opened(whole, search.pairs, of_stops(whole, search.pairs))]
+    wider += [(with_free_boards(fit), fit.state)] if held_boards(fit) else []
+    for unknowns, state in filter(None, wider):
+        other = search.with_unknowns(unknowns)
+        found, left = other.run(state, search.sound, whole)
         # With more noise, anything agrees.
         is_noise = any(
             found.sizes[size.name] > 2.0 * fit.sizes[size.name] for size in fit.unknowns.noise
