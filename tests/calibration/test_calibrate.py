@@ -332,6 +332,17 @@ def first_of_blurred(shown, sigma_px):
     return visioncal.doctor(session).findings[0]
 
 
+def test_lengths_of_another_board_are_measured():
+    other = first_of_blurred(charuco(7, 5, dictionary="DICT_4X4_50"), 0.0).do
+    assert "Measure the side of a square" in other.words
+    assert "of it. In session" in other.words
+    assert "target check" in other.command
+    assert "--square-mm" in other.command
+    counts = first_of_blurred(charuco(11, 6), 0.0).do
+    assert "columns = 11" in counts.words
+    assert "times it as marker_m" in counts.words
+
+
 @pytest.mark.slow
 def test_a_board_too_blurred_for_its_markers_is_no_other_board():
     found = first_of_blurred(charuco(12, 6), 2.9)

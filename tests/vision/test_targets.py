@@ -531,6 +531,12 @@ def test_a_board_is_what_its_files_say(dots):
         target_from_document({"kind": "dots", **alike}, "mine")
 
 
+def test_a_printed_board_is_described_without_a_drawing(tmp_path):
+    run = visioncal("target", "make", "charuco_9x6_30mm", "--toml-only", "-o", tmp_path).good()
+    assert [file.name for file in tmp_path.iterdir()] == ["charuco_9x6_30mm.toml"]
+    assert "Print it" not in run.said
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", ["wide", "fisheye"])
 def test_centres_are_exact_and_rightly_numbered(dots, camera):

@@ -193,6 +193,7 @@ class TargetMakeOptions(BoardOptions):
     page: str | None = option("A5 to A0, letter, legal, tabloid, or 500x300 (mm); else as it fits.")
     landscape: bool | None = option("Left out: as the board fits.", "--landscape/--portrait")
     dpi: float = option("Resolution of the PNG, in pixels per inch.", default=300.0)
+    toml_only: bool = flag("Describe a board that is printed already: write no drawing.")
     force: bool = flag("Replace files that are there.")
 
 

@@ -62,13 +62,16 @@ def target_make_command(options: TargetMakeOptions) -> None:
     else:
         chosen = requested_target(request, pages) if request else load_target(str(options.target))
     sheet = arrange(chosen, pages)
-    files = write_board(options.out, sheet, dpi=options.dpi, force=options.force)
+    files = write_board(
+        options.out, sheet, dpi=options.dpi, force=options.force, is_drawn=not options.toml_only
+    )
     for file in files:
         say(f"wrote {file}")
-    description = files[0].with_name(f"{chosen.name}.toml")
+    description = options.out / f"{chosen.name}.toml"
     if description not in files:
         say(f"kept {description}, which describes this board already")
-    say(f"Print it on {sheet.page} at 100 %, and check both rulers.")
+    if not options.toml_only:
+        say(f"Print it on {sheet.page} at 100 %, and check both rulers.")
 
 
 def _pictured(file: Path, width_mm: float | None, name: str) -> Target:

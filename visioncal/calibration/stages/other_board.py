@@ -193,16 +193,24 @@ def _remedy(
     """The lines to write into a board's description, or the command that describes the one seen."""
     declared, board = session.boards[name], identity.board
     share = declared.marker_m / declared.square_m
-    if "kind" not in found and abs(board.marker_m - share) < 0.06:
+    side, mm = kind_of(board).side, f"{1e3 * declared.square_m:g}"
+    # A board of other counts and other markers is another print, whose lengths are its own.
+    is_other = "kind" in found or found.keys() >= {"columns", "dictionary"}
+    if not is_other and abs(board.marker_m - share) < 0.06:
         figures = " and ".join(tomli_w.dumps(found).splitlines())
         words, command = board_correction(session, name, figures)
-        return Remedy(f"{words[0].upper()}{words[1:]}, or name another target.", command)
-    side, mm = kind_of(board).side, f"{1e3 * declared.square_m:g}"
+        words = f"{words[0].upper()}{words[1:]}, or name another target."
+        if found.keys() & {"columns", "dictionary"}:
+            words += f" Measure the {side}, and where it is not {mm} mm, write square_m"
+            words += f", and {board.marker_m:.3g} times it as marker_m" * (board.marker_m > 0.0)
+            words += "."
+        return Remedy(words, command)
     images = " ".join(f"SESSION/{shlex.quote(view.image)}" for view, _ in looked)
     key = f"in [targets], {name}" if name else "target"
+    markers = f", by which markers are {board.marker_m:.3g} of it" * (board.marker_m > 0.0)
     return Remedy(
         f"Measure the {side}, and where it is not {mm} mm as declared, change the figure in the "
-        f'command. In session.toml, write {key} = "seen.toml", which it makes.',
+        f'command{markers}. In session.toml, write {key} = "seen.toml", which it makes.',
         f"visioncal target check {images} --square-mm {mm} -o SESSION/seen.toml",
     )
 
@@ -222,7 +230,7 @@ def board_correction(session: Session | None, board: str, figures: str) -> tuple
     return (
         f'write target = "{named}.toml" in session.toml, and {figures} in that file, which the '
         "command makes",
-        f"visioncal target make {named} -o SESSION",
+        f"visioncal target make {named} -o SESSION --toml-only",
     )
 
 

@@ -17,7 +17,9 @@ _LEAST_DPI = 50.0
 _LONGEST_NAME = 60
 
 
-def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple[Path, ...]:
+def write_board(
+    folder: Path, sheet: Sheet, *, dpi: float, force: bool, is_drawn: bool = True
+) -> tuple[Path, ...]:
     """Writes a board as PDF, SVG, PNG and TOML, named after the target.
 
     The files appear all at once. An existing `.toml` that describes the same target is kept, with
@@ -28,6 +30,7 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
         sheet: Arranged board.
         dpi: Pixels per inch of the PNG.
         force: Whether existing files may be replaced.
+        is_drawn: Whether it is to be printed; else its description alone is written.
 
     Returns:
         The written files, the PDF first.
@@ -49,13 +52,13 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
             culprits=["--dpi"],
             next_step="The PDF and the SVG are exact at any magnification.",
         )
-    names = [f"{name}.{ending}" for ending in ("pdf", "svg", "png")]
+    names = [f"{name}.{ending}" for ending in ("pdf", "svg", "png") if is_drawn]
     # The folder's name may be invalid for the file system.
     with named_errors(folder):
         described = {} if _describes(folder / f"{name}.toml", sheet.target) else _described(sheet)
         for file in (*names, *described):
             check_free(folder / file, force=force)
-    drawings = (to_pdf(sheet), to_svg(sheet), to_png(sheet, dpi))
+    drawings = (to_pdf(sheet), to_svg(sheet), to_png(sheet, dpi)) if is_drawn else ()
     drawn: dict[str, bytes | str] = {**dict(zip(names, drawings, strict=True)), **described}
 
     def write(aside: Path) -> None:
