@@ -527,6 +527,35 @@ def test_corners_of_smaller_pictures_are_scaled_by_the_printed_command(
         np.testing.assert_allclose(mended.edges[name].matrix, edge.matrix, atol=2e-3)
 
 
+@pytest.mark.parametrize("some", [[6], [3, 4, 12, 19]])
+def test_pictures_that_were_taken_before_are_left_out_by_the_printed_command(
+    tmp_path, monkeypatch, some
+):
+    monkeypatch.chdir(tmp_path)
+    robot, seen = corners_of(MOUNTS[0])
+    for view in some:
+        ids, px = seen[view - 1]
+        seen[view] = ids, px + np.random.default_rng(view).normal(0, 0.1, px.shape)
+    Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]).save(tmp_path / "cell")
+    follow("calibrate", "cell", "-o", "out", run=typed)
+    first, mended = (Calibration.load(out).verdict for out in ("out", "out-new"))
+    (cause,) = first.causes
+    assert cause.kind == "copied_poses"
+    assert "the picture of the row before once more, to within the noise" in cause.words
+    assert [*cause.views] == some
+    assert mended.status == "good"
+
+
+def test_pictures_of_stops_that_are_taken_twice_are_not_taken_before():
+    robot, seen = corners_of(MOUNTS[0])
+    rng, robot = np.random.default_rng(3), np.repeat(robot[:12], 2, axis=0)
+    seen = [(ids, px + rng.normal(0, 0.1, px.shape)) for ids, px in seen[:12] for _ in range(2)]
+    robot[9, 0, 3] += 0.02
+    found = visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
+    assert found.verdict.causes[0].kind == "wrong_views"
+    assert found.verdict.causes[0].views == (9,)
+
+
 def scaled_at(views, share, seen):
     """The corners, and those of some views as if they were of smaller pictures."""
     return [

@@ -49,21 +49,29 @@ class Undoing:
 
 
 def copied_rows(
-    record: Record, apart: FloatArray, own: IntArray, agrees: Mask
+    record: Record, edges: Edges, apart: FloatArray, own: IntArray, agrees: Mask
 ) -> Iterator[Undoing]:
     """Poses of the robot, or of the target, that are there once more though the other moved."""
     closes = apart[agrees].mean() < CLOSING_SCORE**2
-    for copies, pose, but in (
-        (
-            record.copies,
-            "the robot's pose",
-            f"the {record.shows}s differ: the log repeated a pose that was read before",
-        ),
-        (
-            record.lingering,
-            "the target's pose" if record.shows == "image" else "the reading",
-            "the robot moved: the last that was seen lingered",
-        ),
+    anew, digit = "Record them anew", "to the last digit"
+    seen = (
+        record.lingering,
+        "the target's pose" if record.shows == "image" else "the reading",
+        f"{digit}, though the robot moved: the last that was seen lingered",
+        anew,
+    )
+    if record.is_numbered:
+        seen = (
+            _shown_before(record, edges, apart, agrees),
+            "the picture",
+            "to within the noise, though the robot moved: the camera gave what it had taken "
+            "before, as from a buffer",
+            f"Have the camera drop what it holds before each picture. {anew}",
+        )
+    log = f"the {record.shows}s differ: the log repeated a pose that was read before"
+    for copies, pose, but, do in (
+        (record.copies, "the robot's pose", f"{digit}, though {log}", anew),
+        seen,
     ):
         copied = copies & ~agrees & (own >= 0)
         if not copied.any() or not closes:
@@ -77,13 +85,24 @@ def copied_rows(
             MISTAKE - len(views) * float(np.log(chance)),
             Finding(
                 "copied_poses",
-                f"{whose} {pose} of the row before once more, to the last digit, though {but}. "
-                "Left out.",
-                or_alone("Record them anew, or calibrate the other views alone.", others),
+                f"{whose} {pose} of the row before once more, {but}. Left out.",
+                or_alone(f"{do}, or calibrate the other views alone.", others),
                 views,
             ),
             f"{pose} is that of the row before, once more",
         )
+
+
+def _shown_before(record: Record, edges: Edges, apart: FloatArray, agrees: Mask) -> Mask:
+    """(m,) views that show what the view before shows, which agrees or does so, too."""
+    between = edges.squares(invert(record.camera[:-1, :1]) @ record.camera[1:])
+    limits = UNEVEN**2 * (np.median(apart[agrees], axis=0) + LEAST**2)
+    alike = np.append(False, (between < limits).all(axis=-1).any(axis=-1))
+    is_sound = agrees.copy()
+    for at in np.flatnonzero(alike):
+        alike[at] = is_sound[at - 1]
+        is_sound[at] |= alike[at]
+    return alike
 
 
 def chosen_views(

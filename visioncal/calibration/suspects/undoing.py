@@ -92,7 +92,7 @@ def likeliest(run: RunState) -> Undoing | None:
     best = max(every, key=lambda edges: float(evidence(edges.of(own)[None])[0][0]))
     apart = best.of(own)
     (base,), (agrees,) = evidence(apart[None])
-    rivals = [*copied_rows(record, apart, own, agrees)]
+    rivals = [*copied_rows(record, best, apart, own, agrees)]
     if len(record.views) == len(run.session.views):
         # Shifted are all rows, of one point as of others.
         rivals += rows_apart(record, every, pairs, float(base))
