@@ -601,7 +601,27 @@ def test_two_images_that_are_exchanged_have_a_command_that_mends_them(three):
     assert f"--exchange {first},{second}" in wrong.do.command
     mended = exchange_views(swapped, first, second)
     assert len(mended.declaration.corrected) == 2
-    now, was = ({view.number: view.numbers for view in it.views} for it in (mended, three))
-    assert now == was
+    now, was, then = (each.corner_table.views.tolist() for each in (mended, three, swapped))
+    assert now == was != then
     other = next(view.number for view in three.views if view.text.get("target") == "floor")
     raised(DataError, r"another .*target", exchange_views, three, first, other)
+
+
+@pytest.mark.slow
+def test_poses_of_one_arm_that_are_exchanged_have_a_command_that_mends_them():
+    options = replace(PLAIN, robots=ROBOTS[:1], boards=(PLAIN.boards[1],), stops=14)
+    session = recorded(simulate(options))
+    first, second = (
+        [view.number for view in session.views if view.stop == stop] for stop in (4, 9)
+    )
+    pairs = [view for pair in zip(first, second, strict=True) for view in pair]
+    swapped = exchange_views(session, *pairs)
+    (wrong,) = (
+        each for each in calibrate(swapped).verdict.findings if each.kind == "exchanged_views"
+    )
+    assert {*wrong.views} == {*pairs}
+    typed = re.search(r"--exchange ([\d,]+) ", wrong.do.command)[1]
+    mended = exchange_views(swapped, *map(int, typed.split(",")))
+    again, first, then = (each.corner_table.views.tolist() for each in (mended, session, swapped))
+    assert again == first != then
+    assert calibrate(mended).verdict.status == calibrate(session).verdict.status

@@ -118,6 +118,7 @@ def test_two_cameras_of_one_arm_agree_within_a_bounded_search(real_data, monkeyp
     found = visioncal.calibrate(cameras).verdict.findings
     assert found[0].kind == "exchanged_views"
     assert {125, 126, 325, 326} == {int(view) for view in re.findall(r"\d{3}", found[0].words)}
+    assert "convert SESSION FIXED --exchange 125,126,325,326 &&" in found[0].do.command
     # By another reference the board is 0.15 to 0.24 % smaller than stated, within its 0.5 %.
     assert not any(item.kind == "board_size" for item in found)
     # By the board alone, without the robot, camera 3 turns against camera 1 evenly all the time.

@@ -12,12 +12,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from visioncal.core.limits import FEWEST_VIEWS
+from visioncal.core.limits import CLEAR_RATIO, FEWEST_VIEWS
 from visioncal.core.linalg import ROUNDING, covariance_from
+from visioncal.core.procrustes import align
 from visioncal.core.quantiles import FALSE_ALARM, f_limit
-from visioncal.core.transforms import adjoint, invert, log
-from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.arm import SIZES_M, TURN_PER_M, rows_of, stops_of
+from visioncal.core.transforms import adjoint, apply, compose, invert, log, mean_transform
+from visioncal.core.types import FloatArray, IntArray, Mask, evenly
+from visioncal.estimation.arm import SIZES_M, TURN_PER_M, TWIST_UNITS, rows_of, stops_of
 from visioncal.estimation.mixed import PriorInformation
 from visioncal.estimation.moves import CREEP, Creep, fitted_change, moved
 from visioncal.estimation.problem import Problem
@@ -40,6 +41,8 @@ _PRIOR: Mapping[str, tuple[tuple[float, ...], FloatArray]] = {
     JOINT: ((1e-4, 1e-3, 1e-2, 1e-1), np.ones(1)),
     SIZE: ((1e-3, 1e-2, 1e-1), np.ones(1)),
 }
+# Observations among which a common step is sought: of more, all would take memory by their square.
+_CANDIDATES = 200
 # Largest share of the residuals that a change explains.
 _MOST_EXPLAINED = 0.99
 
@@ -356,3 +359,32 @@ def _log_likelihoods(squares: FloatArray) -> FloatArray:
         scale = float(np.mean(10.0 * squares / (4.0 + squares / scale))) / 6.0
     tails = 5.0 * np.log1p(squares / (4.0 * scale))
     return np.array([even, -half * np.log(scale) - float(tails.sum())])
+
+
+def step_of(
+    part: Problem, frame: str, state: State, step: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """The step of a frame that explains observations, or a given one, and what it leaves (n,).
+
+    Of places, a step of the instrument is rigid, and one of the point a shift.
+    """
+    if part.observations.has_rotation.all():
+        changes = part.change_of(frame, state)
+        if step is None:
+            some = changes[evenly(len(changes), _CANDIDATES)]
+            apart = np.linalg.norm(log(invert(some)[:, None] @ changes) / TWIST_UNITS, axis=-1)
+            nearest = apart[int(np.median(apart, axis=1).argmin())]
+            # One wrong pose among few would put their mean off.
+            step = mean_transform(changes[nearest <= CLEAR_RATIO * np.median(nearest)])
+        return step, np.linalg.norm(log(invert(step) @ changes) / TWIST_UNITS, axis=-1)
+    measured, predicted = part.measured(state), part.predicted(state)
+    if frame.startswith("instrument"):
+        if step is None:
+            step = align(predicted[:, :3, 3], measured[:, :3, 3])
+        left = predicted[:, :3, 3] - apply(step, measured[:, :3, 3])
+    else:
+        left = (invert(predicted) @ measured)[:, :3, 3]
+        if step is None:
+            step = compose(np.eye(3), np.median(left, axis=0))
+        left = left - step[:3, 3]
+    return step, np.linalg.norm(left / TWIST_UNITS[3:], axis=-1)

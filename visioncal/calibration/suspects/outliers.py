@@ -13,24 +13,19 @@ from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.limits import CLEAR_RATIO, FEWEST_STOPS, FEWEST_VIEWS, CalibrationLimits
 from visioncal.core.number_format import figure, listed, mm_and_deg, ranges, some_of, view_words
-from visioncal.core.procrustes import align
 from visioncal.core.transforms import (
-    apply,
-    compose,
     exp,
     invert,
     log,
-    mean_transform,
     pose_difference,
     rotation_angle,
 )
-from visioncal.core.types import FloatArray, IntArray, evenly
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
 from visioncal.estimation.moves import creep_effects
 from visioncal.estimation.outliers import InlierFit
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.problem_parts import State
+from visioncal.estimation.steps import step_of
 from visioncal.results import Moved
 from visioncal.robot import Robot
 from visioncal.session.frames import frame_name
@@ -49,8 +44,6 @@ _WRONG = "its pose or its reading is wrong, or something had moved"
 _MARGIN, _MARGINAL_SHARE = 1.5, 10
 # By as much an industrial arm may err [mm, deg]; one that states what it repeats to, by so many.
 _ARM_ERRS, _REPEATS = CalibrationLimits.arm_errors, 6.0
-# Outliers among which a common step is sought: of more, all would take memory by their square.
-_CANDIDATES = 200
 # Another size turns nothing, and a small marker's noise less than so [rad].
 _TURNED_RAD = 0.2
 # Errors of an arm as a twist [rad].
@@ -295,8 +288,8 @@ def _common_change(
         # Rigid motions explain much of a few places.
         if are_places and len(part) < FEWEST_STOPS and frame.startswith("instrument"):
             continue
-        step, away = _step_of(part, frame, state)
-        usually = _step_of(others, frame, state, np.eye(4))[1]
+        step, away = step_of(part, frame, state)
+        usually = step_of(others, frame, state, np.eye(4))[1]
         size = np.linalg.norm(log(step) / TWIST_UNITS)
         left, usual = np.median(away), np.median(usually)
         # Poses that are wrong may have much in common, and differ by far more than noise.
@@ -322,39 +315,10 @@ def _alike(
         return rows, (frame, step)
     every, state = np.arange(len(inliers.problem)), inliers.fit.state
     part = inliers.problem.subset(np.isin(every, rows))
-    away = _step_of(part, frame, state, step)[1]
+    away = step_of(part, frame, state, step)[1]
     rows = rows[CLEAR_RATIO * away < np.linalg.norm(log(step) / TWIST_UNITS)]
     part = inliers.problem.subset(np.isin(every, rows))
-    return rows, (frame, _step_of(part, frame, state)[0])
-
-
-def _step_of(
-    part: Problem, frame: str, state: State, step: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """The step of a frame that explains observations, or a given one, and what it leaves (n,).
-
-    Of places, a step of the instrument is rigid, and one of the point a shift.
-    """
-    if part.observations.has_rotation.all():
-        changes = part.change_of(frame, state)
-        if step is None:
-            some = changes[evenly(len(changes), _CANDIDATES)]
-            apart = np.linalg.norm(log(invert(some)[:, None] @ changes) / TWIST_UNITS, axis=-1)
-            nearest = apart[int(np.median(apart, axis=1).argmin())]
-            # One wrong pose among few would put their mean off.
-            step = mean_transform(changes[nearest <= CLEAR_RATIO * np.median(nearest)])
-        return step, np.linalg.norm(log(invert(step) @ changes) / TWIST_UNITS, axis=-1)
-    measured, predicted = part.measured(state), part.predicted(state)
-    if frame.startswith("instrument"):
-        if step is None:
-            step = align(predicted[:, :3, 3], measured[:, :3, 3])
-        left = predicted[:, :3, 3] - apply(step, measured[:, :3, 3])
-    else:
-        left = (invert(predicted) @ measured)[:, :3, 3]
-        if step is None:
-            step = compose(np.eye(3), np.median(left, axis=0))
-        left = left - step[:3, 3]
-    return step, np.linalg.norm(left / TWIST_UNITS[3:], axis=-1)
+    return rows, (frame, step_of(part, frame, state)[0])
 
 
 def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[PoseFault]:
@@ -375,7 +339,8 @@ def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[
             first, second = (cell_fit.cell.stops[station] for station in stations)
             short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
             words = f"{short}: {{views}} were left out. Each pose is right at the other's stop."
-            yield _fault(cell_fit, EXCHANGED, at_both, words, _EXCHANGE, short)
+            do = _exchange(cell_fit, at_both, stations)
+            yield _fault(cell_fit, EXCHANGED, at_both, words, do, short)
             pairs = [pair for pair in pairs if pair[0] not in at_both]
     if not pairs:
         return
@@ -399,6 +364,23 @@ def _exchanged(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> Iterator[
     typed = ",".join(f"{first},{second}" for first, second in views)
     do = mending(f"their {shown}s are exchanged", f"--exchange {typed}")
     yield _fault(cell_fit, EXCHANGED, [row for pair in pairs for row in pair], words, do)
+
+
+def _exchange(cell_fit: CellFit, rows: Sequence[int], stations: Sequence[int]) -> Remedy:
+    """Advice to exchange what was seen at two stations of a robot, or its poses there by hand.
+
+    Where it stands alone, and everything that was seen at one station was seen at the other.
+    """
+    seen = [cell_fit.cell.rows[at] for at in rows]
+    at_first, at_second = (
+        {(row.seer, row.seen): row.view for row in seen if row.station == station}
+        for station in stations
+    )
+    is_paired = at_first.keys() == at_second.keys() and len(seen) == 2 * len(at_first)
+    if len(cell_fit.cell.poses) > 1 or not is_paired:
+        return _EXCHANGE
+    typed = ",".join(f"{view},{at_second[pair]}" for pair, view in at_first.items())
+    return mending("what was seen at the one is at the other", f"--exchange {typed}")
 
 
 def _exchanged_in_turn(cell_fit: CellFit, circles: Sequence[Sequence[int]]) -> PoseFault:
