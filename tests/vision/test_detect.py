@@ -568,7 +568,7 @@ def test_a_grid_of_circles_leaves_no_row_of_the_plate_over(turns):
     for at in places:
         cv2.circle(image, np.rint(at).astype(int).tolist(), 9, 30, -1, cv2.LINE_AA)
     image = np.ascontiguousarray(np.rot90(image, turns))
-    seen = kind_of(board).seen_in(image)
+    seen, _ = kind_of(board).seen_in(image)
     assert (seen.columns, seen.rows, seen.asymmetric) == (7, 11, True)
     assert isinstance(kind_of(part).search(image, part), NotFound)
 

@@ -395,3 +395,46 @@ def test_a_board_that_is_never_seen_is_no_other_one_of_the_session():
         document, columns, rows, MemoryImages(files), target_document=documents
     )
     assert {view % 2 for view in detect(session).corners} == {0}
+
+
+def cut_checkerboards(shifts):
+    """Pictures of 960 x 640 of 9 x 6 inner corners with squares of 84 px, which edges cut."""
+    squares = np.kron(np.indices((7, 10)).sum(axis=0) % 2, np.ones((84, 84))) * 200 + 20
+    print_ = np.pad(squares, 60, constant_values=220).astype(np.uint8)
+    rng = np.random.default_rng(4)
+    images = []
+    for right, down, tilt in shifts:
+        from_print = np.array([[1.0, 0.03, right], [-0.04, 1.0, down], [tilt, 0.5 * tilt, 1.0]])
+        image = cv2.warpPerspective(print_, from_print, (960, 640), borderValue=90)
+        image = cv2.GaussianBlur(image, (0, 0), 0.7) + rng.normal(0.0, 2.0, image.shape)
+        images.append(np.clip(image, 0, 255).astype(np.uint8))
+    return images
+
+
+def test_a_checkerboard_is_named_where_its_outermost_squares_are_cut():
+    """By all of its inner corners, where each side shows somewhere that no more squares follow."""
+    images = cut_checkerboards([(-20.0, -20.0, 1e-4), (-45.0, -30.0, 2e-4), (-10.0, 0.0, 1.5e-4)])
+    for image in images:
+        assert "9 x 6 inner corners" in board_words(identify(image).board)
+    assert identify(images).shown > 1
+
+
+def test_a_checkerboard_whose_end_is_not_shown_may_have_more():
+    """Of two sides of 9 x 6 squares the picture shows no end; and of parts no name is given."""
+    (image,) = cut_checkerboards([(-20.0, -20.0, 1e-4)])
+    part = image[:, : image.shape[1] * 7 // 12]
+    identity = identify(part)
+    assert identity.shown == 0
+    assert "may have more columns or rows" in identity.notes[0]
+
+
+@pytest.mark.parametrize("stated", [(8, 5), (9, 7), (10, 7)])
+def test_other_counts_of_a_checkerboard_are_named_before_any_long_search(stated, monkeypatch):
+    searched = []
+    monkeypatch.setattr(cv2, "findChessboardCorners", lambda *_, **__: searched.append(1))
+    images = cut_checkerboards(12 * [(-20.0, -20.0, 1e-4)])
+    target = Target("board", "checkerboard", *stated, 0.03, 3e-5)
+    with pytest.raises(OtherBoardError, match="checkerboard of 9 x 6") as caught:
+        detect(Session.from_arrays(images, np.tile(np.eye(4), (12, 1, 1)), target))
+    assert not searched
+    assert ("its squares, of which" in str(caught.value)) == (stated == (10, 7))

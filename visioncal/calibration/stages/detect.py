@@ -32,6 +32,7 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.kinds import name_of
 from visioncal.vision.boards import NotFound, find_target, kind_of
+from visioncal.vision.boards.checkerboard import Checkerboard
 from visioncal.vision.boards.imaging import (
     blur_at_corners,
     decode_image,
@@ -132,20 +133,37 @@ def _looked_at_first(
     first = dict[int, Searched]()
     for name in session.boards:
         some = spread([view for view in views if session.board_of(view) == name])
-        seen = {view.number: searched for view, searched in zip(some, search(some), strict=True)}
-        first |= seen
-        if any(isinstance(searched.found, Corners) for searched in seen.values()):
+        _refuse_other_counts(session, name, some)
+        seen = search(some)
+        first |= {view.number: searched for view, searched in zip(some, seen, strict=True)}
+        if any(isinstance(searched.found, Corners) for searched in seen):
             continue
         _refuse_another(session, name, some)
     return {view.number: first[view.number] for view in views if view.number in first}
 
 
-def _refuse_another(session: Session, name: str, views: Sequence[View]) -> None:
+def _refuse_other_counts(session: Session, name: str, views: Sequence[View]) -> None:
+    """Refuses images of a checkerboard of other counts before they are searched at length.
+
+    A search takes seconds for each image that does not show the declared board.
+    """
+    board, kind = session.boards[name], kind_of(session.boards[name])
+    if isinstance(kind, Checkerboard) and len(session.boards) == 1 and views:
+        image = image_of(session, views[0])
+        if isinstance(image, np.ndarray) and isinstance(
+            kind.search(image, board, quick=True), NotFound
+        ):
+            _refuse_another(session, name, views, plain=True)
+
+
+def _refuse_another(
+    session: Session, name: str, views: Sequence[View], *, plain: bool = False
+) -> None:
     """Refuses images of another board than one of the session's that none of them shows."""
     present = [view for view in views if session.images.exists(view.image)]
     images = [(view, image_of(session, view)) for view in present]
     shown = [(view, image) for view, image in images if not isinstance(image, Rejection)]
-    if shown and (finding := other_board(session, name, shown)):
+    if shown and (finding := other_board(session, name, shown, plain=plain)):
         raise OtherBoardError.of(finding)
 
 

@@ -16,7 +16,7 @@ from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
 from visioncal.session.kinds import declared_targets
 from visioncal.vision.boards import NotFound, find_target, kind_of
-from visioncal.vision.boards.identify import Identity, describe, identify
+from visioncal.vision.boards.identify import Identity, describe, identify, identify_plain
 from visioncal.vision.targets import (
     board_words,
     corner_positions,
@@ -68,7 +68,7 @@ def spread(views: Sequence[View], count: int = LOOKED_AT) -> Sequence[View]:
 
 
 def other_board(
-    session: Session, name: str, looked: Sequence[tuple[View, Image]]
+    session: Session, name: str, looked: Sequence[tuple[View, Image]], *, plain: bool = False
 ) -> Finding | None:
     """Identifies the board in images in which the declared one is not found.
 
@@ -76,21 +76,25 @@ def other_board(
         session: The session.
         name: The board's name in the session's `boards`.
         looked: Views of it and their (h, w) grey images.
+        plain: Whether only boards without markers are looked for, which is quick.
 
     Returns:
         The finding; None where the images may show the declared board.
     """
     declared = session.boards[name]
+    images = [image for _, image in looked]
     try:
-        identity = identify([image for _, image in looked], declared)
+        identity = identify_plain(images) if plain else identify(images, declared)
     except DataError:
+        return None
+    if identity is None:
         return None
     found = _differences(declared, identity)
     # One image of several may show something else, or a part.
     is_sure = identity.shown >= min(2, len(looked))
     if _is_part(identity, declared):
         # A sound one may be covered in part: its paper ends there.
-        is_sure &= sum(_has_rim(image, identity.board) for _, image in looked) > len(looked) / 2
+        is_sure &= sum(_has_rim(image, identity.board) for image in images) > len(looked) / 2
     if not is_sure or identity.corners_seen < _LEAST_CORNERS * identity.corners:
         return None
     numbers = tuple(view.number for view, _ in looked)
@@ -131,10 +135,19 @@ def other_board(
     return Finding(
         "other_board",
         f"The images show another board than declared: {describe(identity)}{where}, "
-        f"and {declared.name} is {stated}.",
+        f"and {declared.name} is {stated}{_counted_squares(declared, identity)}.",
         _remedy(session, name, identity, found, looked),
         numbers,
     )
+
+
+def _counted_squares(declared: Target, identity: Identity) -> str:
+    """The words where a checkerboard's squares were counted in place of its inner corners."""
+    counts = {identity.board.columns + 1, identity.board.rows + 1}
+    is_checkered = declared.kind == identity.board.kind == "checkerboard"
+    if is_checkered and counts == {declared.columns, declared.rows}:
+        return ": its squares, of which there is one more than inner corners each way"
+    return ""
 
 
 def _is_part(identity: Identity, declared: Target) -> bool:

@@ -31,6 +31,8 @@ _FEWEST = ((4, 4), (3, 3))
 # Shares of a square at which its grey levels are compared, and their range in units of contrast
 # from which on it is not plain: light and noise leave a tenth. The part that is averaged.
 _INSIDE, _MARKS, _DOTS = (0.25, 0.4, 0.6, 0.75), 0.4, 0.25
+# Distance from the outermost squares at which it shows whether others follow [squares].
+_RIM = 0.3
 # Share of the way from a corner to the middle of a dark square; usual circles end before.
 _TIP = 0.2
 # About the longer side of the image in which outlines of squares are looked for: among the noise of
@@ -123,23 +125,25 @@ class Checkerboard(Board):
             f"no board: no checkerboard of {target.columns} x {target.rows} inner corners is seen"
         )
 
-    def seen_in(self, image: Image) -> Target | None:
-        """The checkerboard of any count that a (h, w) grey image shows whole, the wider way."""
+    def seen_in(self, image: Image) -> tuple[Target, bool] | None:
+        """The checkerboard of any count in a (h, w) grey image, the wider way; see `BoardKind`."""
         flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
         for size in _FEWEST:
-            found, _, grid = cv2.findChessboardCornersSBWithMeta(image, size, flags=flags)
-            columns, rows = sorted(grid.shape, reverse=True) if found else (0, 0)
+            found, px, meta = cv2.findChessboardCornersSBWithMeta(image, size, flags=flags)
+            grid = px.reshape(*meta.shape, 2).astype(float) if found else np.zeros((0, 0, 2))
+            # Checked before the second look, which takes long where it finds nothing.
+            if not found or not _is_checkered(image, grid) or _ends(image, grid) is False:
+                continue
+            columns, rows = sorted(meta.shape, reverse=True)
             board = Target("board", self.name, columns, rows, 1.0, DEFAULT_RELATIVE_SIGMA)
             # A second look, as this search takes parts of some boards for the whole.
             seen = self.search(image, board, quick=True)
-            if found and isinstance(seen, NotFound):
+            if isinstance(seen, NotFound):
                 seen = self.search(image, board)
             if isinstance(seen, DetectedCorners):
-                px = seen.px.reshape(rows, columns, 2)
-                outside = _extended(px).reshape(-1, 2)
-                is_whole = (outside > -0.5).all() and (outside < image.shape[::-1]).all()
-                is_plain = _has_tips(image, px) and not _has_marks(image, px)
-                return board if is_whole and is_plain else None
+                grid = seen.px.reshape(rows, columns, 2)
+                is_plain = _has_tips(image, grid) and not _has_marks(image, grid)
+                return (board, _ends(image, grid) is True) if is_plain else None
         return None
 
 
@@ -208,6 +212,31 @@ def _extended(grid: FloatArray, share: float = 1.0) -> FloatArray:
         after = last + share * (last - np.take(grid, [-2], axis))
         grid = np.concatenate([before, grid, after], axis=axis)
     return grid
+
+
+def _ends(image: Image, grid: FloatArray) -> bool | None:
+    """Whether no squares follow beyond the outermost ones of a (rows, columns, 2) grid of corners.
+
+    None where the image does not show it of some side.
+    """
+    limits, outermost, shown_sides = np.array(image.shape[::-1]) - 1, _extended(grid), 0
+    for side in (np.rot90(grid, quarter) for quarter in range(4)):
+        first, second, third = _extended(side)[1:4]
+        # By three rows, as perspective and lens change the steps from row to row.
+        last, beyond = (
+            first + by * (first - second) + by * (by + 1) / 2 * (first - 2 * second + third)
+            for by in (0.5, 1.0 + _RIM)
+        )
+        middles = np.stack([last[1:] + last[:-1], beyond[1:] + beyond[:-1]]) / 2
+        inside = (middles >= 0) & (middles <= limits)
+        shown = np.all(inside, axis=(0, 2))
+        steps = np.diff(_at(image, middles), axis=1) * (shown[1:] & shown[:-1])
+        # The next squares' levels change the other way.
+        if -np.sum(steps[0] * steps[1]) > 0.5 * np.sum(steps[0] ** 2):
+            return False
+        shown_sides += bool(steps.any())
+    is_inside = bool(np.all((outermost >= 0) & (outermost <= limits)))
+    return True if is_inside or shown_sides == 4 else None
 
 
 def _has_tips(image: Image, grid: FloatArray) -> bool:

@@ -172,8 +172,8 @@ class CircleGrid(Board):
         size = f"{target.columns} x {target.rows}"
         return NotFound(f"no board: no {self.words(target, size)} is seen")
 
-    def seen_in(self, image: Image) -> Target | None:
-        """The grid of circles of any count that a (h, w) grey image shows whole."""
+    def seen_in(self, image: Image) -> tuple[Target, bool] | None:
+        """The grid of circles of any count in a (h, w) grey image; see `BoardKind`."""
         for picture in (image, 255 - image):
             blobs, lattice, members = _circles(picture)
             px, grids = blobs.px[members], list[tuple[int, float, Target]]()
@@ -193,7 +193,7 @@ class CircleGrid(Board):
                         # The one that leaves the fewest circles over.
                         grids.append((-len(order), _turn_rad(px[order], columns), board))
             if grids:
-                return min(grids, key=lambda grid: grid[:2])[2]
+                return min(grids, key=lambda grid: grid[:2])[2], True
         return None
 
 

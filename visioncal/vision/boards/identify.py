@@ -29,6 +29,7 @@ _MOST_COLUMNS = 40
 _NEAR, _OFF = 2.5, 0.3
 # Least correlation of tags with their ideals.
 _LEAST_LIKENESS = 0.65
+_MAY_HAVE_MORE = "On some side no image shows where it ends: it may have more columns or rows."
 # Images with more pixels are looked at in a copy of about so many first: details hide boards.
 _MANY_PX, _ENOUGH_PX = 8e6, 2e6
 
@@ -72,7 +73,8 @@ def identify(images: Image | Sequence[Image], declared: Target | None = None) ->
     """Identifies the target in one image or in several of the same board.
 
     Boards of markers are known by the ids and places of these, in the images or in their mirror
-    images; checkerboards and grids of circles by their counts, where they are seen whole.
+    images; checkerboards and grids of circles by their counts. Of a checkerboard, an image must
+    show on each side where it ends; else its note says that it may have more, and `shown` is 0.
 
     Args:
         images: (h, w) grey images.
@@ -93,7 +95,7 @@ def identify(images: Image | Sequence[Image], declared: Target | None = None) ->
         sets = [small, pictures]
     for shown in sets:
         look = _Look(shown, declared)
-        identity = next(look.boards(), None) or look.single()
+        identity = next(look.boards(), None) or look.single() or next(look.plain(whole=False), None)
         if identity is not None:
             return identity
     for shown in sets:
@@ -120,6 +122,11 @@ def identify(images: Image | Sequence[Image], declared: Target | None = None) ->
     )
 
 
+def identify_plain(images: Sequence[Image]) -> Identity | None:
+    """Identifies a board without markers that (h, w) grey images show whole; quick."""
+    return next(_Look(images, None).plain(), None)
+
+
 @dataclass(frozen=True, eq=False)
 class _Look:
     """Images of one board, and what is expected."""
@@ -140,15 +147,28 @@ class _Look:
         for mirrored, border in product((False, True), borders):
             yield from self._of_markers(border, mirrored=mirrored)
 
-    def plain(self) -> Iterator[Identity]:
-        """Boards without markers: the one that most images show, of these the largest."""
-        for kind in KINDS.values():
-            found = [board for image in self.pictures if (board := kind.seen_in(image)) is not None]
-            counts = [(board.columns, board.rows, board.asymmetric) for board in found]
+    def plain(self, *, whole: bool = True) -> Iterator[Identity]:
+        """Boards without markers: the one that most images show, of these the largest.
+
+        Args:
+            whole: Whether an image must show on each side that it ends there.
+        """
+        for kind in KINDS:
+            seen = [one for one in self._plain if one is not None and one[0].kind == kind]
+            counts = [(board.columns, board.rows, board.asymmetric) for board, _ in seen]
+            found = [at for at, (_, ends) in enumerate(seen) if ends or not whole]
             if found:
-                at = max(range(len(found)), key=lambda at: (counts.count(counts[at]), counts[at]))
-                corners = found[at].columns * found[at].rows
-                yield Identity(found[at], corners, corners, shown=counts.count(counts[at]))
+                at = max(found, key=lambda at: (counts.count(counts[at]), counts[at]))
+                corners = seen[at][0].columns * seen[at][0].rows
+                shown = counts.count(counts[at]) if whole else 0
+                notes = () if whole else (_MAY_HAVE_MORE,)
+                yield Identity(seen[at][0], corners, corners, notes=notes, shown=shown)
+
+    @cached_property
+    def _plain(self) -> list[tuple[Target, bool] | None]:
+        """Board without markers of each image, by the first kind that sees one; see `seen_in`."""
+        looks = ((kind.seen_in(image) for kind in KINDS.values()) for image in self.pictures)
+        return [next((one for one in look if one is not None), None) for look in looks]
 
     def shown(self, *, mirrored: bool) -> list[Image]:
         """The images or their mirror images."""

@@ -226,8 +226,11 @@ class BoardKind(ABC):
         del numbers, columns
         return ()
 
-    def seen_in(self, image: Image) -> Target | None:
-        """The board without markers that a (h, w) grey image shows whole, with sides of 1 m."""
+    def seen_in(self, image: Image) -> tuple[Target, bool] | None:
+        """The board without markers, of sides of 1 m, that a (h, w) grey image shows.
+
+        And whether the image shows on each side that it ends there.
+        """
         del image
         return None
 
