@@ -46,6 +46,9 @@ from visioncal.core.types import FloatArray, IntArray, Mask, Rejection
 from visioncal.core.verdict import Finding, mending, or_alone
 from visioncal.vision.camera import turned_back
 
+# Share of a flip's angle that its mirror image leaves at most, and a flip's shift without unit:
+# perspective of a near marker puts the second pose off the mirror image by a tenth.
+_NEARLY = 0.15
 # A camera is in its place within this [m].
 _IN_PLACE_M = 0.01
 
@@ -133,6 +136,12 @@ def _flipped(
             gain = EVIDENCE * float(log - base) + MISTAKE - float(np.log(len(own)))
             if gain > odds and squares[agrees].mean() < CLOSING_SCORE**2:
                 odds, wrong = gain, np.arange(len(own)) == at
+    # Wrong poses that a mirror brings so near by chance: the turns left have three directions.
+    nearly = (apart[:, 0] < _NEARLY**2 * apart[:, 1]) & (mirrored[:, 1] < _NEARLY**2 * apart[:, 1])
+    nearly &= ~evidence(apart[None])[1][0] & (own >= 0)
+    gain = MISTAKE + 1.5 * float(np.log(apart[nearly, 1] / (mirrored[nearly, 1] + LEAST**2)).sum())
+    if gain > CLEAR > odds:
+        odds, wrong = gain, nearly
     views = tuple(record.views[record.rows[wrong]].tolist())
     if not views:
         return
