@@ -768,6 +768,26 @@ def test_each_doubt_has_its_sentence(changes, status, words):
         assert len(verdict.reasons) == count + (not verdict.has_accuracy)
 
 
+@pytest.mark.parametrize(
+    ("scatter", "noise", "is_of_arm"),
+    [
+        (Rms(3.3, 0.31), (1.3, 0.15), True),
+        (Rms(1.2, 0.12), (0.5, 0.05), True),
+        # Turns without shifts are a marker's; no arm scatters by centimetres.
+        (Rms(0.6, 0.9), (0.2, 0.5), False),
+        (Rms(30.0, 3.0), (13.0, 1.5), False),
+    ],
+)
+def test_the_scatter_of_an_arm_is_named_whatever_its_size(scatter, noise, is_of_arm):
+    verdict = judge(changed(SOUND, held_out=scatter, noise_mm=noise[0], noise_deg=noise[1]))
+    first = verdict.reasons[0]
+    assert ("neither posture nor time" in first) == is_of_arm
+    assert (f"a flange that is off by {noise[0]} mm and {noise[1]} deg" in first) == is_of_arm
+    assert ("measured, not commanded" in str(verdict.findings[0].do)) == is_of_arm
+    drifting = judge(changed(SOUND, held_out=scatter, noise_mm=1.3, warnings=(DRIFT,)))
+    assert "neither posture nor time" not in str(drifting)
+
+
 @pytest.mark.parametrize(("sigma_mm", "status"), [(0.3, "check"), (4.0, "bad")])
 def test_an_arm_that_is_unsure_elsewhere_is_bad_where_views_place_no_better(sigma_mm, status):
     verdict = judge(changed(SOUND, workspace_mm=4.0, picks=(of_size(sigma_mm),)))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.suspects.arm import NO_JOINTS
-from visioncal.calibration.suspects.judged import Findings, JudgedPair, Sensor
+from visioncal.calibration.suspects.judged import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.calibration.suspects.ranking import MEASURE_BOARD, add_views_remedy
 from visioncal.calibration.suspects.registry import SUSPECTS
 from visioncal.calibration.suspects.suspect import UNEXPLAINED
@@ -30,20 +30,33 @@ _LISTED = 3
 # From here on places disagree by more than arms, markers and lenses err [mm], where that is so many
 # times as much as turns do on the lever.
 _FAR_MM, _MUCH_FARTHER = 20.0, 10.0
+# Levers from joints that scatter to the flange: from a wrist to a long arm [m].
+_LEVERS_M = (0.1, 1.5)
+_ARM_SCATTERS = (
+    "Read each pose and take each picture once the arm stands still, and read poses that are "
+    "measured, not commanded. Where it does, it repeats no better, as a servo arm or one whose "
+    "joints have play: more views then average it in the frames, and not where it picks. Look at "
+    "the worst views, too, for a board or camera that is loose."
+)
 
 
 def collect_findings(judged: Findings) -> list[Finding]:
     """All findings against a result, in the order of the checks."""
     robots, scatter = [*_robot_noise(judged)], [*_scatter(judged)]
+    is_fatal = any(doubt.is_fatal for doubt in scatter)
     if scatter:
         # Scatter replaces the robot's noise, and is accepted up to the same need at least.
         least = max((doubt.until_mm for doubt in robots), default=0.0)
         scatter = [replace(doubt, until_mm=max(doubt.until_mm, least)) for doubt in scatter]
+        if len(judged.arms) == 1 and _is_of_arm(judged, judged.arms[0]) and not is_fatal:
+            words = f"{robots[0].words} {scatter[0].words}"
+            scatter = [replace(scatter[0], words=words, do=robots[0].do)]
         robots = []
     # With fatal scatter, sigmas say nothing about the motion. A step inflates all of them, and more
     # views do not help.
-    is_wild = any(doubt.is_fatal for doubt in scatter)
-    is_wild |= any("calibration" in SUSPECTS[found.kind].inflates for found in judged.warnings)
+    is_wild = is_fatal or any(
+        "calibration" in SUSPECTS[found.kind].inflates for found in judged.warnings
+    )
     return [
         *scatter,
         *(doubt.of(pair.name) for pair in judged.pairs for doubt in _left_out(pair)),
@@ -55,6 +68,18 @@ def collect_findings(judged: Findings) -> list[Finding]:
         *robots,
         *(warning for warning in judged.warnings if SUSPECTS[warning.kind].is_doubt),
     ]
+
+
+def _is_of_arm(judged: Findings, arm: JudgedArm) -> bool:
+    """Whether noise beyond a robot's own is like that of an arm that repeats poorly.
+
+    No pattern by posture or time is known of it, and its shifts are those of its turns by levers
+    that arms have.
+    """
+    if not any(_robot_noise_of(arm)) or any(SUSPECTS[at.kind].is_doubt for at in judged.warnings):
+        return False
+    lever_m = 1e-3 * (arm.noise_mm or 0.0) / np.deg2rad(max(arm.noise_deg or 0.0, 1e-9))
+    return bool(_LEVERS_M[0] < lever_m < _LEVERS_M[1])
 
 
 def _scatter(judged: Findings) -> Iterator[Finding]:
@@ -347,19 +372,28 @@ def _corner_noise(sensor: Sensor) -> Iterator[Finding]:
 def _robot_noise(judged: Findings) -> Iterator[Finding]:
     """Findings on implausible noise of arms, which usually has another cause."""
     for arm in judged.arms:
-        if arm.noise_mm is None or arm.noise_deg is None or arm.has_posture_errors:
-            continue
-        limit_mm, limit_deg = _LIMITS.repeatability * np.array(arm.repeatability)
-        # Only noise whose confidence interval is above the limit counts.
-        least_mm, least_deg = arm.lower_bounds or (arm.noise_mm, arm.noise_deg)
-        if max(least_mm / limit_mm, least_deg / limit_deg) <= 1.0:
-            continue
-        ratio = max(arm.noise_mm / limit_mm, arm.noise_deg / limit_deg)
-        yield Finding(
-            UNEXPLAINED,
-            "The residuals would take a flange that is off by "
-            f"{mm_and_deg(arm.noise_mm, arm.noise_deg)} from stop to stop; such "
-            f"arms repeat to {mm_and_deg(*arm.repeatability)}.",
-            Remedy(_unexplained_words(judged.held_out)),
-            until_mm=_LIMITS.good_enough * ratio * limit_mm,
-        ).of(arm.name)
+        for ratio, limit_mm in _robot_noise_of(arm):
+            words = (
+                "The residuals would take a flange that is off by "
+                f"{mm_and_deg(arm.noise_mm or 0.0, arm.noise_deg or 0.0)} from stop to stop; such "
+                f"arms repeat to {mm_and_deg(*arm.repeatability)}."
+            )
+            do = Remedy(_unexplained_words(judged.held_out))
+            if _is_of_arm(judged, arm):
+                words += (
+                    " They follow neither posture nor time, and shifts go with turns as an arm's."
+                )
+                do = Remedy(_ARM_SCATTERS, REVIEW)
+            until_mm = _LIMITS.good_enough * ratio * limit_mm
+            yield Finding(UNEXPLAINED, words, do, until_mm=until_mm).of(arm.name)
+
+
+def _robot_noise_of(arm: JudgedArm) -> Iterator[tuple[float, float]]:
+    """How many times an arm's noise is above its limit, and the limit [mm], where it clearly is."""
+    if arm.noise_mm is None or arm.noise_deg is None or arm.has_posture_errors:
+        return
+    limit_mm, limit_deg = _LIMITS.repeatability * np.array(arm.repeatability)
+    # Only noise whose confidence interval is above the limit counts.
+    least_mm, least_deg = arm.lower_bounds or (arm.noise_mm, arm.noise_deg)
+    if max(least_mm / limit_mm, least_deg / limit_deg) > 1.0:
+        yield max(arm.noise_mm / limit_mm, arm.noise_deg / limit_deg), float(limit_mm)
