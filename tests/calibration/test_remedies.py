@@ -241,6 +241,25 @@ def test_turns_that_are_wrong_each_in_its_way_are_no_other_frame(tmp_path):
     assert (cause.kind, cause.views) == ("wrong_views", (3, 9, 14))
 
 
+@pytest.mark.parametrize("lens", ["auto", slow("hold")])
+@pytest.mark.parametrize("begins", [(320.0, 180.0), slow((60.0, 40.0))])
+def test_a_lens_of_the_whole_sensor_is_named_by_where_a_part_of_it_begins(tmp_path, lens, begins):
+    cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
+
+    def whole(document):
+        document["camera"] |= {"intrinsics": lens}
+        focal, centre = np.split(np.array(document["camera"]["matrix"]), 2)
+        document["camera"]["matrix"] = [*focal.tolist(), *(centre + begins).tolist()]
+
+    document_of(whole)(tmp_path / "cell")
+    cause = visioncal.calibrate(tmp_path / "cell").verdict.causes[0]
+    assert cause.kind in ("other_lens", "lens")
+    found = re.search(r"begins (\d+) px to the right and (\d+) px below", cause.words)
+    # A few pixels of the centre trade with the distortion.
+    assert [int(at) for at in found.groups()] == pytest.approx(begins, abs=5.0)
+    assert "times as large" not in cause.words
+
+
 def test_another_distortion_is_no_picture_of_another_size(tmp_path):
     cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
     k1, k2, *_ = SOUND.camera.distortion

@@ -30,6 +30,7 @@ from visioncal.results.compare import intrinsics_names
 from visioncal.session import Session, View, frame_name
 from visioncal.session.document import CameraTable
 from visioncal.session.kinds import name_of
+from visioncal.vision.camera import normalise, project
 from visioncal.vision.intrinsics import Intrinsics, estimate_intrinsics
 from visioncal.vision.targets import first_corners
 
@@ -45,6 +46,9 @@ NEW_LENS = mending(
     "and distortion)",
     "--intrinsics estimate",
 )
+# A part of a picture begins farther from its corner than any centre is wrong [px]; what is left of
+# the move where stated intrinsics were misread.
+_CROPPED_PX, _EXPLAINED = 10.0, 0.1
 # Travel during an exposure from which on it matters when the robot's pose was read [m].
 _TRAVEL_M = 2e-4
 
@@ -352,7 +356,11 @@ def _other_lens(
         f"fx, fy, cx, cy = {', '.join(f'{value:.1f}' for value in lens.camera.matrix)} px."
     )
     ratios = stated.matrix / lens.camera.matrix
-    if np.abs(ratios - 1.0).max() < _SAME_RATIO:
+    px = np.concatenate([at.px for at in corners.values()])
+    moved_px, _ = most_moved_px(stated, lens.camera, px)
+    if misread := misread_lens(stated, lens.camera, px, moved_px):
+        words += misread
+    elif np.abs(ratios - 1.0).max() < _SAME_RATIO:
         order = ", ".join(intrinsics_names(stated)[4:])
         words += " The matrix is about as stated: the distortion is another one, or another "
         words += f"program's order of it (OpenCV's is {order})."
@@ -362,6 +370,48 @@ def _other_lens(
         words += f"about {width:.0f} x {height:.0f} px."
     result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
     return result, poses, Finding("other_lens", words, NEW_LENS)
+
+
+def misread_lens(stated: Camera, refined: Camera, px: FloatArray, moved_px: float) -> str:
+    """How stated intrinsics fit after all, as a sentence; empty where no way is known.
+
+    Another program's order of five coefficients, pictures that are rectified, or a part of them.
+    """
+    ways, moves = dict[str, Camera](), refined.matrix[2:] - stated.matrix[2:]
+    if stated.model == "brown" and stated.distortion.any():
+        flat = np.zeros(len(stated.distortion))
+        words = "The pictures are rectified: write distortion = [0, 0, 0, 0, 0]."
+        ways[words] = replace(stated, distortion=flat)
+    if stated.model == "brown" and len(stated.distortion) == 5:
+        other = stated.distortion[[0, 1, 3, 4, 2]]
+        words = "They are in the order k1, k2, k3, p1, p2, and OpenCV's is k1, k2, p1, p2, k3: "
+        words += f"write distortion = [{', '.join(f'{value:.6g}' for value in other)}]."
+        ways[words] = replace(stated, distortion=other)
+    # A part begins within the picture, and no centre is known to the pixel.
+    if max(-moves) > _CROPPED_PX and min(-moves) > -_CROPPED_PX:
+        right, below = (max(round(-move), 0) for move in moves.tolist())
+        words = (
+            f"The pictures are a part of this lens's, which begins {right} px to the right and "
+            f"{below} px below: subtract these from the centre in matrix."
+        )
+        ways[words] = replace(stated, matrix=np.append(stated.matrix[:2], refined.matrix[2:]))
+    left = {words: most_moved_px(lens, refined, px)[0] for words, lens in ways.items()}
+    best = min(left, key=left.__getitem__, default="")
+    return f" {best}" if best and left[best] < _EXPLAINED * moved_px else ""
+
+
+def most_moved_px(stated: Camera, other: Camera, px: FloatArray) -> tuple[float, float]:
+    """Most that corners move from one lens to another, in all and by its distortion [px]."""
+    rays = normalise(stated, px)
+    rays = np.column_stack([rays, np.ones(len(rays))])
+    # By the matrix alone, the rest is the distortion's.
+    unbent = replace(other, distortion=stated.distortion)
+    after = project(other, rays)
+    moved_px, bent_px = (
+        float(np.nanmax(np.linalg.norm(after - project(at, rays), axis=1), initial=0.0))
+        for at in (stated, unbent)
+    )
+    return moved_px, bent_px
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cameras import NEW_LENS
+from visioncal.calibration.stages.cameras import NEW_LENS, misread_lens, most_moved_px
 from visioncal.calibration.stages.error_sizes import Zoom
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
@@ -25,7 +25,7 @@ from visioncal.model.effects.board_sags import BoardSags
 from visioncal.model.effects.effect import SIGNIFICANT
 from visioncal.model.effects.window import Window, nearer
 from visioncal.results.compare import intrinsics_names
-from visioncal.vision.camera import intrinsics, normalise, project, with_intrinsics
+from visioncal.vision.camera import intrinsics, normalise, with_intrinsics
 from visioncal.vision.intrinsics import estimate_intrinsics
 
 # Changes of intrinsics or corners below this show in no image, and in no pick [px].
@@ -36,9 +36,6 @@ _SHIFTED_PX = 3.0
 _MOST_CREEP = 0.03
 # Share of the focal length by which distortion that changed alone may seem to change it, too.
 _ALONE = 3e-3
-# A part of a picture begins farther from its corner than any centre is wrong [px]; what is left of
-# the move where stated intrinsics were misread.
-_CROPPED_PX, _EXPLAINED = 10.0, 0.1
 # Boards whose corners are those of single squares.
 _LONE = ("gridboard", "marker")
 # Another model of a lens leaves so much less: more than an even field does; and so much less that
@@ -97,7 +94,7 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
         sigmas_px = problem.stated_sigma[:4]
         moved = f"fx, fy, cx, cy moved by {_px(moves)} px."
         stated, refined = problem.scene.camera, optics.camera(camera)
-        moved_px, bent_px = _moved_px(stated, refined, stack.px)
+        moved_px, bent_px = most_moved_px(stated, refined, stack.px)
         if bent_px > max(np.abs(moves).max(), _LEAST_MOVE_PX):
             names = ", ".join(intrinsics_names(stated)[4:])
             moved = f"the distortion, {names}, moved corners by up to {figure(bent_px)} px; {moved}"
@@ -107,7 +104,7 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
         is_wrong &= has_changed(assessment.sized, columns)
         if is_wrong and moved_px > _LEAST_MOVE_PX:
             words = f"The given intrinsics do not fit these images and were refined: {moved}"
-            words += _misread(stated, refined, stack.px, moved_px)
+            words += misread_lens(stated, refined, stack.px, moved_px)
             yield Finding("lens", words, NEW_LENS)
         else:
             allowed = "within what is stated, or no more than images or a board's size explain"
@@ -119,7 +116,7 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
         information = np.linalg.inv(fitted.by_noise[np.ix_(columns, columns)])
         squared = float(fitted.shift[columns] @ information @ fitted.shift[columns])
         free = with_intrinsics(held, intrinsics(held) + moves)
-        moved_px, bent_px = _moved_px(held, free, stack.px)
+        moved_px, bent_px = most_moved_px(held, free, stack.px)
         if moved_px > _LEAST_MOVE_PX and squared > chi2_limit(FALSE_ALARM, len(columns)):
             would = f"fx, fy, cx, cy would move by {_px(moves[:4])} px"
             if bent_px > np.abs(moves[:4]).max():
@@ -127,54 +124,13 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
                 would = f"the distortion, {names}, would move corners by up to {figure(bent_px)} px"
             yield Finding(
                 "lens",
-                f"The given intrinsics do not fit these images: free, {would}. But intrinsics = "
+                f"The given intrinsics do not fit these images: free, {would}."
+                f"{misread_lens(held, free, stack.px, moved_px)} But intrinsics = "
                 '"hold" keeps them; what this does to the result counts in its sigmas.',
                 NEW_LENS,
                 mahalanobis_sq=squared,
                 up_to_mm=_misplaced_mm(fitted, camera, moved_px),
             )
-
-
-def _misread(stated: Camera, refined: Camera, px: FloatArray, moved_px: float) -> str:
-    """How stated intrinsics fit after all, as a sentence; empty where no way is known.
-
-    Another program's order of five coefficients, pictures that are rectified, or a part of them.
-    """
-    ways, moves = dict[str, Camera](), refined.matrix[2:] - stated.matrix[2:]
-    if stated.model == "brown" and stated.distortion.any():
-        flat = np.zeros(len(stated.distortion))
-        words = "The pictures are rectified: write distortion = [0, 0, 0, 0, 0]."
-        ways[words] = replace(stated, distortion=flat)
-    if stated.model == "brown" and len(stated.distortion) == 5:
-        other = stated.distortion[[0, 1, 3, 4, 2]]
-        words = "They are in the order k1, k2, k3, p1, p2, and OpenCV's is k1, k2, p1, p2, k3: "
-        words += f"write distortion = [{', '.join(f'{value:.6g}' for value in other)}]."
-        ways[words] = replace(stated, distortion=other)
-    # A part begins within the picture, and no centre is known to the pixel.
-    if max(-moves) > _CROPPED_PX and min(-moves) > -_CROPPED_PX:
-        right, below = (max(round(-move), 0) for move in moves.tolist())
-        words = (
-            f"The pictures are a part of this lens's, which begins {right} px to the right and "
-            f"{below} px below: subtract these from the centre in matrix."
-        )
-        ways[words] = replace(stated, matrix=np.append(stated.matrix[:2], refined.matrix[2:]))
-    left = {words: _moved_px(lens, refined, px)[0] for words, lens in ways.items()}
-    best = min(left, key=left.__getitem__, default="")
-    return f" {best}" if best and left[best] < _EXPLAINED * moved_px else ""
-
-
-def _moved_px(stated: Camera, other: Camera, px: FloatArray) -> tuple[float, float]:
-    """Most that corners move from one lens to another, in all and by its distortion [px]."""
-    rays = normalise(stated, px)
-    rays = np.column_stack([rays, np.ones(len(rays))])
-    # By the matrix alone, the rest is the distortion's.
-    unbent = replace(other, distortion=stated.distortion)
-    after = project(other, rays)
-    moved_px, bent_px = (
-        float(np.nanmax(np.linalg.norm(after - project(at, rays), axis=1), initial=0.0))
-        for at in (stated, unbent)
-    )
-    return moved_px, bent_px
 
 
 def _misplaced_mm(fitted: Fit, camera: str, px: float) -> float:
