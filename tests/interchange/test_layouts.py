@@ -1459,6 +1459,32 @@ def test_files_of_two_sides_are_told_by_their_names(tmp_path, monkeypatch):
             np.testing.assert_allclose(view.cam_from_target().as_matrix(), board, atol=1e-9)
 
 
+def test_quaternions_without_their_real_part(tmp_path, monkeypatch):
+    """Three numbers of them are a form; half turns made of these are named as what they are."""
+    monkeypatch.chdir(tmp_path)
+    poses, _, session = world()
+    seen = np.array([view.cam_from_target().as_matrix() for view in session.views])
+    sides = {"robot": poses, "cam": seen}
+    names = [f"{side}_{name}" for side in sides for name in ("x", "y", "z", "qx", "qy", "qz")]
+    vectors = {
+        side: Rotation.from_matrix(each[:, :3, :3]).as_quat(canonical=True)[:, :3]
+        for side, each in sides.items()
+    }
+    rows = np.hstack([part for s, each in sides.items() for part in (each[:, :3, 3], vectors[s])])
+    rows = [",".join(map(repr, row)) for row in rows.tolist()]
+    write(tmp_path / "in.csv", "\n".join([",".join(names), *rows]))
+    visioncal("convert", "in.csv", "out", "--mount", session.mount).good()
+    for view, pose, board in zip(Session.load("out").views, poses, seen, strict=True):
+        np.testing.assert_allclose(view.base_from_flange().as_matrix(), pose, atol=1e-9)
+        np.testing.assert_allclose(view.cam_from_target().as_matrix(), board, atol=1e-9)
+    half = seen.copy()
+    half[:, :3, :3] = Rotation.from_quat(np.pad(vectors["cam"], ((0, 0), (0, 1)))).as_matrix()
+    records = zip(poses.tolist(), half.tolist(), strict=True)
+    write(tmp_path / "half.json", [{"T_base_ee": a, "T_cam_board": b} for a, b in records])
+    visioncal("convert", "half.json", "turned", "--mount", session.mount).good()
+    assert "The target's rotations are half turns" in visioncal("doctor", "turned").out
+
+
 def test_a_mount_that_is_not_as_stated_is_said_before_a_form_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     poses, _, session = world()

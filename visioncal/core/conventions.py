@@ -52,6 +52,26 @@ def _quaternions(name: str, words: str, order: Sequence[int]) -> RotationForm:
     return RotationForm(name, words, 4, read, write)
 
 
+def _quaternion_vectors() -> RotationForm:
+    """The form of a quaternion's x, y, z, whose real part was not written, and is not negative."""
+
+    def read(numbers: FloatArray) -> FloatArray:
+        squares = (np.clip(numbers, -2.0, 2.0) ** 2).sum(axis=1)
+        # False of NaN, too.
+        valid = squares < 1.0 + NORM_TOLERANCE
+        safe = np.where(valid[:, None], numbers, 0.0)
+        real = np.sqrt(np.maximum(1.0 - np.where(valid, squares, 0.0), 0.0))
+        return _without(Rotation.from_quat(np.column_stack([safe, real])).as_matrix(), ~valid)
+
+    return RotationForm(
+        "quaternion-xyz",
+        "a quaternion's x, y, z without its real part",
+        3,
+        read,
+        lambda rotations: Rotation.from_matrix(rotations).as_quat(canonical=True)[:, :3],
+    )
+
+
 def _rotation_vectors(name: str, words: str, unit_rad: float) -> RotationForm:
     def read(numbers: FloatArray) -> FloatArray:
         finite = _finite_rows(numbers)
@@ -142,6 +162,7 @@ ROTATION_FORMS: Mapping[str, RotationForm] = {
             "a quaternion y, z, w, x (x, y, z, w under the names w, x, y, z)",
             (1, 2, 3, 0),
         ),
+        _quaternion_vectors(),
         _rotation_vectors("rotation-vector", "a rotation vector in radians", 1.0),
         _rotation_vectors(
             "rotation-vector-deg", "a rotation vector in degrees", float(np.deg2rad(1.0))

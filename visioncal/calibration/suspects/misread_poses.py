@@ -63,6 +63,15 @@ _WHICH = (
 _LOG_ANEW = Remedy(
     "Look how this number comes into the log, and record again; or convert the robot's own log."
 )
+_HALF_TURNS = (
+    "are half turns in all views, about axes in all directions: the real part of their quaternion "
+    "was lost, as where w was 0 or one of three numbers was taken for it. How far each turns "
+    "cannot be found again from these numbers."
+)
+_REAL_PART = Remedy(
+    "Convert the recording itself again, with all four numbers of each quaternion, or with x, y "
+    "and z alone as it wrote them (--robot-form or --camera-form quaternion-xyz)."
+)
 # A number that stands still does so to a digit; others vary by more [mm, deg].
 _DIGIT_MM, _DIGIT_DEG, _VARIES_MM, _VARIES_DEG = 1e-3, 2e-3, 20.0, 5.0
 _IN_MOTION = Remedy(
@@ -206,6 +215,9 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
     if np.median(away) > _ALIKE_RAD and (late := _on_the_way(robot, by_camera, kept)) is not None:
         yield late
         return
+    if np.median(away) > _ALIKE_RAD and (whose := _half_turned(both)):
+        yield Finding("misread_poses", f"The {whose}'s rotations {_HALF_TURNS}", _REAL_PART)
+        return
     words = "The robot's poses are not those of the images: "
     if np.ptp(both[:, 0, :3, 3], axis=0).max() < _STILL_M:
         words += "all rows have one position of the robot."
@@ -217,6 +229,19 @@ def _unrecorded(run: RunState) -> Iterator[Finding]:
     else:
         return
     yield Finding("misread_poses", words, UNRECORDED)
+
+
+def _half_turned(both: FloatArray) -> str:
+    """The side of (m, 2, 4, 4) poses all of whose rotations are half turns; empty for none.
+
+    Those of a tool that points straight down are, too, but about axes in one plane.
+    """
+    for whose, poses in zip(("robot", "target"), both.swapaxes(0, 1), strict=True):
+        turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+        spread = np.linalg.svd(turns, compute_uv=False)[-1] / np.sqrt(len(turns))
+        if np.linalg.norm(turns, axis=1).min() > np.pi - _ALIKE_RAD and spread > 3 * _ALIKE_RAD:
+            return whose
+    return ""
 
 
 def _still(robot: FloatArray) -> str:

@@ -185,6 +185,11 @@ def _likely_rotation(
         )
     joined = " ".join(names).lower()
     largest = float(np.nanmax(np.abs(rotations), initial=0.0))
+    if len(names) == 3 and [name[-2:].lower() for name in names] == ["qx", "qy", "qz"]:
+        return "quaternion-xyz", (
+            f"The {whose}'s rotations have no qw, which is taken for the positive root of "
+            "1 - qx² - qy² - qz²."
+        )
     if _ANGLES_NAME.search(joined):
         is_large = not degrees and largest > 2 * np.pi + 0.01 and requested.form is None
         note = (

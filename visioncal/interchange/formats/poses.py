@@ -75,6 +75,8 @@ _POSITION_NAMES = tuple(tuple(names.split()) for names in ("x y z", "tx ty tz", 
 _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
     ("qx", "qy", "qz", "qw"),
     ("q0", "q1", "q2", "q3"),
+    ("qx", "qy", "qz", "w"),
+    ("qx", "qy", "qz"),
     *dict.fromkeys(tuple(form.names.split()) for form in POSE_FORMS.values()),
 )
 
