@@ -1459,6 +1459,54 @@ def test_files_of_two_sides_are_told_by_their_names(tmp_path, monkeypatch):
             np.testing.assert_allclose(view.cam_from_target().as_matrix(), board, atol=1e-9)
 
 
+def pairs():
+    """(2, n, 4, 4) poses of the robot, and of the board as a camera sees it; and the mount."""
+    poses, _, session = world()
+    seen = [view.cam_from_target().as_matrix() for view in session.views]
+    return np.array([poses, seen]), session.mount
+
+
+def came_in(session):
+    """The poses of both sides as they were read."""
+    return np.array(
+        [
+            [view.base_from_flange().as_matrix() for view in session.views],
+            [view.cam_from_target().as_matrix() for view in session.views],
+        ]
+    )
+
+
+def test_structures_and_cells_of_matlab(tmp_path):
+    (robot, camera), mount = pairs()
+    cells = np.empty((1, len(camera)), dtype=object)
+    for at, pose in enumerate(camera):
+        cells[0, at] = pose
+    run = {"robot": np.moveaxis(robot, 0, -1), "camera": cells}
+    savemat(tmp_path / "in.mat", {"run": run, "name": "a"})
+    visioncal("convert", tmp_path / "in.mat", tmp_path / "out", "--mount", mount).good()
+    found = came_in(Session.load(tmp_path / "out"))
+    np.testing.assert_allclose(found, [robot, camera], atol=1e-9)
+
+
+def test_arrays_that_are_numbered_are_series_and_no_rows(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    both, mount = pairs()
+    np.savez("in.npz", series_1=both[0], series_2=both[1])
+    follow("convert", "in.npz", "out", "--mount", mount).last.good()
+    np.testing.assert_allclose(came_in(Session.load("out")), both, atol=1e-9)
+
+
+def test_a_series_is_named_that_is_not_read(tmp_path, monkeypatch):
+    """One in which the robot stands still is not read, however well both sides agree."""
+    monkeypatch.chdir(tmp_path)
+    both, mount = pairs()
+    records = [{"T_base_ee": a, "T_cam_board": b} for a, b in both.swapaxes(0, 1).tolist()]
+    write(tmp_path / "in.json", {"first": records[:1] * 8, "second": records})
+    done = visioncal("convert", "in.json", "out", "--mount", mount).good()
+    assert "second is read; left aside: first (8 rows)" in done.err
+    np.testing.assert_allclose(came_in(Session.load("out")), both, atol=1e-9)
+
+
 def test_quaternions_without_their_real_part(tmp_path, monkeypatch):
     """Three numbers of them are a form; half turns made of these are named as what they are."""
     monkeypatch.chdir(tmp_path)

@@ -4,7 +4,7 @@ import io
 import json
 import zipfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,15 +22,30 @@ Array: TypeAlias = npt.NDArray[Any]
 _OPAQUE = "its values are a table or other objects of MATLAB"
 
 
+def _parts(name: str, array: Array) -> Iterator[tuple[str, Array]]:
+    """An array; those of a structure by its fields, and those of cells that are alike as one."""
+    if array.dtype.names:
+        for key in array.dtype.names:
+            yield from _parts(f"{name}.{key}", array[key])
+    elif array.dtype.kind == "O" and len({*map(np.shape, array.flat)}) == 1:
+        inside = [*map(np.asarray, array.flat)]
+        yield from _parts(name, inside[0] if len(inside) == 1 else np.stack(inside))
+    else:
+        yield name, array
+
+
 def _of_matlab(data: io.BytesIO) -> dict[str, Array]:
     """The arrays of a .mat by name; raises TypeError where objects are all that it holds."""
     from scipy.io import loadmat
     from scipy.io.matlab import MatlabOpaque
 
-    found = {name: each for name, each in loadmat(data).items() if name[:2] != "__"}
-    # Structures and cells are of other kinds.
+    loaded = {name: each for name, each in loadmat(data).items() if name[:2] != "__"}
+    is_opaque = any(isinstance(each, MatlabOpaque) for each in loaded.values())
+    plain = {name: each for name, each in loaded.items() if not isinstance(each, MatlabOpaque)}
+    found = dict(part for name, each in plain.items() for part in _parts(name, each))
+    # Other kinds hold no numbers.
     arrays = {name: each for name, each in found.items() if each.dtype.kind in "fiubU"}
-    if not arrays and any(isinstance(each, MatlabOpaque) for each in found.values()):
+    if not arrays and is_opaque:
         raise TypeError(_OPAQUE)
     return arrays
 

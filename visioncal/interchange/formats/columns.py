@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import some_of
+from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
     Fields,
@@ -80,7 +80,9 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         try:
             for more, foreign in _recordings(fields, asked, images, instead):
                 target, of_board = board if foreign.images else (None, ())
+                beside = [each for _, each, _ in readings if each is not fields]
                 all_notes = (*foreign.notes, *notes, *of_board, *_arm_note(asked, requested))
+                all_notes += _series_note(fields, beside)
                 lens_of = foreign.lens or lens
                 whole = replace(foreign, lens=lens_of, target=target, notes=all_notes)
                 found.append((rank + more, whole))
@@ -98,6 +100,26 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
             first, doubt=unknown(source, requested, [each for _, each, _ in readings[:1]])
         )
     return replace(first, rivals=tuple((at - rank, other) for at, other in others))
+
+
+def _series_note(fields: Fields, others: Sequence[Fields]) -> tuple[str, ...]:
+    """A note on other series of the same fields in the same file, which are not read."""
+    every = [{*map(_split_name, each.numbers)} for each in (fields, *others)]
+    # The name of a series stands before those of its fields.
+    named = [(next(iter(each), ("",))[0], {name for _, name in each}) for each in every]
+    (own, keys), *rest = named
+    alike = {
+        series: f"{series} ({counted(len(each), 'row')})"
+        for each, (series, names) in zip(others, rest, strict=True)
+        if own and series not in ("", own) and names == keys
+    }
+    note = f"Of several series {own} is read; left aside: {some_of([*alike.values()])}, for files"
+    return (f"{note} of their own.",) * bool(alike)
+
+
+def _split_name(name: str) -> tuple[str, str]:
+    series, _, field = name.partition(".")
+    return (series, field) if field else ("", series)
 
 
 def _arm_note(asked: ImportOptions, requested: ImportOptions) -> Iterator[str]:

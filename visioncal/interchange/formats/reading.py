@@ -445,6 +445,15 @@ def _numbered_records(
             yield [*records.values()], tuple(records)
 
 
+def _is_series(value: object) -> bool:
+    """Whether a value is of many poses: matrices, or rows of as many numbers as a pose has."""
+    rows = _arrays_of(value) if isinstance(value, list) else None
+    if rows is None:
+        return False
+    is_rows = rows.ndim == 2 and len(rows) > 4 and rows.shape[1] in POSE_SIZES
+    return is_rows or rows.shape[1:] in ((4, 4), (3, 4), (3, 3))
+
+
 def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
     """Groups matrices by the numbers at the end of their names, or that are their names."""
     rows: dict[int, dict[str, object]] = defaultdict(dict)
@@ -457,6 +466,6 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
         match = re.fullmatch(r"(.*?)[_-]?([0-9]{1,9})", str(name))
         # Columns of numbers may have names such as q1; a matrix is a list of lists.
         nested = isinstance(value, list) and bool(value) and isinstance(value[0], list)
-        if match and (nested or isinstance(value, np.ndarray)):
+        if match and not _is_series(value) and (nested or isinstance(value, np.ndarray)):
             rows[int(match[2])][match[1] or "matrix"] = value
     return dict(sorted(rows.items()))

@@ -69,6 +69,7 @@ def settled(foreign: ForeignRecording, progress: Progress | None = None) -> Fore
     is_known = foreign.stream is not None or not (unstated - {"inverse"} or foreign.doubt)
     if is_known or foreign.mount is None:
         return foreign
+    foreign = _of_turning(foreign)
     _check_sides(foreign)
     # Other images make no difference where the stored poses of the target are used.
     by_images = foreign.camera is None or foreign.target is not None
@@ -174,6 +175,20 @@ def _is_still(foreign: ForeignRecording) -> bool:
     """Whether all rows have one rotation of the robot."""
     turns = foreign.robot.rotations[foreign.robot.present]
     return bool(turns.size) and float(np.ptp(turns, axis=0).max()) < _SAME
+
+
+def _of_turning(foreign: ForeignRecording) -> ForeignRecording:
+    """The recording without series in which the robot does not turn, where it does in others."""
+    readings = [(0, foreign), *foreign.rivals]
+    places = {each.robot.places for _, each in readings if not _is_still(each)}
+    kept = [
+        (rank, each)
+        for rank, each in readings
+        if not _is_still(each) or places <= {each.robot.places}
+    ]
+    (_, first), *others = kept
+    same = len(kept) == len(readings)
+    return foreign if same else replace(first, rivals=tuple(others), doubt=foreign.doubt)
 
 
 def _tested(
