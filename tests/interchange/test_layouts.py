@@ -1,6 +1,9 @@
 """Recordings in layouts that no program of a known name writes: each gives the same session."""
 
 import json
+import shlex
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -1505,6 +1508,25 @@ def test_a_series_is_named_that_is_not_read(tmp_path, monkeypatch):
     done = visioncal("convert", "in.json", "out", "--mount", mount).good()
     assert "second is read; left aside: first (8 rows)" in done.err
     np.testing.assert_allclose(came_in(Session.load("out")), both, atol=1e-9)
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_pictures_within_arrays_come_in_by_the_printed_command(tmp_path, monkeypatch, each):
+    monkeypatch.chdir(tmp_path)
+    poses, pictures, session = world()
+    if each:
+        (tmp_path / "in").mkdir()
+        for at, (pose, picture) in enumerate(zip(poses, pictures, strict=True)):
+            np.savez(f"in/{at}.npz", T_base_ee=pose, rgb=picture)
+    else:
+        np.savez("in.npz", T_base_ee=poses, rgb=np.repeat(np.array(pictures)[..., None], 3, -1))
+    said = ("--target", session.document["target"], "--mount", "eye-in-hand")
+    refused = visioncal("convert", "in" if each else "in.npz", "out", *said).refused().err
+    command = refused[refused.index("python -c") :].partition(" && ")[0]
+    subprocess.run(shlex.split(command.replace("python", sys.executable, 1)), check=True)
+    visioncal("convert", "in-pictures", "out", *said).good()
+    found = [view.base_from_flange().as_matrix() for view in Session.load("out").views]
+    np.testing.assert_allclose(found, poses, atol=1e-9)
 
 
 def test_quaternions_without_their_real_part(tmp_path, monkeypatch):

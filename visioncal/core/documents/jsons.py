@@ -5,6 +5,7 @@ import json
 import zipfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -19,6 +20,7 @@ from visioncal.core.files import MOST_BYTES, decode_text, read_bytes
 Array: TypeAlias = npt.NDArray[Any]
 
 
+_LEAST_SIDE = 64  # Of a picture [px].
 _OPAQUE = "its values are a table or other objects of MATLAB"
 
 
@@ -48,6 +50,25 @@ def _of_matlab(data: io.BytesIO) -> dict[str, Array]:
     if not arrays and is_opaque:
         raise TypeError(_OPAQUE)
     return arrays
+
+
+def pictures_in(path: Path) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of an .npz that are pictures, by name, without reading these.
+
+    They are (h, w) or (h, w, 3) of one, or (n, h, w) or (n, h, w, 3) of several, in bytes.
+    """
+    found = dict[str, tuple[int, ...]]()
+    with suppress(Exception), zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            with archive.open(name) as member:
+                version = np.lib.format.read_magic(member)
+                header = np.lib.format.read_array_header_1_0
+                header = header if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, kind = header(member)
+                sides = shape[:-1] if shape[-1:] == (3,) else shape
+                if kind == np.uint8 and len(sides) in (2, 3) and min(sides[-2:]) >= _LEAST_SIDE:
+                    found[name.removesuffix(".npy")] = shape
+    return found
 
 
 def read_arrays(path: Path) -> Mapping[str, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import counted, some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
     Fields,
@@ -48,6 +48,7 @@ from visioncal.interchange.formats.sources import (
     tables_apart,
     unknown,
 )
+from visioncal.interchange.formats.unread import check_pictures, series_note
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 from visioncal.robot.trajectory import LONGEST_GAP_S, Samples
@@ -64,6 +65,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
         fields = read_fields(path, requested.robot.form)
         return with_camera_file(fields, read_fields(requested.camera_file), requested)
     source = describe(path, requested.robot.form)
+    check_pictures(source, requested)
     if path.is_file() and source.parts[0].fault:
         raise source.parts[0].fault
     if several := several_recordings(source, requested):
@@ -82,7 +84,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
                 target, of_board = board if foreign.images else (None, ())
                 beside = [each for _, each, _ in readings if each is not fields]
                 all_notes = (*foreign.notes, *notes, *of_board, *_arm_note(asked, requested))
-                all_notes += _series_note(fields, beside)
+                all_notes += series_note(fields, beside)
                 lens_of = foreign.lens or lens
                 whole = replace(foreign, lens=lens_of, target=target, notes=all_notes)
                 found.append((rank + more, whole))
@@ -100,26 +102,6 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
             first, doubt=unknown(source, requested, [each for _, each, _ in readings[:1]])
         )
     return replace(first, rivals=tuple((at - rank, other) for at, other in others))
-
-
-def _series_note(fields: Fields, others: Sequence[Fields]) -> tuple[str, ...]:
-    """A note on other series of the same fields in the same file, which are not read."""
-    every = [{*map(_split_name, each.numbers)} for each in (fields, *others)]
-    # The name of a series stands before those of its fields.
-    named = [(next(iter(each), ("",))[0], {name for _, name in each}) for each in every]
-    (own, keys), *rest = named
-    alike = {
-        series: f"{series} ({counted(len(each), 'row')})"
-        for each, (series, names) in zip(others, rest, strict=True)
-        if own and series not in ("", own) and names == keys
-    }
-    note = f"Of several series {own} is read; left aside: {some_of([*alike.values()])}, for files"
-    return (f"{note} of their own.",) * bool(alike)
-
-
-def _split_name(name: str) -> tuple[str, str]:
-    series, _, field = name.partition(".")
-    return (series, field) if field else ("", series)
 
 
 def _arm_note(asked: ImportOptions, requested: ImportOptions) -> Iterator[str]:
