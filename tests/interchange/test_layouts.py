@@ -1019,6 +1019,16 @@ def arrays_each(folder):
         np.save(folder / f"{at}_angles.npy", joints)
 
 
+def infos_as_texts(folder):
+    """A text with the pose a picture, and one with the camera_info that ROS printed."""
+    shoot(folder, "{}.png")
+    for at, pose in enumerate(world()[0]):
+        write(folder / f"{at}_robot_pose.txt", ", ".join(map(repr, map(float, seven(pose)))))
+        info = f"header:\n  seq: {at}\nheight: 400\nwidth: 640\ndistortion_model: plumb_bob\n"
+        info += "D: [0.0, 0.0, 0.0, 0.0, 0.0]\nK: [520.0, 0, 322.5, 0, 521.0, 198.0, 0, 0, 1]\n"
+        write(folder / f"{at}_camera_info.txt", info)
+
+
 def axis_first(folder):
     """Names that begin with the axis, sorted by these."""
     keys = ["x_pos", "y_pos", "z_pos", "x_rot", "y_rot", "z_rot", "w_rot"]
@@ -1064,7 +1074,8 @@ LAYOUTS: Mapping[str, Callable[[Path], None]] = {
         job, within_braces, elements, nested_elements, sections,
         headings_in_turn, lines_of_lost_pictures, lines_of_few_pictures, letters_of_a_lost_picture,
         letters_of_a_picture_too_many, lines_before_the_first_picture, urscript_with_a_start,
-        named_with_depth, named_with_clouds, arrays_each, axis_first, two_of_a_day,
+        named_with_depth, named_with_clouds, arrays_each, infos_as_texts,
+        axis_first, two_of_a_day,
     )
 }  # fmt: skip
 
@@ -1127,7 +1138,7 @@ def test_a_layout_comes_in_at_the_first_attempt(make, tmp_path):
     if make is rapid_with_a_home:
         assert "1 of 10 rows are left out, as they have neither" in done.err
         assert "calib.mod, line 2 (pHome)" in done.err
-    if make in (nested, array, messages, unnamed_angles):
+    if make in (nested, array, messages, unnamed_angles, infos_as_texts):
         assert session.camera is not None
 
 
@@ -1508,6 +1519,20 @@ def test_a_series_is_named_that_is_not_read(tmp_path, monkeypatch):
     done = visioncal("convert", "in.json", "out", "--mount", mount).good()
     assert "second is read; left aside: first (8 rows)" in done.err
     np.testing.assert_allclose(came_in(Session.load("out")), both, atol=1e-9)
+
+
+def test_pictures_of_the_lens_beside_pairs_that_do_not_fit(tmp_path):
+    """Pairs of which no reading fits come in as they are, whatever pictures may be theirs."""
+    both, mount = pairs()
+    for at in range(1, 14):
+        shoot_one(tmp_path / f"in/lens/shot_{at:02d}.png", at % 9)
+    tossed = np.random.default_rng(0).permutation(both[1])
+    np.savez(tmp_path / "in/pairs.npz", T_base_ee=both[0], T_cam_board=tossed)
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", mount).good()
+    assert "The images are left aside" in done.err
+    np.testing.assert_allclose(
+        came_in(Session.load(tmp_path / "out")), [both[0], tossed], atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("each", [False, True])

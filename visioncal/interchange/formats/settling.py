@@ -37,6 +37,7 @@ from visioncal.interchange.formats.assemble import (
     with_observations_only,
 )
 from visioncal.interchange.formats.foreign import ForeignRecording, Side, rows_of
+from visioncal.interchange.formats.pairing import UnpairedError
 from visioncal.interchange.formats.rereading import DoubtfulSession, applied_reading, measured_run
 
 # Advice where the motion determines neither the calibration nor the form of the poses.
@@ -359,7 +360,9 @@ def _untested(
             next_step="Name this board with --target, by its kind, its columns x rows and the "
             "measured side (as checkerboard_9x6_25mm), or by its .toml.",
         )
-    if foreign.doubt is not None:
+    # Other images make no difference where the stored poses of the target are used.
+    is_stored = foreign.camera is not None and foreign.target is None
+    if foreign.doubt and not (is_stored and isinstance(foreign.doubt, UnpairedError)):
         raise foreign.doubt
     is_armless = foreign.arm is None and foreign.robot_document is None
     is_armless &= foreign.joints_rad is not None and not foreign.robot.present.any()

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.calibration.guess import FEWEST_ROWS
+from visioncal.core.documents.structured import parse_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import FloatArray
@@ -27,7 +28,7 @@ from visioncal.interchange.formats.fields import (
     joined,
     named_by,
 )
-from visioncal.interchange.formats.file_search import FileGroup, groups_in
+from visioncal.interchange.formats.file_search import FileGroup, groups_in, head
 from visioncal.interchange.formats.foreign import ImportOptions
 from visioncal.interchange.formats.intrinsics import (
     LENS_KEYS,
@@ -58,6 +59,8 @@ _LISTED = 6
 _PICKLE = "a pickle, which runs code when it is opened: write its arrays as .npz or .json"
 _WORKBOOK = "a workbook: save its sheet with the poses as .csv"
 _SHUT = dict.fromkeys((".pkl", ".pickle"), _PICKLE) | dict.fromkeys((".xlsx", ".xls"), _WORKBOOK)
+# Lines of a camera_info's matrix and coefficients.
+_CAMERA_INFO = re.compile(r"^[KkDd]: *\[.*$", re.MULTILINE)
 # Readings of one source that are tested, and names of rows that are a robot's.
 _MOST_READINGS, _NAMED = 16, re.compile("pose|robot|arm", re.IGNORECASE)
 _OF_ROBOT = re.compile("robot|arm|gripper|flange|tcp|hand", re.IGNORECASE)
@@ -227,7 +230,7 @@ def _part(group: FileGroup, form: str | None) -> Part:
     is_document = first.suffix.lower() in DOCUMENTS
     try:
         document = read_document(first) if is_document else None
-        lenses = dict(lenses_in(document, group.label)) if is_document else {}
+        lenses = dict(lenses_in(document, group.label)) if is_document else _printed_lens(group)
         if not others:
             rows = joined(read_rows(first, form, document), first.stem, first.parent)
             return Part(group, tuple(rows), lenses=lenses)
@@ -238,6 +241,15 @@ def _part(group: FileGroup, form: str | None) -> Part:
     fields = fields_of_records(records, places, group.name, folder, group.numbers)
     stems = tuple(map(str, group.keys.found[HOW[0]].get("", ())))
     return Part(group, (replace(fields, stems=stems),), lenses=lenses)
+
+
+def _printed_lens(group: FileGroup) -> dict[str, Mapping[str, Any]]:
+    """The lens of texts with a camera_info that ROS printed, the same in all; empty of others."""
+    lines = {tuple(_CAMERA_INFO.findall(head(file))) for file in group.files}
+    if len(lines) == 1 and len(*lines) == 2:
+        with suppress(DataError):
+            return dict(lenses_in(parse_yaml(head(group.files[0]), group.label), group.label))
+    return {}
 
 
 def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields, ImportOptions]]:
