@@ -637,6 +637,19 @@ def test_joints_are_judged_by_their_fit():
         assert moved == pytest.approx(base @ arm.base_from_flange(joints), abs=1e-12)
 
 
+@pytest.mark.parametrize(("factor", "arm"), [(0.75, "ur5e"), (1.25, "ur20")])
+def test_a_board_of_another_size_makes_no_other_arm(factor, arm):
+    rng, declared = np.random.default_rng(5), load_robot("ur10e")
+    x, z = exp(np.array([0.3, 0.1, -0.2, 0.05, 0.1, 0.9])), exp(np.array([0, 0.2, 0, 0.1, 0, 0.1]))
+    q = np.array([0.2, -1.4, 1.8, -1.9, -1.5, 0.3]) + rng.uniform(-0.4, 0.4, (16, 6))
+    seen = x @ declared.base_from_flange(q) @ z @ exp(rng.normal(0, 1e-4, (16, 6)))
+    seen[:, :3, 3] *= factor
+    assert not guess_joints(declared, q, seen).stands_out
+    # Another arm is one, still.
+    found = guess_joints(declared, q, x @ load_robot(arm).base_from_flange(q) @ z)
+    assert found.best.reading.words == f"the arm a {arm} and not a ur10e"
+
+
 JOINTS = tuple(f"q{at}_rad" for at in range(1, 7))
 
 

@@ -49,6 +49,9 @@ _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 _LEAST_SIGMA, _MOST_SIGMA = 5e-4, 1.0
 # Prior probability of an outlier view.
 _OUTLIER_PRIOR = 0.05
+# Rounds in which the nearest rows are found; directions with a smaller singular value, relative to
+# the largest, are not determined.
+_CONCENTRATED, _DETERMINED = 4, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,3 +370,27 @@ def distance_rows(
     same = np.broadcast_to(-np.eye(3), (len(robot), 3, 3))
     rows = np.concatenate([turned, same, robot[:, :3, 3:]], axis=2)
     return rows, (turned @ x[:3, :3] @ camera[:, :3, 3:])[:, :, 0]
+
+
+def distance_factor(robot: FloatArray, camera: FloatArray, fit: Fit) -> tuple[float, float] | None:
+    """Factor of the camera's distances by which those of most rows agree; None without motion.
+
+    Args:
+        robot: (m, 4, 4) the robot's part of the chain.
+        camera: (m, 4, 4) `cam_from_target`.
+        fit: Their fit, of whose X the rotation is used.
+
+    Returns:
+        It, and the rms of what is left of the camera's distances in these rows.
+    """
+    by_edges, seen = distance_rows(robot, camera, fit.x)
+    kept, inverse = np.argsort(fit.angle, kind="stable")[: len(fit.kept)], 0.0
+    for _ in range(_CONCENTRATED):
+        rows, some = by_edges[kept].reshape(-1, 7), seen[kept].reshape(-1)
+        solution, _, rank, _ = np.linalg.lstsq(rows, -some, rcond=_DETERMINED)
+        if rank < 7:
+            return None
+        away = np.linalg.norm(seen + by_edges @ solution, axis=1)
+        kept, inverse = np.argsort(away, kind="stable")[: len(kept)], float(solution[6])
+    left = float(np.sqrt(np.mean(away[kept] ** 2)))
+    return (1.0 / inverse, left) if inverse > 0.0 else None

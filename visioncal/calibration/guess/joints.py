@@ -15,6 +15,7 @@ import numpy as np
 from visioncal.calibration.guess.fit import (
     STARTS,
     Fit,
+    distance_factor,
     distances,
     is_about_one_axis,
     mounting_fits,
@@ -221,6 +222,11 @@ def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray) -> JointGuess:
     if least > _MODEL_DEVIATION or declared.score <= CLEAR_RATIO * equivalent[0].score:
         return JointGuess(declared, declared)
     best, *others = equivalent
+    if poses.ndim > 2:
+        # Where turns agree, another arm follows in part what a board of another size explains.
+        scaled = distance_factor(invert(poses), declared.reading.poses(q), declared.fit)
+        if scaled is not None and scaled[1] < best.fit.rms[0]:
+            return JointGuess(declared, declared)
     rivals = (item.reading for item in others if item.reading.cost == best.reading.cost)
     return JointGuess(declared, best, tuple(rivals))
 

@@ -19,7 +19,7 @@ from visioncal.calibration.guess.fit import (
     CLOSING_SCORE,
     HALF_SHARE,
     STARTS,
-    distance_rows,
+    distance_factor,
     distances,
     kept_count,
 )
@@ -53,8 +53,6 @@ _TURNS_AGREE_RAD, _PRINTED, _FOLLOWED, _CONCENTRATED = 0.1, 0.03, 0.2, 4
 _TURNING = frozenset(("rotation", "written", "terms", "angle_unit", "order"))
 # Form of rotations, that of which they were written, terms and unit of angles of a reading.
 _Rotations: TypeAlias = tuple[str, str, tuple[int, ...], float]
-# Directions with a smaller singular value, relative to the largest, are not determined.
-_DETERMINED = 1e-3
 # The screening and the first fits hand on at most so many readings, whose scores are near the best
 # one's but for a quarter of a degree, which noisy poses of few views add to any bound.
 _HANDED_ON, _SLACK = 400, 5e-3
@@ -228,8 +226,12 @@ def _of_another_size(
             continue
         # Signs and mirrors that turn both frames leave the chain as it is declared.
         changed = not np.isclose(item.fit.score, declared.fit.score, rtol=1e-3)
-        scale = _distance_scale(item)
-        if scale is None or abs(np.log(scale)) < (_PRINTED if changed else _FOLLOWED):
+        (robot,), (camera,) = chains(item.recording, [item.hypothesis], item.of_rows)
+        found_factor = distance_factor(robot, camera, item.fit)
+        if found_factor is None:
+            continue
+        scale, _ = found_factor
+        if abs(np.log(scale)) < (_PRINTED if changed else _FOLLOWED):
             continue
         whose = (
             "the board" if recording.is_measured else "the camera's distances, and so the board,"
@@ -244,22 +246,6 @@ def _of_another_size(
         for item in found
         if item.fit.closes and CLEAR_RATIO * item.misfit < as_stated[item.hypothesis]
     ]
-
-
-def _distance_scale(candidate: Candidate) -> float | None:
-    """Factor of the camera's distances by which those of most rows agree; None without motion."""
-    (robot,), (camera,) = chains(candidate.recording, [candidate.hypothesis], candidate.of_rows)
-    by_edges, seen = distance_rows(robot, camera, candidate.fit.x)
-    kept = np.argsort(candidate.fit.angle, kind="stable")[: len(candidate.fit.kept)]
-    inverse = 0.0
-    for _ in range(_CONCENTRATED):
-        rows, some = by_edges[kept].reshape(-1, 7), seen[kept].reshape(-1)
-        solution, _, rank, _ = np.linalg.lstsq(rows, -some, rcond=_DETERMINED)
-        if rank < 7:
-            return None
-        away = np.linalg.norm(seen + by_edges @ solution, axis=1)
-        kept, inverse = np.argsort(away, kind="stable")[: len(kept)], float(solution[6])
-    return 1.0 / inverse if inverse > 0.0 else None
 
 
 def in_one_turn(robot: FloatArray, camera: FloatArray) -> IntArray | None:
