@@ -432,7 +432,8 @@ def test_a_checkerboard_whose_end_is_not_shown_may_have_more():
 def test_other_counts_of_a_checkerboard_are_named_before_any_long_search(stated, monkeypatch):
     searched = []
     monkeypatch.setattr(cv2, "findChessboardCorners", lambda *_, **__: searched.append(1))
-    images = cut_checkerboards(12 * [(-20.0, -20.0, 1e-4)])
+    cut, whole = (-120.0, -20.0, 1e-4), (-20.0, -20.0, 1e-4)
+    images = cut_checkerboards(8 * [cut] + 4 * [whole])
     target = Target("board", "checkerboard", *stated, 0.03, 3e-5)
     with pytest.raises(OtherBoardError, match="checkerboard of 9 x 6") as caught:
         detect(Session.from_arrays(images, np.tile(np.eye(4), (12, 1, 1)), target))

@@ -94,7 +94,8 @@ def other_board(
     is_sure = identity.shown >= min(2, len(looked))
     if _is_part(identity, declared):
         # A sound one may be covered in part: its paper ends there.
-        is_sure &= sum(_has_rim(image, identity.board) for image in images) > len(looked) / 2
+        rims = [rim for image in images if (rim := _has_rim(image, identity.board)) is not None]
+        is_sure &= sum(rims) > len(rims) / 2
     if not is_sure or identity.corners_seen < _LEAST_CORNERS * identity.corners:
         return None
     numbers = tuple(view.number for view, _ in looked)
@@ -165,8 +166,11 @@ def _is_part(identity: Identity, declared: Target) -> bool:
     return all(few <= many for few, many in zip(seen, stated, strict=True))
 
 
-def _has_rim(image: Image, board: Target) -> bool:
-    """Whether an image shows paper all around a board, and in the light squares of it."""
+def _has_rim(image: Image, board: Target) -> bool | None:
+    """Whether an image shows paper all around a board, and in the light squares of it.
+
+    None where it shows paper as far as it does not cut it off.
+    """
     seen = find_target(image, board)
     if isinstance(seen, NotFound):
         return False
@@ -193,7 +197,8 @@ def _has_rim(image: Image, board: Target) -> bool:
     # On the next squares of a longer board a half of a side is dark, on circles a quarter.
     paper = [float(np.percentile(side, 20)) for side in grey[:-1] if len(side)]
     is_plain = board.kind == "circles" or light - dark > _PLAIN * (np.median(paper) - dark)
-    return len(paper) == 4 and min(paper) > (dark + light) / 2 and bool(is_plain)
+    has_paper = min(paper, default=0.0) > (dark + light) / 2 and bool(is_plain)
+    return None if has_paper and len(paper) < 4 else has_paper
 
 
 def _remedy(
