@@ -36,6 +36,8 @@ from visioncal.vision.camera import intrinsics
 _SPARE = 10
 # Log-odds of boards of another size that free it.
 _CLEAR = 7.0
+# Errors of links that arms have at most, a joint [rad], [m / 0.5]: two millimetres of all joints.
+_MOST_LINKS = 1e-3
 # Most effects that are opened, one after the other.
 _OPENED = 5
 
@@ -107,21 +109,25 @@ def _explained(search: Search, fit: Fit, left_out: LeftOut) -> tuple[Search, Fit
     """A fit, or that with an effect of arm or lens by which most of many agree that did not.
 
     Play has one of two values at each stop, and neither half of these shows it; nor do the views
-    before and after a lens was zoomed, and nearly any half of few agrees with another board's size.
+    before and after a lens was zoomed, or an arm went over to another posture with its links'
+    errors; and nearly any half of few agrees with another board's size.
     """
     lost = int((search.sound & ~fit.used).sum())
     if lost <= search.sound.sum() / 10:
         return search, fit, left_out
     whole = search.with_all(fit)
+    links = [effect.name for effect in search.unknowns.effects if isinstance(effect, Links)]
     wider = [opened(whole, search.pairs, of_stops(whole, search.pairs))]
     wider += [(with_free_boards(fit), fit.state)] if held_boards(fit) else []
-    for unknowns, state in filter(None, wider):
+    tried = [(*one, whole) for one in wider if one is not None]
+    for unknowns, state, known in (*[(search.unknowns, fit.state, None)] * bool(links), *tried):
         other = search.with_unknowns(unknowns)
-        found, left = other.run(state, search.sound, whole)
-        # With more noise, anything agrees.
+        found, left = other.run(state, search.sound, known)
+        # With more noise anything agrees, and with links that are far off.
         is_noise = any(
             found.sizes[size.name] > 2.0 * fit.sizes[size.name] for size in fit.unknowns.noise
         )
+        is_noise |= known is None and any(found.sizes[name] > _MOST_LINKS for name in links)
         if not is_noise and (search.sound & ~found.used).sum() < lost / 2:
             return other, found, left
     return search, fit, left_out
