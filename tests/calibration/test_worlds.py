@@ -742,6 +742,16 @@ def test_what_grows_is_named_recovered_and_in_the_budget(change, kind, true):
         assert np.all(np.abs(error_of(cell, known)) < 4.5 * np.sqrt(np.diag(fit.whole))[:12])
 
 
+def test_no_bracket_bends_by_degrees():
+    """Such turns that follow gravity are of another cause, which is not named for it."""
+    cell = simulate(replace(FINE, views=30))
+    turned = np.cross(-cell.robot.base_from_flange[:, 2, :3], [0.0, 0.0, 1.0])
+    poses = cell.robot.base_from_flange @ exp(np.pad(0.03 * turned, ((0, 0), (0, 3))))
+    verdict = calibrated(reporting(cell, base_from_flange=poses), joints=False).verdict
+    assert verdict.status != "good"
+    assert "bracket_bends" not in {finding.kind for finding in verdict.findings}
+
+
 @pytest.mark.slow
 def test_a_bracket_that_bends_alone_is_within_its_sigmas():
     """Across its length, which looks much as if the base were lower and the camera farther."""

@@ -13,6 +13,10 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.model.effects import BracketBends
 from visioncal.model.effects.effect import LensEffect
 
+# A bracket bends by less [mm, deg]: one of 0.15 m whose end sinks by 1 mm turns by 0.6 deg. Larger
+# turns that follow gravity are of another cause.
+_MOST_BENDS = (3.0, 0.6)
+
 
 def _found(kind: str, run: RunState) -> Iterator[Finding]:
     fit, effect, arms = run.assessment.fit, KINDS[kind], run.cell_fit.arms.values()
@@ -27,6 +31,8 @@ def _found(kind: str, run: RunState) -> Iterator[Finding]:
         squared = float(values @ np.linalg.solve(covariance, values))
         if is_alone or issubclass(effect, LensEffect):
             squared = max(squared, run.cell_fit.gains.get(f"{kind} of {owner}", 0.0))
+        if issubclass(effect, BracketBends) and np.greater(effect.up_to(values), _MOST_BENDS).any():
+            continue
         if squared > chi2_limit(FALSE_ALARM, len(values)):
             found = Finding(kind, effect.says(values), Remedy(effect.do), mahalanobis_sq=squared)
             yield found.of(owner if len(fit.noise.robots) > 1 else "")

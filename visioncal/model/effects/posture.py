@@ -207,12 +207,17 @@ class BracketBends(PostureEffect, Named):
     @classmethod
     def says(cls, values: FloatArray) -> str:
         """See `Named`."""
-        turn, shift = (np.linalg.norm(at, ord=2) for at in values.reshape(2, 3, 3))
-        by = mm_and_deg(1e3 * float(shift), float(np.rad2deg(turn / 0.1)))
+        by = mm_and_deg(*cls.up_to(values))
         return (
             f"The load on the flange bends with its weight, by up to {by}. The result is that of "
             "the views' mean attitude; whether a tool bends along, no view shows."
         )
+
+    @staticmethod
+    def up_to(values: FloatArray) -> tuple[float, float]:
+        """How far it bends at most, by its (18,) values [mm, deg]."""
+        turn, shift = (float(np.linalg.norm(at, ord=2)) for at in values.reshape(2, 3, 3))
+        return 1e3 * shift, float(np.rad2deg(turn / 0.1))
 
     def unseen(self, moments: Moments) -> FloatArray:
         """See `Effect`: by twists of base and flange, less those of the flange alone."""
