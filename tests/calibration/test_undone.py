@@ -12,6 +12,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from support.cells import pairs_session
 from support.commands import visioncal as typed
@@ -567,6 +568,24 @@ def test_pictures_of_stops_that_are_taken_twice_are_not_taken_before():
     found = visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
     assert found.verdict.causes[0].kind == "wrong_views"
     assert found.verdict.causes[0].views == (9,)
+
+
+def test_pictures_of_a_slow_motion_whose_log_is_late_are_not_taken_before():
+    """Each is within the noise of the one before, and the last of the late ones 0.2 m away."""
+    rng, count, late = np.random.default_rng(0), 400, slice(133, 213)
+    keys = np.hstack([rng.normal(0, 0.35, (4, 3)), rng.normal(0, 0.05, (4, 3))])
+    boards = exp(CubicSpline(np.linspace(0, 1, 4), keys)(np.linspace(0, 1, count)))
+    boards[:, :3, 3] = boards[:, :3, 3] * [0.3, 0.3, 1.0] + [-0.1, -0.1, 0.6]
+    x, z = exp(np.array([[0.1, -0.2, 0.3, 0.05, 0.02, 0.1], [0, 0, 0.4, 0.7, 0, 0]]))
+    robot = z @ invert(boards) @ invert(x)
+    matrix = np.array([[1100.0, 0, 655], [0, 1100, 471], [0, 0, 1]])
+    pictures = [cv2.projectPoints(POINTS, *split(pose), matrix, None)[0][:, 0] for pose in boards]
+    seen = [(np.arange(len(px)), px + rng.normal(0, 0.1, px.shape)) for px in pictures]
+    robot[late] = robot[late.start - 12 : late.stop - 12]
+    robot = robot @ exp(rng.normal(size=(count, 6)) * np.repeat([1e-3, 5e-4], 3))
+    session = Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0])
+    found = likeliest(located(session))
+    assert found is None or found.found.kind != "copied_poses"
 
 
 def scaled_at(views, share, seen):

@@ -94,14 +94,15 @@ def copied_rows(
 
 
 def _shown_before(record: Record, edges: Edges, apart: FloatArray, agrees: Mask) -> Mask:
-    """(m,) views that show what the view before shows, which agrees or does so, too."""
-    between = edges.squares(invert(record.camera[:-1, :1]) @ record.camera[1:])
+    """(m,) views that show what the last one that agrees shows, as all views between them do."""
+    order = np.arange(len(agrees))
+    # Of views in turn, small motions would add up.
+    last = np.append(-1, np.maximum.accumulate(np.where(agrees, order, -1))[:-1])
+    between = edges.squares(invert(record.camera[last, :1]) @ record.camera)
     limits = UNEVEN**2 * (np.median(apart[agrees], axis=0) + LEAST**2)
-    alike = np.append(False, (between < limits).all(axis=-1).any(axis=-1))
-    is_sound = agrees.copy()
-    for at in np.flatnonzero(alike):
-        alike[at] = is_sound[at - 1]
-        is_sound[at] |= alike[at]
+    alike = np.asarray((last >= 0) & (between < limits).all(axis=-1).any(axis=-1))
+    for at in np.flatnonzero(last < order - 1):
+        alike[at] &= alike[at - 1]
     return alike
 
 
