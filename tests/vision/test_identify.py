@@ -439,3 +439,20 @@ def test_other_counts_of_a_checkerboard_are_named_before_any_long_search(stated,
         detect(Session.from_arrays(images, np.tile(np.eye(4), (12, 1, 1)), target))
     assert not searched
     assert ("its squares, of which" in str(caught.value)) == (stated == (10, 7))
+
+
+def test_a_declared_checkerboard_is_found_beside_a_larger_one():
+    """A poster of squares behind it is seen first, and is no other board than declared."""
+    rng, images = np.random.default_rng(6), []
+    for shift in (0, 4, 8):
+        image = np.full((960, 1280), 110, np.uint8)
+        for columns, rows, side, x, y in ((12, 9, 46, 70, 60), (8, 6, 18, 900 + shift, 700)):
+            squares = np.indices((rows, columns)).sum(axis=0) % 2
+            print_ = np.kron(squares, np.ones((side, side))) * 200 + 20
+            print_ = np.pad(print_, side, constant_values=220)
+            image[y : y + print_.shape[0], x : x + print_.shape[1]] = print_
+        noisy = cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(0.0, 2.0, image.shape)
+        images.append(np.clip(noisy, 0, 255).astype(np.uint8))
+    target = Target("board", "checkerboard", 7, 5, 0.03, 3e-5)
+    found = detect(Session.from_arrays(images, np.tile(np.eye(4), (3, 1, 1)), target))
+    assert sorted(found.corners) == [0, 1, 2]

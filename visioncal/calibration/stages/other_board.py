@@ -16,6 +16,7 @@ from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
 from visioncal.session.kinds import declared_targets
 from visioncal.vision.boards import NotFound, find_target, kind_of
+from visioncal.vision.boards.checkerboard import Checkerboard
 from visioncal.vision.boards.identify import Identity, describe, identify, identify_plain
 from visioncal.vision.targets import (
     board_words,
@@ -87,7 +88,7 @@ def other_board(
         identity = identify_plain(images) if plain else identify(images, declared)
     except DataError:
         return None
-    if identity is None:
+    if identity is None or (plain and _is_beside(images, identity.board, declared)):
         return None
     found = _differences(declared, identity)
     # One image of several may show something else, or a part.
@@ -140,6 +141,16 @@ def other_board(
         _remedy(session, name, identity, found, looked),
         numbers,
     )
+
+
+def _is_beside(images: Sequence[Image], other: Target, declared: Target) -> bool:
+    """Whether images show the declared checkerboard, too: the other one stands behind it."""
+    kind = kind_of(declared)
+    if not isinstance(kind, Checkerboard):
+        return False
+    painted = (kind.without(image, other) for image in images)
+    searched = (kind.search(image, declared, quick=True) for image in painted)
+    return any(not isinstance(found, NotFound) for found in searched)
 
 
 def _counted_squares(declared: Target, identity: Identity) -> str:

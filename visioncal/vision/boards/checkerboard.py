@@ -146,6 +146,15 @@ class Checkerboard(Board):
                 return (board, _ends(image, grid) is True) if is_plain else None
         return None
 
+    def without(self, image: Image, target: Target) -> Image:
+        """A (h, w) grey image in which a board is painted over, where it is seen."""
+        seen = self.search(image, target, quick=True)
+        if isinstance(seen, NotFound):
+            return image
+        grid = _extended(seen.px.reshape(target.rows, target.columns, 2), 1.0 + _RIM)
+        hull = cv2.convexHull(grid.reshape(-1, 2).astype(np.float32)).astype(np.int32)
+        return np.asarray(cv2.fillConvexPoly(image.copy(), hull, int(np.median(image))))
+
 
 def _grids(image: Image, size: tuple[int, int], *, quick: bool) -> Iterator[FloatArray]:
     """(rows, columns, 2) grids of corners that one search after the other takes for the board."""
