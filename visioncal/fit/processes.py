@@ -66,7 +66,8 @@ def consider(fit: Fit, flange: str) -> Considered | None:
         return None
     stops, p = len(alone.stops), fit.unknowns.count
     boards, logs, free = _boards(fit), list[float](), list[float]()
-    off, levels = list[FloatArray](), list[tuple[Process | None, float, float]]()
+    usual, off = list[float](), list[FloatArray]()
+    levels = list[tuple[Process | None, float, float]]()
 
     grid, beside = _grid_of(fit, flange, alone, creeps=True)
 
@@ -76,10 +77,12 @@ def consider(fit: Fit, flange: str) -> Considered | None:
     for tried, found in _climb(grid, weighed, _logs_of):
         logs.append(tried.prior + found[0][0])
         free += [tried.prior + found[at][0] + np.log(share) for at, share in ways]
-        off += [found[at][2] for at, _ in ways]
+        # Other prints show themselves: where none does, a board is off by what printers do.
+        usual.append(free[-len(ways)])
+        off.append(found[ways[0][0]][2])
         levels.append((tried.process, tried.size, tried.white))
     odds = float(np.logaddexp.reduce(free) - np.logaddexp.reduce(logs))
-    mean_squares = np.exp(free - np.logaddexp.reduce(free)) @ np.array(off)
+    mean_squares = np.exp(usual - np.logaddexp.reduce(usual)) @ np.array(off)
     shares = np.exp(logs - np.logaddexp.reduce(logs)).tolist()
     by_process = dict[Process, list[tuple[float, tuple[Process, float, float]]]]()
     for share, (process, size, white) in zip(shares, levels, strict=True):
