@@ -106,6 +106,12 @@ def shoot_one(file: Path, at: int) -> None:
     cv2.imwrite(str(file), world()[1][at])
 
 
+def write_table(path: Path, names, rows) -> None:
+    """Writes a table with a header."""
+    lines = (",".join(map(repr, row)) for row in rows.tolist())
+    write(path, "\n".join([",".join(names), *lines]))
+
+
 def write(path: Path, document: object) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(document if isinstance(document, str) else json.dumps(document))
@@ -1578,6 +1584,45 @@ def test_quaternions_without_their_real_part(tmp_path, monkeypatch):
     write(tmp_path / "half.json", [{"T_base_ee": a, "T_cam_board": b} for a, b in records])
     visioncal("convert", "half.json", "turned", "--mount", session.mount).good()
     assert "The target's rotations are half turns" in visioncal("doctor", "turned").out
+
+
+@pytest.mark.parametrize(("real", "at"), [("qs", 3), ("q_w", 3), ("rw", 0)])
+def test_a_real_part_of_another_name(tmp_path, real, at):
+    """It makes quaternions of either sign unit ones, whatever its column is called."""
+    both, mount = pairs()
+    names, columns = [], []
+    for side, poses in zip(("robot", "cam"), both, strict=True):
+        last = ["qx", "qy", "qz"]
+        last.insert(at, real)
+        names += [f"{side}_{name}" for name in ("x", "y", "z", *last)]
+        turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+        turns[::2] *= -1
+        columns += [poses[:, :3, 3], np.roll(turns, at - 3, axis=1)]
+    write_table(tmp_path / "in.csv", names, np.hstack(columns))
+    visioncal("convert", tmp_path / "in.csv", tmp_path / "out", "--mount", mount).good()
+    np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), both, atol=1e-9)
+
+
+@pytest.mark.parametrize("tracker", ["vicon", "mocap"])
+def test_motion_capture_is_the_robots_where_no_other_is(tmp_path, tracker):
+    both, mount = pairs()
+    robot, board = np.array([[seven(pose) for pose in poses] for poses in both])
+    last = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    names = [f"{tracker}_{name}" for name in last]
+    shoot(tmp_path / "shot", "{}.png")
+    write_table(tmp_path / "shot/poses.csv", names, robot)
+    said = ("--mount", mount, "--target", "charuco_9x6_30mm")
+    visioncal("convert", tmp_path / "shot", tmp_path / "a", *said).good()
+    found = [view.base_from_flange().as_matrix() for view in Session.load(tmp_path / "a").views]
+    np.testing.assert_allclose(found, both[0], atol=1e-9)
+    for other in ("board", "camera"):
+        table = tmp_path / f"{other}.csv"
+        of_robot = [name.replace("_", "_hand_") if other == "camera" else name for name in names]
+        columns = [*of_robot, *(f"{other}_{name}" for name in last)]
+        write_table(table, columns, np.hstack([robot, board]))
+        visioncal("convert", table, tmp_path / f"of_{other}", "--mount", mount).good()
+        found = came_in(Session.load(tmp_path / f"of_{other}"))
+        np.testing.assert_allclose(found, both, atol=1e-9)
 
 
 def test_a_mount_that_is_not_as_stated_is_said_before_a_form_is_asked_for(tmp_path, monkeypatch):

@@ -15,14 +15,16 @@ from visioncal.interchange.formats.fields import (
     ANGLES,
     DEGREES,
     Fields,
+    named_by,
+    position_first,
     split_matrices,
     unit_by_size,
     without_unit,
 )
 from visioncal.interchange.formats.foreign import PoseImportOptions, Side, Unstated
-from visioncal.interchange.formats.poses import split_pose
 
 _ANGLES_NAME = re.compile(r"rpy|roll|euler")
+ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)R(_|$)")
 
 
 def poses_from(
@@ -205,3 +207,44 @@ def _likely_rotation(
             f"radians, as the source does not say; --{whose}-form names another form."
         )
     return "rotation-vector", ""
+
+
+def split_pose(
+    fields: Fields, names: Sequence[str], blocks: Sequence[FloatArray], whose: Side
+) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Positions, rotations, and the names of the rotations' fields; raises DataError."""
+    flat, sizes = np.hstack(blocks), [block.shape[1] for block in blocks]
+    if flat.shape[1] == 7 and 4 not in sizes:
+        flat = position_first(flat)
+    is_unnamed = len(blocks) == 1 or all(map(str.isdecimal, names))
+    if flat.shape[1] == 6 and is_unnamed and _is_rotation_first(flat):
+        flat = np.roll(flat, 3, axis=1)
+    positions, rotations = flat[:, :3], flat[:, 3:]
+    of_rotation = tuple(names[int(np.searchsorted(np.cumsum(sizes), 3)) + 1 :] or names)
+    if len(blocks) == 2:
+        rotation_first = sizes[1] == 3
+        if sizes[0] == sizes[1]:
+            rotation_first = ROTATION_NAME.search(names[0]) is not None
+        positions, rotations = blocks[::-1] if rotation_first else blocks
+        of_rotation = (names[0] if rotation_first else names[1],)
+    if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
+        raise DataError(
+            f"{fields.name}: the {sum(sizes)} numbers of {', '.join(names)} are no pose, which has "
+            "16 or 12 (matrix), 7 (quaternion) or 6 (three angles). There are "
+            f"{fields.listing()}.",
+            culprits=list(names),
+            next_step=f"Name the fields of the {whose}'s poses with --{whose}-"
+            f"{named_by(fields.places[0])}."
+            + " What only moves, as a gantry, or only turns, as a gimbal about a fixed point, has "
+            "zeros for the other three: add these columns." * (sum(sizes) == 3),
+        )
+    # The numbers of a mapping have names of their own.
+    inner = tuple(name for name in fields.numbers if name.startswith(f"{of_rotation[0]}."))
+    return positions, rotations, inner if len(of_rotation) == 1 and inner else of_rotation
+
+
+def _is_rotation_first(flat: FloatArray) -> bool:
+    """Whether of (n, 6) numbers the last three are no rotation, in any unit, and the first are."""
+    filled = np.abs(flat[np.isfinite(flat).all(axis=1)])
+    turns, places = filled[:, :3], filled[:, 3:]
+    return bool(turns.max(initial=0.0) <= 2.0 * np.pi and (places > 360.0).sum() > len(filled) / 2)

@@ -10,19 +10,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.conventions import POSE_FORMS
-from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import (
     Fields,
     appearance,
     is_headerless,
-    named_by,
-    position_first,
     split_matrices,
     without_unit,
 )
-from visioncal.interchange.formats.foreign import Side
 from visioncal.interchange.formats.joints import joint_names
+from visioncal.interchange.formats.pose_forms import ROTATION_NAME, split_pose
 
 
 def _set(words: str) -> set[str]:
@@ -54,6 +51,8 @@ _SIDE_WORDS = {
     "robot": _set("robot arm effector eef endeffector manipulator"),
     "camera": _set("charuco aruco chessboard checkerboard apriltag pattern cft"),
 }
+# Systems that measure the robot's pose, or the camera's where another side is named the robot's.
+_TRACKERS = _set("vicon optitrack mocap")
 # Names of both sides of A X = X B, where no other poses stand beside them.
 _BOTH_SIDES = (("a", "b"), ("h", "e"), ("t1", "t2"))
 # With these words between two frames the child is named first; otherwise second.
@@ -170,7 +169,22 @@ def possible_poses(
         if item.is_named or by_shape:
             complete.setdefault(item.names, item)
     items = sorted(complete.values(), key=lambda item: not item.is_named)
-    return _called(items, is_single=not taken)
+    return _called(_of_trackers(items, taken), is_single=not taken)
+
+
+def _of_trackers(items: list[PoseFields], taken: Collection[str]) -> list[PoseFields]:
+    """Poses without the names of trackers, where these do not say that they are the camera's."""
+    others = [PoseFields((name,), tuple(words_of(name))) for name in taken]
+    if any(item.sides[:1] == ["robot"] for item in others) or any(
+        item.sides == ["robot"] for item in items
+    ):
+        return items
+    plain = [
+        replace(item, words=tuple(word for word in item.words if word not in _TRACKERS))
+        for item in items
+    ]
+    pairs = zip(items, plain, strict=True)
+    return [item if each.sides == ["camera"] else each for item, each in pairs]
 
 
 def _called(items: list[PoseFields], *, is_single: bool) -> list[PoseFields]:
@@ -215,7 +229,7 @@ def _without_names(
         if first.parent == second.parent and len(first.names) == 1 == len(second.names):
             # The position comes first, unless the names say otherwise.
             names = sorted(
-                (*first.names, *second.names), key=lambda name: bool(_ROTATION_NAME.search(name))
+                (*first.names, *second.names), key=lambda name: bool(ROTATION_NAME.search(name))
             )
             yield PoseFields((*names,), (*first.words, *second.words), is_named=False)
     if is_headerless(fields):
@@ -307,10 +321,28 @@ def _numbers(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:
         # Five and more of these are joints.
         if rotation and "q5" not in named:
             names = tuple(named[each] for each in rotation)
-            yield _Piece(names, (*words, "rotation"), len(rotation), "rotation")
+            if rotation == ("qx", "qy", "qz"):
+                others = {*taken, *names, *(named[each] for each in position)}
+                names += _real_part(fields, names, words, others)
+            yield _Piece(names, (*words, "rotation"), len(names), "rotation")
         if position:
             names = tuple(named[each] for each in position)
             yield _Piece(names, (*words, "position"), 3, "")
+
+
+def _real_part(
+    fields: Fields, names: tuple[str, ...], words: Sequence[str], taken: Collection[str]
+) -> tuple[str, ...]:
+    """The column of any name beside x, y, z of quaternions that makes them unit ones, or none."""
+    parent = names[0].rpartition(".")[0]
+    vectors = [fields.numbers[name] for name in names]
+    for name, numbers in fields.numbers.items():
+        is_own = name.rpartition(".")[0] == parent and {*words} <= {*words_of(name)}
+        if name in taken or numbers.ndim > 1 or not is_own:
+            continue
+        if appearance(np.stack([*vectors, numbers], axis=1)) == "quaternion":
+            return (name,)
+    return ()
 
 
 def _counted(named: Mapping[str, str]) -> tuple[str, ...]:
@@ -436,7 +468,6 @@ def ranked_poses(
 
 # Vectors that a calibration of the camera gives.
 _SEEN = re.compile("[rt]vecs?$|(rotation|translation)(al)?_?vectors$", re.IGNORECASE)
-_ROTATION_NAME = re.compile(r"rvec|rot|winkel|angle|quat|orient|rpy|euler|(^|\.)R(_|$)")
 
 
 def columns_named(fields: Fields, wanted: Sequence[str]) -> tuple[str, ...]:
@@ -444,44 +475,3 @@ def columns_named(fields: Fields, wanted: Sequence[str]) -> tuple[str, ...]:
     groups = {k: group for k, group in _by_prefix(fields, ()).items() if {*wanted} <= group.keys()}
     group = groups.get("") or (next(iter(groups.values())) if len(groups) == 1 else None)
     return tuple(group[name] for name in wanted) if group else ()
-
-
-def split_pose(
-    fields: Fields, names: Sequence[str], blocks: Sequence[FloatArray], whose: Side
-) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
-    """Positions, rotations, and the names of the rotations' fields; raises DataError."""
-    flat, sizes = np.hstack(blocks), [block.shape[1] for block in blocks]
-    if flat.shape[1] == 7 and 4 not in sizes:
-        flat = position_first(flat)
-    is_unnamed = len(blocks) == 1 or all(map(str.isdecimal, names))
-    if flat.shape[1] == 6 and is_unnamed and _is_rotation_first(flat):
-        flat = np.roll(flat, 3, axis=1)
-    positions, rotations = flat[:, :3], flat[:, 3:]
-    of_rotation = tuple(names[int(np.searchsorted(np.cumsum(sizes), 3)) + 1 :] or names)
-    if len(blocks) == 2:
-        rotation_first = sizes[1] == 3
-        if sizes[0] == sizes[1]:
-            rotation_first = _ROTATION_NAME.search(names[0]) is not None
-        positions, rotations = blocks[::-1] if rotation_first else blocks
-        of_rotation = (names[0] if rotation_first else names[1],)
-    if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
-        raise DataError(
-            f"{fields.name}: the {sum(sizes)} numbers of {', '.join(names)} are no pose, which has "
-            "16 or 12 (matrix), 7 (quaternion) or 6 (three angles). There are "
-            f"{fields.listing()}.",
-            culprits=list(names),
-            next_step=f"Name the fields of the {whose}'s poses with --{whose}-"
-            f"{named_by(fields.places[0])}."
-            + " What only moves, as a gantry, or only turns, as a gimbal about a fixed point, has "
-            "zeros for the other three: add these columns." * (sum(sizes) == 3),
-        )
-    # The numbers of a mapping have names of their own.
-    inner = tuple(name for name in fields.numbers if name.startswith(f"{of_rotation[0]}."))
-    return positions, rotations, inner if len(of_rotation) == 1 and inner else of_rotation
-
-
-def _is_rotation_first(flat: FloatArray) -> bool:
-    """Whether of (n, 6) numbers the last three are no rotation, in any unit, and the first are."""
-    filled = np.abs(flat[np.isfinite(flat).all(axis=1)])
-    turns, places = filled[:, :3], filled[:, 3:]
-    return bool(turns.max(initial=0.0) <= 2.0 * np.pi and (places > 360.0).sum() > len(filled) / 2)
