@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.io.matlab import MatlabOpaque
 from support.refusals import raised
 
 from visioncal.core.documents.jsons import parse_json, parse_stored, read_arrays, read_json
@@ -177,6 +178,16 @@ def test_pickles_are_not_opened(file, tmp_path):
     np.savez(tmp_path / "a.npz", a=np.array([Executed()], dtype=object))
     raised(DataError, "Python objects are not read", read_arrays, tmp_path / "a.npz")
     raised(DataError, "no arrays", read_arrays, file("b.npz", pickle.dumps(Executed())))
+
+
+def test_objects_of_matlab_have_nothing_inside(file, monkeypatch):
+    """A table within a structure is named as one."""
+    table = MatlabOpaque(np.zeros(1, [(name, "O") for name in ("s0", "s1", "s2", "arr")]))
+    run = np.zeros((1, 1), [("poses", "O")])
+    run[0, 0] = (table,)
+    content = {"run": run, "none": np.array(None, dtype=object)}
+    monkeypatch.setattr("scipy.io.loadmat", lambda _: content)
+    raised(DataError, "a table or other objects of MATLAB", read_arrays, file("a.mat", b"0"))
 
 
 def test_a_zip_bomb_is_not_unpacked(file):

@@ -1541,23 +1541,45 @@ def test_pictures_of_the_lens_beside_pairs_that_do_not_fit(tmp_path):
     )
 
 
-@pytest.mark.parametrize("each", [False, True])
-def test_pictures_within_arrays_come_in_by_the_printed_command(tmp_path, monkeypatch, each):
+@pytest.mark.parametrize("source", ["in.npz", "in/", "./in", "run.1"])
+def test_pictures_within_arrays_come_in_by_the_printed_command(tmp_path, monkeypatch, source):
+    """Files beside without pictures are kept; masks before the pictures are none."""
     monkeypatch.chdir(tmp_path)
     poses, pictures, session = world()
-    if each:
-        (tmp_path / "in").mkdir()
-        for at, (pose, picture) in enumerate(zip(poses, pictures, strict=True)):
-            np.savez(f"in/{at}.npz", T_base_ee=pose, rgb=picture)
-    else:
+    if source == "in.npz":
         np.savez("in.npz", T_base_ee=poses, rgb=np.repeat(np.array(pictures)[..., None], 3, -1))
+    else:
+        folder = Path(source)
+        folder.mkdir()
+        for at, (pose, picture) in enumerate(zip(poses, pictures, strict=True)):
+            more = {"a_mask": picture, "empty": np.zeros_like(picture)}
+            np.savez(folder / f"{at}.npz", T_base_ee=pose, **more, rgb=picture)
+        np.savez(folder / "camera.npz", K=[[520.0, 0, 322.5], [0, 521, 198], [0, 0, 1]])
     said = ("--target", session.document["target"], "--mount", "eye-in-hand")
-    refused = visioncal("convert", "in" if each else "in.npz", "out", *said).refused().err
-    command = refused[refused.index("python -c") :].partition(" && ")[0]
+    refused = visioncal("convert", source, "out", *said).refused().err
+    command, _, second = refused[refused.index("python -c") :].partition(" && ")
     subprocess.run(shlex.split(command.replace("python", sys.executable, 1)), check=True)
-    visioncal("convert", "in-pictures", "out", *said).good()
+    visioncal(*shlex.split(second)[1:]).good()
     found = [view.base_from_flange().as_matrix() for view in Session.load("out").views]
     np.testing.assert_allclose(found, poses, atol=1e-9)
+
+
+def test_series_of_pictures_in_several_files_are_converted_one_by_one(tmp_path):
+    poses, pictures, session = world()
+    for at in range(3):
+        part = slice(3 * at, 3 * at + 3)
+        both = {"rgb": np.array(pictures[part]), "depth_image": np.array(pictures[part])}
+        np.savez(tmp_path / f"run_{at}.npz", T_base_ee=poses[part], **both)
+    said = ("--target", session.document["target"], "--mount", "eye-in-hand")
+    error = visioncal("convert", tmp_path, tmp_path / "out", *said).refused().err
+    assert "'rgb' (3 x 400 x 640), 'depth_image' (3 x 400 x 640), but" in error
+    assert "Convert the files one by one" in error
+
+
+def test_arrays_without_rows(tmp_path):
+    np.savez(tmp_path / "in.npz", angles=np.zeros((0, 7)), poses=np.zeros((0, 4, 4)))
+    error = visioncal("convert", tmp_path / "in.npz", tmp_path / "out").refused().err
+    assert "in.npz has no list with one entry a pose" in error
 
 
 def test_quaternions_without_their_real_part(tmp_path, monkeypatch):

@@ -26,12 +26,17 @@ _OPAQUE = "its values are a table or other objects of MATLAB"
 
 def _parts(name: str, array: Array) -> Iterator[tuple[str, Array]]:
     """An array; those of a structure by its fields, and those of cells that are alike as one."""
-    if array.dtype.names:
+    from scipy.io.matlab import MatlabOpaque
+
+    cells = [*array.flat] if array.dtype.kind == "O" else []
+    objects = [cell for cell in cells if isinstance(cell, MatlabOpaque)]
+    if objects or isinstance(array, MatlabOpaque):
+        yield name, objects[0] if objects else array
+    elif array.dtype.names:
         for key in array.dtype.names:
             yield from _parts(f"{name}.{key}", array[key])
-    elif array.dtype.kind == "O" and len({*map(np.shape, array.flat)}) == 1:
-        inside = [*map(np.asarray, array.flat)]
-        yield from _parts(name, inside[0] if len(inside) == 1 else np.stack(inside))
+    elif len({*map(np.shape, cells)}) == 1 and all(isinstance(c, np.ndarray) for c in cells):
+        yield from _parts(name, cells[0] if len(cells) == 1 else np.stack(cells))
     else:
         yield name, array
 
@@ -42,12 +47,10 @@ def _of_matlab(data: io.BytesIO) -> dict[str, Array]:
     from scipy.io.matlab import MatlabOpaque
 
     loaded = {name: each for name, each in loadmat(data).items() if name[:2] != "__"}
-    is_opaque = any(isinstance(each, MatlabOpaque) for each in loaded.values())
-    plain = {name: each for name, each in loaded.items() if not isinstance(each, MatlabOpaque)}
-    found = dict(part for name, each in plain.items() for part in _parts(name, each))
+    found = dict(part for name, each in loaded.items() for part in _parts(name, each))
     # Other kinds hold no numbers.
     arrays = {name: each for name, each in found.items() if each.dtype.kind in "fiubU"}
-    if not arrays and is_opaque:
+    if not arrays and any(isinstance(each, MatlabOpaque) for each in found.values()):
         raise TypeError(_OPAQUE)
     return arrays
 

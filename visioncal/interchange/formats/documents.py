@@ -111,7 +111,7 @@ def read_document(path: Path) -> object:
         return {
             name: _by_view(array).tolist()
             for name, array in read_arrays(path).items()
-            if array.ndim and array.size <= MOST_NUMBERS * max(array.shape)
+            if array.ndim and 0 < array.size <= MOST_NUMBERS * max(array.shape)
         }
     if suffix == ".json":
         return read_json(path)
