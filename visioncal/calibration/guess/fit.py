@@ -49,9 +49,10 @@ _SECOND_AXIS, _LEAST_TURN_RAD = 0.05, 0.01
 _LEAST_SIGMA, _MOST_SIGMA = 5e-4, 1.0
 # Prior probability of an outlier view.
 _OUTLIER_PRIOR = 0.05
-# Rounds in which the nearest rows are found; directions with a smaller singular value, relative to
-# the largest, are not determined.
-_CONCENTRATED, _DETERMINED = 4, 1e-3
+# Rounds in which the nearest rows are found.
+CONCENTRATED = 4
+# Directions with a smaller singular value, relative to the largest, are not determined.
+_DETERMINED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,7 +386,7 @@ def distance_factor(robot: FloatArray, camera: FloatArray, fit: Fit) -> tuple[fl
     """
     by_edges, seen = distance_rows(robot, camera, fit.x)
     kept, inverse = np.argsort(fit.angle, kind="stable")[: len(fit.kept)], 0.0
-    for _ in range(_CONCENTRATED):
+    for _ in range(CONCENTRATED):
         rows, some = by_edges[kept].reshape(-1, 7), seen[kept].reshape(-1)
         solution, _, rank, _ = np.linalg.lstsq(rows, -some, rcond=_DETERMINED)
         if rank < 7:

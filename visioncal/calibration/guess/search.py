@@ -17,6 +17,7 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import (
     CLOSING_SCORE,
+    CONCENTRATED,
     HALF_SHARE,
     STARTS,
     distance_factor,
@@ -47,8 +48,8 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.closed_form import upper_pairs
 
 # Turns of robot and camera agree from here on [rad]. A print differs by less than the first
-# logarithm from its stated size; a fit follows the second. Rounds in which nearest rows are found.
-_TURNS_AGREE_RAD, _PRINTED, _FOLLOWED, _CONCENTRATED = 0.1, 0.03, 0.2, 4
+# logarithm from its stated size; a fit follows the second.
+_TURNS_AGREE_RAD, _PRINTED, _FOLLOWED = 0.1, 0.03, 0.2
 # Fields of a reading by which its turns from view to view change.
 _TURNING = frozenset(("rotation", "written", "terms", "angle_unit", "order"))
 # Form of rotations, that of which they were written, terms and unit of angles of a reading.
@@ -271,7 +272,7 @@ def in_one_turn(robot: FloatArray, camera: FloatArray) -> IntArray | None:
     best, least = np.zeros(count, dtype=np.int64), np.inf
     for reference in range(len(some)):
         chosen = away[:, :, reference, 0].argmin(axis=1)
-        for _ in range(_CONCENTRATED):
+        for _ in range(CONCENTRATED):
             costs = np.take_along_axis(away, chosen[some][None, None, :, None], 3).sum(axis=(2, 3))
             chosen = costs.argmin(axis=1)
         if (total := float(costs.min(axis=1).sum())) < least:

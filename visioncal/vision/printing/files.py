@@ -20,7 +20,7 @@ _LONGEST_NAME = 60
 def write_board(
     folder: Path, sheet: Sheet, *, dpi: float, force: bool, is_drawn: bool = True
 ) -> tuple[Path, ...]:
-    """Writes a board as PDF, SVG, PNG and TOML, named after the target.
+    """Writes a board as TOML, and to be printed as PDF, SVG and PNG, named after the target.
 
     The files appear all at once. An existing `.toml` that describes the same target is kept, with
     its comments.
@@ -33,7 +33,7 @@ def write_board(
         is_drawn: Whether it is to be printed; else its description alone is written.
 
     Returns:
-        The written files, the PDF first.
+        The written files, a PDF first.
 
     Raises:
         DataError: A file exists, the folder cannot be written, or the PNG would be too large.
