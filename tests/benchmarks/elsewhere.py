@@ -332,7 +332,8 @@ class Case:
     def frames(self):
         """(4, 4) twice: the base that is in the one reported, the flange reported in the other.
 
-        As other views of that cell have them, by least squares.
+        As other views of that cell have them, by least squares. A base that tilts leaves the
+        flange where it is.
         """
         if self.world.robot is None:
             return np.eye(4), np.eye(4)
@@ -345,13 +346,15 @@ class Case:
                 continue
 
         def away(twists):
+            twists = np.pad(twists, (0, 12 - len(twists)))
             found = reported @ pose(*twists[:6].reshape(2, 3)) @ robot
             found = found @ pose(*twists[6:].reshape(2, 3))
             turns = Rotation.from_matrix(found[:, :3, :3]).as_rotvec()
             return np.append(LEVER_M * turns, found[:, :3, 3])
 
-        best = least_squares(away, np.zeros(12), x_scale=1e-3).x.reshape(4, 3)
-        return pose(*best[:2]), pose(*best[2:])
+        free = np.zeros(6 if self.world.causes == "base_tilts" else 12)
+        best = np.pad(least_squares(away, free, x_scale=1e-3).x, (0, 12 - len(free)))
+        return pose(*best[:6].reshape(2, 3)), pose(*best[6:].reshape(2, 3))
 
 
 def pose(turn, place):

@@ -22,13 +22,15 @@ _RARER = SIGNIFICANT + 2.0 * float(np.log(100.0))
 
 @dataclass(frozen=True, eq=False)
 class PostureEffect(Effect):
-    """Errors of a flange, less one twist of its base and one of itself at all postures.
+    """Errors of a flange, less one twist of its base, or of its base and itself, at all postures.
 
     These belong to the frames of which the robot reports: the result is that of the stops' mean
     posture.
     """
 
     stops: FloatArray  # (s, 4, 4) the flange at them.
+    # Whether what errs goes along with the flange: else it is where the arm says, but for its base.
+    moves_flange: ClassVar[bool] = False
 
     @classmethod
     def of_flange(cls, flange: str, stood: Stood) -> Iterator[Effect]:
@@ -59,6 +61,8 @@ class PostureEffect(Effect):
     def _by_stops(self) -> FloatArray:
         """(12, 6 s) derivative of the nearest twists of base and flange by errors at the stops."""
         every = (self._weights * twists_of_frames(self.stops)).reshape(-1, 12)
+        if not self.moves_flange:
+            every[:, 6:] = 0.0
         return np.asarray(np.linalg.pinv(every, rcond=1e-9))
 
     def covariance_of_frames(self, square: FloatArray) -> FloatArray:
@@ -100,7 +104,8 @@ class BaseTilts(PostureEffect, Named):
         size = figure(1e3 * float(np.linalg.norm(values.reshape(2, 2), ord=2)))
         return (
             f"The base tilts as the arm reaches out, by {size} mrad for each metre. The result "
-            "counts it; the robot's own poses do not."
+            "counts it, with the base as it stands on average at these stops; the robot's own "
+            "poses do not."
         )
 
     def raw(self, poses: FloatArray) -> FloatArray:
@@ -201,7 +206,7 @@ class BracketBends(PostureEffect, Named):
 
     kind, bounds, count, most = "bracket bends", (1e-2, 1e-7, 0.1), 18, 3e-3
     clause = "what the flange carries bends with its weight"
-    is_imitated = False
+    is_imitated, moves_flange = False, True
     do = "Stiffen the bracket, or record and work in the same attitudes."
 
     @classmethod
