@@ -260,6 +260,22 @@ def test_a_lens_of_the_whole_sensor_is_named_by_where_a_part_of_it_begins(tmp_pa
     assert "times as large" not in cause.words
 
 
+@pytest.mark.parametrize("lens", ["auto", slow("hold")])
+def test_a_matrix_in_the_order_of_its_rows_is_named(tmp_path, lens):
+    cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
+    right = []
+
+    def by_rows(document):
+        fx, fy, cx, cy = right[:] = document["camera"]["matrix"]
+        document["camera"] |= {"intrinsics": lens, "matrix": [fx, cx, fy, cy]}
+
+    document_of(by_rows)(tmp_path / "cell")
+    cause = visioncal.calibrate(tmp_path / "cell").verdict.causes[0]
+    assert cause.kind in ("other_lens", "lens")
+    found = re.search(r"in the order fx, cx, fy, cy: write matrix = \[(.*?)\]", cause.words)
+    assert [float(at) for at in found[1].split(", ")] == pytest.approx(right, rel=1e-5)
+
+
 def test_another_distortion_is_no_picture_of_another_size(tmp_path):
     cell_session(simulate(SOUND), "cell", seen="corners").save(tmp_path / "cell")
     k1, k2, *_ = SOUND.camera.distortion

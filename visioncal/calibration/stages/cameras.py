@@ -375,9 +375,15 @@ def _other_lens(
 def misread_lens(stated: Camera, refined: Camera, px: FloatArray, moved_px: float) -> str:
     """How stated intrinsics fit after all, as a sentence; empty where no way is known.
 
-    Another program's order of five coefficients, pictures that are rectified, or a part of them.
+    Another order of the matrix or of five coefficients, pictures that are rectified, or a part of
+    them.
     """
     ways, moves = dict[str, Camera](), refined.matrix[2:] - stated.matrix[2:]
+    by_rows = stated.matrix[[0, 2, 1, 3]]
+    listed = ", ".join(f"{value:.6g}" for value in by_rows)
+    words = "The stated matrix is in the order fx, cx, fy, cy: write "
+    words += f"matrix = [{listed}], which is fx, fy, cx, cy."
+    ways[words] = replace(stated, matrix=by_rows)
     if stated.model == "brown" and stated.distortion.any():
         flat = np.zeros(len(stated.distortion))
         words = "The pictures are rectified: write distortion = [0, 0, 0, 0, 0]."
