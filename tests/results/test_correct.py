@@ -358,7 +358,8 @@ def test_ways_through_singular_postures_are_found(stored, result):
     ("text", "words"),
     [
         ("{POSE}\n400,100,200,0,1,0,0\n", "Positions are in metres"),
-        ("x_m,y_m,z_m,qx,qy,qz,q4\n0.4,0.1,0.2,0,1,0,0\n", "qw are missing"),
+        ("x_m,y_m,z_m,qx,qy,qz\n0.4,0.1,0.2,0,1,0\n", "qw are missing"),
+        ("x_m,y_m,z_m,qx,qy,qz,q4\n0.4,0.1,0.2,0,0.6,0,0\n", "qw are missing"),
         ("{POSE}\n0.4,0.1,,0,0,0,1\n", "column z_m: it is empty"),
         ("{POSE}\n0.4,0.1,0.2,0,0,1,1\n", "norm is 1.41"),
         ("{POSE},{JOINTS}\n0.4,0.1,0.2,0,1,0,0,10,-80,90,-100,-90,0\n", "look like degrees"),

@@ -15,7 +15,7 @@ from visioncal.interchange.formats.columns import foreign_from, view_numbers
 from visioncal.interchange.formats.fields import Fields, named_by, without_unit
 from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.pose_forms import check_radians, poses_from
-from visioncal.interchange.formats.poses import columns_named, pose_names
+from visioncal.interchange.formats.poses import columns_named, pose_names, words_of
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.session import Session
 from visioncal.session.columns import POSE, joint_columns
@@ -81,7 +81,10 @@ def read_typed(path: Path, given: PoseImportOptions) -> tuple[tuple[str, ...], P
     fields = read_fields(path, given.form or given.usual)
     # A robot moves to these: their names must say what they are.
     names = pose_names(fields, (), "robot", (), by_shape=False)
-    is_ours = not names or names == POSE
+    words = {word for name in names for word in words_of(name)}
+    # A real part that was lost, or has another name, would turn it elsewhere.
+    is_known = not {"qx", "qy", "qz"} <= words or bool({"qw", "w"} & words)
+    is_ours = not names or names == POSE or not is_known
     return None if is_ours else (names, poses_from(fields, names, given, "robot")[0])
 
 
