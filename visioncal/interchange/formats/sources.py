@@ -245,10 +245,13 @@ def _part(group: FileGroup, form: str | None) -> Part:
 
 def _printed_lens(group: FileGroup) -> dict[str, Mapping[str, Any]]:
     """The lens of texts with a camera_info that ROS printed, the same in all; empty of others."""
-    lines = {tuple(_CAMERA_INFO.findall(head(file))) for file in group.files}
-    if len(lines) == 1 and len(*lines) == 2:
+    first, *others = group.files
+    text = head(first)
+    lines = _CAMERA_INFO.findall(text)
+    # Others are read only where the first has one.
+    if len(lines) == 2 and all(_CAMERA_INFO.findall(head(file)) == lines for file in others):
         with suppress(DataError):
-            return dict(lenses_in(parse_yaml(head(group.files[0]), group.label), group.label))
+            return dict(lenses_in(parse_yaml(text, group.label), group.label))
     return {}
 
 
