@@ -1541,16 +1541,19 @@ def test_pictures_of_the_lens_beside_pairs_that_do_not_fit(tmp_path):
     )
 
 
-@pytest.mark.parametrize("source", ["in.npz", "in/", "./in", "run.1"])
+@pytest.mark.parametrize("source", ["in.npz", "in/", "./in", "run.1", "."])
 def test_pictures_within_arrays_come_in_by_the_printed_command(tmp_path, monkeypatch, source):
     """Files beside without pictures are kept; masks before the pictures are none."""
     monkeypatch.chdir(tmp_path)
     poses, pictures, session = world()
+    if source == ".":
+        Path("run").mkdir()
+        monkeypatch.chdir("run")
     if source == "in.npz":
         np.savez("in.npz", T_base_ee=poses, rgb=np.repeat(np.array(pictures)[..., None], 3, -1))
     else:
         folder = Path(source)
-        folder.mkdir()
+        folder.mkdir(exist_ok=True)
         for at, (pose, picture) in enumerate(zip(poses, pictures, strict=True)):
             more = {"a_mask": picture, "empty": np.zeros_like(picture)}
             np.savez(folder / f"{at}.npz", T_base_ee=pose, **more, rgb=picture)
@@ -1576,10 +1579,24 @@ def test_series_of_pictures_in_several_files_are_converted_one_by_one(tmp_path):
     assert "Convert the files one by one" in error
 
 
+def test_a_board_that_is_not_said_is_the_one_that_the_images_show(tmp_path, monkeypatch):
+    """From `calibrate` of a folder on, what is printed leads to a session."""
+    monkeypatch.chdir(tmp_path)
+    stems_with_depth(tmp_path / "in")
+    advised = visioncal("calibrate", "in").refused("asked for where no file beside").err
+    asked = visioncal(*shlex.split(advised.partition("visioncal ")[2].partition(" && ")[0]))
+    asked.refused("is not said: a ChArUco board of 9 x 6 squares")
+    command = next(line for line in asked.err.splitlines() if line.startswith("visioncal target"))
+    visioncal(*shlex.split(command)[1:]).good()
+    visioncal("convert", "in", "out", "--target", "board.toml", "--mount", "eye-in-hand").good()
+    found = [view.base_from_flange().as_matrix() for view in Session.load("out").views]
+    np.testing.assert_allclose(found, world()[0], atol=1e-9)
+
+
 def test_arrays_without_rows(tmp_path):
     np.savez(tmp_path / "in.npz", angles=np.zeros((0, 7)), poses=np.zeros((0, 4, 4)))
     error = visioncal("convert", tmp_path / "in.npz", tmp_path / "out").refused().err
-    assert "in.npz has no list with one entry a pose" in error
+    assert "in.npz has no list with one entry a pose, but empty ones alone" in error
 
 
 def test_quaternions_without_their_real_part(tmp_path, monkeypatch):

@@ -54,8 +54,7 @@ def _conversion_of(path: Path) -> str:
     named = named if named.name.strip(".") else named.resolve()
     made = shlex.quote(f"{named.with_suffix('') if named.is_file() else named}-session")
     what, source, images = "A folder's pictures and poses", shlex.quote(str(named)), ""
-    by = "the name of their board (instead of charuco_9x6_30mm) and "
-    board = " --target charuco_9x6_30mm"
+    board = " and their board, which is asked for where no file beside describes it"
     endings = {file.suffix.lower() for file in islice(named.rglob("*.*"), 999) if file.is_file()}
     if named.is_file():
         what, images = "A table of poses and a folder of pictures", " --images PICTURES"
@@ -63,9 +62,9 @@ def _conversion_of(path: Path) -> str:
         what, images = "A folder of pictures and a table of their poses", f" --images {source}"
         source = "TABLE"
     elif endings and endings.isdisjoint((*IMAGE_ENDINGS, *_HOLDING_IMAGES)):
-        what, by, board = "A folder's poses of robot and target", "", ""
+        what, board = "A folder's poses of robot and target", ""
     return (
-        f"{what} become a session by {by}the camera's mount (eye-to-hand where it is fixed). Run: "
-        f"visioncal convert {source} {made}{images}{board} --mount eye-in-hand && "
+        f"{what} become a session by the camera's mount (eye-to-hand where it is fixed){board}. "
+        f"Run: visioncal convert {source} {made}{images} --mount eye-in-hand && "
         f"visioncal doctor {made}"
     )

@@ -29,7 +29,7 @@ from visioncal.vision.targets import (
 # Images that are searched for any board: at first, and where none shows the declared one.
 LOOKED_AT, LOOKED_AT_LAST = 3, 12
 # Least share of a board's corners in an image that identifies it.
-_LEAST_CORNERS = 0.2
+LEAST_CORNERS = 0.2
 # Paper that is looked for beyond a checkerboard [squares].
 _RIM = 0.35
 # Contrast of squares over that of paper: markers that blur hides leave half of it.
@@ -97,7 +97,7 @@ def other_board(
         # A sound one may be covered in part: its paper ends there.
         rims = [rim for image in images if (rim := _has_rim(image, identity.board)) is not None]
         is_sure &= sum(rims) > len(rims) / 2
-    if not is_sure or identity.corners_seen < _LEAST_CORNERS * identity.corners:
+    if not is_sure or identity.corners_seen < LEAST_CORNERS * identity.corners:
         return None
     numbers = tuple(view.number for view, _ in looked)
     # Of many images, some may not show it.

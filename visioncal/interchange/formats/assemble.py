@@ -1,7 +1,9 @@
 """Builds a session from a foreign recording."""
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.calibration.stages.other_board import LEAST_CORNERS, LOOKED_AT
 from visioncal.core.conventions import POSE_FORMS, PoseNumbers, Reading
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError
@@ -26,7 +29,9 @@ from visioncal.session import columns as session_columns
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import CLOUD_ENDINGS, ListedImages
 from visioncal.session.table import check_two_sides
-from visioncal.vision.boards.imaging import image_size, looks_like_image
+from visioncal.vision.boards import kind_of
+from visioncal.vision.boards.identify import describe, identify
+from visioncal.vision.boards.imaging import image_size, looks_like_image, read_image
 from visioncal.vision.targets import target_name
 
 _TARGET = (
@@ -246,12 +251,30 @@ def lacks_target(foreign: ForeignRecording) -> bool:
 
 def unknown_target(foreign: ForeignRecording, culprit: str, then: str = "") -> DataError:
     """The error of images of which nothing says what they show, and what `then` follows."""
+    seen, step = _seen_board([image for image in foreign.images if image is not None])
     return DataError(
         f"{foreign.name}: there are {'images' if foreign.images else 'corners'}, but what target "
-        "they show is not known.",
+        f"they show is not {seen}.",
         culprits=[culprit],
-        next_step=f"Say {_TARGET}{then}",
+        next_step=f"{step} {_TARGET}{then}",
     )
+
+
+def _seen_board(images: Sequence[Path]) -> tuple[str, str]:
+    """Words on the board that a few images show, and how it becomes a target."""
+    some = images[:: max(len(images) // LOOKED_AT, 1)][:LOOKED_AT]
+    with suppress(DataError):
+        seen = identify([read_image(image) for image in some])
+        is_sure = not seen.is_single or len(seen.marker_ids) < 2
+        is_sure &= seen.shown >= min(2, len(some))
+        if is_sure and seen.corners_seen >= LEAST_CORNERS * seen.corners:
+            return (
+                f"said: a {describe(seen)}",
+                f"Measure the {kind_of(seen.board).side}, write it [mm] in place of 30, and say "
+                "--target board.toml, which this makes:\nvisioncal target check "
+                f"{shlex.join(map(str, some))} --square-mm 30 -o board.toml\nElse say",
+            )
+    return "known", "Say"
 
 
 def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignRecording:

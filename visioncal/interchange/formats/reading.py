@@ -332,7 +332,8 @@ def rows_of_document(document: object, path: Path) -> list[Fields]:
     lists = [*_row_lists(document)]
     if not lists:
         raise DataError(
-            f"{path} has no list with one entry a pose, but names and values alone.",
+            f"{path} has no list with one entry a pose, but "
+            f"{'names and values' if document else 'empty ones'} alone.",
             culprits=[str(path)],
         )
     opened = {name: [*_opened(rows, name)] for name, rows, _ in lists}

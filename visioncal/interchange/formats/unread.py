@@ -42,7 +42,8 @@ def check_pictures(source: Source, requested: ImportOptions) -> None:
         (array, shape), is_single = next(iter(found.items())), len(group.files) == 1
         is_series = len(shape) - (shape[-1] == 3) == 3
         listed = (f"{name!r} ({' x '.join(map(str, each))})" for name, each in found.items())
-        folder = f"{source.path if source.path.is_dir() else source.path.with_suffix('')}-pictures"
+        named = source.path if source.path.name else source.path.resolve()
+        folder = f"{named if named.is_dir() else named.with_suffix('')}-pictures"
         script = _UNPACK.format(
             folder=json.dumps(folder),
             parent=json.dumps(str(group.files[0].parent)),
