@@ -32,6 +32,7 @@ from visioncal.interchange.formats.poses import pose_names
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.registry import read_foreign
 from visioncal.interchange.formats.sources import describe, proposed
+from visioncal.results.frame import FrameFile
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 from visioncal.session import Session
@@ -1591,6 +1592,32 @@ def test_a_board_that_is_not_said_is_the_one_that_the_images_show(tmp_path, monk
     visioncal("convert", "in", "out", "--target", "board.toml", "--mount", "eye-in-hand").good()
     found = [view.base_from_flange().as_matrix() for view in Session.load("out").views]
     np.testing.assert_allclose(found, world()[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("is_one_file", [False, True])
+def test_pairs_of_points_lead_to_the_camera_s_frame(tmp_path, monkeypatch, is_one_file):
+    """They have no rotations: the printed command fits the camera's frame to them."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(7)
+    truth, ours = world()[0][0], rng.uniform(-0.3, 0.3, (12, 3))
+    theirs = (ours - truth[:3, 3]) @ truth[:3, :3] + rng.normal(scale=2e-4, size=ours.shape)
+    if is_one_file:
+        names = [f"{side}_{axis}" for side in ("cam", "gt") for axis in "xyz"]
+        write_table(tmp_path / "in/pairs.csv", names, np.hstack([theirs, ours]))
+    else:
+        (tmp_path / "in").mkdir()
+        np.savetxt(tmp_path / "in/pos_hand.txt", ours)
+        np.savetxt(tmp_path / "in/pos_eye.txt", 1e3 * theirs)
+    refused = visioncal("convert", "in", "out", "--mount", "eye-to-hand")
+    refused.refused("12 pairs of points without rotations: a rigid motion maps")
+    command = refused.err[refused.err.index("visioncal fixture") :]
+    visioncal(*shlex.split(command)[1:]).good()
+    found = FrameFile.load("frames.json").frames["base_from_camera"].edge.matrix
+    np.testing.assert_allclose(found, truth, atol=2e-3)
+    if is_one_file:
+        write_table(tmp_path / "in/pairs.csv", names, np.hstack([theirs, rng.permutation(ours)]))
+        refused = visioncal("convert", "in", "out", "--mount", "eye-to-hand")
+        refused.refused("12 pairs of points without rotations, and no rigid motion maps")
 
 
 def test_arrays_without_rows(tmp_path):

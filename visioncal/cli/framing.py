@@ -23,7 +23,12 @@ from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.frames.tcp import touched_tool
 from visioncal.frames.touches import NO_TOOL, Tool
-from visioncal.interchange.formats.touches import read_nominal, read_touches, robots_of
+from visioncal.interchange.formats.touches import (
+    read_nominal,
+    read_point_pairs,
+    read_touches,
+    robots_of,
+)
 from visioncal.interchange.outputs import RECORDING, Written
 from visioncal.interchange.result_files import load_result, load_result_or_frames, rewrite_result
 from visioncal.results import Calibration, Frame, FrameFile
@@ -174,13 +179,19 @@ def place_frame(
             "prints touches that work.",
         )
     _check_paths(request, cad, kind == "fixture" and tool is None)
-    session = _image_session(source, {"--cad": cad, "--tool": tool, **request.for_touches()})
+    # A file or folder that is both has points of a robot and of a camera.
+    are_pairs = cad == source
+    session = (
+        None
+        if are_pairs
+        else _image_session(source, {"--cad": cad, "--tool": tool, **request.for_touches()})
+    )
     if session is None:
         origin = "the tool's point" if kind == "tool" else "the fixture's origin"
         refuse_given({"--point-mm": request.point}, f"touches say where {origin} is")
         unneeded = {"--camera": request.camera, "--target": request.target}
         refuse_given(unneeded, "touches need no camera")
-        robots = robots_of(source)
+        robots = () if are_pairs else robots_of(source)
         if request.calibration is None and not robots and tool in (None, "none"):
             named = {"--robot": request.robot}
             refuse_given(named, "neither touches nor a calibration name robots")
@@ -278,6 +289,10 @@ def fixture_command(options: FixtureOptions) -> None:
     """Runs `visioncal fixture`."""
 
     def by_touches(source: Path, calibration: Calibration | None) -> Frame:
+        model, noise_m = _model(options), options.noise_m
+        if options.cad == source:
+            rows, seen = read_point_pairs(source)
+            return touched_fixture(rows, None, seen, calibration, model, touch_noise_m=noise_m)
         drawing = None if options.cad is None else read_nominal(options.cad, options.cad_unit)
         robot, asked = options.robot, import_options(options, calibration)
         if options.tool is None and calibration is None:
@@ -288,7 +303,6 @@ def fixture_command(options: FixtureOptions) -> None:
             )
         tool = _tool(options.tool, calibration, robot)
         rows = read_touches(source, asked, robot, positions=tool is None)
-        noise_m, model = options.noise_m, _model(options)
         return touched_fixture(rows, tool, drawing, calibration, model, touch_noise_m=noise_m)
 
     place_frame("fixture", options, by_touches, options.cad, options.tool)

@@ -264,7 +264,9 @@ def _seen_board(images: Sequence[Path]) -> tuple[str, str]:
     """Words on the board that a few images show, and how it becomes a target."""
     some = images[:: max(len(images) // LOOKED_AT, 1)][:LOOKED_AT]
     with suppress(DataError):
-        seen = identify([read_image(image) for image in some])
+        seen = identify([read_image(image) for image in some]) if some else None
+        if seen is None:
+            return "known", "Say"
         is_sure = not seen.is_single or len(seen.marker_ids) < 2
         is_sure &= seen.shown >= min(2, len(some))
         if is_sure and seen.corners_seen >= LEAST_CORNERS * seen.corners:

@@ -48,7 +48,7 @@ from visioncal.interchange.formats.sources import (
     tables_apart,
     unknown,
 )
-from visioncal.interchange.formats.unread import check_pictures, series_note
+from visioncal.interchange.formats.unread import check_pictures, check_points, series_note
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 from visioncal.robot.trajectory import LONGEST_GAP_S, Samples
@@ -127,6 +127,7 @@ def _files_apart(
         or {"meas_x_m", "point"} & first.columns.keys()
     ):
         return None
+    check_points(source)
     if apart := tables_apart(source, requested):
         return apart
     own = pose_names(fields, requested.robot.names, "robot", ())

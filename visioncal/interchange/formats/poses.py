@@ -297,6 +297,16 @@ class _Piece:
         return self.names[0].rpartition(".")[0]
 
 
+def points_in(fields: Fields) -> list[PoseFields]:
+    """Fields of three numbers a row that are no rotation."""
+    pieces = (*_arrays(fields, ()), *_numbers(fields, ()))
+    return [
+        PoseFields(piece.names, piece.words)
+        for piece in pieces
+        if piece.size == 3 and not _ROTATION_WORDS & {*piece.words}
+    ]
+
+
 def _arrays(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:
     for name, numbers in fields.numbers.items():
         if numbers.ndim > 1 and name not in taken and len(numbers):

@@ -264,7 +264,7 @@ def proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields
     given = (*requested.robot.names, *requested.camera.names, *requested.joints)
     is_seen = bool(source.images or requested.images)
     found: list[tuple[int, Fields, ImportOptions]] = []
-    rows = _joined(source)
+    rows = rows_in(source)
     for fields in [each for each in rows if _has(each, given)] or rows:
         # A robot's program beside a table has the same poses once more.
         later = 4 * bool(fields.form) + 2 * (len(rows) > 1 and not _NAMED.search(fields.name))
@@ -466,7 +466,7 @@ def _sides(file: Path) -> list[str]:
     return PoseFields((), tuple(words_of(re.sub(r"[0-9]+", "_", file.stem)))).sides
 
 
-def _joined(source: Source) -> list[Fields]:
+def rows_in(source: Source) -> list[Fields]:
     """Rows of the parts, those joined that belong together; those of poses where there are any."""
     found = joined(
         [

@@ -17,6 +17,8 @@ from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptio
 from visioncal.interchange.formats.pose_forms import check_radians, poses_from
 from visioncal.interchange.formats.poses import columns_named, pose_names, words_of
 from visioncal.interchange.formats.reading import read_fields
+from visioncal.interchange.formats.sources import describe
+from visioncal.interchange.formats.unread import point_pairs
 from visioncal.session import Session
 from visioncal.session.columns import POSE, joint_columns
 
@@ -70,6 +72,28 @@ def read_touches(
     kinds, points = (texts.get(name, ("",) * len(fields)) for name in ("kind", "point"))
     labels = tuple(map(str, numbers))
     return TouchRows(path.name, labels, fields.places, poses, joints_rad, kinds, points, written)
+
+
+def read_point_pairs(path: Path) -> tuple[TouchRows, NominalPoints]:
+    """Reads a robot's points and a camera's of one source, in which no rotations stand.
+
+    Raises:
+        DataError: It cannot be read, or has no pairs that a rigid motion maps.
+    """
+    pairs = point_pairs(describe(path))
+    if pairs is None or not pairs.agree:
+        raise DataError(
+            f"{path.name} has no pairs of points of robot and camera that agree.",
+            culprits=[str(path)],
+            next_step="Name the touches first, and the drawing's table with --cad.",
+        )
+    ours, theirs = pairs.points
+    labels = tuple(map(str, range(len(ours))))
+    poses = np.full((len(ours), 4, 4), np.nan)
+    poses[:, :3, 3] = ours
+    kinds = ("point",) * len(ours)
+    rows = TouchRows(path.name, labels, pairs.places, poses, None, kinds, labels)
+    return rows, NominalPoints(path.name, labels, theirs, np.zeros(len(theirs)))
 
 
 def read_typed(path: Path, given: PoseImportOptions) -> tuple[tuple[str, ...], PoseNumbers] | None:

@@ -1,21 +1,31 @@
-"""Content of a source that is not read: pictures within arrays, and other series of a file."""
+"""Content of a source that is not read: pictures in arrays, other series, pairs of points."""
 
 import json
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from glob import escape
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
+from visioncal.core.conventions import UNITS_M
 from visioncal.core.documents.jsons import pictures_in
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import counted, some_of
-from visioncal.interchange.formats.fields import Fields
+from visioncal.core.procrustes import align, spreads
+from visioncal.core.transforms import apply, rotation_angle
+from visioncal.core.types import FloatArray
+from visioncal.interchange.formats.fields import Fields, unit_by_size, without_unit
 from visioncal.interchange.formats.file_search import DRAWN
 from visioncal.interchange.formats.foreign import ImportOptions
-from visioncal.interchange.formats.poses import possible_poses
-from visioncal.interchange.formats.sources import Source
+from visioncal.interchange.formats.poses import PoseFields, points_in, possible_poses
+from visioncal.interchange.formats.sources import Source, rows_in
+
+# Fewest pairs of points, and the largest residual of a rigid motion that maps one side's to the
+# other's, as a share of their least extents in a plane (rms): numbers of poses leave about all.
+_FEWEST_POINTS, _MOST_RESIDUAL = 4, 0.1
 
 # Writes the pictures of .npz files to a folder, and beside them what else they hold.
 _UNPACK = """\
@@ -96,3 +106,75 @@ def _series(fields: Fields) -> tuple[str, set[str]]:
     parts = [name.partition(".")[::2] for name in fields.numbers]
     before = {series for series, name in parts if name}
     return before.pop() if len(before) == 1 else "", {name or series for series, name in parts}
+
+
+@dataclass(frozen=True, eq=False)
+class PointPairs:
+    """The same n points by a robot and by a camera, without rotations."""
+
+    names: tuple[str, str]  # Of the robot's field, and of the camera's.
+    places: tuple[str, ...]  # (n,) lines.
+    points: FloatArray  # (2, n, 3) in the robot's base, and in the camera [m].
+    rms_m: float  # Residual of the rigid motion between both.
+    agree: bool  # Whether this is small.
+
+
+def point_pairs(source: Source) -> PointPairs | None:
+    """The two fields of points that a rigid motion maps best, or whose names say it; else None."""
+    found: list[PointPairs] = []
+    rows = (each for part in source.parts for each in part.rows)
+    for fields in (*rows_in(source), *rows):
+        items = [(item, _metres(fields, item)) for item in points_in(fields)]
+        for (one, first), (other, second) in combinations(items, 2):
+            points = np.stack([first, second])
+            present = np.flatnonzero(np.isfinite(points).all(axis=(0, 2)))
+            points = points[:, present]
+            if one.sides == other.sides != [] or points.shape[1] < _FEWEST_POINTS:
+                continue
+            motion = align(*points)
+            rms_m = float(np.sqrt(3.0) * (points[0] - apply(motion, points[1])).std())
+            extent_m = min(spreads(side)[0][1] for side in points)
+            # Points of one frame, as commanded and as reached, are no pairs.
+            is_one = rotation_angle(motion[:3, :3]) < _MOST_RESIDUAL
+            agree = rms_m < _MOST_RESIDUAL * extent_m and not is_one
+            if agree or (len(items) == 2 and ["camera"] in (one.sides, other.sides)):
+                ours = [one, other] if _is_robot(one, other) else [other, one]
+                sides = points if _is_robot(one, other) else points[::-1]
+                names = (_named(ours[0]), _named(ours[1]))
+                places = tuple(fields.places[at] for at in present)
+                found.append(PointPairs(names, places, sides, rms_m, agree))
+    return min(found, key=lambda pairs: pairs.rms_m, default=None)
+
+
+def _metres(fields: Fields, item: PoseFields) -> FloatArray:
+    """Points (n, 3) of fields [m]."""
+    numbers = np.hstack([fields.column(name) for name in item.names])
+    stated = {without_unit(name)[1] for name in item.names} - {""}
+    return UNITS_M[stated.pop() if len(stated) == 1 else unit_by_size(numbers)] * numbers
+
+
+def _is_robot(one: PoseFields, other: PoseFields) -> bool:
+    return one.sides == ["robot"] or other.sides == ["camera"]
+
+
+def _named(item: PoseFields) -> str:
+    return ", ".join(item.names)
+
+
+def check_points(source: Source) -> None:
+    """Raises DataError where a source has pairs of points without rotations."""
+    if pairs := point_pairs(source):
+        robot, camera = pairs.names
+        where = shlex.quote(str(source.path))
+        fit = f"maps one to the other but for {1e3 * pairs.rms_m:.3g} mm (rms)"
+        raise DataError(
+            f"{source.path.name}: {robot} and {camera} are {len(pairs.points[0])} pairs of points "
+            f"without rotations{': a rigid motion' if pairs.agree else ', and no rigid motion'} "
+            f"{fit}. A calibration takes the robot's poses.",
+            culprits=[pairs.places[0]],
+            next_step="Record the robot's rotations, too."
+            if not pairs.agree
+            else f"Where {robot} are places of the robot's tip at what the camera saw, this "
+            f"fits the camera's frame to them:\nvisioncal fixture {where} --cad {where} --tool "
+            "none --name camera -o frames.json",
+        )
