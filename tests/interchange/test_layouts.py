@@ -1594,6 +1594,30 @@ def test_a_board_that_is_not_said_is_the_one_that_the_images_show(tmp_path, monk
     np.testing.assert_allclose(found, world()[0], atol=1e-9)
 
 
+@pytest.mark.parametrize("names", [("g2b", "t2c"), ("b2e", "o2c")])
+def test_frames_by_their_initials(tmp_path, names):
+    both, mount = pairs()
+    robot = both[0] if names[0] == "g2b" else np.linalg.inv(both[0])
+    arrays = {f"T_{names[1]}": both[1], f"T_{names[0]}": robot, "T_c2g": np.eye(4)}
+    np.savez(tmp_path / "in.npz", **arrays)
+    visioncal("convert", tmp_path / "in.npz", tmp_path / "out", "--mount", mount).good()
+    np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), both, atol=1e-9)
+
+
+def test_points_of_a_camera_in_a_file_beside_the_robot_s_poses(tmp_path):
+    """A matrix a row and homogeneous points in files of any names; no command is needed."""
+    poses, seen = pairs()[0]
+    write(tmp_path / "in/rt.txt", "\n".join(" ".join(map(str, each.ravel())) for each in poses))
+    points = [" ".join(map(str, [*each[:3, 3], 1.0])) for each in seen]
+    write(tmp_path / "in/psi.txt", "\n".join(points))
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand").good()
+    assert "psi are taken for points that the camera measured, in m" in done.err
+    session = Session.load(tmp_path / "out")
+    assert session.document["camera"] == {"model": "points"}
+    found = [view.base_from_flange().as_matrix() for view in session.views]
+    np.testing.assert_allclose(found, poses, atol=1e-9)
+
+
 @pytest.mark.parametrize("is_one_file", [False, True])
 def test_pairs_of_points_lead_to_the_camera_s_frame(tmp_path, monkeypatch, is_one_file):
     """They have no rotations: the printed command fits the camera's frame to them."""

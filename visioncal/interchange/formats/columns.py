@@ -38,7 +38,7 @@ from visioncal.interchange.formats.pairing import (
     with_depth,
 )
 from visioncal.interchange.formats.pose_forms import makers_of, poses_from
-from visioncal.interchange.formats.poses import columns_named, pose_names, possible_poses
+from visioncal.interchange.formats.poses import columns_named, points_in, pose_names, possible_poses
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.sources import (
     Source,
@@ -171,6 +171,8 @@ def _recordings(
     points = names["camera"]
     if not points or sum(fields.column(name).shape[1] for name in points) != 3:
         points = ()
+    if names["robot"] and not (names["camera"] or joint_fields or found or instead):
+        points = _points_beside(fields, names["robot"])
     names["camera"] = () if points else names["camera"]
     poses: dict[Side, PoseNumbers] = {"robot": PoseNumbers.empty(fields.places)}
     unstated: dict[Side, Unstated] = {}
@@ -287,6 +289,20 @@ def _joint_angles(
     return joints, [*notes]
 
 
+def _points_beside(fields: Fields, robot: tuple[str, ...]) -> tuple[str, ...]:
+    """The only points of another file than the robot's poses, or of a camera by their words."""
+    own = robot[0].partition(".")[0]
+    poses = {name for item in possible_poses(fields, robot) for name in item.names}
+    points = [item for item in points_in(fields) if {*item.names}.isdisjoint({*robot, *poses})]
+    files = [item.names[0].partition(".")[0] for item in points]
+    found = [
+        item.names
+        for item, file in zip(points, files, strict=True)
+        if item.sides == ["camera"] or (file != own and f"{file}." in fields.places[0])
+    ]
+    return found[0] if len(found) == 1 else ()
+
+
 def _readings(
     fields: Fields, used: set[str], points: tuple[str, ...]
 ) -> tuple[dict[str, tuple[str, ...]], tuple[str, ...]]:
@@ -304,7 +320,7 @@ def _readings(
     if not (names := points or names):
         return {}, ()
     used.update(names)
-    places = np.hstack([fields.column(name) for name in names])
+    places = np.hstack([fields.column(name)[:, :3] for name in names])
     stated = {unit for name in names if (unit := without_unit(name)[1])}
     unit = stated.pop() if len(stated) == 1 else unit_by_size(places)
     cells = [

@@ -55,6 +55,8 @@ _SIDE_WORDS = {
 _TRACKERS = _set("vicon optitrack mocap")
 # Names of both sides of A X = X B, where no other poses stand beside them.
 _BOTH_SIDES = (("a", "b"), ("h", "e"), ("t1", "t2"))
+# Frames by their initials, as in `t2c` and `g2b`: a parent of one side, and its children.
+_INITIALS = (("b", "base", "gefht", "gripper"), ("c", "cam", "tmo", "target"))
 # With these words between two frames the child is named first; otherwise second.
 _CHILD_FIRST = {"2", "to", "in", "wrt"}
 # Numbers of poses' sizes that are none, and poses that were not reached but asked for.
@@ -83,7 +85,15 @@ _ROTATION_NAMES: tuple[tuple[str, ...], ...] = (
 def words_of(name: str) -> list[str]:
     """The words of a field's name, in small letters and without its unit."""
     plain = re.sub(r"(?<=[a-z])(?=[A-Z][a-z])", "_", without_unit(name)[0])
-    return [part for part in re.split(r"[\W_]+|(2)", plain.lower()) if part]
+    words = [part for part in re.split(r"[\W_]+|(2)", plain.lower()) if part]
+    for at in (at for at, word in enumerate(words[1:-1], 1) if word == "2"):
+        ends = (words[at - 1], words[at + 1])
+        for letter, parent, letters, child in _INITIALS:
+            if ends in ((letter, other) for other in letters):
+                words[at - 1 : at + 2] = [parent, "2", child]
+            elif ends in ((other, letter) for other in letters):
+                words[at - 1 : at + 2] = [child, "2", parent]
+    return words
 
 
 @dataclass(frozen=True)
@@ -298,13 +308,18 @@ class _Piece:
 
 
 def points_in(fields: Fields) -> list[PoseFields]:
-    """Fields of three numbers a row that are no rotation."""
+    """Fields of three numbers a row, or four of which the last is 1, that are no rotation."""
     pieces = (*_arrays(fields, ()), *_numbers(fields, ()))
     return [
         PoseFields(piece.names, piece.words)
         for piece in pieces
-        if piece.size == 3 and not _ROTATION_WORDS & {*piece.words}
+        if not _ROTATION_WORDS & {*piece.words}
+        and (piece.size == 3 or (piece.size == 4 and _is_homogeneous(fields, piece)))
     ]
+
+
+def _is_homogeneous(fields: Fields, piece: "_Piece") -> bool:
+    return bool((fields.column(piece.names[-1])[:, -1] == 1.0).all())
 
 
 def _arrays(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:

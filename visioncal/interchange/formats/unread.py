@@ -148,7 +148,7 @@ def point_pairs(source: Source) -> PointPairs | None:
 
 def _metres(fields: Fields, item: PoseFields) -> FloatArray:
     """Points (n, 3) of fields [m]."""
-    numbers = np.hstack([fields.column(name) for name in item.names])
+    numbers = np.hstack([fields.column(name)[:, :3] for name in item.names])
     stated = {without_unit(name)[1] for name in item.names} - {""}
     return UNITS_M[stated.pop() if len(stated) == 1 else unit_by_size(numbers)] * numbers
 
