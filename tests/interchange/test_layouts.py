@@ -1594,6 +1594,36 @@ def test_a_board_that_is_not_said_is_the_one_that_the_images_show(tmp_path, monk
     np.testing.assert_allclose(found, world()[0], atol=1e-9)
 
 
+@pytest.mark.parametrize("has_matrices", [False, True])
+def test_rows_of_both_sides_in_turn_without_names(tmp_path, has_matrices):
+    """Even and odd rows turn alike; of a pose that was written twice they are copies."""
+    both, mount = pairs()
+    quaternions = Rotation.from_matrix(both[..., :3, :3]).as_quat()
+    rows = both.reshape(2, -1, 16) if has_matrices else np.dstack([both[..., :3, 3], quaternions])
+    np.savetxt(tmp_path / "in.txt", rows.swapaxes(0, 1).reshape(-1, rows.shape[2]), fmt="%.12f")
+    visioncal("convert", tmp_path / "in.txt", tmp_path / "out", "--mount", mount).good()
+    np.testing.assert_allclose(came_in(Session.load(tmp_path / "out")), both, atol=1e-9)
+    np.savetxt(tmp_path / "twice.txt", np.repeat(rows[0], 2, axis=0))
+    twice = visioncal("convert", tmp_path / "twice.txt", tmp_path / "two", "--mount", mount)
+    twice.refused("18 poses of the robot, but neither images nor poses of the target")
+
+
+def test_angles_of_two_runs_are_no_sides(tmp_path):
+    """By the files' name they are joints, or by their numbers those of one motion."""
+    (tmp_path / "in").mkdir()
+    rng = np.random.default_rng(0)
+    angles = rng.uniform(-2, 2, (2, 9, 6))
+    for name, each in zip(("qs_8", "qs_rand_8"), angles, strict=True):
+        np.savetxt(tmp_path / f"in/{name}.txt", each)
+    done = visioncal("convert", tmp_path / "in", tmp_path / "out", "--mount", "eye-in-hand")
+    done.refused("there are joint angles", "--robot-model")
+    (tmp_path / "again").mkdir()
+    for name in ("first", "second"):
+        np.savetxt(tmp_path / f"again/{name}.txt", angles[0] + rng.normal(scale=1e-3, size=(9, 6)))
+    done = visioncal("convert", tmp_path / "again", tmp_path / "out", "--mount", "eye-in-hand")
+    done.refused("nearly the same 9 rows as", "both are of one side")
+
+
 @pytest.mark.parametrize("names", [("g2b", "t2c"), ("b2e", "o2c")])
 def test_frames_by_their_initials(tmp_path, names):
     both, mount = pairs()

@@ -42,6 +42,8 @@ from visioncal.interchange.formats.fields import (
     holds_pose,
     is_small,
     joined,
+    position_first,
+    split_matrices,
 )
 from visioncal.interchange.formats.keys import is_image_name
 from visioncal.interchange.formats.lines import (
@@ -74,9 +76,9 @@ def _stacked_matrices(table: TextTable, path: Path) -> Fields | None:
 
 
 def _of_joints(table: TextTable, path: Path) -> TextTable:
-    """The table; without a header in a file called joints, with the joints' names."""
+    """The table; without a header in a file called joints or q, with the joints' names."""
     is_whole = not table.has_header and 5 <= len(table.columns) <= 8
-    if is_whole and {"joint", "joints"} & {*re.split("[^a-z]+", path.stem.lower())}:
+    if is_whole and {"joint", "joints", "q", "qs"} & {*re.split("[^a-z]+", path.stem.lower())}:
         return replace(table, columns=tuple(map("joint_{}".format, table.columns)))
     return table
 
@@ -85,6 +87,7 @@ def _paired_rows(table: TextTable, path: Path) -> Fields | None:
     """Rows in pairs, one of the robot and one of the camera: every other one, or by halves.
 
     A column of two words says which is whose; below an empty line in the middle stand the camera's.
+    Without either, poses whose rotations are known show by these that two sides stand in turn.
     """
     count, rows = len(table.rows), table.rows
     half, columns = count // 2, range(len(table.columns))
@@ -102,7 +105,9 @@ def _paired_rows(table: TextTable, path: Path) -> Fields | None:
     elif not worded and not table.has_header:
         names, steps = ("robot", "camera"), np.diff(table.lines)
         if steps[half - 1] == 1 or (np.delete(steps, half - 1) != 1).any():
-            return None
+            if not _turn_by_two(rows):
+                return None
+            first, second = np.arange(0, count, 2), np.arange(1, count, 2)
     else:
         return None
     numbers = [at for at in columns if at not in worded]
@@ -122,6 +127,27 @@ def _paired_rows(table: TextTable, path: Path) -> Fields | None:
     ]
     places = [table.place(at) for at in first.tolist()]
     return fields_of_records(records, places, path.stem, path.parent)
+
+
+# Cosines of the same turns by two sides differ by less, as a share of all: a degree or two.
+_TURN_ALIKE = 0.05
+
+
+def _turn_by_two(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether even and odd rows are poses that turn by the same angles, and no copies."""
+    if not all(is_number(cell) for row in rows for cell in row):
+        return False
+    numbers = np.array(rows, dtype=float)
+    if appearance(numbers) != "pose":
+        return False
+    is_short = numbers.shape[1] == 7
+    turns = position_first(numbers)[:, 3:] if is_short else split_matrices(numbers)[1]
+    even, odd = turns[::2], turns[1::2]
+    # Cosines of half the angle between two quaternions, of either sign, or traces.
+    first, second = (np.abs(own @ own.T) if is_short else own @ own.T for own in (even, odd))
+    spread = float(np.ptp(first))
+    is_copy = np.median(np.abs(even - odd)) < _TURN_ALIKE * spread
+    return bool(np.median(np.abs(first - second)) < _TURN_ALIKE * spread and not is_copy)
 
 
 # Names of numbers in a mapping that are one array.

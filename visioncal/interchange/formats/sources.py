@@ -59,6 +59,8 @@ _LISTED = 6
 _PICKLE = "a pickle, which runs code when it is opened: write its arrays as .npz or .json"
 _WORKBOOK = "a workbook: save its sheet with the poses as .csv"
 _SHUT = dict.fromkeys((".pkl", ".pickle"), _PICKLE) | dict.fromkeys((".xlsx", ".xls"), _WORKBOOK)
+# Runs of one motion differ by less, as a share of what they span.
+_RUN_AGAIN = 0.05
 # Lines of a camera_info's matrix and coefficients.
 _CAMERA_INFO = re.compile(r"^[KkDd]: *\[.*$", re.MULTILINE)
 # Readings of one source that are tested, and names of rows that are a robot's.
@@ -442,15 +444,22 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
     files.sort(key=lambda of: (sides[of[0]] == ["camera"], not _OF_ROBOT.search(of[0].stem)))
     # Two files of one side, as of a camera's poses before and after a filter, are no pair.
     pairs = [
-        (a, b, fields)
+        (a, b, fields, others)
         for (a, fields), (b, others) in combinations(files, 2)
         if len(fields) == len(others) and sides[a] != ["camera"] and sides[b] != ["robot"]
     ]
     if len(pairs) != 1 or (len(files) > 2 and len(pairs[0][2]) < FEWEST_ROWS):
         return None
-    robot, camera, fields = pairs[0]
+    robot, camera, fields, others = pairs[0]
     if sides[robot] == ["robot"] and sides[camera] == ["camera"]:
         return robot, camera
+    if _is_run_again(fields, others):
+        raise DataError(
+            f"{source.path}: {camera.name} has nearly the same {len(fields)} rows as {robot.name}: "
+            "both are of one side, as of two runs, and nothing says what a camera saw.",
+            culprits=[str(camera)],
+            next_step="Name one of them as the source, and what was seen with --images.",
+        )
     command = [str(robot) if word == str(source.path) else word for word in requested.command]
     raise DataError(
         f"{source.path} has {len(fields)} poses in {robot.name} and as many in {camera.name}: "
@@ -459,6 +468,14 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
         next_step=f"Name the file of the robot, and that of the camera with --camera-file:\n"
         f"{shlex.join([*command, '--camera-file', str(camera)])}",
     )
+
+
+def _is_run_again(fields: Fields, others: Fields) -> bool:
+    """Whether rows are those of another run of the same motion: both are of one side."""
+    one, other = (np.hstack([*map(each.column, each.numbers)]) for each in (fields, others))
+    if one.shape != other.shape:
+        return False
+    return bool(np.nanmedian(np.abs(one - other)) < _RUN_AGAIN * np.nanstd(one, axis=0).max())
 
 
 def _sides(file: Path) -> list[str]:
