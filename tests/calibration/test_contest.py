@@ -6,6 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from benchmarks import elsewhere
 from support.cells import calibrated, pairs_session, reporting
 from support.misfits import misfit
 from support.refusals import raised
@@ -15,10 +16,13 @@ import visioncal
 from visioncal.calibration.pipeline.judging import findings_of
 from visioncal.calibration.suspects.contest import contested
 from visioncal.calibration.suspects.judge import judge
+from visioncal.calibration.suspects.judged import Findings, JudgedArm
+from visioncal.calibration.suspects.limits import few_stops
+from visioncal.calibration.suspects.ranking import rank_causes
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import MOUNTS
-from visioncal.core.verdict import Finding, Verdict
+from visioncal.core.verdict import LEFT_OPEN, Finding, Verdict
 from visioncal.simulation import BOARDS, CAMERAS, CellOptions, simulate
 
 FINE = CellOptions(camera=CAMERAS["fine"], pixel_sigma_px=0.1)
@@ -262,11 +266,44 @@ def test_a_lens_that_far_views_leave_open_hears_what_to_state():
     assert "role = intrinsics" in words
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [4, 7])
+def test_a_base_that_creeps_before_a_fixed_camera_is_among_what_is_named(seed, tmp_path):
+    """By 0.5 mm along the line of sight, as a lens that creeps or a board that shrinks.
+
+    Beside independent noise alone, these and a lens that changed at once explained more.
+    """
+    world = elsewhere.World(lift=lambda share: 5e-4 * share, views=30)
+    elsewhere.cell(world, MOUNTS[1], seed % 2 == 0, seed, tmp_path / "cell")
+    verdict = visioncal.calibrate(tmp_path / "cell").verdict
+    (cause, *_) = verdict.causes
+    assert cause.kind == "base_creeps" or "the base, or what stands in it, crept" in cause.words
+    assert cause.kind == "base_creeps" or verdict.top[0].startswith("Likeliest of these")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.9])
+def test_a_cure_that_hardly_helps_is_not_most_likely(share):
+    """Of a finding that is significant; its cure leaves as much."""
+    found = Finding("lens_grows", "The lens.", mahalanobis_sq=40.0, explains=share)
+    (ranked,) = rank_causes([found], (), None)
+    said = Verdict("check", (ranked,)).top[0]
+    assert said == f"{'Most likely' if share > 0.5 else 'Possibly'}: The lens."
+
+
+def test_the_number_of_views_is_no_cause():
+    (few,) = few_stops(Findings((), (), (JudgedArm(9),), ()), 9)
+    (ranked,) = rank_causes([few], (), None)
+    assert ranked.probability
+    assert Verdict("check", (ranked,)).top[0].startswith("Only 9 views are used")
+
+
 def test_words_say_whether_rivals_are_left():
     first = Finding("lens", "The lens.", probability=0.9, by_limit=True)
     other = replace(first, words="The board.", probability=0.1)
     assert Verdict("bad", (first, other)).top[0] == "Likeliest of these: The lens."
     assert Verdict("bad", (first,)).top[0] == "Most likely: The lens."
+    left_open = replace(first, words=f"The lens.{LEFT_OPEN} the board grew.")
+    assert Verdict("bad", (left_open,)).top[0].startswith("Likeliest of these: The lens.")
     proven = replace(first, by_limit=False, without_it="It leaves nothing.")
     said = "Most likely (90 %): The lens. It leaves nothing."
     assert Verdict("bad", (proven, other)).top[0] == said

@@ -25,6 +25,8 @@ LEAST_NEED_MM = 1e-3
 _HEADLINES = {"good": "Good: ready to use", "check": "Check before use", "bad": "Bad: do not use"}
 # Kinds of what is no doubt: praise, remarks, and that a bad result's accuracy is unknown.
 AGREEMENT, NOTE, NO_ACCURACY = "agreement", "note", "no_accuracy"
+# Begins a sentence that names what explains about as much as a finding.
+LEFT_OPEN = " Or else, as these views leave it open:"
 # Kind of what verify finds where depth is not what it was.
 DEPTH_CHANGED = "depth_changed"
 # Commands of remedies.
@@ -110,7 +112,8 @@ class Finding:
     # Whether this probability ranks its cause alone and is not stated: it follows from the limit of
     # a comparison, the same in all sessions, or no cure was applied that proves it.
     by_limit: Annotated[bool, DROPPED] = False
-    # Whether its probability is its share of the errors of picks: a source of errors, no mistake.
+    # Whether its probability is its share of the errors of picks, or that of a remark on the number
+    # of views: no mistake.
     is_share: Annotated[bool, DROPPED] = False
     without_it: Annotated[str, DROPPED] = ""  # The result without it, as a sentence.
     # Whether it alone makes a result bad.
@@ -125,6 +128,8 @@ class Finding:
     is_proven: Annotated[bool, UNWRITTEN] = field(default=False, compare=False)
     # Share of the misfit, as a variance, that its cure removes: all of it where none was applied.
     explains: Annotated[float, UNWRITTEN] = field(default=1.0, compare=False)
+    # Whether its cure is in the fit, and clearly lowers the misfit: it is no rival of what remains.
+    is_apart: Annotated[bool, UNWRITTEN] = field(default=False, compare=False)
     # Greatest error of a pick that it causes [mm]; infinite where unknown.
     up_to_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
 
@@ -230,7 +235,10 @@ class Verdict:
         how = "Also likely" if finding.probability >= _EVEN else "Possibly"
         if finding in self.causes[:1]:
             others = [cause for cause in self.causes[1:] if cause.probability >= LEAST_LIKELY]
-            how = "Likeliest of these" if finding.by_limit and others else "Most likely"
+            is_open = bool(others) or LEFT_OPEN in finding.words
+            is_even = finding.probability > 0.9 * _EVEN
+            how = "Most likely" if is_even or not finding.by_limit else how
+            how = "Likeliest of these" if finding.by_limit and is_open else how
         is_likely = finding.probability >= LEAST_LIKELY and not finding.is_share
         begin = f"{how}{likely}: " if is_likely else ""
         return f"{begin}{finding.words} {finding.without_it}".strip()

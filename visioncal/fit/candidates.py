@@ -14,7 +14,7 @@ from visioncal.fit.fit import Fit
 from visioncal.fit.lens_field import Field
 from visioncal.fit.linearise import linearised, predicted
 from visioncal.fit.pairs import Pair, images_of
-from visioncal.fit.score import best_displacement, best_field, of_effect, of_rows
+from visioncal.fit.score import added_by, best_displacement, best_field, of_effect, of_rows
 from visioncal.fit.sizes import most_likely
 from visioncal.fit.unknowns import State, Unknowns, Vector, given_lens, lens_field, random_effect
 from visioncal.model import MeasuredPose
@@ -48,6 +48,8 @@ from visioncal.vision.targets import corner_positions
 _RULED_OUT = float(np.log(CheckLimits.ruled_out))
 # Most stops after which a frame may have been moved, and a lens.
 _STEPS, _ZOOMS = 12, 60
+# Boards that swell are rarer by so much than what creeps.
+_SWELLS = 100.0
 # Most stops at which images may move while they are read, of four unknowns each, and what counts
 # between their first row and their last [px]: below, other errors of images look so; and its size
 # at most, over that which each image shows by itself.
@@ -64,11 +66,18 @@ class Candidate:
     member: Vector  # Its unknowns, whose size starts there.
     effect: Effect | None = None
     field: Field | None = None  # Beside a lens that is as stated.
+    # The same at its estimate, with nothing off for the number of its values.
+    explained: float = np.nan
 
     @property
     def limit(self) -> float:
         """The least likelihood ratio by which it is opened."""
         return SIGNIFICANT if self.effect is None else self.effect.size.limit
+
+    @property
+    def name(self) -> str:
+        """The name of its effect; empty of others."""
+        return "" if self.effect is None else self.effect.name
 
     @property
     def lens(self) -> str:
@@ -106,7 +115,10 @@ def opened(
                 for other in clear
                 if other.effect is not None
                 and other.lens in ("", one.lens)
-                and other.gain > one.gain - _RULED_OUT
+                and (
+                    other.gain > one.gain - _RULED_OUT
+                    or other.explained > one.explained - _RULED_OUT
+                )
             }
             rivals -= {kind, one.effect.wider}
             unknowns = replace(
@@ -129,7 +141,9 @@ def opened(
 
 def candidates(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
     """All that are not open yet, with their scores."""
-    yield from beside_zooms(fit, scored(fit, effects_of_lenses(fit), sole_flange(fit)))
+    seen = [camera for camera in fit.unknowns.lenses if images_of(pairs, camera)]
+    growing = (*effects_of_lenses(fit), *map(BoardSwells, seen))
+    yield from beside_zooms(fit, scored(fit, growing, sole_flange(fit), pairs))
     yield from of_arms(fit, pairs)
     yield from of_images(fit, pairs)
     yield from scored(fit, creeps_of_frames(fit))
@@ -165,7 +179,7 @@ def of_images(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
                 member = starting_at(random_effect(effect), size, _SHOWN * size)
                 yield Candidate(gain, member, effect)
         opened_there = {known.name for known in fit.unknowns.effects}
-        displacements = (Window.tried(camera), (BoardSwells(camera),), *_sags(fit, pairs, camera))
+        displacements = (Window.tried(camera), *_sags(fit, pairs, camera))
         for tried in displacements:
             if tried[0].name not in opened_there and images_of(pairs, camera):
                 best, size, gain = best_displacement(fit, pairs, tried)
@@ -225,17 +239,19 @@ def of_arms(fit: Fit, pairs: Sequence[Pair]) -> Iterator[Candidate]:
             yield Candidate(gain_of(fit, pairs, effect), random_effect(effect), effect)
 
 
-def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Candidate]:
+def scored(
+    fit: Fit, effects: Iterable[Effect], flange: str = "", pairs: Sequence[Pair] = ()
+) -> Iterator[Candidate]:
     """Those of some effects that are not open yet; of a flange, beside what its arm errs by."""
     known = {effect.name for effect in fit.unknowns.effects}
-    found = list[tuple[Effect, float, float]]()
+    found = list[tuple[Effect, float, float, float]]()
     for effect in effects:
         if effect.name not in known and effect.count:
             bounds = effect.size
             # One of very many unknowns is judged by some of them.
-            own = of_effect(fit, effect.typical)
+            own = of_effect(fit, effect.typical, pairs)
             best = own.best(np.ones(len(own.pull)), bounds.low, bounds.high)
-            found.append((effect, *best))
+            found.append((effect, *best, np.nan))
     if flange:
         # An effect that gains little beside independent noise gains less beside errors that last;
         # one that differs from stop to stop does not last.
@@ -245,14 +261,17 @@ def scored(fit: Fit, effects: Iterable[Effect], flange: str = "") -> Iterator[Ca
             creeps = [(one[2], one[0].about_m) for one in found if isinstance(one[0], BaseCreeps)]
             _, place = max(creeps, default=(0.0, ()))
             clear += [one for one in steps(fit, flange, place) if one.name not in known]
-        beside = processes.scored(fit, flange, clear) if clear else []
+        added = [(one, added_by(fit, one, pairs)) for one in clear]
+        beside = processes.scored(fit, flange, added) if clear else []
         others = [one for one in found if one[0] not in (clear if beside else ())]
         found = [*others, *((one, *best) for one, best in zip(clear, beside, strict=False))]
-    for effect, size, gain in found:
+    for effect, size, gain, explained in found:
         # When something was moved is a free choice.
-        choices = np.log(_STEPS) if isinstance(effect, BaseSteps | MountSteps) else 0.0
-        choices += np.log(_ZOOMS) if isinstance(effect, LensSteps) else 0.0
-        yield Candidate(gain - choices, starting_at(random_effect(effect), size), effect)
+        off = np.log(_STEPS) if isinstance(effect, BaseSteps | MountSteps) else 0.0
+        off += np.log(_ZOOMS) if isinstance(effect, LensSteps) else 0.0
+        off += np.log(_SWELLS) if isinstance(effect, BoardSwells) else 0.0
+        member = starting_at(random_effect(effect), size)
+        yield Candidate(gain - off, member, effect, explained=explained - off)
 
 
 def starting_at(member: Vector, size: float, most: float = np.inf) -> Vector:
@@ -357,18 +376,25 @@ def beside_zooms(fit: Fit, changes: Iterable[Candidate]) -> Iterator[Candidate]:
     clear = set[str]()
     for one in changes:
         yield one
-        if 2.0 * one.gain >= SIGNIFICANT:
+        if 2.0 * one.gain >= SIGNIFICANT and one.lens:
             clear.add(one.lens)
-    yield from scored(fit, (step for camera in clear for step in zooms(fit, camera)))
+    alone = dict[str, Candidate]()
+    for camera in clear:
+        for kind in (LensSteps, LensChanges):
+            for one in scored(fit, zooms(fit, camera, kind)):
+                alone[one.name] = max(one, alone.get(one.name, one), key=lambda at: at.gain)
+    likeliest = [one.effect for one in alone.values() if one.effect is not None]
+    # One that grows is judged beside an arm's lasting errors; these also make room for steps.
+    for one in scored(fit, likeliest, sole_flange(fit)):
+        yield replace(one, gain=min(one.gain, alone[one.name].gain))
 
 
-def zooms(fit: Fit, camera: str) -> Iterator[Effect]:
+def zooms(fit: Fit, camera: str, kind: type[LensSteps]) -> Iterator[Effect]:
     """Changes of a lens at once: rivals to what grows, and to what differs from stop to stop."""
     grams = [(gram.stops, fit.used[gram.rows]) for gram in fit.grams if gram.pair[0] == camera]
     stops = np.unique(np.concatenate([own[used] for own, used in grams]))
     for at in (evenly(len(stops) - 3, _ZOOMS) + 2).tolist():
-        for kind in (LensSteps, LensChanges):
-            yield kind(camera, fit.unknowns.lenses[camera], int(stops[at]))
+        yield kind(camera, fit.unknowns.lenses[camera], int(stops[at]))
 
 
 def tried_effects(fit: Fit) -> Iterator[Effect]:

@@ -25,7 +25,7 @@ from visioncal.estimation.arm import (
 from visioncal.fit.fit import Fit
 from visioncal.fit.kernels import SIZES, WHITE, Process, Shared, StopErrors, Tried, processes
 from visioncal.fit.mixed import body_with, factors_of, inverse
-from visioncal.fit.score import Products, Score, added_by, products
+from visioncal.fit.score import Added, Products, Score, products
 from visioncal.fit.unknowns import Key, Prior
 from visioncal.model.effects import Effect
 from visioncal.model.effects.posture import PostureEffect, twists_of_frames
@@ -144,13 +144,18 @@ def _of_frames(fit: Fit, flange: str, alone: StopErrors, gains: FloatArray) -> F
     return np.asarray(moved @ frames @ moved.T)
 
 
-def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float, float]]:
-    """Sizes of effects beside an arm's lasting errors, and what each gains alone.
+def scored(
+    fit: Fit, flange: str, effects: Sequence[tuple[Effect, Sequence[Added]]]
+) -> list[tuple[float, float, float]]:
+    """Effects, with their columns, beside an arm's lasting errors.
 
     Empty where too few stops show the arm's errors.
+
+    Returns:
+        The size of each, its gain in log-likelihood alone, and the same at its estimate.
     """
-    counts = np.cumsum([0, *(effect.count for effect in effects)]).tolist()
-    each = [products(fit, added_by(fit, effect), effect.count) for effect in effects]
+    counts = np.cumsum([0, *(effect.count for effect, _ in effects)]).tolist()
+    each = [products(fit, added, effect.count) for effect, added in effects]
     alone, boards = _alone(fit, flange, each), _boards(fit)
     if alone is None:
         return []
@@ -164,20 +169,16 @@ def scored(fit: Fit, flange: str, effects: Sequence[Effect]) -> list[tuple[float
             value, left, _ = judged(tried, boards, off)
             logs.append(tried.prior + value + np.log(share))
             lefts.append(left)
-    under = np.array(lefts)
-    gains = [
-        Score(under[:, a:b, -1], under[:, a:b, a:b], np.inf).gains(sizes)
-        for a, b in pairwise(counts)
-    ]
-    found, known = [], np.array(logs)
-    averaged = np.logaddexp.reduce(known[:, None] + np.array(gains), axis=1)
-    for effect, gain in zip(effects, averaged - np.logaddexp.reduce(known), strict=True):
-        best = int(
-            np.where(
-                (sizes >= effect.size.low) & (sizes <= effect.size.high), gain, -np.inf
-            ).argmax()
+    under, found, known = np.array(lefts), [], np.array(logs)
+    for (effect, _), (a, b) in zip(effects, pairwise(counts), strict=True):
+        own = Score(under[:, a:b, -1], under[:, a:b, a:b], np.inf)
+        gain, explained = (
+            np.logaddexp.reduce(known[:, None] + each, axis=0) - np.logaddexp.reduce(known)
+            for each in (own.gains(sizes), own.explained(sizes))
         )
-        found.append((float(sizes[best]), float(gain[best])))
+        is_possible = (sizes >= effect.size.low) & (sizes <= effect.size.high)
+        best = int(np.where(is_possible, gain, -np.inf).argmax())
+        found.append((float(sizes[best]), float(gain[best]), float(explained[best])))
     return found
 
 

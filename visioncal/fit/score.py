@@ -81,6 +81,14 @@ class Score:
         values, vectors = np.linalg.eigh(self.information)
         return self._gains(values, (self.pull[..., None, :] @ vectors)[..., 0, :], sizes)
 
+    def explained(self, sizes: FloatArray) -> FloatArray:
+        """(..., k) gains at the estimates of columns, with nothing off for their number."""
+        within = np.eye(self.pull.shape[-1]) / sizes[:, None, None] ** 2
+        solved = np.linalg.solve(
+            self.information[..., None, :, :] + within, self.pull[..., None, :, None]
+        )
+        return self._student((self.pull[..., None, None, :] @ solved)[..., 0, 0])
+
     def _gains(self, values: FloatArray, pull: FloatArray, sizes: FloatArray) -> FloatArray:
         within = 1.0 + sizes[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
         squares = np.sum(sizes[:, None] ** 2 * pull[..., None, :] ** 2 / within, axis=-1)
@@ -167,14 +175,16 @@ def score(fit: Fit, added: Iterable[Added], count: int, freedom: float) -> Score
     return Score(pull, (information + information.T) / 2, freedom)
 
 
-def of_effect(fit: Fit, effect: Effect) -> Score:
+def of_effect(fit: Fit, effect: Effect, pairs: Sequence[Pair] = ()) -> Score:
     """The score of an effect that is not among the unknowns."""
     freedom = fit.freedom if effect.place == "edge" else fit.of_corners
-    return score(fit, added_by(fit, effect), effect.count, freedom)
+    return score(fit, added_by(fit, effect, pairs), effect.count, freedom)
 
 
-def added_by(fit: Fit, effect: Effect) -> list[Added]:
-    """The columns of an effect."""
+def added_by(fit: Fit, effect: Effect, pairs: Sequence[Pair] = ()) -> list[Added]:
+    """The columns of an effect; of a displacement that has one, by the sightings in pairs."""
+    if isinstance(effect, Displacement):
+        return added_by_displacements(fit, pairs, (effect,))
     added = []
     for gram in _used(fit):
         if effect.place == "edge" and effect.frame in gram.by_effects:
@@ -226,6 +236,24 @@ def best_displacement(
 
     By the first of its values.
     """
+    count = len(tried)
+    found = score(fit, added_by_displacements(fit, pairs, tried), count, fit.of_corners)
+    # The thickness of a pane is positive.
+    pull = np.where(found.pull > 0.0, found.pull, 0.0) if tried[0].is_positive else found.pull
+    alone = [
+        Score(pull[[at]], found.information[[at]][:, [at]], found.freedom).best(
+            np.ones(1), *tried[at].bounds[1:]
+        )
+        for at in range(count)
+    ]
+    best = max(range(count), key=lambda at: alone[at][1])
+    return tried[best], alone[best][0], alone[best][1] - float(np.log(count))
+
+
+def added_by_displacements(
+    fit: Fit, pairs: Sequence[Pair], tried: Sequence[Displacement]
+) -> list[Added]:
+    """The columns of the first value of each of one camera's displacements."""
     camera, count, added = tried[0].frame, len(tried), list[Added]()
     lens = fit.unknowns.camera(fit.linearised, camera)
     for gram, pair, rows in _of_images(fit, images_of(pairs, camera)):
@@ -246,17 +274,7 @@ def best_displacement(
         local, weight = np.swapaxes(left, 1, 2) @ right, _weight(fit, gram)
         inner, taken = left.reshape(-1, count), gram if kept.all() else gram.take(kept)
         added.append(_beside_poses(fit, taken, local, weight * inner.T @ inner))
-    found = score(fit, added, count, fit.of_corners)
-    # The thickness of a pane is positive.
-    pull = np.where(found.pull > 0.0, found.pull, 0.0) if tried[0].is_positive else found.pull
-    alone = [
-        Score(pull[[at]], found.information[[at]][:, [at]], found.freedom).best(
-            np.ones(1), *tried[at].bounds[1:]
-        )
-        for at in range(count)
-    ]
-    best = max(range(count), key=lambda at: alone[at][1])
-    return tried[best], alone[best][0], alone[best][1] - float(np.log(count))
+    return added
 
 
 def _beside_poses(fit: Fit, gram: Gram, local: FloatArray, product: FloatArray) -> Added:

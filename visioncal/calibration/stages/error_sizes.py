@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.types import Camera, Corners, FloatArray
+from visioncal.core.verdict import LEFT_OPEN
 from visioncal.estimation.outliers import EARLY_SHARE
 from visioncal.estimation.scene import BoardSizes
 from visioncal.fit.fit import Fit
@@ -116,7 +117,7 @@ class ErrorSizes:
         """The rivals of a kind of effects, as a sentence behind others; empty without any."""
         words = (EFFECTS[rival].clause for rival in sorted(self.rivals.get(kind, ())))
         listed = " or ".join(words)
-        return f" Or else, as these views leave it open: {listed}." if listed else ""
+        return f"{LEFT_OPEN} {listed}." if listed else ""
 
 
 def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:

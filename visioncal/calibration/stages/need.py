@@ -99,12 +99,12 @@ class Picks:
         covariances, offsets = self._with_strays
         return chance_within(covariances, turn_rad, shift_m, self.freedom, offsets)
 
-    def without(self, source: str) -> "Picks":
-        """Picks without the error of one source."""
-        if source == CONTROLLER:
-            return replace(self, offsets=None)
-        parts = {name: part for name, part in self.parts.items() if name != source}
-        return replace(self, parts=parts or {"none": np.zeros_like(self.parts[source])})
+    def without(self, *sources: str) -> "Picks":
+        """Picks without the errors of some sources."""
+        offsets = None if CONTROLLER in sources else self.offsets
+        parts = {name: part for name, part in self.parts.items() if name not in sources}
+        none = {"none": np.zeros_like(self.covariances)}
+        return replace(self, parts=parts or none, offsets=offsets)
 
     @cached_property
     def good_for_mm(self) -> float:

@@ -34,6 +34,8 @@ from visioncal.robot.model import REPEATABILITY
 from visioncal.vision.camera import intrinsics
 
 _LIMITS = CalibrationLimits()
+# Scatter that arms have anyway [mm, deg].
+_USUAL = _LIMITS.repeatability * np.array(REPEATABILITY)
 _OF_LENSES = ("focus", "image_shifted")
 _CREEPS = [name for name, kind in KINDS.items() if issubclass(kind, Creeps)]
 
@@ -79,7 +81,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
         # Turns count by what they move at a typical distance.
         left = np.sum((trial.levels * [1.0, 1e3 * LEVER_M * np.deg2rad(1.0)]) ** 2, axis=1)
         share = max(1.0 - float(left[1] / max(left[0], np.finfo(float).tiny)), 0.0)
-        if trial.is_in_fit and CLEAR_RATIO**2 * left[1] < left[0]:
+        is_apart = bool(trial.is_in_fit and CLEAR_RATIO**2 * left[1] < left[0])
+        if is_apart:
             rest = min(rest, 1.0 - share)
         is_proven, instead = bool(finding.mahalanobis_sq) and _proves(run, trial), ""
         if finding.kind in KINDS:
@@ -100,8 +103,12 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
             without_it=f"Applied and refitted, it leaves noise of {after} an axis; else it is "
             f"{before}.",
             is_proven=is_proven,
-            # Without evidence of its own, or where most remains, it stands for what it removes.
-            explains=1.0 if finding.mahalanobis_sq and share > 0.5 else share,
+            is_apart=is_apart,
+            # Without evidence of its own, or where most of a misfit remains, it stands for what it
+            # removes.
+            explains=1.0
+            if finding.mahalanobis_sq and (share > 0.5 or (trial.levels[1] < _USUAL).all())
+            else share,
         )
     yield from (replace(finding, explains=rest) for finding in by_arms)
 
@@ -109,9 +116,8 @@ def contested(run: RunState, found: Iterable[Finding]) -> Iterator[Finding]:
 def _proves(run: RunState, trial: Trial) -> bool:
     """Whether a cure leaves mere noise, and no other cause leaves about as little."""
     (before, after), (problem, fit) = trial.levels, trial.cured
-    usual = _LIMITS.repeatability * np.array(REPEATABILITY)
     # Scatter that such arms have anyway needs no cure.
-    is_noise = bool((after < usual).all() and not (before < usual).all())
+    is_noise = bool((after < _USUAL).all() and not (before < _USUAL).all())
     is_less = (after < (_LIMITS.scatter_mm[0], _LIMITS.scatter_deg[0])).all()
     if not is_noise and not (is_less and (CLEAR_RATIO * after < before).any()):
         return False

@@ -324,6 +324,7 @@ def few_stops(judged: Findings, used: int) -> Iterator[Finding]:
                 f"Only {counted(arm.stops, thing, ('is', 'are'))} used, but a check of the "
                 f"result needs {check} or more.",
                 _tilted(judged),
+                is_share=True,
                 is_fatal=is_fatal,
                 until_mm=0.0,
             ).of(arm.name)

@@ -173,10 +173,15 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
 
     def weighed(finding: Finding) -> Finding:
         name, of_chain = finding.kind, SUSPECTS[finding.kind].of_chain
+        competes = of_chain and not finding.is_apart
         found = replace(finding, do=None) if name in hidden else finding
         if first.get(name) is not finding or (name in hidden and not of_chain):
             return found
-        rivals = [rival for rival in log_odds if of_chain and SUSPECTS[rival].of_chain] or [name]
+        rivals = [
+            rival
+            for rival, other in first.items()
+            if competes and SUSPECTS[rival].of_chain and not other.is_apart
+        ] or [name]
         among = [log_odds[rival] for rival in rivals]
         # "None of these" has odds one, unless `unexplained` stands for it as a finding.
         if UNEXPLAINED not in rivals:
@@ -209,7 +214,8 @@ def _log_odds(doubt: Finding, misfit_mm: float = 0.0) -> float:
         log_chance = min(np.log(2.0) + float(log_ndtr(-np.sqrt(doubt.mahalanobis_sq))), log_chance)
     log_chance = max(log_chance, np.finfo(float).min)
     log_odds = float(-1.0 - log_chance - np.log(-log_chance))
-    share = doubt.explains if misfit_mm or doubt.kind == ARM_ERRORS else 1.0
+    is_part = bool(misfit_mm or doubt.mahalanobis_sq or doubt.kind == ARM_ERRORS)
+    share = doubt.explains if is_part else 1.0
     share = min(share, (doubt.up_to_mm / misfit_mm) ** 2) if misfit_mm else share
     return log_odds if share == 1.0 else float(logit(share * expit(log_odds)))
 
@@ -233,16 +239,20 @@ def _sources(
     in_mm = need is None or need.mm is not None
     budget, unit = (worst.budget_mm, "mm") if in_mm else (worst.budget_deg, "deg")
     total = budget.pop("total")
+    # More than an arm errs by, or repeats to, is not blamed on it.
+    most = max(CalibrationLimits.arm_errors[1 - in_mm], 6.0 * repeats[1 - in_mm])
+    sources = dict[str, list[str]]()
     for name, size in budget.items():
+        is_of_arm = name in ("arm", "look", "pick")
+        sources.setdefault("left out" if is_of_arm and size > most else name, []).append(name)
+    for source, names in sources.items():
+        size = float(np.linalg.norm([budget[name] for name in names]))
         if size**2 < _LEAST_SHARE * total**2:
             continue
-        # More than an arm errs by, or repeats to, is not blamed on it.
-        most = max(CalibrationLimits.arm_errors[1 - in_mm], 6.0 * repeats[1 - in_mm])
-        is_of_arm = name in ("arm", "look", "pick")
-        kind, words, do = _SOURCES["left out" if is_of_arm and size > most else name]
+        kind, words, do = _SOURCES[source]
         without = ""
-        if len(budget) > 1:
-            rest = worst.without(name)
+        if len(budget) > len(names):
+            rest = worst.without(*names)
             without = f"Without this part 95 % of picks land within {rest.stays_within(need)}"
             if need is not None:
                 without += f", and {percent(rest.probability(need))} within what is needed"
@@ -251,7 +261,7 @@ def _sources(
             kind,
             f"Picks err by {figure(total)} {unit} (sigma); {figure(size)} {unit} of this come from "
             f"{words}.",
-            correcting(need) if name == CONTROLLER else do or more,
+            correcting(need) if source == CONTROLLER else do or more,
             probability=size**2 / total**2,
             is_share=True,
             without_it=without,

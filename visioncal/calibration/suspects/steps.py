@@ -11,7 +11,7 @@ from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, Suspect
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import exp, pose_difference
-from visioncal.core.verdict import Finding, Remedy
+from visioncal.core.verdict import LEFT_OPEN, Finding, Remedy
 from visioncal.estimation.identifiability import joint_words
 from visioncal.estimation.steps import DRIFT, FRAME, JOINT, SIZE, Step, with_step
 
@@ -37,7 +37,7 @@ def _found(run: RunState) -> Iterator[Finding]:
         return
     step, instead = steps[0], ""
     if steps[1:]:
-        instead = f" Or else, as these views leave it open: {_words(steps[1], run)}."
+        instead = f"{LEFT_OPEN} {_words(steps[1], run)}."
     thing = _THINGS.get(step.of, step.of)
     fasten = f"Fasten {thing[0].lower()}{thing[1:]}"
     if (

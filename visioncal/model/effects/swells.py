@@ -1,17 +1,13 @@
 """A board that grows in the damp, or shrinks as it dries, during the session."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.estimation.moves import still_to_come
 from visioncal.model.arm import Moments
-from visioncal.model.effects.effect import Displacement, Size
-
-# Likelihood ratio of a board that grows: an arm with joints that walks by tenths of a millimetre
-# from stop to stop, which is commoner by far, reaches 44 in one of 36 sessions.
-_RARER = 50.0
+from visioncal.model.effects.effect import Displacement
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +19,6 @@ class BoardSwells(Displacement):
 
     kind, bounds, count = "board swells", (1e-2, 1e-6, 0.1), 1
     clause = "the board grew or shrank"
-
-    @property
-    def size(self) -> Size:
-        """See `Effect`."""
-        return replace(super().size, limit=_RARER)
 
     def moved(self, points: FloatArray, poses: FloatArray) -> FloatArray:
         """See `Displacement`."""
