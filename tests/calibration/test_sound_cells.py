@@ -157,3 +157,11 @@ def test_an_accusation_of_a_sound_cell_is_found(monkeypatch):
     # Round numbers alone, whatever the residuals show.
     monkeypatch.setattr(rounded_poses, "_SHOWN", 1e-9)
     assert "rounded_poses" in accused(session_of(*CELLS["whole millimetres"]()))
+
+
+@pytest.mark.parametrize(("mended", "step"), [(0, 1.0), (3, 1.0), (10, 0.0)])
+def test_poses_are_rounded_where_most_rows_are(mended, step):
+    """A copy from whose rows a tool was taken off has many digits in these."""
+    numbers = np.round(np.random.default_rng(3).uniform(-500.0, 500.0, (18, 3)))
+    numbers[:mended] += 0.1234
+    assert rounded_poses._step(numbers) == step

@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,8 +26,8 @@ from visioncal.calibration.suspects.arm import NO_JOINTS
 from visioncal.calibration.suspects.board import scale_finding
 from visioncal.calibration.suspects.judge import in_reading_order, judge
 from visioncal.calibration.suspects.lens import pane_finding
-from visioncal.calibration.suspects.outliers import farthest_by_arms
-from visioncal.calibration.suspects.ranking import MEASURE_BOARD, correcting
+from visioncal.calibration.suspects.outliers import _changed_words, farthest_by_arms
+from visioncal.calibration.suspects.ranking import MEASURE_BOARD, correcting, rank_causes
 from visioncal.core.codec import read, write
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.quantiles import chi2_limit
@@ -1069,6 +1070,57 @@ def test_noise_beyond_any_such_arm_is_not_said_to_be_the_robots() -> None:
         assert verdict.status == ("check" if need is None else "bad")
         assert ids(verdict) == ["unexplained"]
         assert "repeats better" not in " ".join(verdict.reasons)
+
+
+def test_a_step_that_several_frames_explain_alike_has_its_size() -> None:
+    step = exp(np.array([1e-3, 0.0, 0.0, 2e-3, 0.0, 0.0]))
+    what, how = _changed_words(SimpleNamespace(arms={}), "", step)
+    assert what == "the camera, the target or a frame of the controller"
+    assert how == ": by about 2 mm and 0.057 deg"
+    assert not _changed_words(SimpleNamespace(arms={}), "", np.eye(4))[1]
+
+
+def test_sources_of_one_kind_are_one_sentence() -> None:
+    """Of a robot's noise at the look and at the pick, both larger than any arm's."""
+    large = np.diag(np.repeat([1e-6, 3e-3], 3) ** 2)[None]
+    picks = (Picks("cam", "robot", dict.fromkeys(("look", "pick"), large), np.inf, 0.5),)
+    doubts = [Finding("few_stops", "Only 9 views are used.", until_mm=0.0)]
+    (source,) = (at for at in rank_causes(doubts, picks, None) if at.is_share)
+    assert "Picks err by 7.3 mm (sigma); 7.3 mm of this come from errors" in source.words
+    assert source.probability == pytest.approx(1.0)
+    assert not source.without_it
+
+
+def test_a_board_of_another_size_is_no_noise_of_the_robot() -> None:
+    parts = {name: of_size(0.8).parts["calibration"] for name in ("look", "pick")}
+    picks = (replace(of_size(0.1), parts=parts),)
+    board = Finding("board_size", "The board is 2 % smaller.", until_mm=0.0)
+    assert [at.kind for at in rank_causes([board], picks, None)] == ["board_size"]
+
+
+def test_a_lens_that_explains_its_own_misfit_is_likely_beside_a_step() -> None:
+    """Without the lens all views disagree by centimetres, and the step explains the rest."""
+    step = Finding("moved_at_once", "The target moved.", mahalanobis_sq=400.0)
+    lens = Finding("lens", "The intrinsics do not fit.", is_apart=True)
+    assert all(at.probability > 0.9 for at in rank_causes([step, lens], (), None))
+    assert rank_causes([step, replace(lens, is_apart=False)], (), None)[1].probability < 0.01
+
+
+def test_noise_that_a_finding_explains_asks_no_more_of_a_need_than_the_finding() -> None:
+    found = changed(SOUND, held_out=Rms(3.0, 0.1), noise_mm=1.0)
+    found = replace(found, picks=(of_size(0.1),))
+    rounded = Finding("rounded_poses", "The poses are rounded.", until_mm=0.0)
+    known = judge(replace(found, warnings=(rounded,)))
+    assert known.good_for_mm == pytest.approx(0.28, rel=0.01)
+    assert judge(found).good_for_mm == pytest.approx(10.0)
+    assert "whatever is behind the doubts; if mere noise is, of 0.28 mm" in judge(found).reasons[-1]
+
+
+def test_what_inflates_all_sigmas_is_said_beside_the_accuracy() -> None:
+    length = Finding("arm_parameter", "A length is 4 mm longer.", until_mm=0.0)
+    verdict = judge(replace(SOUND, picks=(of_size(4.0),), warnings=(length,)))
+    (words,) = (at.words for at in verdict.findings if at.kind == "good_for")
+    assert "and of less once the first cause is mended" in words
 
 
 @pytest.mark.parametrize("sigma_mm", [0.1, 0.102])

@@ -9,7 +9,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.distance_scale import distance_scale, other_size, scaling
 from visioncal.calibration.stages.other_board import board_correction
 from visioncal.calibration.suspects.lens import has_changed
-from visioncal.calibration.suspects.suspect import Suspect
+from visioncal.calibration.suspects.suspect import SOURCES, Suspect
 from visioncal.core.limits import CONTRADICTION
 from visioncal.core.number_format import counted, figure, ranges
 from visioncal.core.quantiles import FALSE_ALARM, SIGMA_PER_MAD, chi2_limit
@@ -275,5 +275,6 @@ def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
 
 
 PRINT = Suspect("print_size", _of_prints, is_doubt=False)
-SIZE = Suspect("board_size", _found, 2.7e-3, True, inflates=("unmeasured_board",))
+# Where its size is held, the noise of the robot has what it makes of the residuals.
+SIZE = Suspect("board_size", _found, 2.7e-3, True, inflates=SOURCES[1:4])
 SHAPE = Suspect("board_shape", None, 1e-4, True)

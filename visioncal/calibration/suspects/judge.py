@@ -1,5 +1,6 @@
 """Verdict whether a result can be trusted, in plain sentences."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -48,6 +49,10 @@ def judge(findings: Findings) -> Verdict:
     notes = remarks((*findings.notes, *(finding.words for finding in small)), NOTE)
     findings = replace(findings, warnings=[found for found in warnings if found not in small])
     found = collect_findings(findings)
+    # Mere effects of what a need judges are judged with it.
+    judged = (doubt.kind for doubt in found if np.isfinite(doubt.until_mm))
+    effects = {*itertools.chain.from_iterable(SUSPECTS[kind].hides for kind in judged)}
+    found = [replace(at, until_mm=0.0) if at.kind in effects else at for at in found]
     met = need_met(findings.need, findings.judged_picks)
     is_met = met is not None and met.probability >= NeedLimits.probability[0]
     enough_mm = (met.need.mm or 0.0) if met is not None and is_met else -1.0
@@ -80,7 +85,7 @@ def judge(findings: Findings) -> Verdict:
         stated.insert(len(stated) * is_met, Finding("need", _need_words(findings, met)))
     elif worst and good_for_mm is not None and good_for_mm < 1e3 * worst.distance_m / 10.0:
         # A need of a tenth of the distance is none of a calibration.
-        stated.append(_good_for(worst, good_for_mm, status))
+        stated.append(_good_for(worst, good_for_mm, status, stated))
     if not doubts:
         stated.append(_agreement(findings, is_enough=status == "good"))
     stated += [warning for warning in warnings if not SUSPECTS[warning.kind].is_doubt]
@@ -129,7 +134,9 @@ def _good_for_mm(worst: Picks | None, doubts: Sequence[Finding]) -> float | None
     return None if worst is None or np.isinf(least) else max(least, worst.good_for_mm)
 
 
-def _good_for(worst: Picks, good_for_mm: float, status: VerdictStatus) -> Finding:
+def _good_for(
+    worst: Picks, good_for_mm: float, status: VerdictStatus, stated: Sequence[Finding]
+) -> Finding:
     verb = "would be" if status == "bad" else "is"
     is_read = worst.camera.startswith("instrument")
     # Where no corners were, a lens that the views determine says little.
@@ -138,12 +145,13 @@ def _good_for(worst: Picks, good_for_mm: float, status: VerdictStatus) -> Findin
     corrected = "" if worst.uncorrected is None else ", with corrected targets"
     limit, alone = (figure(rounded_up(mm)) for mm in (good_for_mm, worst.good_for_mm))
     without_doubts = ""
+    likely = (found for found in stated if found.probability >= LEAST_LIKELY)
     if alone != limit:
         # The doubts decide, not the predicted picks.
-        without_doubts = (
-            ": beside these, the doubts are small. Without the doubts, 95 % of picks would "
-        )
-        without_doubts += f"land within {alone} mm"
+        without_doubts = f", whatever is behind the doubts; if mere noise is, of {alone} mm"
+    elif any("calibration" in SUSPECTS[found.kind].inflates for found in likely):
+        without_doubts = ", and of less once the first cause is mended: till then, what is like it "
+        without_doubts += "counts as off by as much"
     return Finding(
         "good_for",
         f"It {verb} good for tasks of {limit} mm and more {where} {figure(worst.distance_m)} m "

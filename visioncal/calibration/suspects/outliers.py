@@ -242,7 +242,9 @@ def _changed_words(cell_fit: CellFit, frame: str, step: FloatArray) -> tuple[str
     if not frame:
         known = any(arm.matched is not None for arm in cell_fit.arms.values())
         joint = ", or the zero of a joint," if known else ""
-        return f"the camera, the target or a frame of the controller{joint}", ""
+        moved = mm_and_deg(*pose_difference(np.eye(4), step))
+        how = f": by about {moved}" if np.any(step != np.eye(4)) else ""
+        return f"the camera, the target or a frame of the controller{joint}", how
     thing, edge = ("camera" if frame.startswith("cam") else "target"), cell_fit.fit.frames[frame]
     on_flange = (cell_fit.cell.mount == "eye-in-hand") == (thing == "camera")
     if cell_fit.cell.mount == "instrument":

@@ -9,7 +9,7 @@ from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS
 from visioncal.core.number_format import figure, mm_and_deg
-from visioncal.core.types import FloatArray
+from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.robot.model import REPEATABILITY
 from visioncal.session.columns import POSE
@@ -62,19 +62,24 @@ def rounded(run: RunState, robot: str, noise_mm: float, noise_deg: float) -> Fin
 
 
 def _step(numbers: FloatArray) -> float:
-    """The largest of 10, 1 and 0.1 and their halves of which all numbers are multiples, or zero."""
+    """The largest of 10, 1, 0.1 and their halves of which most rows are multiples, or zero."""
     for step in (10.0, 5.0, 1.0, 0.5, 0.1):
         shares = numbers / step
         # Digits of a table in metres and of quaternions.
-        if np.abs(shares - np.round(shares)).max(initial=0.0) * step < 2e-4:
+        if _are_most(np.abs(shares - np.round(shares)) * step < 2e-4):
             return step
     return 0.0
+
+
+def _are_most(rounded: Mask) -> bool:
+    """Whether most of (n, k) numbers' rows are round: a mended copy has others of many digits."""
+    return bool(rounded.all(axis=1).mean() > 0.5)
 
 
 def _angle_step(quaternions: FloatArray) -> tuple[float, str]:
     """The same of angles [deg] as they were written, and how these are called."""
     for digits in range(1, _MOST_DIGITS + 1):
-        if (quaternions == np.round(quaternions, digits)).all():
+        if _are_most(quaternions == np.round(quaternions, digits)):
             # A part of a quaternion is half of an angle in radians.
             step = 2.0 * float(np.rad2deg(0.1**digits))
             return step, f"rotations (quaternions of {digits} decimals)"
