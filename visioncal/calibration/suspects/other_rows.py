@@ -1,8 +1,8 @@
 """Columns of the robot's poses whose numbers stand rows apart from the others of their pose."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import combinations
 
 import numpy as np
 
@@ -40,23 +40,26 @@ def of_other_rows(run: RunState, beside: float) -> Iterator[Finding]:
         return
     camera = np.array([seen[views[at]] for at in rows])
 
-    def fitted(parts: str, by: int) -> Fit | None:
-        moved = _moved(flanges, parts, shifted(by, len(views)))[rows]
-        there = np.isfinite(moved).all(axis=(1, 2))
-        if there.sum() <= FEWEST_ROWS:
-            return None
-        sides = robot_part(moved[there], run.mount or "eye-in-hand")[None], camera[there][None]
-        return replace(robust_fits(*sides, STARTS)[0], lost=int(np.sum(~there)))
+    def fitted(choices: Sequence[str], by: int) -> Iterator[tuple[Fit, str, int]]:
+        """The fits of choices of columns whose numbers stand so many rows apart, all at once."""
+        moved = np.array([_moved(flanges, parts, shifted(by, len(views)))[rows] for parts in choices])
+        # A row has no other one, whichever of its columns are moved.
+        there = np.isfinite(moved).all(axis=(0, 2, 3))
+        if there.sum() > FEWEST_ROWS:
+            robot = robot_part(moved[:, there], run.mount or "eye-in-hand")
+            fits = robust_fits(robot, np.broadcast_to(camera[there], robot.shape), STARTS)
+            for fit, parts in zip(fits, choices, strict=True):
+                yield replace(fit, lost=int(np.sum(~there))), parts, by
 
     choices = ["".join(some) for size in (1, 2, 3) for some in combinations(_PARTS, size)]
-    tried = [*product(choices, _SHIFTS)]
-    fits = ((fitted(*each), *each) for each in tried)
-    found = [(fit, parts, by) for fit, parts, by in fits if fit is not None]
-    declared = fitted("", 0)
+    found = [each for by in _SHIFTS for each in fitted(choices, by)]
+    declared = next(fitted([""], 0), None)
     if declared is None or not found:
         return
     best, parts, by = max(found, key=lambda item: item[0].log_likelihood)
-    odds = EVIDENCE * (best.log_likelihood - declared.log_likelihood) - np.log(len(tried))
+    first = declared[0]
+    odds = EVIDENCE * (best.log_likelihood - first.log_likelihood)
+    odds -= np.log(len(choices) * len(_SHIFTS))
     if not best.closes or odds < 2.0 * CLEAR or CLEAR_RATIO * best.score > beside:
         return
     names, apart = listed([_NAMES[part] for part in parts]), counted(abs(by), "row")
@@ -65,7 +68,7 @@ def of_other_rows(run: RunState, beside: float) -> Iterator[Finding]:
         "misread_poses",
         f"In views.csv, the numbers of {names} stand {apart} {stand} than the others of their "
         f"pose, as where cells were pasted into other rows: moved, robot and camera agree to "
-        f"{best.figures}; as first read, to {declared.figures}.",
+        f"{best.figures}; as first read, to {first.figures}.",
         Remedy(
             f"In views.csv, move the cells of {names} {where} by {apart}, delete the rows that "
             "have none then, and calibrate again.",
