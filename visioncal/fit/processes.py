@@ -12,7 +12,7 @@ flange by its stop alone follows from the factorisation.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import TypeAlias, TypeVar
 
 import numpy as np
@@ -31,7 +31,7 @@ from visioncal.model.effects import Effect
 from visioncal.model.effects.posture import PostureEffect, twists_of_frames
 
 T = TypeVar("T")
-# Log-likelihood of what is tried, what it leaves of further columns, and squares of boards.
+# Log-likelihood of what is tried, what it takes of further columns, and squares of boards.
 Judged: TypeAlias = tuple[float, FloatArray, FloatArray]
 # Stops that determine errors of an arm's posture; of more than the most, some stand for all in the
 # likelihood.
@@ -154,37 +154,56 @@ def scored(
     Returns:
         The size of each, its gain in log-likelihood alone, and the same at its estimate.
     """
-    counts = np.cumsum([0, *(effect.count for effect, _ in effects)]).tolist()
+    counts, by_count = [effect.count for effect, _ in effects], dict[int, list[int]]()
+    for at, count in enumerate(counts):
+        by_count.setdefault(count, []).append(at)
+    # (g, c) columns of effects with c unknowns each, and which ones they are.
+    ends = np.cumsum(counts)
+    groups = [
+        (ends[own][:, None] - np.arange(count, 0, -1), own) for count, own in by_count.items()
+    ]
     each = [products(fit, added, effect.count) for effect, added in effects]
     alone, boards = _alone(fit, flange, each), _boards(fit)
     if alone is None:
         return []
-    sizes, logs, lefts = np.geomspace(1e-6, 0.1, 31), list[float](), list[FloatArray]()
-    ways = {0.0: 1.0}
+    sizes, ways = np.geomspace(1e-6, 0.1, 31), {0.0: 1.0}
     if boards:
         # One board of twenty is of another size.
         ways = {0.0: 0.95, **{off: 0.05 * share for off, share in _LOOSE.items()}}
-    for tried in _tried_of(fit, flange, alone, creeps=False):
-        for off, share in ways.items():
-            value, left, _ = judged(tried, boards, off)
-            logs.append(tried.prior + value + np.log(share))
-            lefts.append(left)
-    under, found, known = np.array(lefts), [], np.array(logs)
-    for (effect, _), (a, b) in zip(effects, pairwise(counts), strict=True):
-        own = Score(under[:, a:b, -1], under[:, a:b, a:b], np.inf)
-        gain, explained = (
-            np.logaddexp.reduce(known[:, None] + each, axis=0) - np.logaddexp.reduce(known)
-            for each in (own.gains(sizes), own.explained(sizes))
-        )
+    shares = np.log([*ways.values()])
+    grid, beside = _grid_of(fit, flange, alone, creeps=False)
+
+    def weighed(one: Tried) -> tuple[FloatArray, FloatArray]:
+        """Evidence (w,) with boards in w ways, and what e effects gain by size (2, w, e, 31)."""
+        seen = beside(one)
+        found = [judged(seen, boards, off) for off in ways]
+        taken = np.array([pull for _, pull, _ in found])
+        whole = seen.total[len(seen.boards) :, len(seen.boards) :]
+        gains = np.empty((2, len(ways), len(effects), len(sizes)))
+        for at, own in groups:
+            each = taken[:, :, at].transpose(0, 2, 3, 1)
+            information = whole[at[:, :, None], at[:, None, :]] - each @ np.swapaxes(each, 2, 3)
+            pull = whole[at, -1] - (each @ taken[:, None, :, -1:])[..., 0]
+            gains[:, :, own] = Score(pull, information, np.inf).gains(sizes)
+        return seen.prior + shares + [value for value, *_ in found], gains
+
+    def logs_of(each: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """With no effect, and with each: an effect may explain what else takes errors that last."""
+        logs, gains = each
+        return np.append(logs, logs[:, None] + gains[0].max(axis=2))
+
+    tried = [*_climb(grid, weighed, logs_of)]
+    known = np.concatenate([logs for logs, _ in tried])
+    gains = np.concatenate([gain for _, gain in tried], axis=1)
+    averaged = np.logaddexp.reduce(known[:, None, None] + gains, axis=1)
+    found = list[tuple[float, float, float]]()
+    for (effect, _), gain, explained in zip(
+        effects, *(averaged - np.logaddexp.reduce(known)), strict=True
+    ):
         is_possible = (sizes >= effect.size.low) & (sizes <= effect.size.high)
         best = int(np.where(is_possible, gain, -np.inf).argmax())
         found.append((float(sizes[best]), float(gain[best]), float(explained[best])))
     return found
-
-
-def _tried_of(fit: Fit, flange: str, alone: StopErrors, *, creeps: bool) -> Iterator[Tried]:
-    grid, beside = _grid_of(fit, flange, alone, creeps=creeps)
-    return map(beside, grid)
 
 
 def _grid_of(
@@ -459,23 +478,24 @@ def judged(tried: Tried, boards: Sequence[_Board], off: float) -> Judged:
         off: Share by which the boards may be off, where it is more than is stated.
 
     Returns:
-        It; what unknowns and errors leave of the information (c + 1, c + 1) of the columns and the
-        residual; and (b,) mean squares of what the boards are off by.
+        It; the (p, c + 1) part of columns and residual that p unknowns take, in units of their
+        information; and (b,) mean squares of what the boards are off by.
     """
-    own, prior, p = tried.total.copy(), -tried.log_det / 2.0, len(tried.boards)
+    prior, p = -tried.log_det / 2.0, len(tried.boards)
+    within, by_columns = tried.total[:p, :p].copy(), tried.total[:p, p:].copy()
+    corner = float(tried.total[-1, -1])
     diagonal, by_boards = np.arange(p), tried.boards[:, : len(boards)]
     for board, by in zip(boards, by_boards.T, strict=True):
         sigma = max(off, board.held.considered)
-        row = np.zeros(len(own))
-        row[:p], row[-1] = by, -board.past
-        own += (sigma**-2.0 - board.held.sigma**-2.0) * np.outer(row, row)
+        more = sigma**-2.0 - board.held.sigma**-2.0
+        within += more * np.outer(by, by)
+        by_columns[:, -1] -= more * board.past * by
+        corner += more * board.past**2
         prior -= np.log(sigma)
-    own[diagonal, diagonal] *= 1.0 + 1e-12
-    factor = np.linalg.cholesky(own[:p, :p])
-    pull, _ = lapack.dtrtrs(factor, own[:p, p:], lower=1)
-    left = own[p:, p:] - pull.T @ pull
-    value = prior - np.log(np.diag(factor)).sum()
+    within[diagonal, diagonal] *= 1.0 + 1e-12
+    factor = np.linalg.cholesky(within)
+    pull, _ = lapack.dtrtrs(factor, by_columns, lower=1)
+    value = prior - np.log(np.diag(factor)).sum() - 0.5 * (corner - pull[:, -1] @ pull[:, -1])
     of_boards, _ = lapack.dtrtrs(factor, by_boards, lower=1)
     found = of_boards.T @ pull[:, -1] + [board.past for board in boards]
-    squares = found**2 + np.sum(of_boards**2, axis=0)
-    return float(value - 0.5 * left[-1, -1]), left, squares
+    return float(value), pull, found**2 + np.sum(of_boards**2, axis=0)

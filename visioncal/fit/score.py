@@ -68,31 +68,29 @@ class Score:
             return _best_of_many(scaled, pull, low, high, self._student)
         values, vectors = np.linalg.eigh(scaled)
         sizes = _sizes_of(float(values.max(initial=0.0)), low, high)
-        gains = self._gains(values, vectors.T @ pull, sizes)
+        gains, _ = self._gains(values, vectors.T @ pull, sizes)
         return float(sizes[gains.argmax()]), float(gains.max())
 
     def posterior(self, low: float, high: float) -> tuple[FloatArray, FloatArray]:
         """Sizes (k,) that the data would hardly show to clearly show, and their gains (k,)."""
         sizes = _sizes_of(float(np.linalg.eigvalsh(self.information)[-1]), low, high)
-        return sizes, self.gains(sizes)
+        return sizes, self.gains(sizes)[0]
 
-    def gains(self, sizes: FloatArray) -> FloatArray:
-        """(..., k) gains of columns with equal sigmas, of k sizes; of many scores at once, too."""
+    def gains(self, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(..., k) gains of columns with equal sigmas, of k sizes; of many scores at once, too.
+
+        The second are at the estimates of the columns, with nothing off for their number.
+        """
         values, vectors = np.linalg.eigh(self.information)
         return self._gains(values, (self.pull[..., None, :] @ vectors)[..., 0, :], sizes)
 
-    def explained(self, sizes: FloatArray) -> FloatArray:
-        """(..., k) gains at the estimates of columns, with nothing off for their number."""
-        within = np.eye(self.pull.shape[-1]) / sizes[:, None, None] ** 2
-        solved = np.linalg.solve(
-            self.information[..., None, :, :] + within, self.pull[..., None, :, None]
-        )
-        return self._student((self.pull[..., None, None, :] @ solved)[..., 0, 0])
-
-    def _gains(self, values: FloatArray, pull: FloatArray, sizes: FloatArray) -> FloatArray:
+    def _gains(
+        self, values: FloatArray, pull: FloatArray, sizes: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         within = 1.0 + sizes[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
         squares = np.sum(sizes[:, None] ** 2 * pull[..., None, :] ** 2 / within, axis=-1)
-        return np.asarray(self._student(squares) - 0.5 * np.log(within).sum(axis=-1))
+        explained = self._student(squares)
+        return explained - 0.5 * np.log(within).sum(axis=-1), explained
 
     def _student(self, squares: npt.ArrayLike) -> FloatArray:
         """Log-likelihood that some squares gain, with the level of the noise integrated out."""

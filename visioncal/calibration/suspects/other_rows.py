@@ -42,7 +42,8 @@ def of_other_rows(run: RunState, beside: float) -> Iterator[Finding]:
 
     def fitted(choices: Sequence[str], by: int) -> Iterator[tuple[Fit, str, int]]:
         """The fits of choices of columns whose numbers stand so many rows apart, all at once."""
-        moved = np.array([_moved(flanges, parts, shifted(by, len(views)))[rows] for parts in choices])
+        order = shifted(by, len(views))
+        moved = np.array([_moved(flanges, parts, order)[rows] for parts in choices])
         # A row has no other one, whichever of its columns are moved.
         there = np.isfinite(moved).all(axis=(0, 2, 3))
         if there.sum() > FEWEST_ROWS:
