@@ -28,6 +28,8 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
 from visioncal.calibration.stages.other_board import OtherBoardError
+from visioncal.calibration.stages.robots import pairs_of
+from visioncal.calibration.suspects.misread_poses import _of_pair
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
 from visioncal.core.errors import DataError, DegenerateError
@@ -991,6 +993,17 @@ def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind,
     # The command that mends it is of one robot alone.
     assert not causes[0].do.command
     assert causes[0].do.words.endswith("Of several robots or cameras, correct the files by hand.")
+
+
+def test_corners_of_other_boards_are_no_corners_of_a_pair_of_a_cell():
+    run = RunState(in_a_cell(0, "nothing")[0])
+    for stage in STAGES[:5]:
+        run = stage.run(run)
+    pair = next(one for one in pairs_of(run, "b") if one.target == "target_plate_b")
+    alone = _of_pair(run, "b", pair)
+    (look,) = alone.cameras.values()
+    assert {*look.corners} == {view.number for view in alone.session.views}
+    assert {*look.corners} < {*run.cameras[pair.camera].corners}
 
 
 @pytest.mark.slow

@@ -167,7 +167,7 @@ def test_a_board_of_another_size_is_scaled_in_a_copy(place, seen):
 def test_one_of_several_boards_is_scaled_by_its_name(place):
     session = cell_session(simulate(CellOptions(views=6)), "cell", seen="corners")
     document = {**session.document, "targets": {"left": {"target": "charuco_9x6_30mm"}}}
-    document["targets"]["right"] = {"target": "aprilgrid_6x4_32mm"}
+    document["targets"]["right"] = "aprilgrid_6x4_32mm"
     del document["target"]
     row = [[*(view.cell(at) for at in session.columns), "left"] for view in session.views]
     two = session.with_content(
@@ -178,13 +178,14 @@ def test_one_of_several_boards_is_scaled_by_its_name(place):
     )
     two.save(place / "cell")
     refused = visioncal("convert", "cell", "copy", "--board-scale", "1.01").refused().said
-    assert "Name one of left, right" in refused
+    assert "Name one of right, left" in refused
     session.save(place / "one")
     refused = visioncal("convert", "one", "copy", "--board-scale", "left:1.01").refused().said
     assert "Give the factor alone, as 1.01." in refused
     visioncal("convert", "cell", "copy", "--board-scale", "right:1.01").good()
-    left, right = Session.load(place / "copy").boards.values()
-    assert (left.square_m, right.square_m) == pytest.approx((0.03, 1.01 * 0.032))
+    boards = Session.load(place / "copy").boards
+    sizes = [boards[name].square_m for name in ("left", "right")]
+    assert sizes == pytest.approx([0.03, 1.01 * 0.032])
 
 
 def test_a_size_that_poses_gave_is_known_no_better_than_so(place):

@@ -12,7 +12,7 @@ from support.whole_cells import OPTIONS, recorded
 from visioncal.core.transforms import invert, log
 from visioncal.fit.assemble import mixed_model
 from visioncal.fit.kernels import processes
-from visioncal.fit.processes import _alone, _boards, _tried_of, consider, judged
+from visioncal.fit.processes import _alone, _boards, _grid_of, consider, judged
 from visioncal.fit.search import Search
 from visioncal.fit.solve import _explained, solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
@@ -132,7 +132,8 @@ def test_odds_of_boards_are_those_of_the_whole_likelihood():
     fit = Search.of(cell, fit.unknowns)._sized(state, fit.used, fit)
     alone = _alone(fit, "flange")
     (board,) = _boards(fit)
-    white = next(_tried_of(fit, "flange", alone, creeps=True))
+    grid, beside = _grid_of(fit, "flange", alone, creeps=True)
+    white = beside(next(grid))
     found = [judged(white, [board], off)[0] for off in (0.0, 1e-2)]
     values = []
     for sigma in (3e-4, 1e-2):
@@ -188,7 +189,8 @@ def test_what_is_judged_by_combinations_of_many_unknowns_is_the_same():
     assert fit.unknowns.count > 6 * len(alone.stops)
     rows, sizes = alone.rows.reshape(-1, alone.rows.shape[2]), np.eye(fit.unknowns.count)
     found, values = [], []
-    for tried in _tried_of(fit, "flange", alone, creeps=True):
+    grid, beside = _grid_of(fit, "flange", alone, creeps=True)
+    for tried in map(beside, grid):
         full = alone.covariance(np.arange(8), tried.white)
         if tried.process is not None:
             full += tried.size**2 * tried.process.covariance(np.arange(8))

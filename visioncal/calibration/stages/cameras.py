@@ -243,7 +243,8 @@ def _of_one_size(
         # They were found as the lens was estimated.
         return seen, corners
     given = [view.number for view in seen.session.views if view.has_corners]
-    scaled = scaled_views(corners, targets, look.resolution, by_all, given)
+    is_stated = not isinstance(fit, Intrinsics)
+    scaled = scaled_views(corners, targets, look.resolution, by_all, given, is_stated=is_stated)
     if scaled is None:
         return seen, corners
     why = "its corners are those of a smaller picture"

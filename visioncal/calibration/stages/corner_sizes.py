@@ -50,6 +50,8 @@ def scaled_views(
     resolution: tuple[int, int],
     fitted: Camera,
     among: Collection[int],
+    *,
+    is_stated: bool = False,
 ) -> ScaledViews | None:
     """Finds views whose corners are those of smaller pictures than the others'.
 
@@ -64,6 +66,7 @@ def scaled_views(
         fitted: Intrinsics as stated or by all views, under which unequal noise of views makes the
             search due.
         among: Views that may be of another size.
+        is_stated: Whether the intrinsics are stated: no view of another size bent these.
 
     Returns:
         The views that the likeliest share explains; None where no share clearly explains any.
@@ -71,7 +74,8 @@ def scaled_views(
     if not corners:
         return None
     levels_px = rms_px(corners, targets, fitted)
-    if levels_px.max() < _UNEVEN * float(np.quantile(levels_px, 0.25)):
+    uneven = CLEAR_RATIO if is_stated else _UNEVEN
+    if levels_px.max() < uneven * float(np.quantile(levels_px, 0.25)):
         return None
 
     @cache
@@ -79,23 +83,28 @@ def scaled_views(
         some = {view: at for view, at in corners.items() if view in views}
         return _lens_of(some, targets, resolution, fitted.model)
 
-    every, found = [*corners], list[ScaledViews]()
+    every, found, size = [*corners], list[ScaledViews](), np.array(resolution)
     ends = {frozenset(every[: len(every) // 2]), frozenset(every[len(every) // 2 :])}
-    for share in _SHARES:
-        box = share * np.array(resolution)
-        small = {view: at for view, at in corners.items() if (at.px < box).all()}
+    small_by = {
+        share: {view: at for view, at in corners.items() if (at.px < share * size).all()}
+        for share in _SHARES
+    }
+    # Views that are small by no share are of the camera's size: one lens of these tries all shares.
+    sure = frozenset(every).difference(small_by[_SHARES[-1]])
+    for share, small in small_by.items():
         # Where all are small, the views of one end may be of one size.
         beyond = frozenset(every).difference(small)
-        small = {view: at for view, at in small.items() if view in among}
+        tried = {view: at for view, at in small.items() if view in among}
         for views in {beyond} if len(beyond) >= FEWEST_COMPARED else ends:
-            if not small or len(views) < FEWEST_COMPARED:
+            if not tried or len(views) < FEWEST_COMPARED:
                 continue
-            some = [sorted(views)[at] for at in evenly(len(views), _FIRST_VIEWS)]
+            chosen = sorted(sure if len(sure) >= _FIRST_VIEWS else views)
+            some = [chosen[at] for at in evenly(len(chosen), _FIRST_VIEWS)]
             first = lens_of(frozenset(some))
-            if first is None or not _fit_better(first, small, targets, share):
+            if first is None or not _fit_better(first, tried, targets, share):
                 continue
             if (known := lens_of(views)) is not None:
-                found += _scaled_by(known, small, targets, share)
+                found += _scaled_by(known, tried, targets, share)
     return max(found, key=lambda each: len(each.views), default=None)
 
 

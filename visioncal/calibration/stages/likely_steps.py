@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration.stages.pose_errors import find_pose_errors
+from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import FEWEST_STOPS
 from visioncal.core.types import FloatArray
 from visioncal.estimation.appearance import SCALE
@@ -113,9 +114,13 @@ def likely_steps(
     for step in found[:_MOST_FITTED]:
         if step.kind == DRIFT:
             continue
-        gain, apart, there = evidence(problem, fit, step)
+        try:
+            gain, apart, there = evidence(problem, fit, step)
+            both = twice(problem, fit, step, (apart, there)) if step.kind == FRAME else None
+        except (VisioncalError, np.linalg.LinAlgError):
+            # A step with which no fit converges is not likelier.
+            continue
         alone = _weighed(replace(step, gain=gain - penalty), apart, there, errors)
-        both = twice(problem, fit, step, (apart, there)) if step.kind == FRAME else None
         if both is not None and (drift is None or both[0].gain - 2.0 * penalty > drift.gain):
             second = replace(both[0], gain=both[0].gain - 2.0 * penalty)
             of_both = _weighed(second, *both[1:], errors)

@@ -343,12 +343,15 @@ def turned_boards(run: RunState) -> Iterator[Finding]:
 
 def _of_pair(run: RunState, robot: str, pair: CameraTargetPair) -> RunState:
     """A cell's run as that of one robot, camera and target alone."""
-    cameras = {name: look for name, look in run.cameras.items() if name == pair.camera}
+    session, look = run.session.of(pair.camera, robot, pair.target), run.cameras[pair.camera]
+    views = {view.number for view in session.views}
+    # Corners of other targets are no corners of this one.
+    corners = {view: seen for view, seen in look.corners.items() if view in views}
     return replace(
         run,
-        session=run.session.of(pair.camera, robot, pair.target),
+        session=session,
         robots={robot: run.robots[robot]},
-        cameras=cameras,
+        cameras={pair.camera: replace(look, corners=corners)},
         poses=pair.poses,
     )
 

@@ -335,7 +335,9 @@ def scale_board(session: Session, name: str, factor: float) -> Session:
         file = f"target_{only}.toml" if only else "target.toml"
         if only:
             tables = document["targets"]
-            document["targets"] = {**tables, only: {**tables[only], "target": file}}
+            # A table of the target, or its file alone.
+            own = {} if isinstance(tables[only], str) else tables[only]
+            document["targets"] = {**tables, only: {**own, "target": file} if own else file}
         else:
             document["target"] = file
         is_one = len(stated) == 1
