@@ -495,6 +495,7 @@ def test_points_beside_pictures_need_no_board(tmp_path):
 def test_files_of_objects_say_how_to_write_them(tmp_path, monkeypatch):
     """A table of MATLAB, a pickle, and a workbook."""
     write(tmp_path / "in/frame.pkl", "numbers 0.1 0.2 0.3 0.4 0.5 0.6")
+    write(tmp_path / "in/wood.p", "numbers 0.1 0.2 0.3 0.4 0.5 0.6")
     write(tmp_path / "in/read.m", "T = 1;")
     write(tmp_path / "in/run.xlsx", "numbers 0.1 0.2 0.3 0.4 0.5 0.6")
     write(tmp_path / "in/poses.mat", "a file of MATLAB")
@@ -502,6 +503,7 @@ def test_files_of_objects_say_how_to_write_them(tmp_path, monkeypatch):
     monkeypatch.setattr(scipy.io, "loadmat", lambda _: {"__version__": "1.0", "T": table})
     words = describe(tmp_path / "in").words()
     assert "frame.pkl: a pickle, which runs code when it is opened" in words
+    assert "wood.p: a pickle" in words
     assert "run.xlsx: a workbook: save its sheet with the poses as .csv" in words
     assert "poses.mat holds no arrays of numbers: its values are a table" in words
     assert "1 kind not read: read.m" in words

@@ -313,13 +313,9 @@ def points_in(fields: Fields) -> list[PoseFields]:
     return [
         PoseFields(piece.names, piece.words)
         for piece in pieces
-        if not _ROTATION_WORDS & {*piece.words}
-        and (piece.size == 3 or (piece.size == 4 and _is_homogeneous(fields, piece)))
+        if piece.size in (3, 4) and not _ROTATION_WORDS & {*piece.words}
+        if piece.size == 3 or (fields.column(piece.names[-1])[:, -1] == 1.0).all()
     ]
-
-
-def _is_homogeneous(fields: Fields, piece: "_Piece") -> bool:
-    return bool((fields.column(piece.names[-1])[:, -1] == 1.0).all())
 
 
 def _arrays(fields: Fields, taken: Collection[str]) -> Iterator[_Piece]:

@@ -58,9 +58,9 @@ _LISTED = 6
 # Files of numbers that are not read, and how to write them.
 _PICKLE = "a pickle, which runs code when it is opened: write its arrays as .npz or .json"
 _WORKBOOK = "a workbook: save its sheet with the poses as .csv"
-_SHUT = dict.fromkeys((".pkl", ".pickle"), _PICKLE) | dict.fromkeys((".xlsx", ".xls"), _WORKBOOK)
-# Runs of one motion differ by less, as a share of what they span.
-_RUN_AGAIN = 0.05
+_SHUT = dict.fromkeys((".pkl", ".pickle", ".p"), _PICKLE) | dict.fromkeys(
+    (".xlsx", ".xls"), _WORKBOOK
+)
 # Lines of a camera_info's matrix and coefficients.
 _CAMERA_INFO = re.compile(r"^[KkDd]: *\[.*$", re.MULTILINE)
 # Readings of one source that are tested, and names of rows that are a robot's.
@@ -471,11 +471,11 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
 
 
 def _is_run_again(fields: Fields, others: Fields) -> bool:
-    """Whether rows are those of another run of the same motion: both are of one side."""
+    """Whether rows are of another run of one motion: they differ by under 5 % of what they span."""
     one, other = (np.hstack([*map(each.column, each.numbers)]) for each in (fields, others))
     if one.shape != other.shape:
         return False
-    return bool(np.nanmedian(np.abs(one - other)) < _RUN_AGAIN * np.nanstd(one, axis=0).max())
+    return bool(np.nanmedian(np.abs(one - other)) < 0.05 * np.nanstd(one, axis=0).max())
 
 
 def _sides(file: Path) -> list[str]:
