@@ -1657,7 +1657,14 @@ def test_pairs_of_points_lead_to_the_camera_s_frame(tmp_path, monkeypatch, is_on
     theirs = (ours - truth[:3, 3]) @ truth[:3, :3] + rng.normal(scale=2e-4, size=ours.shape)
     if is_one_file:
         names = [f"{side}_{axis}" for side in ("cam", "gt") for axis in "xyz"]
-        write_table(tmp_path / "in/pairs.csv", names, np.hstack([theirs, ours]))
+        both = {"camera": theirs, "robot": ours}
+        records = [
+            {side: dict(zip("xyz", each[at].tolist(), strict=True)) for side, each in both.items()}
+            for at in range(12)
+        ]
+        # No poses, and rows whose names count.
+        corners = {str(at): [0.1 * at, 0.2, 0.3] for at in range(4)}
+        write(tmp_path / "in/pairs.json", {"points": records, "corners": corners})
     else:
         (tmp_path / "in").mkdir()
         np.savetxt(tmp_path / "in/pos_hand.txt", ours)
@@ -1669,6 +1676,7 @@ def test_pairs_of_points_lead_to_the_camera_s_frame(tmp_path, monkeypatch, is_on
     found = FrameFile.load("frames.json").frames["base_from_camera"].edge.matrix
     np.testing.assert_allclose(found, truth, atol=2e-3)
     if is_one_file:
+        (tmp_path / "in/pairs.json").unlink()
         write_table(tmp_path / "in/pairs.csv", names, np.hstack([theirs, rng.permutation(ours)]))
         refused = visioncal("convert", "in", "out", "--mount", "eye-to-hand")
         refused.refused("12 pairs of points without rotations, and no rigid motion maps")

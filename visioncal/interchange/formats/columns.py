@@ -38,7 +38,7 @@ from visioncal.interchange.formats.pairing import (
     with_depth,
 )
 from visioncal.interchange.formats.pose_forms import makers_of, poses_from
-from visioncal.interchange.formats.poses import columns_named, points_in, pose_names, possible_poses
+from visioncal.interchange.formats.poses import columns_named, pose_names, possible_poses
 from visioncal.interchange.formats.reading import read_fields
 from visioncal.interchange.formats.sources import (
     Source,
@@ -48,7 +48,12 @@ from visioncal.interchange.formats.sources import (
     tables_apart,
     unknown,
 )
-from visioncal.interchange.formats.unread import check_pictures, check_points, series_note
+from visioncal.interchange.formats.unread import (
+    check_pictures,
+    check_points,
+    points_beside,
+    series_note,
+)
 from visioncal.robot import Robot
 from visioncal.robot.files import read_robot_document
 from visioncal.robot.trajectory import LONGEST_GAP_S, Samples
@@ -76,7 +81,7 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     board = (None, ()) if requested.target else source.board()
     found: list[tuple[int, ForeignRecording]] = []
     faults: list[DataError] = []
-    readings = proposed(source, requested)
+    readings = _proposed(source, requested)
     instead = image_groups(requested.images) if requested.images else None
     for rank, fields, asked in readings:
         try:
@@ -102,6 +107,14 @@ def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
             first, doubt=unknown(source, requested, [each for _, each, _ in readings[:1]])
         )
     return replace(first, rivals=tuple((at - rank, other) for at, other in others))
+
+
+def _proposed(source: Source, requested: ImportOptions) -> list[tuple[int, Fields, ImportOptions]]:
+    try:
+        return proposed(source, requested)
+    except DataError:
+        check_points(source)
+        raise
 
 
 def _arm_note(asked: ImportOptions, requested: ImportOptions) -> Iterator[str]:
@@ -172,7 +185,7 @@ def _recordings(
     if not points or sum(fields.column(name).shape[1] for name in points) != 3:
         points = ()
     if names["robot"] and not (names["camera"] or joint_fields or found or instead):
-        points = _points_beside(fields, names["robot"])
+        points = points_beside(fields, names["robot"])
     names["camera"] = () if points else names["camera"]
     poses: dict[Side, PoseNumbers] = {"robot": PoseNumbers.empty(fields.places)}
     unstated: dict[Side, Unstated] = {}
@@ -287,20 +300,6 @@ def _joint_angles(
         note = f"Of {count} joint angles a row the first {arm} are taken: {robot.name} has {arm}, "
         return joints[:, :arm], [*notes, f"{note}and others may be those of a gripper."]
     return joints, [*notes]
-
-
-def _points_beside(fields: Fields, robot: tuple[str, ...]) -> tuple[str, ...]:
-    """The only points of another file than the robot's poses, or of a camera by their words."""
-    own = robot[0].partition(".")[0]
-    poses = {name for item in possible_poses(fields, robot) for name in item.names}
-    points = [item for item in points_in(fields) if {*item.names}.isdisjoint({*robot, *poses})]
-    files = [item.names[0].partition(".")[0] for item in points]
-    found = [
-        item.names
-        for item, file in zip(points, files, strict=True)
-        if item.sides == ["camera"] or (file != own and f"{file}." in fields.places[0])
-    ]
-    return found[0] if len(found) == 1 else ()
 
 
 def _readings(

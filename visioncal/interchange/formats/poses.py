@@ -314,6 +314,7 @@ def points_in(fields: Fields) -> list[PoseFields]:
         PoseFields(piece.names, piece.words)
         for piece in pieces
         if piece.size in (3, 4) and not _ROTATION_WORDS & {*piece.words}
+        if not _NO_POSE.search(piece.names[0].lower())
         if piece.size == 3 or (fields.column(piece.names[-1])[:, -1] == 1.0).all()
     ]
 

@@ -145,9 +145,8 @@ def _turn_by_two(rows: Sequence[Sequence[str]]) -> bool:
     even, odd = turns[::2], turns[1::2]
     # Cosines of half the angle between two quaternions, of either sign, or traces.
     first, second = (np.abs(own @ own.T) if is_short else own @ own.T for own in (even, odd))
-    spread = float(np.ptp(first))
-    is_copy = np.median(np.abs(even - odd)) < _TURN_ALIKE * spread
-    return bool(np.median(np.abs(first - second)) < _TURN_ALIKE * spread and not is_copy)
+    copied, apart = np.median(np.abs(even - odd)), np.median(np.abs(first - second))
+    return bool(apart < _TURN_ALIKE * np.ptp(first) <= copied)
 
 
 # Names of numbers in a mapping that are one array.
@@ -353,9 +352,11 @@ _Rows: TypeAlias = tuple[str, list[object], tuple[str, ...]]
 def rows_of_document(document: object, path: Path) -> list[Fields]:
     """Rows of a document at any depth, of lists and of mappings of records; raises DataError."""
     numbered = _numbered(document) if isinstance(document, Mapping) else {}
-    if len(numbered) > 1:
-        return [_fields_of_rows("", [*numbered.values()], path, (*numbered,))]
     lists = [*_row_lists(document)]
+    if len(numbered) > 1:
+        counted = _fields_of_rows("", [*numbered.values()], path, (*numbered,))
+        records = [each for each in lists if isinstance(each[1][0], Mapping) and not each[2]]
+        return [counted, *_fields_of_lists([] if holds_pose(counted) else records, path)]
     if not lists:
         raise DataError(
             f"{path} has no list with one entry a pose, but "

@@ -1,4 +1,4 @@
-"""Content of a source that is not read: pictures in arrays, other series, pairs of points."""
+"""Content of a source beside poses: pictures in arrays, other series, points."""
 
 import json
 import shlex
@@ -159,6 +159,20 @@ def _is_robot(one: PoseFields, other: PoseFields) -> bool:
 
 def _named(item: PoseFields) -> str:
     return ", ".join(item.names)
+
+
+def points_beside(fields: Fields, robot: tuple[str, ...]) -> tuple[str, ...]:
+    """The only points of another file than the robot's poses, or of a camera by their words."""
+    own = robot[0].partition(".")[0]
+    poses = {name for item in possible_poses(fields, robot) for name in item.names}
+    found = [
+        item.names
+        for item in points_in(fields)
+        for file in [item.names[0].partition(".")[0]]
+        if item.sides == ["camera"] or (file != own and f"{file}." in fields.places[0])
+        if {*item.names}.isdisjoint({*robot, *poses})
+    ]
+    return found[0] if len(found) == 1 else ()
 
 
 def check_points(source: Source) -> None:
