@@ -200,6 +200,12 @@ def test_wrong_touches_of_an_axis_are_left_out_where_others_tell():
         assert left_out or not fit.agreement.beyond[10:].any()
 
 
+def of_other_kinds(made):
+    kinds = list(made.touches.kinds)
+    kinds[10], kinds[-1] = kinds[-1], kinds[10]
+    return replace(made.touches, kinds=tuple(kinds))
+
+
 def tips_alone(made):
     return made.touches
 
@@ -239,6 +245,7 @@ def small_turns(made):
         (Job(axes=1), of_another_point, "touch 10 of kind z is of point 'B'"),
         (Job(axes=1), moved_by(10, [0.0, 0.0, -2e-3], 1.0), "kind z or xz have their points too"),
         (Job(axes=3), moved_by(11, np.zeros(3), 2.0), "lie on both sides: 11 on .* than 10, 12"),
+        (Job(axes=2), of_other_kinds, r"touches 10 \(xz\) and 13 \(z\) have each other's kinds"),
         (Job(), small_turns, r"sigma of .* mm \(limit 5\).*turn by at most"),
         (Job(tips=4, contact_m=0.02, cone_deg=20.0), tips_alone, r"at a scatter of 1\d mm"),
     ],

@@ -353,7 +353,12 @@ def test_features_need_their_kinds(tmp_path, tool_file):
     run(("orgin", *KINDS[1:])).refused("line 2: kind is 'orgin'", "Did you mean origin?")
     run(KINDS[:3]).refused("no touch of kind xy")
     other = {"origin": "origin", "x": "xy", "xy": "x"}
-    run([other[kind] for kind in KINDS]).refused("each other's kinds (x is xy, xy is x): corrected")
+    run([other[kind] for kind in KINDS]).refused("(x is xy, xy is x) have each other's kinds: corr")
+    of_two = [KINDS.index("x"), KINDS.index("xy")]
+    kinds = list(KINDS)
+    kinds[of_two[0]], kinds[of_two[1]] = "xy", "x"
+    words = f"touches {of_two[0]} (xy) and {of_two[1]} (x) have each other's kinds: corrected"
+    run(kinds).refused(words)
     on_a_line = 0.1 * np.outer([0.0, 1.0, 3.0], [1.0, 0.0, 0.0])
     poses = touching(on_a_line, np.random.default_rng(2), NOISE_M)
     run(("origin", "x", "xy")).refused(
@@ -649,6 +654,18 @@ def test_touches_of_another_point_are_named(tmp_path):
     assert "Touches 6, 7, 8, 9 (touches.csv, line 8 and below) agree on a point" in done.out
     names = ["a"] * 6 + ["b"] * 4
     visioncal("tcp", write_poses(tmp_path / "named.csv", poses, {"point": names})).good()
+
+
+@pytest.mark.parametrize(("count", "status"), [(3, 2), (4, 3)])
+def test_as_many_touches_of_another_point_are_named(tmp_path, count, status):
+    """As one point they refuse a tip, or give a bad one."""
+    poses = touched(Job(tips=2 * count), 12).touches.base_from_flange.copy()
+    poses[count:, :3, 3] += [0.1, -0.2, 0.05]
+    done = visioncal("tcp", write_poses(tmp_path / "touches.csv", poses))
+    assert done.status == status
+    words = f"Touches {', '.join(map(str, range(count, 2 * count)))} (touches.csv"
+    assert words in next(line for line in (done.out + done.err).splitlines() if "Touches" in line)
+    assert "agree on a point of their own, 229 mm from that of the others" in done.out + done.err
 
 
 # --- What cannot be is refused.

@@ -28,7 +28,7 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply, apply_each, compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 from visioncal.estimation.observability import Direction, Turning
-from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem
+from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem, fit_groups
 from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.frames.placing import (
@@ -36,6 +36,7 @@ from visioncal.frames.placing import (
     TOUCH_NOISE_M,
     check_sides,
     counted_noise_m,
+    refuse_exchanged_kinds,
     refuse_poor,
     worst_of,
 )
@@ -126,12 +127,38 @@ def tool_problem(touches: Touches, noise: Noise = _NO_NOISE, *, oriented: bool) 
 
 def scatter_m(touches: Touches) -> float:
     """Root mean square distance of the tips from their points, by all touches of kind `point`."""
-    are_tips = touches.are("point")
-    state = _start(touches, np.flatnonzero(are_tips), oriented=False)
-    tips = apply(touches.base_from_flange[are_tips], state.frame[None, :3, 3])[:, 0]
-    points = touches.points[are_tips]
-    middles = np.array([tips[points == at].mean(axis=0) for at in range(len(touches.names))])
-    return float(np.sqrt(np.mean(np.sum((tips - middles[points]) ** 2, axis=1))))
+    of_tips = touches.subset(touches.are("point"))
+    tips, points = tips_and_points(of_tips)
+    return float(np.sqrt(np.mean(np.sum((tips - points[of_tips.points]) ** 2, axis=1))))
+
+
+def tips_and_points(
+    touches: Touches, rows: IntArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """(n, 3) tips in the base, by some touches, and (k, 3) means of them by their points [m]."""
+    chosen = np.arange(len(touches)) if rows is None else rows
+    tip = _start(touches, chosen, oriented=False).frame[None, :3, 3]
+    tips = apply(touches.base_from_flange, tip)[:, 0]
+    means = [tips[touches.points == at].mean(axis=0) for at in range(len(touches.names))]
+    return tips, np.array(means)
+
+
+def two_points(touches: Touches) -> Touches | None:
+    """The touches of one point as of two, where they agree best; None of too few touches.
+
+    Three touches of one point determine a tip, whose places by all touches lie at two points.
+    """
+    # Five of two points would leave the choice of two touches among five few redundant coordinates.
+    if len(touches) < 6 or len(touches.names) > 1 or not touches.are("point").all():
+        return None
+    splits = list[Touches]()
+    for rows in small_sets(len(touches), FEWEST_POINTS):
+        tips = tips_and_points(touches, rows)[0]
+        off_m = np.linalg.norm(tips - tips[rows].mean(axis=0), axis=1)
+        points = (off_m > 0.5 * off_m.max()).astype(np.int64)
+        if np.bincount(points).min() > 1:
+            splits.append(replace(touches, points=points, names=("", "")))
+    return min(splits, key=scatter_m, default=None)
 
 
 def _start(touches: Touches, rows: IntArray, *, oriented: bool) -> Placement:
@@ -197,6 +224,12 @@ def fit_pivot(
             problem = tool_problem(touches, noise, oriented=True)
             start = (presumed, _turned(touches, inliers.fit.state))
             inliers = find_inlier_groups(problem, expected_sigma_m, start)
+
+            def refitted(kinds: tuple[TouchKind, ...]) -> GroupFit:
+                of_kinds = replace(touches, kinds=kinds)
+                return fit_groups(tool_problem(of_kinds, noise, oriented=True))
+
+            refuse_exchanged_kinds("tcp", touches.labels, touches.kinds, refitted)
         fit, edge = inliers.fit, 6 if problem.oriented else 3
 
         def edge_covariance(covariance: FloatArray) -> FloatArray:

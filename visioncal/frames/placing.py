@@ -1,12 +1,15 @@
 """Certainty of a placed frame: its worst directions in words, and the noise of a touch."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations, permutations
+from typing import TypeVar
 
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.limits import CLEAR_RATIO
 from visioncal.core.linalg import covariance_from
-from visioncal.core.number_format import some_of
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
@@ -16,6 +19,9 @@ from visioncal.estimation.points import GroupFit
 LEAST_NOISE_M = 1e-6
 # A careful touch by hand [m]: the noise where nothing determines it.
 TOUCH_NOISE_M = 1e-4
+# Noise beyond which touches may be of other kinds [m].
+_DISAGREE_M = 1e-3
+_Kind = TypeVar("_Kind", bound=str)
 # Fewest degrees of freedom that estimate the noise: a single residual is within a tenth of its
 # sigma in one frame of twelve. Features that were touched twice leave six.
 _ENOUGH = 6
@@ -61,12 +67,57 @@ def check_sides(
             for side in (-1.0, 1.0)
         )
         if behind:
+            words = f"are on the negative side of the axis: {some_of(behind)}"
+            if before:
+                words = f"lie on both sides: {some_of(behind)} on the other side than "
+                words += some_of(before)
             raise DataError(
-                f"{label}: the touches of kind {kind} lie on both sides: {some_of(behind)} on the "
-                f"other side than {some_of(before)}.",
+                f"{label}: the touches of kind {kind} {words}.",
                 culprits=[*behind, *before],
                 next_step="Touch again only where the axis is positive.",
             )
+
+
+def refuse_exchanged_kinds(
+    label: str,
+    names: Sequence[str],
+    kinds: tuple[_Kind, ...],
+    fitted: Callable[[tuple[_Kind, ...]], GroupFit],
+) -> None:
+    """Refuses touches that agree with other kinds, and do not with theirs.
+
+    Args:
+        label: The first word of the message.
+        names: (n,) names of the touches.
+        kinds: (n,) their kinds.
+        fitted: The fit of all touches, of (n,) kinds.
+    """
+    declared_m = fitted(kinds).sigma
+    if declared_m < _DISAGREE_M:
+        return
+    tried = list[tuple[GroupFit, str, Sequence[str]]]()
+    for a, b in combinations(range(len(kinds)), 2):
+        if kinds[a] != kinds[b]:
+            exchanged = tuple(kinds[{a: b, b: a}.get(row, row)] for row in range(len(kinds)))
+            words = f"touches {names[a]} ({kinds[a]}) and {names[b]} ({kinds[b]})"
+            tried.append((fitted(exchanged), words, (names[a], names[b])))
+    every = sorted(set(kinds))
+    for others in permutations(every):
+        renamed = dict(zip(every, others, strict=True))
+        wrong = some_of([f"{a} is {b}" for a, b in renamed.items() if a != b])
+        fit = fitted(tuple(renamed[kind] for kind in kinds))
+        tried.append((fit, f"the touches ({wrong})", ()))
+    tried = [one for one in tried if one[0].freedom > 1]
+    agree_m = min((fit.sigma for fit, _, _ in tried), default=np.inf)
+    if CLEAR_RATIO * agree_m < declared_m:
+        rivals = [one for one in tried if one[0].sigma < CLEAR_RATIO * agree_m]
+        raise DataError(
+            f"{label}: {', or '.join(words for _, words, _ in rivals)} have each other's kinds: "
+            f"corrected, all agree to {figure(1e3 * agree_m)} mm per axis, and to "
+            f"{figure(1e3 * declared_m)} mm as they are.",
+            culprits=rivals[0][2],
+            next_step="Look what was touched, and correct the column kind.",
+        )
 
 
 def worst_of(

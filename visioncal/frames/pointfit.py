@@ -27,14 +27,18 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.points import FEWEST_POINTS, GroupFit, Placement, PointProblem, fit_groups
 from visioncal.frames.group_outliers import GroupInliers, find_inlier_groups
-from visioncal.frames.placing import TOUCH_NOISE_M, check_sides, refuse_poor, worst_of
+from visioncal.frames.placing import (
+    TOUCH_NOISE_M,
+    check_sides,
+    refuse_exchanged_kinds,
+    refuse_poor,
+    worst_of,
+)
 
 FeatureKind: TypeAlias = Literal["origin", "x", "xy"]
 FEATURE_KINDS: tuple[FeatureKind, ...] = ("origin", "x", "xy")
 # Names that are tried in all pairs, and in any order; and frames by three points that are tried.
 _MOST_NAMES, _FRAMES = 12, 40
-# Noise beyond which touches of features may be of other kinds [m].
-_DISAGREE_M = 1e-3
 # Units of a drawing in place of those that it has, by the ratio of the part to it.
 _UNITS = {
     25.4: "inches read as millimetres (--cad-unit inch)",
@@ -179,7 +183,12 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
     problem = fixture_problem(touches)
     agreement = find_inlier_groups(problem, expected_noise_m)
     fit = agreement.fit
-    _refuse_exchanged_kinds(touches, fit.sigma)
+    refuse_exchanged_kinds(
+        "fixture",
+        touches.labels,
+        touches.kinds,
+        lambda kinds: fit_groups(fixture_problem(replace(touches, kinds=kinds))),
+    )
     local = problem.local(fit.state)
     reaches = local[touches.rows("x"), 0].max(), local[touches.rows("xy"), 1].max()
     reach_mm = 1e3 * np.maximum(reaches, 0.0).round(9)
@@ -201,25 +210,6 @@ def fit_features(touches: PointPairs, expected_noise_m: float | None = None) -> 
     along = {"x": local[:, 0], "xy": local[:, 1]}
     check_sides("fixture", touches.labels, touches.kinds, agreement.mask, along)
     return agreement
-
-
-def _refuse_exchanged_kinds(touches: PointPairs, sigma_m: float) -> None:
-    """Refuses touches that agree with other kinds, where they do not at some noise [m]."""
-    if sigma_m < _DISAGREE_M:
-        return
-    for others in permutations(FEATURE_KINDS):
-        renamed = dict(zip(FEATURE_KINDS, others, strict=True))
-        kinds = tuple(renamed[kind] for kind in touches.kinds)
-        fit = fit_groups(fixture_problem(replace(touches, kinds=kinds)))
-        if fit.freedom > 1 and CLEAR_RATIO * fit.sigma < sigma_m:
-            wrong = [f"{a} is {b}" for a, b in renamed.items() if a != b]
-            agree_mm, off_mm = (figure(1e3 * level) for level in (fit.sigma, sigma_m))
-            raise DataError(
-                f"fixture: the touches have each other's kinds ({some_of(wrong)}): corrected, all "
-                f"agree to {agree_mm} mm per axis, and to {off_mm} mm as they are.",
-                culprits=touches.labels,
-                next_step="Look what was touched, and correct the column kind.",
-            )
 
 
 def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> DrawingFit:

@@ -15,7 +15,15 @@ from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.verdict import AGAIN, Finding, Remedy
 from visioncal.frames.fixture import FitSettings, PointsFit
-from visioncal.frames.pivot import PivotFit, Touches, TouchKind, fit_pivot, scatter_m
+from visioncal.frames.pivot import (
+    PivotFit,
+    Touches,
+    TouchKind,
+    fit_pivot,
+    scatter_m,
+    tips_and_points,
+    two_points,
+)
 from visioncal.frames.placing import assumed_words
 from visioncal.frames.touches import TouchRows, flange_poses, refuse_copies, robot_noise
 from visioncal.results import Calibration, Edge, Frame
@@ -69,9 +77,11 @@ def touched_tool(
         fit = fit_pivot(touches, robot_noise(calibration), touch_noise_m)
     except DegenerateError as error:
         other = _other_reading(touches, rows.numbers, limit_m)
+        other = other or next(_two_points(touches, rows.places, limit_m), None)
         if other is None or other.do is None:
             raise
-        step = f"{other.do.words[:-1]}: {other.do.command.removeprefix(AGAIN).strip()}."
+        command = other.do.command.removeprefix(AGAIN).strip()
+        step = f"{other.do.words[:-1]}{command and ': '}{command}."
         raise DataError(f"tcp: {other.words}", culprits=[rows.source], next_step=step) from error
     fitted = PointsFit(
         rows.source,
@@ -122,6 +132,7 @@ def touched_tool(
     }
     other = _other_reading(touches, rows.numbers, limit_m)
     first = [other] if other is not None else [*_other_points(fit, touches, rows.places)]
+    first = first or [*_two_points(touches, rows.places, limit_m)]
     return fitted.frame(method, more, details, setting, first)
 
 
@@ -169,14 +180,30 @@ def _other_points(fit: PivotFit, touches: Touches, places: Sequence[str]) -> Ite
             continue
         apart_m = float(np.linalg.norm(middle - inliers.fit.state.points[at]))
         chosen = out[near].tolist()
-        some = some_of([touches.labels[row] for row in chosen])
-        words = (
-            f"Touches {some} ({places[chosen[0]]} and below) agree on a point of their own, "
-            f"{figure(1e3 * apart_m)} mm from that of the others, to "
-            f"{figure(1e3 * off_m[near].max())} mm."
-        )
-        step = "Name the points in a column point, this one otherwise: then both count."
-        yield Finding("other_point", words, Remedy(step, AGAIN))
+        yield _other_point(touches, places, chosen, apart_m, float(off_m[near].max()))
+
+
+def _two_points(touches: Touches, places: Sequence[str], limit_m: float) -> Iterator[Finding]:
+    """The finding that touches agree as of two points, of which a consensus finds neither."""
+    declared_m, split = scatter_m(touches), two_points(touches)
+    if split is not None and max(limit_m, CLEAR_RATIO * scatter_m(split)) < declared_m:
+        chosen = np.flatnonzero(split.points != split.points[0]).tolist()
+        apart_m = float(np.linalg.norm(np.diff(tips_and_points(split)[1], axis=0)))
+        finding = _other_point(touches, places, chosen, apart_m, scatter_m(split))
+        yield replace(finding, is_fatal=True)
+
+
+def _other_point(
+    touches: Touches, places: Sequence[str], chosen: Sequence[int], apart_m: float, agree_m: float
+) -> Finding:
+    """The finding that chosen touches are of another point."""
+    words = (
+        f"Touches {some_of([touches.labels[row] for row in chosen])} ({places[chosen[0]]} and "
+        f"below) agree on a point of their own, {figure(1e3 * apart_m)} mm from that of the "
+        f"others, to {figure(1e3 * agree_m)} mm."
+    )
+    step = "Name the points in a column point, this one otherwise: then both count."
+    return Finding("other_point", words, Remedy(step, AGAIN))
 
 
 def _findings(fit: PivotFit, touches: Touches, setting: FitSettings) -> Iterator[Finding]:
