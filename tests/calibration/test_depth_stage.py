@@ -178,6 +178,18 @@ def test_an_empty_picture_and_one_of_another_size_are_named_and_left_out():
     assert depth is None
 
 
+def test_depth_beside_corners_needs_no_image():
+    """Black and white are then not told apart."""
+    session, made_run = made()
+    blank = [replace(view, text={**view.text, "image": ""}) for view in session.views]
+    imageless = replace(session, views=tuple(blank))
+    result, _ = with_depth(without(made_run.calibration), made_run.evidence, imageless)
+    depth = result.camera.depth
+    assert depth is not None
+    sigma = np.sqrt(depth.covariance[0, 0])
+    assert abs(depth.scale - made_run.calibration.camera.depth.scale) < 4 * sigma
+
+
 def test_depth_beside_measured_poses_without_a_board_is_named():
     session = made_up(9, images=False).session
     depth = cv2.imencode(".png", np.full((40, 64), 500, np.uint16))[1].tobytes()

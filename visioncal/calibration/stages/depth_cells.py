@@ -213,7 +213,7 @@ class Sensor:
     def _shades(self, view: View, points_cam: FloatArray) -> tuple[Mask, Mask]:
         """(n,) which of some points are imaged well within white, and which within black."""
         images, camera = self.session.images, self.camera.camera
-        data = images.read(view.image) if images.exists(view.image) else b""
+        data = images.read(view.image) if view.image and images.exists(view.image) else b""
         image = decode_image(data) if data else ""
         if isinstance(image, str) or image.shape != camera.resolution[::-1]:
             return np.ones(len(points_cam), dtype=bool), np.zeros(len(points_cam), dtype=bool)
