@@ -1685,7 +1685,7 @@ def test_pairs_of_points_lead_to_the_camera_s_frame(tmp_path, monkeypatch, is_on
 def test_arrays_without_rows(tmp_path):
     np.savez(tmp_path / "in.npz", angles=np.zeros((0, 7)), poses=np.zeros((0, 4, 4)))
     error = visioncal("convert", tmp_path / "in.npz", tmp_path / "out").refused().err
-    assert "in.npz has no list with one entry a pose, but empty ones alone" in error
+    assert "in.npz has no list with one entry a pose: it is empty" in error
 
 
 def test_quaternions_without_their_real_part(tmp_path, monkeypatch):

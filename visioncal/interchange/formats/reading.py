@@ -359,8 +359,8 @@ def rows_of_document(document: object, path: Path) -> list[Fields]:
         return [counted, *_fields_of_lists([] if holds_pose(counted) else records, path)]
     if not lists:
         raise DataError(
-            f"{path} has no list with one entry a pose, but "
-            f"{'names and values' if document else 'empty ones'} alone.",
+            f"{path} has no list with one entry a pose"
+            f"{', but names and values alone' if document else ': it is empty'}.",
             culprits=[str(path)],
         )
     opened = {name: [*_opened(rows, name)] for name, rows, _ in lists}
