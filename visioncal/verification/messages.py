@@ -63,14 +63,17 @@ _PAIR_AGAIN = Remedy(
 )
 # Words for each kind of change, a part of a sentence, and the advice on it.
 _KINDS = {
-    CAMERA: ("the camera {moved}", Remedy(f"Fasten the camera, and {_ANEW}", CALIBRATE_ANEW)),
+    CAMERA: (
+        "the camera {moved}{or_base}",
+        Remedy(f"Fasten the camera, and {_ANEW}", CALIBRATE_ANEW),
+    ),
     LENS: (
         "the lens is {percent} % {longer} (sigma {sigma}) than it was, as where its focus or zoom "
         "was touched",
         Remedy(f"Fasten its focus, and {_ANEW}", CALIBRATE_ANEW),
     ),
     BOARD: (
-        "the {name} {moved}",
+        "the {name} {moved}{or_base}",
         Remedy(
             "Put the board back; if it was moved on purpose, verify without its place.",
             f"{AGAIN} --board-moved",
@@ -186,7 +189,11 @@ def change_words(check: Check, change: PossibleChange) -> str:
     """A change with its estimates, as a part of a sentence."""
     found, robot = _estimates(check, change), check.calibration.calibrated_robot
     share, sigma = found.get("share", 0.0), found.get("sigma", 0.0)
+    is_camera = change.cause.kind == CAMERA
+    # All that stands before the robot moves alike in its base.
+    is_all = not _is_carried(check, is_camera) and (is_camera or len(check.prior.targets) < 2)
     facts = {
+        "or_base": ", or the robot's base was pushed" if is_all else "",
         "name": change.name,
         "board": f"board {change.name.partition(' ')[2]}".strip(),
         "moved": _moved_words(found.get(CAMERA, found)),
@@ -209,6 +216,11 @@ def change_words(check: Check, change: PossibleChange) -> str:
             "offset": f"{sign}{figure(abs(offset))} {unit} (sigma {figure(sigma)})",
         }
     return _KINDS[change.cause.kind][0].format(**facts)
+
+
+def _is_carried(check: Check, is_camera: bool) -> bool:
+    """Whether the robot carries the camera, or else the board."""
+    return (check.calibration.mount == "eye-in-hand") == is_camera
 
 
 def _pair_words(pairs: Sequence[tuple[int, int]]) -> str:
@@ -271,7 +283,7 @@ def _motion(check: Check, change: PossibleChange, first: int) -> dict[str, Any]:
         # A board's motion is that of its middle.
         point = corner_positions(targets[check.prior.boards[cause.at]]).mean(axis=0)
     rotation = edges[0 if is_camera else 1 + cause.at, :3, :3]
-    parent = "tool" if (check.calibration.mount == "eye-in-hand") == is_camera else "base"
+    parent = "tool" if _is_carried(check, is_camera) else "base"
     twist, covariance = explained.values[part], explained.covariance[part, part]
     grown = float(explained.values[6]) if cause.kind == REPLACED else 0.0
     moved = exp(twist)
