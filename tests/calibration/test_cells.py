@@ -151,6 +151,21 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     assert away_m < 2.5e-4
 
 
+@pytest.mark.parametrize("stop", [slow(6), 12])
+def test_a_base_that_was_pushed_is_one_finding(stop):
+    cell = simulate(replace(PLAIN, moved=(Moved("base_b", stop),), seed=3))
+    found = solved(cell)
+    assert reason(found, f"Between stops {stop - 1} and {stop}, base_b moved by 5.1 mm and 0.57")
+    (fault,) = (at for at in found.verdict.findings if at.kind == "something_moved")
+    assert sorted(fault.views) == [view.view for view in found.views if not view.used]
+    first = min(view.number for view in session_of(cell).views if view.stop == stop)
+    assert fault.do.command.endswith(f"--views {first}-79")
+    # The result has it where it stood first.
+    away_m, squared = off(cell, found, "base_a", "base_b")
+    assert squared < MOST
+    assert away_m < 2.5e-4
+
+
 @pytest.mark.parametrize("frame", ["cam_right", slow("target_floor")])
 def test_a_frame_that_creeps_was_not_bumped_again_and_again(frame):
     cell = simulate(replace(PLAIN, moved=(Moved(frame, creeps=True, shift_m=0.012),), seed=3))

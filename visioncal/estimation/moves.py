@@ -198,12 +198,12 @@ def find_move(
     Of a frame that creeps, where that explains more, the stop is -1. A pushed robot base is no
     move: its observations stay outliers. `agrees` is the (n,) inlier mask.
     """
-    bases = {base for base in problem.tree.bases.values() if base in problem.unknown}
+    bases = _unknown_bases(problem)
     found = []
     for frame in (*movable, *bases):
         rows = problem.observations.involves(frame)
         if frame in bases:
-            rows = np.isfinite(problem.change_of(frame, fit.state)[:, 0, 0])
+            rows = observations_over(problem, fit, frame)
         if np.sum(~agrees[rows]) >= FEWEST_VIEWS:
             found += [(*step, frame) for step in _best_move(problem, fit, agrees, frame, rows)]
             may_creep = frame not in bases and may_have_crept(problem, frame)
@@ -215,6 +215,32 @@ def find_move(
     # Of equal ones the first: what moved at once.
     _, stop, change, frame = max(found, key=lambda step: step[0])
     return None if frame in bases else (frame, stop, change)
+
+
+def _unknown_bases(problem: Problem) -> list[str]:
+    """The bases of robots that are estimated."""
+    return [base for base in problem.tree.bases.values() if base in problem.unknown]
+
+
+def observations_over(problem: Problem, fit: Solution, base: str) -> Mask:
+    """(n,) observations whose chains lead over a robot's base."""
+    return np.isfinite(problem.change_of(base, fit.state)[:, 0, 0])
+
+
+def find_push(problem: Problem, fit: Solution, agrees: Mask) -> tuple[str, int, FloatArray] | None:
+    """Base, first stop and (6,) change of the push that explains most outliers over this base.
+
+    The search begins with the earliest stops, so that the inliers are those before the push.
+    """
+    found = []
+    for base in _unknown_bases(problem):
+        rows = observations_over(problem, fit, base)
+        least = max(FEWEST_VIEWS, 0.5 * np.sum(~agrees[rows]))
+        if np.sum(~agrees[rows]) >= FEWEST_VIEWS:
+            for gain, stop, change in _best_move(problem, fit, agrees, base, rows):
+                if gain >= least:
+                    found.append((gain, (base, stop, change)))
+    return max(found, key=lambda push: push[0])[1] if found else None
 
 
 def _best_move(

@@ -23,7 +23,7 @@ from visioncal.core.transforms import (
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
-from visioncal.estimation.moves import creep_effects
+from visioncal.estimation.moves import creep_effects, find_push, observations_over
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.steps import step_of
 from visioncal.results import Moved
@@ -152,6 +152,8 @@ def explained_outliers(
     faults = [*_exchanged(cell_fit, circles)]
     if cell_fit.cell.mount is not None and not faults:
         faults += _moved_run(cell_fit)
+    if cell_fit.cell.mount is None and not faults:
+        faults += _pushed_base(cell_fit)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     causes = {at: _cause(cell_fit, at, fitting, circles) for at in outliers.tolist()} | clauses
     return tuple(faults), *_reasons(cell_fit, causes)
@@ -216,6 +218,25 @@ def _moved_run(cell_fit: CellFit) -> Iterator[PoseFault]:
         how += ", or another load bends the arm"
     words = f"{{views}} were left out: {when}, {what} was another one{how}."
     yield _fault(cell_fit, "something_moved", outliers, words, do, f"{when}, something had moved")
+
+
+def _pushed_base(cell_fit: CellFit) -> Iterator[PoseFault]:
+    """Outliers from some stop on that agree on one other pose of a robot's base."""
+    inliers, cell = cell_fit.inlier_fit, cell_fit.cell
+    push = find_push(inliers.problem, inliers.fit, inliers.used)
+    if push is None:
+        return
+    (base, stop, change), stops = push, inliers.problem.observations.stops
+    is_over = observations_over(inliers.problem, inliers.fit, base)
+    out = np.flatnonzero(is_over & ~inliers.used & (stops >= stop))
+    last = cell.stops[stops[is_over & (stops < stop)].max()]
+    moved = mm_and_deg(*pose_difference(np.eye(4), exp(change)))
+    words = (
+        f"between stops {last} and {cell.stops[stop]}, {base} moved by {moved}. The result has it "
+        "where it stood first: {views}, later, were left out."
+    )
+    do = cell.or_separately(f"Fasten {base}", stop)
+    yield _fault(cell_fit, "something_moved", out.tolist(), words, do, f"{base} had moved")
 
 
 def _tool_taken_off(
