@@ -616,6 +616,16 @@ def test_sizes_that_are_no_listed_share_are_not_named():
     assert "image_sizes" not in {each.kind for each in found.verdict.causes}
 
 
+@pytest.mark.parametrize(("share", "named"), [(0.5, True), slow(1.0, False)])
+def test_a_camera_whose_corners_are_all_of_smaller_pictures_is_named(share, named):
+    """Its lens is estimated, and shows the size by its centre."""
+    robot, seen = corners_of(MOUNTS[0])
+    seen = scaled_at(range(len(seen)), share, seen)
+    found = visioncal.calibrate(Session.from_corners(seen, robot, BOARD, SIZE, mount=MOUNTS[0]))
+    said = [each.do.words for each in found.verdict.findings if each.kind == "image_sizes"]
+    assert ["resolution = [640, 480]" in words for words in said] == [True] * named
+
+
 def test_the_noise_of_scaled_corners_is_scaled_with_them():
     robot, seen = corners_of(MOUNTS[0])
     seen = scaled_at(range(9, 15), 0.5, seen)

@@ -31,6 +31,8 @@ _CLEAR_ALONE = 5.0
 _FIRST_VIEWS = 8
 # Most error of a share, 3 sigma of it: usual sizes beside the listed ones (5/8) are 4 % off.
 _MOST_OFF = 0.015
+# Most distance of a lens's centre from the middle of its picture, as a share of half the picture.
+_OFF_CENTRE = 0.05
 # Step by which a share's cost is differentiated.
 _STEP = 0.005
 
@@ -169,6 +171,20 @@ def _is_share(
     of_lens = np.sqrt(np.diag(known.covariance)[:4]) / known.camera.matrix
     most = 3.0 * float(np.hypot(of_corners, of_lens.max()))
     return bool(abs(off) < most < _MOST_OFF)
+
+
+def smaller_picture(lens: Camera, px: FloatArray) -> tuple[int, int] | None:
+    """(width, height) [px] of the pictures that all corners look to be of, else None.
+
+    Nothing scales a lens that is estimated by such corners alone: its centre is that of a smaller
+    picture, in whose place, at the upper left, all (n, 2) corners lie.
+    """
+    size = np.array(lens.resolution)
+    shares = 2.0 * (lens.matrix[2:4] + 0.5) / size
+    share = min(_SHARES, key=lambda each: float(np.abs(shares - each).max()))
+    width, height = np.round(share * size).astype(int).tolist()
+    is_near = bool(np.all(np.abs(shares - share) < _OFF_CENTRE * share))
+    return (width, height) if is_near and (px < [width, height]).all() else None
 
 
 def scaled_px(px: FloatArray, factor: float) -> FloatArray:

@@ -9,6 +9,7 @@ from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.lens_fields import mean_distance_m
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import NEW_LENS, misread_lens, most_moved_px
+from visioncal.calibration.stages.corner_sizes import smaller_picture
 from visioncal.calibration.stages.error_sizes import Zoom
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, INFLATED, UNEXPLAINED, Suspect
 from visioncal.core.errors import VisioncalError
@@ -87,6 +88,19 @@ def _of_camera(assessment: FitAssessment, camera: str) -> Iterator[Finding]:
             Remedy(
                 "Show a board with more corners, or more views, or state matrix_sigma_px, how well "
                 "fx, fy, cx, cy are known."
+            ),
+        )
+    lens_now = optics.camera(camera)
+    if problem.scene.estimated and (size := smaller_picture(lens_now, stack.px)) is not None:
+        (width, height), (cx, cy) = lens_now.resolution, lens_now.matrix[2:4]
+        yield Finding(
+            "image_sizes",
+            f"The corners look like those of pictures of {size[0]} x {size[1]} px, where the "
+            f"camera's are {width} x {height}: the lens has its centre at ({cx:.0f}, {cy:.0f}), "
+            "and no corner lies beyond that size. Its frames are right, but pixels of a whole "
+            "picture are of another lens.",
+            Remedy(
+                f"State resolution = [{size[0]}, {size[1]}], or find the corners in whole pictures."
             ),
         )
     if not problem.scene.estimated and has_changed(fitted, columns):
