@@ -281,6 +281,28 @@ def test_a_base_that_creeps_before_a_fixed_camera_is_among_what_is_named(seed, t
     assert cause.kind == "base_creeps" or verdict.top[0].startswith("Likeliest of these")
 
 
+def test_a_lens_that_was_zoomed_far_is_none_that_varies(tmp_path):
+    """By 4 % midway: beside errors that last, it gains less than one that varies does alone."""
+
+    def zoomed(far, _):
+        return 1.0 + 0.04 * (np.arange(len(far)) >= len(far) // 2)
+
+    folder = tmp_path / "cell"
+    elsewhere.cell(elsewhere.World(focus=zoomed, views=18), MOUNTS[0], False, 1, folder)
+    cause = visioncal.calibrate(folder).verdict.causes[0]
+    assert "The lens changed at once" in cause.words
+    assert "from view 9 on" in cause.words
+
+
+def test_the_rest_of_a_misfit_is_unexplained_by_no_less_than_its_cause():
+    """Motions stop short, by which most of the misfit goes; what remains is no other fault."""
+    short = Finding("stops_short", "Motions stop short.", mahalanobis_sq=400.0, is_apart=True)
+    rest = Finding("unexplained", "A flange that is off.")
+    first, second = rank_causes([short, rest], (), None)
+    assert first.probability > 0.9
+    assert second.probability < 0.05
+
+
 @pytest.mark.parametrize("share", [0.1, 0.9])
 def test_a_cure_that_hardly_helps_is_not_most_likely(share):
     """Of a finding that is significant; its cure leaves as much."""

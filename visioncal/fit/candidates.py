@@ -32,6 +32,7 @@ from visioncal.model.effects import (
     FrameCreeps,
     Heat,
     LensChanges,
+    LensGrows,
     LensSteps,
     MountSteps,
     Play,
@@ -373,20 +374,24 @@ def steps(fit: Fit, flange: str, place: tuple[float, ...]) -> Iterator[Effect]:
 
 def beside_zooms(fit: Fit, changes: Iterable[Candidate]) -> Iterator[Candidate]:
     """Candidates that change a lens, and beside clear ones that it changed at once."""
-    clear = set[str]()
+    clear, grown, alone = set[str](), dict[str, float](), dict[str, Candidate]()
     for one in changes:
         yield one
         if 2.0 * one.gain >= SIGNIFICANT and one.lens:
             clear.add(one.lens)
-    alone = dict[str, Candidate]()
+        if isinstance(one.effect, LensGrows):
+            grown[one.lens] = max(one.gain, grown.get(one.lens, -np.inf))
     for camera in clear:
         for kind in (LensSteps, LensChanges):
             for one in scored(fit, zooms(fit, camera, kind)):
                 alone[one.name] = max(one, alone.get(one.name, one), key=lambda at: at.gain)
     likeliest = [one.effect for one in alone.values() if one.effect is not None]
-    # One that grows is judged beside an arm's lasting errors; these also make room for steps.
     for one in scored(fit, likeliest, sole_flange(fit)):
-        yield replace(one, gain=min(one.gain, alone[one.name].gain))
+        # A lens that grows is judged beside an arm's lasting errors. Where it explains more there,
+        # so is one that changed at once.
+        most = alone[one.name].gain
+        is_less = one.gain < grown.get(one.lens, -np.inf)
+        yield replace(one, gain=min(one.gain, most) if is_less else most)
 
 
 def zooms(fit: Fit, camera: str, kind: type[LensSteps]) -> Iterator[Effect]:

@@ -180,7 +180,7 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
         rivals = [
             rival
             for rival, other in first.items()
-            if competes and SUSPECTS[rival].of_chain and not other.is_apart
+            if competes and SUSPECTS[rival].of_chain and (name == UNEXPLAINED or not other.is_apart)
         ] or [name]
         among = [log_odds[rival] for rival in rivals]
         # "None of these" has odds one, unless `unexplained` stands for it as a finding.
