@@ -12,12 +12,14 @@ from support.refusals import raised
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.run import STAGES, calibrate
+from visioncal.calibration.stages.clock_offset import why_undetermined
 from visioncal.calibration.stages.clocks import set_clocks
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import stated_poses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
+from visioncal.estimation.clock_correlation import Match
 from visioncal.estimation.effects.rolling_shutter import delayed_points, target_twists
 from visioncal.present.recording import write_recording
 from visioncal.present.report.content import method_facts
@@ -356,6 +358,12 @@ def test_motion_that_repeats_itself_is_refused_unless_the_offset_is_stated():
     # A period off, which is for whoever stated it, to 1 ms, to know.
     clock = clocked_of(stating(again, 2.05)).clock
     assert abs(clock.camera_minus_robot_s - 2.0) < 1e-3
+
+
+def test_clocks_far_apart_are_named_where_no_offset_fits():
+    why = why_undetermined((), (Match(0.3, 1.0),), 60.0)
+    assert "at no offset of up to 5 s from the stated one" in why
+    assert "?" not in why
 
 
 @pytest.mark.slow

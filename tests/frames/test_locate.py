@@ -570,6 +570,8 @@ def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(located, ra
     test = evaluate_gaps(points, gaps_mm)
     assert test.passed == passed
     assert (f"The gap at {points[3].name} (" in touch_test_finding(test).words) != passed
+    # Without a tool there is none to be measured anew.
+    assert "tool" not in touch_test_finding(evaluate_gaps(points, [9.0] * 5)).do.words
 
 
 @pytest.mark.slow
@@ -591,7 +593,7 @@ def test_targets_are_printed_and_gaps_join_the_result(proved):
 
     done = visioncal("touch-test", look, "-c", out, *GAUGE, "--gaps-mm", "3,3,3,3,3")
     assert done.status == 3
-    assert "Measure the tool's tip anew" in done.out
+    assert "Look whether the camera or the robot was moved" in done.out
     assert not Calibration.load(out).touch_test.passed
     visioncal("touch-test", look, "-c", out, "--tool", "gripper").refused(
         "the calibration has no tool", f"visioncal tcp TOUCHES -c {out} --name gripper"

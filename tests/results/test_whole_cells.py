@@ -250,6 +250,8 @@ def test_a_tool_is_found_by_touches_of_either_robot_and_joins_the_cell(folder, t
     assert error @ np.linalg.solve(edge.covariance[3:, 3:], error) < MOST_OF_THREE
     assert "flange_from_pin" in whole.of("left", "b").frames
     assert "flange_from_pin" not in whole.of("left", "a").frames
+    # By the name that it has in the cell.
+    done("export", out, "--to", "ur-tcp", "--robot", "b", "--edge", "flange_b_from_pin")
 
 
 def test_touches_or_a_tool_of_a_cell_say_which_robot_is_meant(folder, tmp_path):

@@ -191,7 +191,6 @@ def touch_test_finding(test: TouchTest) -> Finding:
         )
     else:
         words = f"{words} More than predicted: {named}."
-        step = Remedy(
-            "Measure the tool's tip anew, then look whether the camera or the robot was moved."
-        )
+        first = "" if test.tool == "flange" else "Measure the tool's tip anew, then l"
+        step = Remedy(f"{first or 'L'}ook whether the camera or the robot was moved.")
     return Finding("touch_test", words, step, is_fatal=True)

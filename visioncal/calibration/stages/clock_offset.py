@@ -13,7 +13,7 @@ from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Mask, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.clock import ClockChange, ClockFit
-from visioncal.estimation.clock_correlation import Match
+from visioncal.estimation.clock_correlation import WIDEST_OFFSET_S, Match
 from visioncal.results.sections import ClockResult
 from visioncal.robot.trajectory import LONGEST_GAP_S
 from visioncal.session import View, too_far_apart
@@ -168,8 +168,10 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match], span_s:
         )
     if not fits:
         return (
-            "camera and robot turn alike, but move alike at no offset: are these the times of the "
-            "images, and are the poses read as they are meant (visioncal convert --guess)?"
+            "camera and robot turn alike, but move alike at no offset of up to "
+            f"{WIDEST_OFFSET_S:g} s from the stated one, as far as is searched: the clocks are "
+            "farther apart (state [clock] camera_minus_robot_s roughly), these are not the times "
+            "of the images, or the poses are meant otherwise (visioncal convert --guess)"
         )
     if fits[0].sigma_s > span_s:
         return "the motion says nothing of it, as it is too even, or too slow"

@@ -37,6 +37,7 @@ from visioncal.interchange.exports.mujoco import MUJOCO
 from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import FILES, ROS_FORMATS
 from visioncal.results import Calibration, Edge, Verdict
+from visioncal.session.frames import frame_name
 from visioncal.session.selecting import ARM, EYE, PARTS, Choice
 
 EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
@@ -151,7 +152,12 @@ def _robot_part(
     of_robot = ARM if isinstance(form, ArmFormat) or form.holds in ("tool", "fixture") else EYE
     choice = Choice(selection.camera, selection.robot, selection.target)
     part = source.chosen(choice, PARTS if selection.target is not None and not is_arm else of_robot)
-    return part, replace(selection, camera=None, robot=None, target=None)
+    edge = selection.edge
+    if edge is not None and selection.robot is not None:
+        # The robot's part has its frames without its name.
+        for kind in ("base", "flange"):
+            edge = re.sub(f"^{frame_name(kind, selection.robot)}_from_", f"{kind}_from_", edge)
+    return part, replace(selection, camera=None, robot=None, target=None, edge=edge)
 
 
 def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
