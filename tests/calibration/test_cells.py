@@ -129,6 +129,15 @@ def test_any_frame_is_placed_in_any_other_with_the_covariance_of_the_chain(clean
     raised(DataError, "no frame 'cam_lft'", found.between, "cam_lft", "base_a")
 
 
+def test_the_joint_covariance_is_in_the_order_of_the_transforms_where_a_frame_moved():
+    found = solved(simulate(replace(PLAIN, moved=(Moved("cam_left", 9),), seed=3)))
+    assert [value.frame for value in found.cell.moved] == ["cam_left"]
+    for at, edge in enumerate(found.edges.values()):
+        block = found.joint_covariance[6 * at :, 6 * at :][:6, :6]
+        # They are the same numbers.
+        np.testing.assert_allclose(block, edge.covariance, rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     pushes = (Moved("target_floor", 9), Moved("cam_right", 12))

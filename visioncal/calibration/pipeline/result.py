@@ -109,8 +109,9 @@ def _edge_names(run: RunState) -> dict[str, str]:
     if run.mount == "instrument":
         # Of the points that an instrument read, the first is the probe.
         return dict(zip(answer.fit.frames, edge_names(run.mount), strict=False))
-    branches = answer.fit.problem.tree.branches
-    parents = {name: branches[key].parent for key, name in answer.versions.items()}
+    problem = answer.fit.problem
+    # In the order of the fit, whose covariance has a frame that moved at the end.
+    parents = {answer.versions[key]: problem.tree.branches[key].parent for key in problem.unknown}
     # The root of a pair's frames is the robot's base.
     root = CELL if run.mount is None else "base"
     return {
