@@ -111,5 +111,5 @@ def test_no_board_explains_poses_that_agree_nowhere():
     places = cell.robot.base_from_flange.copy()
     places[:, :3, 3] = places[:, [0, 2, 1], 3]
     known = calibrated(reporting(cell, base_from_flange=places), joints=False)
-    assert known.cell_fit.sizes.holds_scales
+    assert all(sizes.is_held for sizes in known.cell_fit.sizes.boards.values())
     assert "board_size" not in {cause.kind for cause in known.verdict.causes}

@@ -303,7 +303,9 @@ def _step(found: _Likelihood, inside: IntArray, damping: float) -> tuple[FloatAr
     curvature = found.curvature[inside[:, None], inside]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 1e-8))
     values, vectors = np.linalg.eigh(curvature * np.outer(scale, scale))
-    curvature = (vectors * (np.maximum(values, _FLAT) + damping)) @ vectors.T
+    # No direction is flatter than a share of the steepest, either: the matrix would be singular.
+    flat = _FLAT * max(float(values.max(initial=0.0)), 1.0)
+    curvature = (vectors * (np.maximum(values, flat) + damping)) @ vectors.T
     slope = scale * slope
     promised = 0.5 * float(slope @ np.linalg.solve(curvature, slope))
     moved, rest = np.zeros(len(inside)), np.ones(len(inside), bool)

@@ -132,15 +132,23 @@ def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
     return Distances(squares, directions, uneven * limit)
 
 
-def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = ()) -> InlierFit:
-    """Finds the inliers and the clear moves in a first pass; `refine_inliers` refines both."""
+def inliers_and_moves(
+    problem: Problem, state: State, movable: Sequence[str] = (), used: Mask | None = None
+) -> InlierFit:
+    """Finds the inliers and the clear moves in a first pass; `refine_inliers` refines both.
+
+    `used` are (n,) presumed inliers, if any; else the search begins with the earliest stops.
+    """
     if not movable:
         return find_inliers(problem, state)
     # The observations of the earliest stops.
     stops = problem.observations.stops
     last = max(EARLY_SHARE * float(stops.max()), float(np.unique(stops)[:FEWEST_STOPS][-1]))
-    used, fit = _core(problem, state, stops <= last)
     moves: list[Move] = []
+    if used is None:
+        used, fit = _core(problem, state, stops <= last)
+    else:
+        fit = fit_problem(problem.subset(used), state)
     used, fit = widened(_ObservationSearch(problem), used, fit)
     while len(moves) < _MOST_MOVES:
         relative_squares = _ObservationSearch(problem).distances(used, fit).beyond

@@ -55,6 +55,9 @@ class BoardSizes:
     scale: float = 0.0  # Of its size, relative.
     plane: float = 0.0  # Of its aspect ratio and its shear.
     bend: float = 0.0  # Of each term of its bend [m].
+    # Whether it keeps its stated scale: errors of an arm by its posture look like a scale, and
+    # weigh more than white noise does.
+    is_held: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +77,6 @@ class CornerProblem:
     # (k, k) covariance of a given lens's intrinsics beyond what is stated; None for a sound one.
     lens_covariance: FloatArray | None = None
     board_sizes: tuple[BoardSizes, ...] = ()  # The same of each printed board.
-    # Whether boards keep their stated scales: errors of an arm by its posture look like a scale,
-    # and weigh more than white noise does.
-    holds_scales: bool = False
 
     @classmethod
     def of(
@@ -146,7 +146,7 @@ class CornerProblem:
         """(k + s,) mask of the values that no fit moves, however uncertain they are."""
         held = np.zeros(len(self.stated_sigma), dtype=bool)
         held[self.lens] = self.scene.mode == "hold" and not self.scene.estimated
-        held[self.scale] = self.holds_scales
+        held[self.scale] = [sizes.is_held for sizes in self.board_sizes]
         return held
 
     @cached_property

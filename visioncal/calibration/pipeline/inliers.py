@@ -7,6 +7,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.starting import Start, sensors_of
 from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.error_sizes import scales_of
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.priors import with_loose_positions, without_most_contradicted
 from visioncal.calibration.stages.refine import PRINTED_SCALE
@@ -46,12 +47,15 @@ def initial_inliers(start: Start) -> InlierFit:
     printed = [target for target, sensor in pairs if sensor < 0 and movable]
     if printed:
         # Otherwise all observations of a board of another size would be outliers.
-        sizes = target_sizes(problem, dict.fromkeys(printed, PRINTED_SCALE))
+        off = scales_of(start.solved) if start.agreeing is not None else {}
+        known = {target: off.get(target, 0.0) for target in printed}
+        sigmas = {target: max(PRINTED_SCALE, abs(share)) for target, share in known.items()}
+        sizes = target_sizes(problem, sigmas)
         problem = problem.with_effects([*problem.effects, sizes])
-        state = State(state.edges, np.append(state.values, sizes.values))
+        state = State(state.edges, np.append(state.values, [*known.values()]))
     loose = replace(problem, priors=with_loose_positions(cell.priors))
     if cell.mount is None or (agreeing := start.agreeing) is None:
-        inliers = inliers_and_moves(loose, state, movable)
+        inliers = inliers_and_moves(loose, state, movable, start.agreeing)
     else:
         inliers = presumed_inliers(loose, state, agreeing)
     if cell.priors:

@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.connectivity import ambiguous_error, refuse_unconnected_robots
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.error_sizes import session_start
+from visioncal.calibration.stages.error_sizes import scales_of, session_start
 from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DegenerateError, VisioncalError
@@ -30,6 +30,8 @@ from visioncal.session import frame_name
 _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
 # Share of the rows that agree, below which something may have moved.
 _MOST_AGREE = 0.9
+# Share from which a board is of another size: some sigma of a print that is as stated.
+_OTHER_SIZE = 5e-3
 _AMBIGUOUS = "ambiguous: two poses of the target fit image and motion alike"
 
 
@@ -47,11 +49,8 @@ class Start:
 
     @property
     def agreeing(self) -> Mask | None:
-        """(n,) rows that agree by the one likelihood; None where that does not tell.
-
-        Where many do not agree, something may have moved, which no single row shows.
-        """
-        if self.solved is None:
+        """(n,) rows that agree by the one likelihood; None where that is no start."""
+        if self.solved is None or not _is_start(self.solved, self.cell):
             return None
         used = np.flatnonzero(self.solved.used).tolist()
         views = {self.solved.fit.cell.sightings[at].view for at in used}
@@ -94,8 +93,7 @@ def find_start(cell: Cell, observed: Observed, *, is_solved: bool) -> Start:
     with suppress(VisioncalError):
         solved = solve_from(begun) if is_solved else None
     edges = dict(begun.edges)
-    if solved is not None and cell.mount is not None and np.mean(solved.used) >= _MOST_AGREE:
-        # In a whole cell, frames may have moved since.
+    if solved is not None and _is_start(solved, cell):
         edges = {name: solved.fit.edge(name) for name in edges}
     chosen, ambiguous = _chosen(cell, problem, views, edges)
     cell = cell.without(dict.fromkeys(ambiguous, _AMBIGUOUS))
@@ -113,6 +111,19 @@ def find_start(cell: Cell, observed: Observed, *, is_solved: bool) -> Start:
     problem = problem_of(cell, poses)
     loose = tuple(name for name in apart if not branches[name].robot)
     return Start(cell, poses, problem, problem.start(edges), loose, solved)
+
+
+def _is_start(solved: CellFit, cell: Cell) -> bool:
+    """Whether a fit begins with what the one likelihood has found.
+
+    Where many rows do not agree, something may have moved, which no single row shows. In a whole
+    cell frames may have moved by less: only a board of another size is no less clear, with which
+    the poses of no half of the rows agree otherwise.
+    """
+    is_pair, opened = cell.mount is not None, solved.fit.unknowns.opened
+    is_sized = any(abs(share) > _OTHER_SIZE for share in scales_of(solved).values())
+    is_still = not any(effect.place == "edge" for effect in opened)
+    return bool(np.mean(solved.used) >= _MOST_AGREE) and (is_pair or (is_sized and is_still))
 
 
 def _chosen(

@@ -16,12 +16,15 @@ from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.transforms import apply, pose_difference
 from visioncal.core.types import Corners, FloatArray, IntArray
+from visioncal.estimation.appearance import SCALE
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.fit import Fit
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.scene import BoardSizes, CornerProblem, Scene
+from visioncal.estimation.unknowns import BOARD
+from visioncal.session import frame_name
 from visioncal.vision.targets import corner_positions
 
 # An arm without joint angles may look like a step of a frame.
@@ -137,7 +140,7 @@ class CellFit:
     ) -> CameraParameters:
         """The corners of scenes and views (by camera frame), with stated lenses and boards.
 
-        They have the `sizes` of errors.
+        They have the `sizes` of errors. Boards start at the size that the one likelihood has.
         """
         shares, sizes, problems, poses = self._shares, self.sizes, {}, {}
         stops = self.inlier_fit.problem.observations.stops.tolist()
@@ -156,11 +159,18 @@ class CellFit:
                 problem if levels is None else problem.with_levels(levels),
                 lens_covariance=sizes.lenses.get(frame),
                 board_sizes=tuple(sizes.boards.get(at, BoardSizes()) for at in scene.printed),
-                holds_scales=sizes.holds_scales,
             )
             with_corners = [view for view in views[frame] if view.view in corners]
             poses[frame] = np.array([view.cam_from_target[0] for view in with_corners])
-        return CameraParameters.of(problems, poses)
+        stated = CameraParameters.of(problems, poses)
+        starts = {
+            stated.parts[BOARD, name].start + SCALE: sizes.scales[frame]
+            for scene in scenes.values()
+            for name in scene.printed
+            if (frame := frame_name("target", name)) in sizes.scales
+            and not sizes.boards[name].is_held
+        }
+        return stated.with_values(np.array([*starts], dtype=np.int64), np.array([*starts.values()]))
 
     @property
     def _shares(self) -> dict[int, float]:

@@ -78,8 +78,8 @@ class ErrorSizes:
     opened: tuple[Effect, ...] = ()  # Of frames that move; of measured poses, their steps alone.
     displaced: tuple[Displaced, ...] = ()  # By panes before lenses, and boards that swell.
     rivals: Mapping[str, frozenset[str]] = field(default_factory=dict)  # See `Unknowns.rivals`.
-    # Whether boards keep their stated sizes: errors of arms are confounded with them.
-    holds_scales: bool = False
+    # Shares by which boards are larger than stated, by frame: where their fit starts.
+    scales: Mapping[str, float] = field(default_factory=dict)
 
     def steadied(
         self,
@@ -122,14 +122,18 @@ class ErrorSizes:
 
 def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
     """The sizes by the one likelihood of a session; none where it does not come to rest."""
+    session = observed.timed
     if solved is None:
         # A fit without rest determines no board.
-        return ErrorSizes(holds_scales=True)
-    session = observed.timed
+        return ErrorSizes(boards=dict.fromkeys(session.boards, BoardSizes(is_held=True)))
     fit, doubted = solved.fit, doubted_boards(solved.doubts)
     grown = tuple(_grown(fit))
     levels = {name: _levels(fit, name) for name in fit.unknowns.lenses}
-    boards, held = dict[str, BoardSizes](), False
+    # Positive evidence (Kass and Raftery 1995, 3.2) frees boards, within what they may be off by;
+    # but not where links may be as much longer.
+    is_confounded = any(_size(fit, f"links {name}") for name in fit.cell.arms)
+    holds = is_confounded or all(one.board_odds < np.log(3.0) for one in solved.doubts)
+    boards = dict[str, BoardSizes]()
     for name, target in session.boards.items():
         key: Key = ("shape", frame_name("target", name))
         if key in fit.unknowns:
@@ -138,12 +142,8 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
             square = max(scale**2 - stated**2, doubted.get(key, 0.0))
             # A doubt within what is stated leaves the board as it is.
             beyond = float(np.sqrt(square)) if square > stated**2 else 0.0
-            boards[name] = BoardSizes(beyond, plane, bend)
-            held |= any(prior.considered > 0.0 for prior in fit.unknowns[key].priors)
-    # Positive evidence (Kass and Raftery 1995, 3.2) frees them, within what they may be off by; but
-    # not where links may be as much longer.
-    if not any(_size(fit, f"links {name}") for name in fit.cell.arms):
-        held &= all(one.board_odds < np.log(3.0) for one in solved.doubts)
+            is_doubted = any(prior.considered > 0.0 for prior in fit.unknowns[key].priors)
+            boards[name] = BoardSizes(beyond, plane, bend, is_held=is_doubted and holds)
     given = (name for name in levels if observed.cameras[name].table.stated is not None)
     lenses = {name: _covariance(fit, name, levels[name]) for name in given}
     lenses = {name: covariance for name, covariance in lenses.items() if covariance.any()}
@@ -165,8 +165,14 @@ def error_sizes(observed: Observed, solved: CellFit | None) -> ErrorSizes:
             zoomed[name], grew[name] = zoom, abs(zoom.share)
     effects = (at for at in fit.unknowns.effects if at.place == "edge" and _size(fit, at.name))
     displaced = tuple(_displaced(fit))
-    known = tuple(effects), displaced, fit.unknowns.rivals
-    return ErrorSizes(levels, lenses, boards, grown, zoomed, *known, held)
+    known = tuple(effects), displaced, fit.unknowns.rivals, scales_of(solved)
+    return ErrorSizes(levels, lenses, boards, grown, zoomed, *known)
+
+
+def scales_of(solved: CellFit | None) -> dict[str, float]:
+    """Shares by which boards are larger than stated, by frame, by the one likelihood."""
+    shapes = {} if solved is None else solved.fit.state.values
+    return {key[1]: float(values[0]) for key, values in shapes.items() if key[0] == "shape"}
 
 
 @dataclass(frozen=True, eq=False)

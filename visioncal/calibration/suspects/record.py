@@ -3,6 +3,7 @@
 Mistakes of a record pair its rows otherwise; see `undoing`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -26,6 +27,9 @@ LEAST = 5e-4
 _KEPT, _STARTS = 0.45, 40
 # Neighbouring rows by which a fit starts, too: those of one end of the session may be right alone.
 _WINDOW = 7
+# Robots that stand still are within so much of where they stood [m], [rad], and what a camera sees
+# of them within a share of the distance and an angle [rad].
+_STILL_M, _STILL_RAD, _STILL_SEEN = 3e-4, 1e-3, 0.02
 # Log-density of a wrong view's pose, over two radians and two distances by axis, with the prior
 # probability of wrong views. Copies of poses differ by less.
 _WRONG, _WIDTH, _SAME = float(np.log(0.05)), 3.0 * float(np.log(2.0)), 1e-9
@@ -73,7 +77,9 @@ class Record:
         padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
         mount: Mount = run.mount or "eye-in-hand"
         mount = mount if read is None else "eye-to-hand"
-        known, shown = robot_part(robot, mount), np.array(rows, dtype=int)
+        known = robot_part(robot, mount)
+        kept = _moved_on(robot[rows], [poses[0] for poses in camera])
+        shown, padded = np.array(rows, dtype=int)[kept], [padded[at] for at in kept]
         marks = corner_positions(*session.boards.values()) if len(turns) == 1 else np.zeros((0, 3))
         is_numbered = bool(run.corners) and len(marks) > 0
         shows, are_places = ("image", False) if read is None else ("reading", not read.are_poses)
@@ -94,6 +100,25 @@ class Record:
     def lingering(self) -> Mask:
         """(m,) views in which the pose of the target before is there once more."""
         return _same_as_before(self.camera[:, 0])
+
+
+def _moved_on(robot: FloatArray, camera: Sequence[FloatArray]) -> list[int]:
+    """Indices of (m, 4, 4) poses of both sides but those at which neither has moved from another.
+
+    A robot of a cell may wait at one place while others move: its rows there agree whatever the
+    edges are, and would be the half on which a robust fit stands.
+    """
+    kept = list[int]()
+    for at, (pose, seen) in enumerate(zip(robot, camera, strict=True)):
+        others, seen_then = robot[kept], np.array(camera)[kept]
+        near = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1) < _STILL_M
+        near &= np.linalg.norm(others[:, :3, :3] - pose[:3, :3], axis=(1, 2)) < _STILL_RAD
+        near_m = _STILL_SEEN * np.linalg.norm(seen[:3, 3])
+        near &= np.linalg.norm(seen_then[:, :3, 3] - seen[:3, 3], axis=1) < near_m
+        near &= np.linalg.norm(seen_then[:, :3, :3] - seen[:3, :3], axis=(1, 2)) < _STILL_SEEN
+        if not near.any():
+            kept.append(at)
+    return kept
 
 
 def _same_as_before(poses: FloatArray) -> Mask:
