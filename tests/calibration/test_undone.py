@@ -30,6 +30,7 @@ from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
 from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.stages.robots import pairs_of
 from visioncal.calibration.suspects.misread_poses import _of_pair
+from visioncal.calibration.suspects.record import Record
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
 from visioncal.core.errors import DataError, DegenerateError
@@ -480,6 +481,19 @@ def test_a_whole_table_two_rows_apart_is_named():
 def located(session):
     """What is known of a session before its fit."""
     return run_stages(RunState(session), STAGES[:5])
+
+
+def test_a_robot_that_waits_while_another_moves_is_seen_once():
+    robot, boards = poses_of("eye-to-hand")
+    rng, waits = np.random.default_rng(0), np.arange(24) % 2 == 1
+    # Within a tenth of the limits by which it has moved.
+    robot[waits] = robot[1] @ exp(3e-5 * rng.normal(size=(12, 6)))
+    boards[waits] = boards[1] @ exp(1e-3 * rng.normal(size=(12, 6)))
+    # A board of another size, which all rows that wait would agree with.
+    boards[:, :3, 3] *= 0.8
+    run = located(pairs_session("eye-to-hand", robot, boards))
+    assert len(Record.of(run).rows) == 13
+    assert likeliest(run) is None
 
 
 @pytest.mark.slow
@@ -1003,6 +1017,11 @@ def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind,
     # The command that mends it is of one robot alone.
     assert not causes[0].do.command
     assert causes[0].do.words.endswith("Of several robots or cameras, correct the files by hand.")
+
+
+def test_rows_of_a_whole_cell_are_not_shifted_together():
+    session = in_a_cell(0, "nothing")[0]
+    raised(DataError, "has several robots or cameras", shift_views, session, [3, 4], 1)
 
 
 def test_corners_of_other_boards_are_no_corners_of_a_pair_of_a_cell():

@@ -112,8 +112,15 @@ def shift_views(session: Session, views: Sequence[int], by: int) -> Session:
     """Gives some views the robot's columns of so many rows later, or earlier where negative.
 
     Views whose row there is none, or another view's that stays, are dropped, and `corrected` names
-    them. Raises DataError.
+    them. Raises DataError, also for a whole cell: rows next to each other are of other robots.
     """
+    if len(session.robots) > 1 or len(session.cameras) > 1:
+        raise DataError(
+            f"Session {session.name!r} has several robots or cameras: rows next to each other are "
+            "not of one of them, and cannot be shifted together.",
+            culprits=["--shift"],
+            next_step="In views.csv, move the pose columns of that robot by hand.",
+        )
     moved, rows = set(_chosen_views(session, views, "--shift")), session.views
     places = {at for at, view in enumerate(rows) if view.number in moved}
     kept = {*_OBSERVED, *_MUST_AGREE, "view", "role"}
