@@ -29,7 +29,7 @@ from visioncal.calibration.run import STAGES, run_stages
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS
 from visioncal.calibration.stages.other_board import OtherBoardError
 from visioncal.calibration.stages.robots import pairs_of
-from visioncal.calibration.suspects.misread_poses import _of_pair
+from visioncal.calibration.suspects.misread_poses import _of_pair, misreadings
 from visioncal.calibration.suspects.record import Record
 from visioncal.calibration.suspects.suspect import UNDONE
 from visioncal.calibration.suspects.undoing import likeliest
@@ -1017,6 +1017,16 @@ def test_a_mistake_in_a_whole_cell_is_named_and_a_sound_one_is_not_accused(kind,
     # The command that mends it is of one robot alone.
     assert not causes[0].do.command
     assert causes[0].do.words.endswith("Of several robots or cameras, correct the files by hand.")
+
+
+def test_a_camera_that_is_declared_on_another_robot_is_named_with_its_own():
+    session = in_a_cell(0, "nothing")[0]
+    frames = {**session.document["frames"], "cam_hand": "flange_b"}
+    rows = [[view.cell(name) for name in session.columns] for view in session.views]
+    wrong = session.with_content(document={**session.document, "frames": frames}, cells=rows)
+    (found,) = misreadings(located(wrong))
+    assert found.words.startswith("cam_hand is on robot a, and not on robot b as [frames] declares")
+    assert 'Write cam_hand = "flange_a" in [frames]' in found.do.words
 
 
 def test_rows_of_a_whole_cell_are_not_shifted_together():

@@ -168,7 +168,7 @@ class CellFit:
             for scene in scenes.values()
             for name in scene.printed
             if (frame := frame_name("target", name)) in sizes.scales
-            and not sizes.boards[name].is_held
+            and not sizes.boards.get(name, BoardSizes()).is_held
         }
         return stated.with_values(np.array([*starts], dtype=np.int64), np.array([*starts.values()]))
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess.decide import POSE_OPTIONS
-from visioncal.calibration.guess.fit import robust_fits
+from visioncal.calibration.guess.fit import Fit, robust_fits
 from visioncal.calibration.guess.recording import FEWEST_ROWS, thinned
 from visioncal.calibration.guess.search import PAIRS_SHARE, relative_angles
 from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
@@ -33,6 +33,7 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy, mending, or_alone
 from visioncal.estimation.chain import robot_part
+from visioncal.session import frame_name
 
 # A robot that moves by less stood still [m].
 _STILL_M = 1e-3
@@ -148,6 +149,9 @@ def misreadings(run: RunState) -> Iterator[Finding]:
         wrong = [pair for pair in every if not closes(poses, pair.poses, pair.mount)]
         whose = f"robot {robot}" if robot else "the robot"
         for pair in wrong:
+            if (other := _on_another(run, robot, pair)) is not None:
+                yield other
+                break
             hint = next(_misread_poses(_of_pair(run, robot, pair)), None)
             if hint is None:
                 continue
@@ -159,6 +163,38 @@ def misreadings(run: RunState) -> Iterator[Finding]:
             yield replace(hint, words=f"{whose[0].upper()}{whose[1:]}{within}: {hint.words}")
             # All of these would show the same.
             break
+
+
+def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | None:
+    """The finding that a camera or a target is on another robot's flange than is declared."""
+    stops = {view.number: view.stop for view in run.session.views}
+
+    def fitted(poses: Mapping[int, FloatArray]) -> Fit | None:
+        _, both = _both_sides(poses, pair.poses, pair.mount)
+        if len(both) < FEWEST_ROWS:
+            return None
+        return robust_fits(robot_part(both[:, 0], pair.mount)[None], both[:, 1][None])[0]
+
+    declared = fitted(run.robots[robot].base_from_flange)
+    for other in run.robots.keys() - {robot}:
+        there = run.robots[other].base_from_flange.items()
+        by_stop = {stops[view]: pose for view, pose in there}
+        poses = {view: by_stop[stops[view]] for view in pair.poses if stops[view] in by_stop}
+        found = fitted(poses)
+        if found is not None and declared is not None and found.closes:
+            frame = pair.camera if pair.mount == "eye-in-hand" else pair.target
+            return Finding(
+                "misread_poses",
+                f"{frame} is on robot {other}, and not on robot {robot} as [frames] declares: "
+                f"with the poses of robot {other}, robot and camera agree to {found.figures}, "
+                f"with those of robot {robot} to {declared.figures}.",
+                Remedy(
+                    f'Write {frame} = "{frame_name("flange", other)}" in [frames] of session.toml, '
+                    "and calibrate again.",
+                    CALIBRATE,
+                ),
+            )
+    return None
 
 
 def _misread_poses(run: RunState) -> Iterator[Finding]:
@@ -343,15 +379,21 @@ def turned_boards(run: RunState) -> Iterator[Finding]:
 
 def _of_pair(run: RunState, robot: str, pair: CameraTargetPair) -> RunState:
     """A cell's run as that of one robot, camera and target alone."""
-    session, look = run.session.of(pair.camera, robot, pair.target), run.cameras[pair.camera]
+    session = run.session.of(pair.camera, robot, pair.target)
     views = {view.number for view in session.views}
-    # Corners of other targets are no corners of this one.
-    corners = {view: seen for view, seen in look.corners.items() if view in views}
+    # Corners of other targets are no corners of this one; of given poses there are none.
+    cameras = {
+        name: replace(
+            look, corners={view: seen for view, seen in look.corners.items() if view in views}
+        )
+        for name, look in run.cameras.items()
+        if name == pair.camera
+    }
     return replace(
         run,
         session=session,
         robots={robot: run.robots[robot]},
-        cameras={pair.camera: replace(look, corners=corners)},
+        cameras=cameras,
         poses=pair.poses,
     )
 
