@@ -12,6 +12,7 @@ from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Target
 from visioncal.estimation.tree import Branch, Tree
+from visioncal.fit.consensus import Candidates, hand_eye
 from visioncal.fit.solve import solve
 from visioncal.fit.start import start_of
 from visioncal.model import Arm, Cell, MeasuredPose, Moments, Sighting
@@ -68,6 +69,20 @@ def test_poses_at_random_are_not_taken_for_shifted():
     cell = with_poses(small.cell, poses)
     assert start_of(cell).sound.all()
     assert np.flatnonzero(~solve(cell).fit.used).tolist() == sorted(rows.tolist())
+
+
+def test_a_parked_robot_counts_once_for_its_hand_eye_calibration():
+    """Half of the views have one pose of it, and agree with any edges beside their product."""
+    rng = np.random.default_rng(62)
+    x, z = pose([0.1, 0.4, -0.2], [0.03, -0.05, 0.09]), pose([0.3, 0.1, 1.0], [0.5, 0.1, 0.2])
+    robot = np.array([pose(*rng.normal(0, [[0.6], [0.3]], (2, 3))) for _ in range(5)])
+    robot = np.concatenate([robot[:1].repeat(6, axis=0), robot[1:]])
+    robot = robot @ exp(rng.normal(0, 1e-4, (len(robot), 6)))
+    seen = Candidates.of((invert(robot @ x) @ z)[:, None], [[0]] * len(robot))
+    edges = hand_eye(robot, seen)
+    assert edges is not None
+    assert np.abs(log(invert(edges.x) @ x)).max() < 1e-6
+    assert edges.residuals.max() < 1e-6
 
 
 @pytest.mark.slow

@@ -146,8 +146,30 @@ def hand_eye(robot: FloatArray, candidates: Candidates) -> PairEdges | None:
     """Solves for both edges of `robot * x * camera = z` by a consensus of m views.
 
     `robot` is (m, 4, 4), the robot's part of the chain. None where the motion leaves a direction
-    undetermined, or no half of the views agrees.
+    undetermined, or no half of the views agrees. A robot that was parked while others moved repeats
+    one pose, and half of the views may have it: then each pose counts once.
     """
+    edges = _half_edges(robot, candidates)
+    rows = _distinct(robot)
+    if edges is not None or not FEWEST_VIEWS <= len(rows) < len(robot):
+        return edges
+    edges = _half_edges(robot[rows], candidates.take(rows))
+    if edges is None:
+        return None
+    return replace(edges, residuals=candidates.distances(invert(robot @ edges.x) @ edges.z))
+
+
+def _distinct(robot: FloatArray) -> IntArray:
+    """(d,) the first row of each of (m, 4, 4) poses that differ by more than views may."""
+    rows = list[int]()
+    for at, pose in enumerate(robot):
+        if not rows or distances_m(robot[rows], pose).min() > AGREE_M:
+            rows.append(at)
+    return np.array(rows, dtype=np.int64)
+
+
+def _half_edges(robot: FloatArray, candidates: Candidates) -> PairEdges | None:
+    """Both edges by the half of the views that agrees best; None where it determines them not."""
     half, edges, typical_m = _trimmed_edges(robot, candidates, SOLVERS["park"])
     if typical_m > AGREE_M:
         return None
