@@ -11,7 +11,7 @@ from support.wrong_arms import GOOD
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.fit.candidates import effects_of_frames, scored
-from visioncal.fit.processes import _alone, _boards, _tried_of, judged
+from visioncal.fit.processes import _alone, _boards, _grid_of, judged
 from visioncal.fit.score import added_by, of_effect, products
 from visioncal.fit.solve import solve
 from visioncal.model import read_cell
@@ -82,9 +82,11 @@ def test_scores_beside_no_process_are_those_of_independent_noise():
     for effect in effects_of_frames(fit, "flange"):
         each = products(fit, added_by(fit, effect), effect.count)
         alone = _alone(fit, "flange", [each])
-        white = next(_tried_of(fit, "flange", alone, creeps=True))
+        grid, beside = _grid_of(fit, "flange", alone, creeps=True)
+        white = beside(next(grid))
         # With boards held as the fit has them.
-        _, left, _ = judged(white, [], 0.0)
+        _, pull, _ = judged(white, [], 0.0)
+        left = white.total[len(pull) :, len(pull) :] - pull.T @ pull
         score = of_effect(fit, effect)
         scale = np.sqrt(np.diag(score.information)) + 1e-9 * np.abs(score.information).max() ** 0.5
         assert np.abs((left[:-1, :-1] - score.information) / np.outer(scale, scale)).max() < 1e-4
