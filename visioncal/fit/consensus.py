@@ -149,10 +149,11 @@ def hand_eye(robot: FloatArray, candidates: Candidates) -> PairEdges | None:
     undetermined, or no half of the views agrees. A robot that was parked while others moved repeats
     one pose, and half of the views may have it: then each pose counts once.
     """
-    edges = _half_edges(robot, candidates)
-    rows = _distinct(robot)
-    if edges is not None or not FEWEST_VIEWS <= len(rows) < len(robot):
+    if (edges := _half_edges(robot, candidates)) is not None:
         return edges
+    rows = _distinct(robot)
+    if not FEWEST_VIEWS <= len(rows) < len(robot):
+        return None
     edges = _half_edges(robot[rows], candidates.take(rows))
     if edges is None:
         return None
