@@ -14,14 +14,17 @@ from support.refusals import raised
 from support.slopes import twists
 from support.whole_cells import OPTIONS, recorded
 
+from visioncal import results
 from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.calibration.run import calibrate
+from visioncal.calibration.suspects.moved_frames import moved_findings
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Target
 from visioncal.interchange.formats.mending import exchange_views
 from visioncal.present.recording import paths, read_evidence
 from visioncal.results import Calibration
+from visioncal.results.edge import Edge
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (
@@ -127,6 +130,27 @@ def test_any_frame_is_placed_in_any_other_with_the_covariance_of_the_chain(clean
     np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-13)
     raised(DataError, "moves with robot .b., whose pose must be given", found.between, *ends)
     raised(DataError, "no frame 'cam_lft'", found.between, "cam_lft", "base_a")
+
+
+def test_cameras_that_have_each_others_images_from_a_stop_on_are_no_moves():
+    top, side = np.eye(4), exp(np.array([0.0, 1.0, 0.0, 1.9, 0.0, 0.0]))
+    near = exp(np.array([0.0, 0.0, 1e-3, 1e-3, 0.0, 0.0]))
+    places = {"cam_top": side @ near, "cam_side": top, "target_floor": side}
+    places |= {"cam_top_until_stop_19": top, "cam_side_until_stop_19": side}
+    places |= {"target_floor_until_stop_19": near}
+    edges = {name: Edge(place, np.eye(6)) for name, place in places.items()}
+    moves = [
+        move
+        for frame in ("cam_top", "target_floor", "cam_side")
+        for move in [results.Moved(frame, f"{frame}_until_stop_19", 19, 20, 1900.0, 57.0)]
+    ]
+    found = [finding.words for finding in moved_findings(moves, edges)]
+    assert len(found) == 2
+    assert found[0].startswith("From stop 20 on, or up to there, cam_top and cam_side have each")
+    assert found[1].startswith("target_floor moved between stops 19 and 20, by 1900 mm")
+    # A camera that came near to another's place is moved.
+    alone = [finding.words for finding in moved_findings(moves[:2], edges)]
+    assert alone[0].startswith("cam_top was bumped between stops 19 and 20")
 
 
 def test_the_joint_covariance_is_in_the_order_of_the_transforms_where_a_frame_moved():

@@ -23,7 +23,7 @@ from visioncal.core.transforms import (
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy, mending, or_alone
 from visioncal.estimation.arm import LEVER_M, TWIST_UNITS
-from visioncal.estimation.moves import creep_effects, find_push, observations_over
+from visioncal.estimation.moves import find_push, observations_over
 from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.steps import step_of
 from visioncal.results import Moved
@@ -99,38 +99,6 @@ def movements(cell_fit: CellFit) -> tuple[Moved, ...]:
             away = pose_difference(edges[before], edges[after])
             moved.append((start, Moved(frame, named[before], last, first, *away)))
     return tuple(move for _, move in sorted(moved, key=lambda item: item[0]))
-
-
-def moved_finding(moved: Moved) -> Finding:
-    """Finding that a frame moved."""
-    what = "was bumped" if moved.frame.startswith("cam") else "moved"
-    return Finding(
-        "moved_frame",
-        f"{moved.frame} {what} between stops {moved.last_stop} and {moved.first_stop}, by "
-        f"{mm_and_deg(moved.shift_mm, moved.turn_deg)}. The result has "
-        f"{moved.frame} where it stood last, and as {moved.before} where it stood before.",
-        Remedy(f"Fasten {moved.frame}, and record again."),
-    )
-
-
-def crept_findings(cell_fit: CellFit) -> Iterator[Finding]:
-    """Finding that frames of a whole cell crept."""
-    problem, state = cell_fit.inlier_fit.problem, cell_fit.inlier_fit.fit.state
-    crept = sorted(
-        (
-            (pose_difference(np.eye(4), exp(problem.values_of(at.name, state))), at.frame)
-            for at in creep_effects(problem)
-        ),
-        reverse=True,
-    )
-    if crept:
-        words = ", ".join(f"{frame} by {mm_and_deg(*by)}" for by, frame in crept)
-        yield Finding(
-            "frame_creeps",
-            f"Frames crept during the session, as where mounts give way: {words}. The result has "
-            "each where it stood last.",
-            Remedy(f"Fasten {some_of([frame for _, frame in crept])}, and record again."),
-        )
 
 
 def explained_outliers(

@@ -19,7 +19,8 @@ from visioncal.calibration.suspects import (
     steps,
     turned_views,
 )
-from visioncal.calibration.suspects.outliers import EXCHANGED, crept_findings, moved_finding
+from visioncal.calibration.suspects.moved_frames import crept_findings, moved_findings
+from visioncal.calibration.suspects.outliers import EXCHANGED
 from visioncal.calibration.suspects.suspect import (
     ARM_ERRORS,
     FACT,
@@ -40,7 +41,7 @@ def _outliers(run: RunState) -> Iterator[Finding]:
     for fault in run.assessment.faults:
         yield replace(fault.found, without_it=without(fault.found.views, held_out.words))
     if run.mount is None:
-        yield from map(moved_finding, run.assessment.moved)
+        yield from moved_findings(run.assessment.moved, run.assessment.edges)
         yield from crept_findings(run.cell_fit)
 
 
