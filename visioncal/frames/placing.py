@@ -21,6 +21,8 @@ LEAST_NOISE_M = 1e-6
 TOUCH_NOISE_M = 1e-4
 # Noise beyond which touches may be of other kinds [m].
 _DISAGREE_M = 1e-3
+# Touches of which any two may have each other's kinds: those that are farthest off.
+_WORST = 12
 _Kind = TypeVar("_Kind", bound=str)
 # Fewest degrees of freedom that estimate the noise: a single residual is within a tenth of its
 # sigma in one frame of twelve. Features that were touched twice leave six.
@@ -92,11 +94,15 @@ def refuse_exchanged_kinds(
         kinds: (n,) their kinds.
         fitted: The fit of all touches, of (n,) kinds.
     """
-    declared_m = fitted(kinds).sigma
+    declared = fitted(kinds)
+    declared_m = declared.sigma
     if declared_m < _DISAGREE_M:
         return
     tried = list[tuple[GroupFit, str, Sequence[str]]]()
-    for a, b in combinations(range(len(kinds)), 2):
+    # Groups are touches in their order, unless some of these make several.
+    away, rows = np.linalg.norm(declared.groups.residuals, axis=1), np.arange(len(kinds))
+    worst = np.argsort(-away)[:_WORST] if len(away) == len(kinds) else rows[:_WORST]
+    for a, b in combinations(sorted(worst.tolist()), 2):
         if kinds[a] != kinds[b]:
             exchanged = tuple(kinds[{a: b, b: a}.get(row, row)] for row in range(len(kinds)))
             words = f"touches {names[a]} ({kinds[a]}) and {names[b]} ({kinds[b]})"
@@ -112,7 +118,7 @@ def refuse_exchanged_kinds(
     if CLEAR_RATIO * agree_m < declared_m:
         rivals = [one for one in tried if one[0].sigma < CLEAR_RATIO * agree_m]
         raise DataError(
-            f"{label}: {', or '.join(words for _, words, _ in rivals)} have each other's kinds: "
+            f"{label}: {some_of([words for _, words, _ in rivals])} have each other's kinds: "
             f"corrected, all agree to {figure(1e3 * agree_m)} mm per axis, and to "
             f"{figure(1e3 * declared_m)} mm as they are.",
             culprits=rivals[0][2],

@@ -145,11 +145,14 @@ def _good_for(
     corrected = "" if worst.uncorrected is None else ", with corrected targets"
     limit, alone = (figure(rounded_up(mm)) for mm in (good_for_mm, worst.good_for_mm))
     without_doubts = ""
-    likely = (found for found in stated if found.probability >= LEAST_LIKELY)
+    likely = [found for found in stated if found.probability >= LEAST_LIKELY]
     if alone != limit:
         # The doubts decide, not the predicted picks.
         without_doubts = f", whatever is behind the doubts; if mere noise is, of {alone} mm"
-    elif any("calibration" in SUSPECTS[found.kind].inflates for found in likely):
+    elif any(
+        "calibration" in SUSPECTS[found.kind].inflates
+        for found in in_reading_order(likely, status)[:1]
+    ):
         without_doubts = ", and of less once the first cause is mended: till then, what is like it "
         without_doubts += "counts as off by as much"
     return Finding(

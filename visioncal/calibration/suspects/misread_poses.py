@@ -10,13 +10,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.calibration.guess.decide import POSE_OPTIONS
-from visioncal.calibration.guess.fit import Fit, robust_fits
+from visioncal.calibration.guess.fit import Fit, is_about_one_axis, robust_fits
 from visioncal.calibration.guess.recording import FEWEST_ROWS, thinned
 from visioncal.calibration.guess.search import PAIRS_SHARE, relative_angles
 from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cameras import exchanged_columns
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
+from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.calibration.stages.other_board import MEND_IMAGES
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
@@ -34,6 +35,8 @@ from visioncal.core.types import FloatArray, IntArray, Mount
 from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy, mending, or_alone
 from visioncal.estimation.chain import robot_part
 from visioncal.session import frame_name
+from visioncal.session.frames import object_name
+from visioncal.vision.targets import first_corners
 
 # A robot that moves by less stood still [m].
 _STILL_M = 1e-3
@@ -143,7 +146,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
     if run.mount is not None:
         yield from _misread_poses(run) if run.readings is None else misread_readings(run)
         return
-    for robot in run.session.robots:
+    for robot in (name for name in run.session.robots if name in run.robots):
         poses, every = run.robots[robot].base_from_flange, pairs_of(run, robot)
         every = [pair for pair in every if len(pair.poses) >= FEWEST_ROWS]
         wrong = [pair for pair in every if not closes(poses, pair.poses, pair.mount)]
@@ -176,10 +179,14 @@ def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | 
         return robust_fits(robot_part(both[:, 0], pair.mount)[None], both[:, 1][None])[0]
 
     declared = fitted(run.robots[robot].base_from_flange)
-    for other in run.robots.keys() - {robot}:
+    for other in (name for name in run.robots if name != robot):
         there = run.robots[other].base_from_flange.items()
         by_stop = {stops[view]: pose for view, pose in there}
         poses = {view: by_stop[stops[view]] for view in pair.poses if stops[view] in by_stop}
+        # One that waited, or turned about one axis, agrees with much.
+        turns = np.array([pose[:3, :3] for pose in poses.values()]).reshape(-1, 3, 3)
+        if len(turns) < FEWEST_ROWS or is_about_one_axis(turns):
+            continue
         found = fitted(poses)
         if found is not None and declared is not None and found.closes:
             frame = pair.camera if pair.mount == "eye-in-hand" else pair.target
@@ -381,14 +388,19 @@ def _of_pair(run: RunState, robot: str, pair: CameraTargetPair) -> RunState:
     """A cell's run as that of one robot, camera and target alone."""
     session = run.session.of(pair.camera, robot, pair.target)
     views = {view.number for view in session.views}
-    # Corners of other targets are no corners of this one; of given poses there are none.
-    cameras = {
-        name: replace(
-            look, corners={view: seen for view, seen in look.corners.items() if view in views}
-        )
-        for name, look in run.cameras.items()
-        if name == pair.camera
-    }
+    boards, cameras = run.session.boards, dict[str, CameraObservations]()
+    firsts = dict(zip(boards, first_corners(tuple(boards.values())).tolist(), strict=True))
+    first = firsts.get(object_name(pair.target, "target"), 0)
+    # Of poses that are given there are no corners.
+    for name, look in run.cameras.items():
+        if name == pair.camera:
+            # Corners of other targets are no corners of this one, which has numbers of its own.
+            corners = {
+                view: replace(seen, ids=seen.ids - first)
+                for view, seen in look.corners.items()
+                if view in views
+            }
+            cameras[name] = replace(look, corners=corners)
     return replace(
         run,
         session=session,

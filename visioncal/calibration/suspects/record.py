@@ -3,7 +3,6 @@
 Mistakes of a record pair its rows otherwise; see `undoing`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -29,7 +28,7 @@ _KEPT, _STARTS = 0.45, 40
 _WINDOW = 7
 # Robots that stand still are within so much of where they stood [m], [rad], and what a camera sees
 # of them within a share of the distance and an angle [rad].
-_STILL_M, _STILL_RAD, _STILL_SEEN = 3e-4, 1e-3, 0.02
+_STILL_M, _STILL_RAD, _STILL_SEEN = 1e-3, 2e-3, 0.02
 # Log-density of a wrong view's pose, over two radians and two distances by axis, with the prior
 # probability of wrong views. Copies of poses differ by less.
 _WRONG, _WIDTH, _SAME = float(np.log(0.05)), 3.0 * float(np.log(2.0)), 1e-9
@@ -77,9 +76,7 @@ class Record:
         padded = [poses[np.minimum(np.arange(most), len(poses) - 1)] for poses in camera]
         mount: Mount = run.mount or "eye-in-hand"
         mount = mount if read is None else "eye-to-hand"
-        known = robot_part(robot, mount)
-        kept = _moved_on(robot[rows], [poses[0] for poses in camera])
-        shown, padded = np.array(rows, dtype=int)[kept], [padded[at] for at in kept]
+        known, shown = robot_part(robot, mount), np.array(rows, dtype=int)
         marks = corner_positions(*session.boards.values()) if len(turns) == 1 else np.zeros((0, 3))
         is_numbered = bool(run.corners) and len(marks) > 0
         shows, are_places = ("image", False) if read is None else ("reading", not read.are_poses)
@@ -102,23 +99,20 @@ class Record:
         return _same_as_before(self.camera[:, 0])
 
 
-def _moved_on(robot: FloatArray, camera: Sequence[FloatArray]) -> list[int]:
-    """Indices of (m, 4, 4) poses of both sides but those at which neither has moved from another.
+def _distinct(robot: FloatArray, camera: FloatArray) -> IntArray:
+    """Rows of (m, 4, 4) poses of both sides, one of each place at which neither moved.
 
     A robot of a cell may wait at one place while others move: its rows there agree whatever the
-    edges are, and would be the half on which a robust fit stands.
+    edges are, and would be the half on which a robust fit stands. Places are told apart by a grid.
     """
-    kept = list[int]()
-    for at, (pose, seen) in enumerate(zip(robot, camera, strict=True)):
-        others, seen_then = robot[kept], np.array(camera)[kept]
-        near = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1) < _STILL_M
-        near &= np.linalg.norm(others[:, :3, :3] - pose[:3, :3], axis=(1, 2)) < _STILL_RAD
-        near_m = _STILL_SEEN * np.linalg.norm(seen[:3, 3])
-        near &= np.linalg.norm(seen_then[:, :3, 3] - seen[:3, 3], axis=1) < near_m
-        near &= np.linalg.norm(seen_then[:, :3, :3] - seen[:3, :3], axis=(1, 2)) < _STILL_SEEN
-        if not near.any():
-            kept.append(at)
-    return kept
+    far_m = _STILL_SEEN * max(float(np.median(np.linalg.norm(camera[:, :3, 3], axis=1))), 1e-9)
+    sides = ((robot, _STILL_M, _STILL_RAD), (camera, far_m, _STILL_SEEN))
+    cells = [
+        np.round(part.reshape(len(part), -1) / step)
+        for poses, step_m, step_rad in sides
+        for part, step in ((poses[:, :3, 3], step_m), (poses[:, :3, :3], step_rad))
+    ]
+    return np.sort(np.unique(np.hstack(cells), axis=0, return_index=True)[1])
 
 
 def _same_as_before(poses: FloatArray) -> Mask:
@@ -141,6 +135,8 @@ class Edges:
         some = np.flatnonzero(among & (pairs >= 0))
         if len(some) < FEWEST_COMPARED:
             return None
+        distinct = _distinct(record.robot[pairs[some]], record.camera[some, 0])
+        some = some[distinct] if len(distinct) >= FEWEST_COMPARED else some
         robot, seen = record.robot[pairs[some]][None], record.camera[some, 0]
         if record.are_places:
             # Of a reading, the chain is that of the point on the flange.

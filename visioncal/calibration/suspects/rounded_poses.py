@@ -9,7 +9,7 @@ from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.suspects.suspect import ARM_ERRORS, UNEXPLAINED, Suspect
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS
 from visioncal.core.number_format import figure, mm_and_deg
-from visioncal.core.types import FloatArray, Mask
+from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.robot.model import REPEATABILITY
 from visioncal.session.columns import POSE
@@ -62,24 +62,28 @@ def rounded(run: RunState, robot: str, noise_mm: float, noise_deg: float) -> Fin
 
 
 def _step(numbers: FloatArray) -> float:
-    """The largest of 10, 1, 0.1 and their halves of which most rows are multiples, or zero."""
-    for step in (10.0, 5.0, 1.0, 0.5, 0.1):
-        shares = numbers / step
-        # Digits of a table in metres and of quaternions.
-        if _are_most(np.abs(shares - np.round(shares)) * step < 2e-4):
-            return step
-    return 0.0
+    """The largest of 10, 1, 0.1 and their halves of which all rows are multiples, or zero.
 
-
-def _are_most(rounded: Mask) -> bool:
-    """Whether most of (n, k) numbers' rows are round: a mended copy has others of many digits."""
-    return bool(rounded.all(axis=1).mean() > 0.5)
+    Where there is none, that of which most are.
+    """
+    steps = np.array([10.0, 5.0, 1.0, 0.5, 0.1])
+    shares = numbers[None] / steps[:, None, None]
+    # Digits of a table in metres and of quaternions.
+    rows = (np.abs(shares - np.round(shares)) * steps[:, None, None] < 2e-4).all(axis=2)
+    are_all, are_most = steps[rows.all(axis=1)], steps[rows.mean(axis=1) > 0.5]
+    return float(max(are_all, default=max(are_most, default=0.0)))
 
 
 def _angle_step(quaternions: FloatArray) -> tuple[float, str]:
     """The same of angles [deg] as they were written, and how these are called."""
-    for digits in range(1, _MOST_DIGITS + 1):
-        if _are_most(quaternions == np.round(quaternions, digits)):
+    round_rows = {
+        digits: (quaternions == np.round(quaternions, digits)).all(axis=1).mean()
+        for digits in range(1, _MOST_DIGITS + 1)
+    }
+    # All rows first: some of few digits may be of simple turns.
+    for least in (1.0, 0.5):
+        digits = next((at for at, share in round_rows.items() if share >= least), 0)
+        if digits:
             # A part of a quaternion is half of an angle in radians.
             step = 2.0 * float(np.rad2deg(0.1**digits))
             return step, f"rotations (quaternions of {digits} decimals)"

@@ -453,20 +453,21 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
     robot, camera, fields, others = pairs[0]
     if sides[robot] == ["robot"] and sides[camera] == ["camera"]:
         return robot, camera
+    command = [str(robot) if word == str(source.path) else word for word in requested.command]
+    both = shlex.join([*command, "--camera-file", str(camera)])
     if _is_run_again(fields, others):
         raise DataError(
-            f"{source.path}: {camera.name} has nearly the same {len(fields)} rows as {robot.name}: "
-            "both are of one side, as of two runs, and nothing says what a camera saw.",
+            f"{source.path}: {camera.name} has nearly the same {len(fields)} rows as {robot.name}, "
+            "as of two runs of one side: then nothing says what a camera saw.",
             culprits=[str(camera)],
-            next_step="Name one of them as the source, and what was seen with --images.",
+            next_step="Name one of them as the source, and what was seen with --images; or both, "
+            f"where robot and instrument have nearly one frame:\n{both}",
         )
-    command = [str(robot) if word == str(source.path) else word for word in requested.command]
     raise DataError(
         f"{source.path} has {len(fields)} poses in {robot.name} and as many in {camera.name}: "
         "whose they are is not said.",
         culprits=[str(robot), str(camera)],
-        next_step=f"Name the file of the robot, and that of the camera with --camera-file:\n"
-        f"{shlex.join([*command, '--camera-file', str(camera)])}",
+        next_step=f"Name the file of the robot, and that of the camera with --camera-file:\n{both}",
     )
 
 
