@@ -1621,7 +1621,7 @@ def test_angles_of_two_runs_are_no_sides(tmp_path):
     for name in ("first", "second"):
         np.savetxt(tmp_path / f"again/{name}.txt", angles[0] + rng.normal(scale=1e-3, size=(9, 6)))
     done = visioncal("convert", tmp_path / "again", tmp_path / "out", "--mount", "eye-in-hand")
-    done.refused("nearly the same 9 rows as", "both are of one side")
+    done.refused("nearly the same 9 rows as", "as of two runs of one side")
 
 
 @pytest.mark.parametrize("names", [("g2b", "t2c"), ("b2e", "o2c")])

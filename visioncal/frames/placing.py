@@ -21,8 +21,8 @@ LEAST_NOISE_M = 1e-6
 TOUCH_NOISE_M = 1e-4
 # Noise beyond which touches may be of other kinds [m].
 _DISAGREE_M = 1e-3
-# Touches of which any two may have each other's kinds: those that are farthest off.
-_WORST = 12
+# Touches at most of which any two are tried with each other's kinds.
+_MOST_TRIED = 24
 _Kind = TypeVar("_Kind", bound=str)
 # Fewest degrees of freedom that estimate the noise: a single residual is within a tenth of its
 # sigma in one frame of twelve. Features that were touched twice leave six.
@@ -94,15 +94,13 @@ def refuse_exchanged_kinds(
         kinds: (n,) their kinds.
         fitted: The fit of all touches, of (n,) kinds.
     """
-    declared = fitted(kinds)
-    declared_m = declared.sigma
+    declared_m = fitted(kinds).sigma
     if declared_m < _DISAGREE_M:
         return
     tried = list[tuple[GroupFit, str, Sequence[str]]]()
-    # Groups are touches in their order, unless some of these make several.
-    away, rows = np.linalg.norm(declared.groups.residuals, axis=1), np.arange(len(kinds))
-    worst = np.argsort(-away)[:_WORST] if len(away) == len(kinds) else rows[:_WORST]
-    for a, b in combinations(sorted(worst.tolist()), 2):
+    # Of many touches each two take too long, and none stands for all.
+    some = range(len(kinds) if len(kinds) <= _MOST_TRIED else 0)
+    for a, b in combinations(some, 2):
         if kinds[a] != kinds[b]:
             exchanged = tuple(kinds[{a: b, b: a}.get(row, row)] for row in range(len(kinds)))
             words = f"touches {names[a]} ({kinds[a]}) and {names[b]} ({kinds[b]})"
