@@ -19,9 +19,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from visioncal.core.types import FloatArray, IntArray, evenly
-from visioncal.estimation.arm import (
-    posture_features,
-)
+from visioncal.estimation.arm import posture_features
 from visioncal.fit.fit import Fit
 from visioncal.fit.kernels import SIZES, WHITE, Process, Shared, StopErrors, Tried, processes
 from visioncal.fit.mixed import body_with, factors_of, inverse

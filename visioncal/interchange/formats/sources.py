@@ -460,8 +460,7 @@ def tables_apart(source: Source, requested: ImportOptions) -> tuple[Path, Path] 
             f"{source.path}: {camera.name} has nearly the same {len(fields)} rows as {robot.name}, "
             "as of two runs of one side: then nothing says what a camera saw.",
             culprits=[str(camera)],
-            next_step="Name one of them as the source, and what was seen with --images; or both, "
-            f"where robot and instrument have nearly one frame:\n{both}",
+            next_step=f"Name one, with --images; or both, where their frames are alike:\n{both}",
         )
     raise DataError(
         f"{source.path} has {len(fields)} poses in {robot.name} and as many in {camera.name}: "
