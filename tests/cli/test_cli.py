@@ -400,13 +400,13 @@ def test_what_is_no_session_yet_is_told_how_to_become_one(rendered, tmp_path):
     pictures, table = tmp_path / "pictures", tmp_path / "log.csv"
     shutil.copytree(rendered / "images", pictures)
     table.write_text("X,Y,Z,W,P,R\n1,2,3,4,5,6\n")
-    named = f"{tmp_path}/log-session --images PICTURES --target"
+    named = f"{tmp_path}/log-session --images PICTURES --mount"
     visioncal("calibrate", table).refused(
         "must be the folder of a session", f"convert {table} {named}"
     )
     visioncal("doctor", pictures).refused(f"convert TABLE {pictures}-session --images {pictures}")
     shutil.copy(table, pictures)
-    visioncal("doctor", pictures).refused(f"convert {pictures} {pictures}-session --target")
+    visioncal("doctor", pictures).refused(f"convert {pictures} {pictures}-session --mount")
     # Poses of both sides need no board.
     (tmp_path / "both").mkdir()
     (tmp_path / "both/pairs.csv").write_text("x,y\n1,2\n")
@@ -760,7 +760,7 @@ WRONG_PLACES = {
     "no folder, as one word": (("plan", "session", "--out="), "--out is empty", "variable"),
     "touches for a drawing": (
         ("fixture", "session/views.csv", "--cad", "session/views.csv", "--tool", "none"),
-        "views.csv has rotations",
+        "views.csv has no pairs of points",
         "Name the touches first",
     ),
     "no arm": (("simulate", "x", "--robot", "foo"), "generic-scara-600 are", "Name one"),
