@@ -179,7 +179,7 @@ def test_an_empty_picture_and_one_of_another_size_are_named_and_left_out():
 
 
 def test_depth_beside_corners_needs_no_image():
-    """Black and white are then not told apart."""
+    """Black and white are then one."""
     session, made_run = made()
     blank = [replace(view, text={**view.text, "image": ""}) for view in session.views]
     imageless = replace(session, views=tuple(blank))

@@ -486,7 +486,7 @@ def located(session):
 def test_edges_are_not_those_of_a_robot_that_waits_while_another_moves():
     robot, boards = poses_of("eye-in-hand")
     rng, waits = np.random.default_rng(0), np.arange(24) % 2 == 1
-    # Noise of a tenth of what tells places apart.
+    # Noise of a tenth of what separates places.
     robot[waits] = robot[1] @ exp(1e-4 * rng.normal(size=(12, 6)))
     boards[waits] = boards[1] @ exp(1e-3 * rng.normal(size=(12, 6)))
     boards[:, :3, 3] *= 0.95

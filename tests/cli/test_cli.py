@@ -760,7 +760,7 @@ WRONG_PLACES = {
     "no folder, as one word": (("plan", "session", "--out="), "--out is empty", "variable"),
     "touches for a drawing": (
         ("fixture", "session/views.csv", "--cad", "session/views.csv", "--tool", "none"),
-        "views.csv has no pairs of points",
+        "views.csv has rotations",
         "Name the touches first",
     ),
     "no arm": (("simulate", "x", "--robot", "foo"), "generic-scara-600 are", "Name one"),

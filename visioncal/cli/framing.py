@@ -290,8 +290,8 @@ def fixture_command(options: FixtureOptions) -> None:
 
     def by_touches(source: Path, calibration: Calibration | None) -> Frame:
         model, noise_m = _model(options), options.noise_m
-        if options.cad == source:
-            rows, seen = read_point_pairs(source)
+        if options.cad == source and (pairs := read_point_pairs(source)) is not None:
+            rows, seen = pairs
             return touched_fixture(rows, None, seen, calibration, model, touch_noise_m=noise_m)
         drawing = None if options.cad is None else read_nominal(options.cad, options.cad_unit)
         robot, asked = options.robot, import_options(options, calibration)

@@ -17,7 +17,14 @@ from typing import Protocol, TypeVar
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.core.linalg import NULL_SHARE, covariance_root, gram, inverse_roots, times_root
+from visioncal.core.linalg import (
+    NULL_SHARE,
+    ROUNDING,
+    covariance_root,
+    gram,
+    inverse_roots,
+    times_root,
+)
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray, Mask
 
@@ -303,8 +310,8 @@ def _step(found: _Likelihood, inside: IntArray, damping: float) -> tuple[FloatAr
     curvature = found.curvature[inside[:, None], inside]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 1e-8))
     values, vectors = np.linalg.eigh(curvature * np.outer(scale, scale))
-    # No direction is flatter than a share of the steepest, either: the matrix would be singular.
-    flat = _FLAT * max(float(values.max(initial=0.0)), 1.0)
+    # Beside a direction that is steeper by far, one that is flat would be rounding.
+    flat = max(_FLAT, ROUNDING * float(values.max(initial=0.0)))
     curvature = (vectors * (np.maximum(values, flat) + damping)) @ vectors.T
     slope = scale * slope
     promised = 0.5 * float(slope @ np.linalg.solve(curvature, slope))

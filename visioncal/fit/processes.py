@@ -160,8 +160,8 @@ def scored(
     groups = [
         (ends[own][:, None] - np.arange(count, 0, -1), own) for count, own in by_count.items()
     ]
-    each = [products(fit, added, effect.count) for effect, added in effects]
-    alone, boards = _alone(fit, flange, each), _boards(fit)
+    columns = [products(fit, added, effect.count) for effect, added in effects]
+    alone, boards = _alone(fit, flange, columns), _boards(fit)
     if alone is None:
         return []
     sizes, ways = np.geomspace(1e-6, 0.1, 31), {0.0: 1.0}
@@ -179,9 +179,9 @@ def scored(
         whole = seen.total[len(seen.boards) :, len(seen.boards) :]
         gains = np.empty((2, len(ways), len(effects), len(sizes)))
         for at, own in groups:
-            each = taken[:, :, at].transpose(0, 2, 3, 1)
-            information = whole[at[:, :, None], at[:, None, :]] - each @ np.swapaxes(each, 2, 3)
-            pull = whole[at, -1] - (each @ taken[:, None, :, -1:])[..., 0]
+            part = taken[:, :, at].transpose(0, 2, 3, 1)
+            information = whole[at[:, :, None], at[:, None, :]] - part @ np.swapaxes(part, 2, 3)
+            pull = whole[at, -1] - (part @ taken[:, None, :, -1:])[..., 0]
             gains[:, :, own] = Score(pull, information, np.inf).gains(sizes)
         return seen.prior + shares + [value for value, *_ in found], gains
 

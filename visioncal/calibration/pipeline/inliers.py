@@ -35,7 +35,7 @@ def initial_inliers(start: Start) -> InlierFit:
 
     Of one robot and one camera, they are those of the one likelihood, if it comes to rest.
     """
-    cell, problem = start.cell, start.problem
+    cell, problem, agreeing = start.cell, start.problem, start.agreeing
     movable, observations = _movable_frames(cell, problem), problem.observations
     # Cameras may disagree about one stop by more than their corners say, and not before the lenses
     # are fitted alone: a board shrunk to nothing would reconcile them, or a robot's noise of
@@ -47,15 +47,15 @@ def initial_inliers(start: Start) -> InlierFit:
     printed = [target for target, sensor in pairs if sensor < 0 and movable]
     if printed:
         # Otherwise all observations of a board of another size would be outliers.
-        off = scales_of(start.solved) if start.agreeing is not None else {}
+        off = scales_of(start.solved) if agreeing is not None else {}
         known = {target: off.get(target, 0.0) for target in printed}
         sigmas = {target: max(PRINTED_SCALE, abs(share)) for target, share in known.items()}
         sizes = target_sizes(problem, sigmas)
         problem = problem.with_effects([*problem.effects, sizes])
         state = State(state.edges, np.append(state.values, [*known.values()]))
     loose = replace(problem, priors=with_loose_positions(cell.priors))
-    if cell.mount is None or (agreeing := start.agreeing) is None:
-        inliers = inliers_and_moves(loose, state, movable, start.agreeing)
+    if cell.mount is None or agreeing is None:
+        inliers = inliers_and_moves(loose, state, movable, agreeing)
     else:
         inliers = presumed_inliers(loose, state, agreeing)
     if cell.priors:

@@ -100,12 +100,17 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
     return with_stop_means(without_repeats(seen))
 
 
+def first_numbers(session: Session) -> dict[str, int]:
+    """Numbers of boards' first corners where those of all are numbered through, by their names."""
+    firsts = first_corners(tuple(session.boards.values())).tolist()
+    return dict(zip(session.boards, firsts, strict=True))
+
+
 def _numbered(
     session: Session, views: Sequence[View], corners: Mapping[int, Corners]
 ) -> dict[int, Corners]:
     """Corners of some views, those of several boards numbered through."""
-    firsts = first_corners(tuple(session.boards.values())).tolist()
-    starts = dict(zip(session.boards, firsts, strict=True))
+    starts = first_numbers(session)
     return {
         view.number: replace(at, ids=at.ids + starts[session.board_of(view)])
         for view in views

@@ -1,8 +1,8 @@
 """Verdict whether a result can be trusted, in plain sentences."""
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -51,7 +51,7 @@ def judge(findings: Findings) -> Verdict:
     found = collect_findings(findings)
     # Mere effects of what a need judges are judged with it.
     judged = (doubt.kind for doubt in found if np.isfinite(doubt.until_mm))
-    effects = {*itertools.chain.from_iterable(SUSPECTS[kind].hides for kind in judged)}
+    effects = {*chain.from_iterable(SUSPECTS[kind].hides for kind in judged)}
     found = [replace(at, until_mm=0.0) if at.kind in effects else at for at in found]
     met = need_met(findings.need, findings.judged_picks)
     is_met = met is not None and met.probability >= NeedLimits.probability[0]

@@ -15,7 +15,7 @@ from visioncal.calibration.guess.recording import FEWEST_ROWS, thinned
 from visioncal.calibration.guess.search import PAIRS_SHARE, relative_angles
 from visioncal.calibration.pipeline.guess_inputs import alike_turning, guess_from_camera_poses
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.cameras import exchanged_columns
+from visioncal.calibration.stages.cameras import exchanged_columns, first_numbers
 from visioncal.calibration.stages.corner_numbers import EXCHANGE_COLUMNS, are_from_behind
 from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.calibration.stages.other_board import MEND_IMAGES
@@ -36,7 +36,6 @@ from visioncal.core.verdict import CALIBRATE, READ_AGAIN, Finding, Remedy, mendi
 from visioncal.estimation.chain import robot_part
 from visioncal.session import frame_name
 from visioncal.session.frames import object_name
-from visioncal.vision.targets import first_corners
 
 # A robot that moves by less stood still [m].
 _STILL_M = 1e-3
@@ -171,14 +170,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
 def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | None:
     """The finding that a camera or a target is on another robot's flange than is declared."""
     stops = {view.number: view.stop for view in run.session.views}
-
-    def fitted(poses: Mapping[int, FloatArray]) -> Fit | None:
-        _, both = _both_sides(poses, pair.poses, pair.mount)
-        if len(both) < FEWEST_ROWS:
-            return None
-        return robust_fits(robot_part(both[:, 0], pair.mount)[None], both[:, 1][None])[0]
-
-    declared = fitted(run.robots[robot].base_from_flange)
+    declared = _chain_fit(run.robots[robot].base_from_flange, pair.poses, pair.mount)
     for other in (name for name in run.robots if name != robot):
         there = run.robots[other].base_from_flange.items()
         by_stop = {stops[view]: pose for view, pose in there}
@@ -187,7 +179,7 @@ def _on_another(run: RunState, robot: str, pair: CameraTargetPair) -> Finding | 
         turns = np.array([pose[:3, :3] for pose in poses.values()]).reshape(-1, 3, 3)
         if len(turns) < FEWEST_ROWS or is_about_one_axis(turns):
             continue
-        found = fitted(poses)
+        found = _chain_fit(poses, pair.poses, pair.mount)
         if found is not None and declared is not None and found.closes:
             frame = pair.camera if pair.mount == "eye-in-hand" else pair.target
             return Finding(
@@ -388,19 +380,17 @@ def _of_pair(run: RunState, robot: str, pair: CameraTargetPair) -> RunState:
     """A cell's run as that of one robot, camera and target alone."""
     session = run.session.of(pair.camera, robot, pair.target)
     views = {view.number for view in session.views}
-    boards, cameras = run.session.boards, dict[str, CameraObservations]()
-    firsts = dict(zip(boards, first_corners(tuple(boards.values())).tolist(), strict=True))
-    first = firsts.get(object_name(pair.target, "target"), 0)
+    first = first_numbers(run.session).get(object_name(pair.target, "target"), 0)
+    cameras = dict[str, CameraObservations]()
     # Of poses that are given there are no corners.
-    for name, look in run.cameras.items():
-        if name == pair.camera:
-            # Corners of other targets are no corners of this one, which has numbers of its own.
-            corners = {
-                view: replace(seen, ids=seen.ids - first)
-                for view, seen in look.corners.items()
-                if view in views
-            }
-            cameras[name] = replace(look, corners=corners)
+    if (look := run.cameras.get(pair.camera)) is not None:
+        # Corners of other targets are no corners of this one, which has numbers of its own.
+        corners = {
+            view: replace(seen, ids=seen.ids - first)
+            for view, seen in look.corners.items()
+            if view in views
+        }
+        cameras[pair.camera] = replace(look, corners=corners)
     return replace(
         run,
         session=session,
@@ -414,12 +404,18 @@ def closes(
     base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
 ) -> bool:
     """Whether the chain of one robot closes as declared; true with too few views to show it."""
+    fit = _chain_fit(base_from_flange, seen, mount)
+    return fit is None or fit.closes
+
+
+def _chain_fit(
+    base_from_flange: Mapping[int, FloatArray], seen: Mapping[int, ViewPoses], mount: Mount
+) -> Fit | None:
+    """The robust fit of the chain of one robot; None of too few views."""
     _, both = _both_sides(base_from_flange, seen, mount)
-    robot, camera = np.moveaxis(both, 1, 0)
-    return (
-        len(robot) < FEWEST_ROWS
-        or robust_fits(robot_part(robot, mount)[None], camera[None])[0].closes
-    )
+    if len(both) < FEWEST_ROWS:
+        return None
+    return robust_fits(robot_part(both[:, 0], mount)[None], both[:, 1][None])[0]
 
 
 def _both_sides(

@@ -103,7 +103,7 @@ def _distinct(robot: FloatArray, camera: FloatArray) -> IntArray:
     """Rows of (m, 4, 4) poses of both sides, one of each place at which neither moved.
 
     A robot of a cell may wait at one place while others move: its rows there agree whatever the
-    edges are, and would be the half on which a robust fit stands. Places are told apart by a grid.
+    edges are, and would be the half on which a robust fit stands. A grid separates places.
     """
     far_m = _STILL_SEEN * max(float(np.median(np.linalg.norm(camera[:, :3, 3], axis=1))), 1e-9)
     sides = ((robot, _STILL_M, _STILL_RAD), (camera, far_m, _STILL_SEEN))

@@ -17,7 +17,7 @@ from visioncal.interchange.formats.foreign import ImportOptions, PoseImportOptio
 from visioncal.interchange.formats.pose_forms import check_radians, poses_from
 from visioncal.interchange.formats.poses import columns_named, pose_names, words_of
 from visioncal.interchange.formats.reading import read_fields
-from visioncal.interchange.formats.sources import describe
+from visioncal.interchange.formats.sources import describe, rows_in
 from visioncal.interchange.formats.unread import point_pairs
 from visioncal.session import Session
 from visioncal.session.columns import POSE, joint_columns
@@ -74,14 +74,17 @@ def read_touches(
     return TouchRows(path.name, labels, fields.places, poses, joints_rad, kinds, points, written)
 
 
-def read_point_pairs(path: Path) -> tuple[TouchRows, NominalPoints]:
-    """Reads a robot's points and a camera's of one source, in which no rotations stand.
+def read_point_pairs(path: Path) -> tuple[TouchRows, NominalPoints] | None:
+    """Reads a robot's points and a camera's of one source; None of others, as of poses.
 
     Raises:
-        DataError: It cannot be read, or has no pairs that a rigid motion maps.
+        DataError: It cannot be read, or no rigid motion maps the pairs.
     """
-    pairs = point_pairs(describe(path))
-    if pairs is None or not pairs.agree:
+    source = describe(path)
+    pairs = point_pairs(source)
+    if pairs is None or any("qw" in rows.numbers for rows in rows_in(source)):
+        return None
+    if not pairs.agree:
         raise DataError(
             f"{path.name} has no pairs of points of robot and camera that agree.",
             culprits=[str(path)],
