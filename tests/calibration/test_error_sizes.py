@@ -1,7 +1,7 @@
 """Sizes of errors of lenses and boards by the one likelihood, and lenses by the robot's motion."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,10 +11,16 @@ from support.cells import calibrated, known_of, reporting, session_of, showing
 import visioncal
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses
 from visioncal.calibration.stages.error_sizes import error_sizes, solve_session
-from visioncal.core.transforms import invert, log
+from visioncal.core.transforms import apply, invert, log
+from visioncal.estimation.moves import still_to_come
+from visioncal.fit import candidates
+from visioncal.model.effects import Named
+from visioncal.model.effects.effect import LensEffect
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
+from visioncal.vision.camera import project
 from visioncal.vision.lens_field import LensLevels, displacements
+from visioncal.vision.targets import corner_positions
 
 
 def square_of(path, edge):
@@ -82,6 +88,46 @@ def test_sizes_of_a_field_are_found_and_of_a_sound_cell_none():
     found = sizes_of(estimate_lenses(known_of(stated, joints=False)))
     (levels,) = found.levels.values()
     assert 0.2 < levels.field * px < 0.45
+
+
+@dataclass(frozen=True, eq=False)
+class Bows(LensEffect, Named):
+    """A distortion that changes evenly until the end: as an effect that is added later may."""
+
+    kind, bounds, count, most = "lens bows", (1e-1, 1e-6, 1.0), 1, 0.1
+    clause, do, says = "", "", str
+
+    @classmethod
+    def of_lens(cls, camera, lens, _):
+        """Of each lens."""
+        yield cls(camera, lens)
+
+    def columns(self, moments, _):
+        """Of the first coefficient of distortion."""
+        found = self.none(moments)
+        found[:, 4, 0] = still_to_come(moments.progress, 0.0)
+        return found
+
+
+def test_a_named_effect_on_a_lens_needs_no_second_entry(monkeypatch):
+    """It reaches the fit of frames, whose corners are as at the end, whatever it changes."""
+    cell, true = simulate(CellOptions(views=20, seed=4)), 0.05
+    lens, left = cell.stated[""], true * (1.0 - np.linspace(0.0, 1.0, len(cell.corners)))
+    points, looks = corner_positions(cell.options.target), []
+    for seen, pose, by in zip(cell.corners, cell.cam_from_target, left, strict=True):
+        other = replace(lens, distortion=lens.distortion + by * np.eye(len(lens.distortion))[0])
+        moved = [project(at, apply(pose, points[seen.ids])) for at in (lens, other)]
+        looks.append(replace(seen, px=seen.px + moved[1] - moved[0]))
+    monkeypatch.setattr(candidates, "NAMED", (Bows,))
+    sizes = sizes_of(estimate_lenses(known_of(showing(cell, looks), joints=False)))
+    (grown,) = sizes.grown
+    assert isinstance(grown.effect, Bows)
+    # Beyond four sigma once in some thousand.
+    assert abs(grown.values[0] - true) < 4.0 * np.sqrt(grown.covariance[0, 0])
+    shown = lens, cell.cam_from_target[0], apply(cell.cam_from_target[0], points[looks[0].ids])
+    ended = sizes.steadied(grown.effect.frame, 0, looks[0], shown)
+    off = [np.abs(at.px - cell.corners[0].px).max() for at in (looks[0], ended)]
+    assert off[1] < 0.1 * off[0]
 
 
 def test_what_a_held_lens_is_off_by_counts():

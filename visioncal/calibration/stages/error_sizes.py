@@ -22,12 +22,13 @@ from visioncal.model.effects import (
     Displacement,
     Effect,
     LensGrows,
-    LensSags,
     LensSteps,
+    Named,
     SightSteps,
 )
+from visioncal.model.effects.effect import LensEffect
 from visioncal.session import frame_name
-from visioncal.vision.camera import intrinsics, project
+from visioncal.vision.camera import intrinsics, project, project_with_jacobian
 from visioncal.vision.lens_field import LensLevels, lens_part
 from visioncal.vision.targets import corner_positions, first_corners
 
@@ -36,7 +37,7 @@ from visioncal.vision.targets import corner_positions, first_corners
 class FoundEffect:
     """An effect of a size that chance does not explain."""
 
-    effect: LensGrows | LensSags
+    effect: LensEffect
     columns: FloatArray  # See `Effect.columns`, at the session's stations.
     values: FloatArray  # (c,) estimates.
     covariance: FloatArray  # (c, c) of these.
@@ -103,8 +104,8 @@ class ErrorSizes:
                 px = px + project(lens_now, seen) - project(lens_now, seen + moved)
         for found in self.grown:
             if found.effect.frame == camera and 0 <= station < len(found.columns):
-                moves, lens = (found.columns[station] @ found.values)[:4], found.effect.lens.matrix
-                px = px - moves[2:] - (px - lens[2:]) * (moves[:2] / lens[:2])
+                by_lens = project_with_jacobian(found.effect.lens, seen).jacobian_intrinsics
+                px = px - by_lens @ (found.columns[station] @ found.values)
         return replace(corners, px=px)
 
     def steadied_by(self, kind: str, camera: str) -> FloatArray:
@@ -304,8 +305,9 @@ def _grown(fit: Fit) -> Iterator[FoundEffect]:
     """Lenses that grow or sag by what they may."""
     stations, moments = np.array(fit.cell.stations), fit.cell.moments
     for effect in fit.unknowns.effects:
-        size = _size(fit, effect.name)
-        if not isinstance(effect, LensGrows | LensSags) or not 0.0 < size <= effect.most:
+        if not isinstance(effect, LensEffect) or not isinstance(effect, Named):
+            continue
+        if not 0.0 < _size(fit, effect.name) <= effect.most:
             continue
         known = effect.columns(moments, np.ones(len(moments)))
         columns = np.zeros((stations.max() + 1, *known.shape[1:]))
