@@ -52,6 +52,13 @@ def cells(path):
     return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
 
 
+@cache
+def text_of_tests(*folders):
+    """The text of all tests of some packages."""
+    paths = (path for folder in folders for path in (ROOT / "tests" / folder).rglob("test_*.py"))
+    return "\n".join(map(page, sorted(paths)))
+
+
 def export_faults(formats):
     """Exports that a page, the listing or the tests leave out."""
     listing = visioncal("export", "--list").out
@@ -67,7 +74,7 @@ def export_faults(formats):
             page("tests/interchange/test_exports.py") + page("tests/support/readers.py"),
         )
         if not is_read:
-            yield f"{form.name}: no test reads it as its program would"
+            yield f"{form.name}: no reader of tests/support/readers.py reads it"
 
 
 def maker_faults(forms):
@@ -103,7 +110,9 @@ def kind_faults(kinds):
     """Kinds of boards that `target make` or the page of boards leave out."""
     for name, kind in kinds.items():
         if kind.options and not in_help(name, "target", "make"):
-            yield f"{name}: not among --kind of visioncal target make --help"
+            yield f"{name}: not among --kind of BoardOptions in cli/session_options.py"
+        if f'"{name}"' not in text_of_tests("vision"):
+            yield f"{name}: no board of this kind in tests/vision, as in test_printing.py"
         if f'"{name}"' not in page("visioncal/vision/README.md"):
             yield f"{name}: not among the kinds of visioncal/vision/README.md"
         file = "points" if name == "points" else name
@@ -133,7 +142,7 @@ def command_faults(names):
     pages = "\n".join(page(path.relative_to(ROOT)) for path in PACKAGE.glob("*/README.md"))
     for name in names:
         if not re.search(rf"visioncal {name}\b", pages + page("README.md")):
-            yield f"visioncal {name}: on no page of a package, and not in README.md"
+            yield f"visioncal {name}: no row in the table of visioncal/cli/README.md"
 
 
 @cache
@@ -164,7 +173,7 @@ def finding_faults(kinds):
 
 
 def effect_faults(kinds, effects):
-    """Effects without a clause or a page, and named ones whose kind is no suspect."""
+    """Effects without a clause or a page, and named ones that are no suspect or in no test."""
     for kind, effect in kinds.items():
         if not hasattr(effect, "clause"):
             yield f"{kind}: no clause says what it does"
@@ -174,6 +183,10 @@ def effect_faults(kinds, effects):
         kind = effect.kind.replace(" ", "_")
         if kind not in SUSPECTS:
             yield f"{kind}: no suspect has its kind"
+        if f'"{kind}"' not in text_of_tests("calibration") and effect.__name__ not in text_of_tests(
+            "fit"
+        ):
+            yield f"{kind}: in no world of tests/calibration/test_worlds.py"
         if not effect.__module__.startswith("visioncal.model.effects."):
             yield f"{kind}: no file in model/effects"
 
@@ -188,26 +201,25 @@ def import_faults(formats):
 
 
 def contributing_faults(text):
-    """Rows of CONTRIBUTING's table whose file, folder or registry is not there."""
-    rows = re.findall(r"^\| (an? .*?) \| (.*?) \| (.*?) \|$", text, re.MULTILINE)
-    assert len(rows) >= 9
-    for what, place, entry in rows:
-        for name in re.findall(r"`([^`]+)`", place):
-            if not (PACKAGE / name).exists():
-                yield f"{what}: {name} is not there"
-        names = re.findall(r"`([^`]+)`", entry)
-        files = [PACKAGE / name for name in names if "/" in name]
-        for file in files:
-            if not file.exists():
-                yield f"{what}: {file} is not there"
-        folder = PACKAGE / re.findall(r"`([^`]+)`", place)[0]
+    """Rows of CONTRIBUTING's table whose files, registry or neighbour are absent."""
+    rows = re.findall(
+        r"^\| (an? .*?) \| (.*?) \| (.*?) \| (.*?) ?\| `(.*?)` \|$", text, re.MULTILINE
+    )
+    assert len(rows) >= 15
+    for added, place, entry, neighbour, test in rows:
+        (home,), names = re.findall(r"`([^`]+)`", place), re.findall(r"`([^`]+)`", entry)
+        folder, files = PACKAGE / home, [PACKAGE / name for name in names if "/" in name]
         searched = files or [folder / "__init__.py" if folder.is_dir() else folder]
-        for name in names:
-            texts = [file.read_text(encoding="utf-8") for file in searched if file.exists()]
-            if "/" not in name and not any(
-                re.search(rf"^{name}\b", text, re.MULTILINE) for text in texts
-            ):
-                yield f"{what}: no {name} in {searched}"
+        of_folder = folder.is_dir()
+        needed = [folder, *files, ROOT / test]
+        copied = re.findall(r"`([^`]+)`", neighbour)
+        needed += [folder / name for name in copied if of_folder]
+        yield from (f"{added}: there is no {path}" for path in needed if not path.exists())
+        defined = [name for name in names if "/" not in name] + copied * (not of_folder)
+        texts = "\n".join(file.read_text(encoding="utf-8") for file in searched if file.exists())
+        for name in defined:
+            if not re.search(rf"^(?:def )?{name}\b", texts, re.MULTILINE):
+                yield f"{added}: no {name} in {searched}"
 
 
 def test_every_entry_is_where_a_user_looks():
@@ -231,10 +243,11 @@ def test_an_entry_that_is_left_out_is_found():
     # Form, pages, manual: a maker's export follows from its form.
     assert len([*maker_faults([replace(maker, name="no-such")])]) == 5
     assert len([*device_faults(["no-such"], ["no-such-cam"])]) == 4
-    assert len([*kind_faults({"no-such": KINDS["charuco"]})]) == 3
+    assert len([*kind_faults({"no-such": KINDS["charuco"]})]) == 4
     assert len([*command_faults(["no-such"])]) == 1
     assert len([*finding_faults({"no-such": "calibration/stages/no_such.py"})]) == 1
     assert len([*effect_faults({"no such": object}, [])]) == 2
     assert len([*import_faults([replace(FOREIGN_FORMATS[0], name="no-such")])]) == 1
-    text = page(".github/CONTRIBUTING.md").replace("`STAGES`", "`STEPS`")
-    assert len([*contributing_faults(text)]) == 1
+    text = page(".github/CONTRIBUTING.md")
+    for there in ("`STAGES`", "`marker.py`", "`_axes`", "`tests/cli/test_cli.py`"):
+        assert len([*contributing_faults(text.replace(there, f"`absent{there[1:]}"))]) == 1

@@ -194,7 +194,7 @@ def test_errors_as_json_have_one_form(poor, tmp_path, monkeypatch):
     with_json = [
         name for name, value in every_command() if "as_json" in {p.name for p in value.params}
     ]
-    assert len(with_json) == 19
+    assert "calibrate" in with_json
     for name in with_json:
         source = [] if name == "record" else ["nowhere"]
         done = visioncal(*name.split(), *source, *NEEDED.get(name, ()), "--json").refused()

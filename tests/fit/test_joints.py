@@ -11,8 +11,8 @@ from support.wrong_arms import CARRIED, GOOD, SAGGING, WRONG_LINKS, away_m
 
 from visioncal.core.transforms import exp, invert, log
 from visioncal.fit.candidates import effects_of_arms
+from visioncal.fit.inliers import Search
 from visioncal.fit.linearise import predicted
-from visioncal.fit.search import Search
 from visioncal.fit.solve import _explained, effects_of, solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
 from visioncal.model import Moments, read_cell

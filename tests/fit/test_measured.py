@@ -13,9 +13,9 @@ from support.small_cells import BOARD, PX, ROBOT_M, ROBOT_RAD, TABLE, made, pose
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Target
 from visioncal.estimation.tree import Branch, Tree
+from visioncal.fit.inliers import Search, nearest
 from visioncal.fit.linearise import linearised
 from visioncal.fit.pairs import pairs_of
-from visioncal.fit.search import Search, nearest
 from visioncal.fit.solve import solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
 from visioncal.fit.unknowns import State, printed_board

@@ -11,9 +11,9 @@ from support.whole_cells import OPTIONS, recorded
 
 from visioncal.core.transforms import invert, log
 from visioncal.fit.assemble import mixed_model
+from visioncal.fit.inliers import Search
 from visioncal.fit.kernels import processes
 from visioncal.fit.processes import _alone, _boards, _grid_of, consider, judged
-from visioncal.fit.search import Search
 from visioncal.fit.solve import _explained, solve, state_of, unknowns_of
 from visioncal.fit.start import start_of
 from visioncal.fit.unknowns import State

@@ -164,7 +164,7 @@ def test_columns_that_only_sound_like_ours_get_another_name(tmp_path):
         ({"robot": PoseImportOptions(("X", "Y", "Q"))}, "it has X, Y, Z, A, B, C"),
         ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "operator"))}, "is 'Ann'"),
         ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), form="kuko")}, "kuka"),
-        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), unit="feet")}, "m, cm, mm"),
+        ({"robot": PoseImportOptions(("X", "Y", "Z", "A", "B", "C"), unit="feet")}, "m, mm, cm"),
         ({"mount": None}, "--mount"),
         ({"target": "chekerboard_9x6_25mm"}, "checkerboard_9x6_23.6mm"),
         ({"intrinsics": "no such file.yaml"}, "does not exist"),

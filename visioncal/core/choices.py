@@ -43,8 +43,8 @@ DYNAMICS_FILE = "dynamics.json"
 # of a UR10e's gains has an rms of 12 % [-].
 GAIN_SIGMA = 0.12
 
-# Length units of foreign files [m].
-UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "inch": 0.0254}
+# Length units of foreign files [m]; of two that fit alike, the first is taken.
+UNITS_M: Mapping[str, float] = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254, "um": 1e-6}
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,9 @@
 
 It is a Gaussian process with a squared exponential kernel, by waves over somewhat more than the
 image whose variances are the kernel's spectrum (Solin and Sarkka 2020). Its length is chosen with
-its size, by the score of a fit without it. Of all waves, those combinations are kept that corners
-show (Karhunen and Loeve): as functions of the image alone, they are far fewer.
+its size, by the score of a fit without it (`score.best_field`). Of all waves, those combinations
+are kept that corners show (Karhunen and Loeve): as functions of the image alone, they are far
+fewer.
 """
 
 from collections.abc import Iterator, Sequence

@@ -10,9 +10,9 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.fit.candidates import candidates, of_stops, opened
 from visioncal.fit.fit import Fit, LeftOut
 from visioncal.fit.held import with_held_boards, with_held_lenses, with_small_sizes
+from visioncal.fit.inliers import Effort, Search, nearest
 from visioncal.fit.processes import ENOUGH_STOPS, Considered, consider, held_boards
 from visioncal.fit.refuse import refuse_open, refuse_unjoined
-from visioncal.fit.search import Effort, Search, nearest
 from visioncal.fit.start import Start, at_rest, start_of
 from visioncal.fit.unknowns import (
     Edge,

@@ -15,7 +15,7 @@ from visioncal.core.types import MOUNTS, FloatArray, IntArray, Mount
 # Mirroring another axis is equivalent, up to half turns of both frames.
 _MIRROR = np.array([1.0, -1.0, 1.0])
 # Units of poses; micrometres are for instruments.
-_UNITS = ("m", "mm", "cm", "inch")
+_UNITS = tuple(unit for unit in UNITS_M if unit != "um")
 # Radians that were read as degrees leave all rotations within 2 pi degrees of identity, per angle.
 _RADIANS_AS_DEGREES_RAD = np.deg2rad(12.0)
 _GON = 0.9  # Degrees of a gon, of which 400 are a turn.

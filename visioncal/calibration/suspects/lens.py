@@ -26,6 +26,7 @@ from visioncal.model.effects.board_sags import BoardSags
 from visioncal.model.effects.effect import SIGNIFICANT
 from visioncal.model.effects.window import Window, nearer
 from visioncal.results.compare import intrinsics_names
+from visioncal.vision.boards import kind_of
 from visioncal.vision.camera import intrinsics, normalise, with_intrinsics
 from visioncal.vision.intrinsics import estimate_intrinsics
 
@@ -37,8 +38,6 @@ _SHIFTED_PX = 3.0
 _MOST_CREEP = 0.03
 # Share of the focal length by which distortion that changed alone may seem to change it, too.
 _ALONE = 3e-3
-# Boards whose corners are those of single squares.
-_LONE = ("gridboard", "marker")
 # Another model of a lens leaves so much less: more than an even field does; and so much less that
 # it is the lens, however small both are: where corners end, the models part by far more.
 _BETTER, _FAR_BETTER = 1.1, 2.0
@@ -180,7 +179,7 @@ def _beyond(run: RunState) -> Iterator[Finding]:
             words = "corners of one part of the image are off alike, by "
             words = f"{of} departs from its model: {words}{figure(field_px)} px."
             advice = _OTHER_MODEL
-            if any(board.kind in _LONE for board in run.session.boards.values()):
+            if any(kind_of(board).has_lone_tags for board in run.session.boards.values()):
                 words += " Or else the corners of lone tags were found off: blur and light shift "
                 words += "them, unlike those where squares meet."
                 advice += " Or take a ChArUco board or an AprilGrid."

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from visioncal.core.choices import UNITS_M
 from visioncal.core.documents.toml import MAX_VALUES, too_many
 from visioncal.core.documents.values import DECIMAL, DECIMAL_COMMA, read_plain_text
 from visioncal.core.errors import DataError
@@ -28,7 +29,7 @@ _COMMENTS = ("#", "%", "//")
 # A row printed as a list, possibly with a name: `pose: [1.0, 2.0]`, `array([1, 2]),`.
 _LISTED = re.compile(r"[^\[\](){}]*+[\[({]++([^\[\](){}]*+)[\])}]++\s*+[,;]?\s*+")
 # The unit of a column in a row below the header.
-_UNIT = re.compile(r"(?:um|mm|cm|m|inch|deg|rad|°|º|s|ms)?", re.I)
+_UNIT = re.compile(rf"(?:{'|'.join(UNITS_M)}|deg|rad|°|º|s|ms)?", re.I)
 # A text that begins so is a formula to spreadsheets.
 _FORMULAS = ("=", "+", "-", "@", "\t", "\r")
 
