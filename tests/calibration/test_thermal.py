@@ -19,6 +19,8 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert, log
 from visioncal.present.report.page import render
 from visioncal.results import Calibration
+from visioncal.results.arm import NOMINAL, ArmResult, WorkspaceSigma
+from visioncal.results.compensation.correction import predicted_sigma_mm
 from visioncal.robot import load_robot
 from visioncal.robot.thermal import Heating, Inputs, OnlineCompensator, ThermalModel
 from visioncal.robot.workspace import postures
@@ -308,6 +310,18 @@ def test_correct_goes_by_the_temperatures_and_kelvin_is_no_celsius(learnt, tmp_p
     sent = json.loads(done.out)["targets"][0]
     # The warm arm is at the target with the joints that the target was made of.
     assert [sent[f"q{at}_rad"] for at in range(1, 7)] == pytest.approx(q[0], abs=1e-6)
+    # Read as degrees Fahrenheit, they are those of the session.
+    far = ",".join(f"{1.8 * value + 32.0:.9f}" for value in warm)
+    odd = run("correct", table, "--against", tmp_path, "--temperatures", far, "--json")
+    assert "Fahrenheit" in " ".join(json.loads(odd.out)["warnings"])
+    assert not json.loads(done.out)["warnings"]
+    arm = ArmResult(level=NOMINAL, levels=(), workspace_sigma_mm=WorkspaceSigma(0.03, 0.05))
+    sigmas = [
+        predicted_sigma_mm(replace(known, arm=arm), pose[None, :3, 3], q, links_c=links_c)[0]
+        for links_c in (known.drift.reference_c, warm, 1.8 * warm + 32.0)
+    ]
+    assert sigmas[0] == pytest.approx(0.03)
+    assert sigmas[0] < sigmas[1] < sigmas[2]
     kelvin = ",".join(["300"] * 6)
     run("correct", table, "--against", tmp_path, "--temperatures", kelvin).refused("not in kelvin")
     session.save(tmp_path / "warm")

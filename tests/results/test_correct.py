@@ -392,6 +392,43 @@ def test_a_payload_is_counted_where_joints_bend(stored, result):
     stands = bending.base_from_flange(q, payload_kg=3.0, payload_m=(0.0, 0.0, 0.1)).as_matrix()
     # The table's digits, and what three looks at a bent arm leave.
     assert stands == pytest.approx(poses, abs=1e-5)
-    run("correct", table, "-c", stored, "--payload-kg", "-1", "--seed-joints", SEED).refused(
-        "payload is -1 kg"
+    for wrong, words in (
+        (("--payload-kg", "-1"), "payload is -1 kg"),
+        (("--payload-kg", "5000"), "2500 kg at most, as on the flange of every arm"),
+        (("--payload-kg", "5", "--payload-m", "10,-20,100"), "payload_m must be 3 m at most"),
+    ):
+        run("correct", table, "-c", stored, *wrong, "--seed-joints", SEED).refused(words)
+
+
+def test_what_no_stop_has_shown_of_a_payload_counts_in_the_sigma_and_is_said(stored, result):
+    """Shoulder and elbow were seen to yield; the wrist bore nothing, and yields as wrists do."""
+    seen = {"determined": True, "torque_nm": (-300.0, 300.0)}
+    hidden = {"determined": False, "torque_nm": (-0.2, 0.2), "sigma_rad_per_nm": 5e-6}
+    springs = tuple(
+        JointSpring(joint=name, compliance_rad_per_nm=0.0, **hidden)
+        if at not in (1, 2)
+        else JointSpring(
+            joint=name,
+            compliance_rad_per_nm=4e-6,
+            sigma_rad_per_nm=1e-7,
+            stiffness_nm_per_rad=2.5e5,
+            **seen,
+        )
+        for at, name in enumerate(result.robot.joint_names)
     )
+    sagging = {"not_determined": (), "weight": "of the model's masses", "payload_kg": (0.0, 0.0)}
+    elastic = ElasticResult(joints=springs, sag_mm=Sag(0.1, 0.2), **sagging)
+    # As soft as the wrists of arms of that size.
+    assert elastic.sigmas[5] == pytest.approx(2e-5)
+    replace(result, elastic=elastic).save(stored / "calibration.json")
+    table = write_poses(stored / "t.csv", targets_near(2, result))
+    sigmas = []
+    for kg in ("0", "20", "60"):
+        load = ("--payload-kg", kg, "--payload-m", "0.05,0,0.15", "--seed-joints", SEED)
+        done = run("correct", table, "-c", stored, *load)
+        sigmas.append([float(row["sigma_mm"]) for row in rows_of(done.out)])
+        assert ("bore up to 0.2 N m at the stops" in done.err) == (kg != "0")
+    added = np.sqrt(np.square(sigmas[1:]) - np.square(sigmas[0]))
+    assert (added[0] > 0.01).all()
+    # Torques, and what they leave open, are in proportion to the load.
+    assert added[1] == pytest.approx(3.0 * added[0], rel=0.1)

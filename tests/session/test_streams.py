@@ -188,6 +188,7 @@ def test_loads_are_read_and_nothing_is_no_load():
     [
         ({"payload_kg": "-2"}, "column payload_kg: -2 kg must be a payload"),
         ({"payload_x_m": "0.1"}, "payload_kg, its mass, is missing"),
+        ({"payload_kg": "5", "payload_z_m": "100"}, r"within 3 m, .*\(100 mm\?\)"),
         ({"force_z_n": "5e7"}, "5e\\+07 N is beyond every force"),
         ({"approach": "up"}, "column approach: 'up' must be a side"),
     ],

@@ -27,6 +27,7 @@ from visioncal.results.compensation.correction import (
     Corrected,
     correct,
     predicted_sigma_mm,
+    unseen,
 )
 from visioncal.results.compensation.table import (
     Targets,
@@ -68,7 +69,7 @@ def _correct_table(options: CorrectOptions, moved: tuple[FloatArray, FloatArray]
     needs = EYE if options.tool is not None and options.tool.removeprefix(_TOOLS) == "cam" else ARM
     loaded = load_calibration(options.calibration, options.choice, needs)
     bad = check_usable(loaded.verdict, "the calibration", force=options.force)
-    calibration = _at_temperatures(loaded, options.temperatures)
+    calibration, links_c = _at_temperatures(loaded, options.temperatures)
     arm = CalibratedArm.of(calibration, or_nominal=moved is not None)
     if file is not None:
         check_free(file, force=options.force)
@@ -80,15 +81,11 @@ def _correct_table(options: CorrectOptions, moved: tuple[FloatArray, FloatArray]
     flange_from_tool = _tool(calibration, options.tool)
     before, after = moved or (np.eye(4), np.eye(4))
     base_from_flange = before @ targets.base_from_tool @ invert(flange_from_tool) @ after
-    corrected = correct(
-        arm,
-        base_from_flange,
-        _seeds(targets.q_seed, options.seed_joints),
-        widest_rad=np.deg2rad(options.widest_deg),
-        loads=Loads.alike(
-            len(base_from_flange), options.payload_kg, options.payload_m, (0.0, 0.0, 0.0)
-        ),
+    loads = Loads.alike(
+        len(base_from_flange), options.payload_kg, options.payload_m, (0.0, 0.0, 0.0)
     )
+    seeds, widest_rad = _seeds(targets.q_seed, options.seed_joints), np.deg2rad(options.widest_deg)
+    corrected = correct(arm, base_from_flange, seeds, widest_rad=widest_rad, loads=loads)
     unreachable = []
     for row in np.flatnonzero(~corrected.reached):
         left = mm_and_deg(1e3 * corrected.off_m[row], np.rad2deg(corrected.off_rad[row]))
@@ -107,10 +104,12 @@ def _correct_table(options: CorrectOptions, moved: tuple[FloatArray, FloatArray]
             if len(unreachable) < count
             else "Targets are base_from_flange in metres; of a tool, name it with --tool.",
         )
-    sigma_mm = predicted_sigma_mm(calibration, base_from_flange[:, :3, 3], corrected.q)
+    places = base_from_flange[:, :3, 3]
+    sigma_mm = predicted_sigma_mm(calibration, places, corrected.q, loads=loads, links_c=links_c)
     base_from_tool = corrected.base_from_flange @ flange_from_tool
     columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm, form)
     warnings = [*bad, *_warn_turns(arm, targets, corrected, options.widest_deg)]
+    warnings += unseen(calibration, corrected.q[rows], loads.chosen(rows), links_c)
     if options.payload_kg and not arm.compliance.any():
         warnings.append(
             f"--payload-kg {options.payload_kg:g} changes nothing: the calibration has no joints "
@@ -159,7 +158,7 @@ def _correct_program(options: CorrectOptions, dialect: Dialect) -> None:
         )
     folder, calibration = options.out, load_calibration(options.calibration, options.choice, ARM)
     bad = check_usable(calibration.verdict, "the calibration", force=options.force)
-    calibration = _at_temperatures(calibration, options.temperatures)
+    calibration, links_c = _at_temperatures(calibration, options.temperatures)
     arm = CalibratedArm.of(calibration)
     others = options.targets.parent.glob(f"{options.targets.stem}.*")
     files = [options.targets, *(at for at in others if at.suffix.lower() == dialect.companion)]
@@ -191,22 +190,25 @@ def _correct_program(options: CorrectOptions, dialect: Dialect) -> None:
     say(f"{len(done.changed)} targets corrected{most}; {len(done.left)} motions stay")
     for words in dict.fromkeys(done.left):
         say(words, "left as it is: ", "bold yellow")
-    for words in bad:
+    loads = Loads.alike(len(done.q), *load, (0.0, 0.0, 0.0))
+    for words in (*bad, *unseen(calibration, done.q, loads, links_c)):
         warn(words)
     for name in texts:
         say(f"wrote {folder / name}")
 
 
-def _at_temperatures(calibration: Calibration, words: str | None) -> Calibration:
-    """The calibration at the stated temperatures."""
+def _at_temperatures(
+    calibration: Calibration, words: str | None
+) -> tuple[Calibration, FloatArray | None]:
+    """The calibration at the stated temperatures, and these, (n,) [deg C]; None for none."""
     if words is None:
-        return calibration
+        return calibration, None
     form = ",".join(f"T{index + 1}" for index in range(calibration.drift.joint_count))
     temperatures = np.array(numbers_in(words, "--temperatures", form))
     wrong = next(filter(None, map(column_of("ambient_c").fault, temperatures.tolist())), "")
     if wrong:
         raise DataError(f"--temperatures: {wrong}.", culprits=["--temperatures"])
-    return calibration.at_temperatures(temperatures)
+    return calibration.at_temperatures(temperatures), temperatures
 
 
 def _tool(calibration: Calibration, name: str | None) -> FloatArray:

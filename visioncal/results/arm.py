@@ -17,6 +17,9 @@ from visioncal.robot.thermal import Heating, Kind, ThermalModel
 NOMINAL, FUNCTIONS = "nominal", "functions"
 # Number of standard deviations beyond which a change is significant.
 _SURE = 3.0
+# Times by which a joint of an arm yields more than its stiffest: wrists have gears of a third to a
+# tenth of the size of a shoulder's.
+_WRIST = 5.0
 
 StoredRobot = Annotated[
     Robot, WrittenForm(lambda item: dict(item.document), lambda item, _: Robot.from_document(item))
@@ -283,6 +286,18 @@ class ElasticResult(Section):
         """(n,) compliance of the joints [rad/(N m)]."""
         return np.array([joint.compliance_rad_per_nm for joint in self.joints])
 
+    @cached_property
+    def sigmas(self) -> FloatArray:
+        """(n,) standard deviations of these; joints not shown may be as soft as wrists are."""
+        shown = [at.compliance_rad_per_nm for at in self.joints if at.stiffness_nm_per_rad]
+        softest = _WRIST * min(shown, default=0.0)
+        return np.array(
+            [
+                joint.sigma_rad_per_nm if joint.determined else max(joint.sigma_rad_per_nm, softest)
+                for joint in self.joints
+            ]
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class JointDrift:
@@ -346,6 +361,12 @@ class ThermalResult(Section):
     likelihood_ratio: float  # Twice the gain in log-likelihood over an arm without drift.
     course: tuple[DriftPoint, ...]  # Predicted drift over time.
     views: tuple[ViewDrift, ...]  # Drift at each view.
+
+    @property
+    def seen_c(self) -> tuple[float, float]:
+        """Lowest and highest temperature of a link in the session [deg C]."""
+        references = [joint.reference_c for joint in self.joints]
+        return min(references), max(references) + max(point.rise_k for point in self.course)
 
     def model(self, robot: Robot) -> ThermalModel:
         """Thermal model of the arm; `robot` is the arm at its reference temperatures."""

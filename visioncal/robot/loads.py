@@ -15,6 +15,8 @@ from visioncal.core.documents.toml import DocumentTable
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray, Mask, chosen_rows
 
+# Most that any arm carries [kg], and how far from its flange at most the centre of that is [m].
+MOST_KG, MOST_CENTRE_M = 2500.0, 3.0
 # Keys of a link's mass in a joint's table.
 MASS_KEYS = ("mass_kg", "com_m")
 # Keys of the limits in a joint's table.
@@ -62,7 +64,8 @@ class Loads:
         """Loads of `count` stops, each value for all or one per stop.
 
         Raises:
-            DataError: A mass is negative, a number is not finite, or a shape does not fit.
+            DataError: A mass is negative, a load is beyond every arm, a number is not finite, or a
+                shape does not fit.
         """
         try:
             loads = cls(
@@ -83,6 +86,18 @@ class Loads:
                 "and all numbers finite.",
                 culprits=["payload_kg"],
             )
+        far_m = float(np.abs(loads.payload_m).max(initial=0.0))
+        for name, most, limit, unit, small in (
+            ("payload_kg", float(loads.payload_kg.max(initial=0.0)), MOST_KG, "kg", "g"),
+            ("payload_m", far_m, MOST_CENTRE_M, "m", "mm"),
+        ):
+            if most > limit:
+                raise DataError(
+                    f"loads: {name} must be {limit:g} {unit} at most, as on the flange of every "
+                    f"arm, and is {most:g} {unit} ({most:g} {small}?).",
+                    culprits=[name],
+                    next_step=f"Write {unit}.",
+                )
         return loads
 
     @property

@@ -11,6 +11,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import READ_AGAIN
+from visioncal.robot.loads import MOST_CENTRE_M, MOST_KG
 
 POSITION = ("x_m", "y_m", "z_m")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -72,7 +73,14 @@ def is_number(column: str) -> bool:
 def column_of(name: str) -> Column:
     """A column of views.csv or a stream with the plausible range of its numbers."""
     if name == "payload_kg":
-        return Column(name, 0.0, 2500.0, "{:g} kg must be a payload of 0 to 2500 kg".format)
+        words = f"{{:g}} kg must be a payload of 0 to {MOST_KG:g} kg"
+        return Column(name, 0.0, MOST_KG, words.format)
+    if name in LOAD[1:4]:
+        words = (
+            f"{{0:g}} m must be within {MOST_CENTRE_M:g} m, the place of a payload's centre in the "
+            "flange's frame; write metres ({0:g} mm?)"
+        )
+        return Column(name, -MOST_CENTRE_M, MOST_CENTRE_M, words.format)
     rate = _RATE.fullmatch(name)
     unit = rate[1] if rate else name.rpartition("_")[2] if is_number(name) else ""
     if unit == "c":

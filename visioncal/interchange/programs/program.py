@@ -128,6 +128,7 @@ class CorrectedProgram:
     changed: tuple[str, ...]  # Names of the targets that were replaced.
     left: tuple[str, ...]  # Lines that stay, and why.
     moved_mm: FloatArray  # (k,) how far each command moves.
+    q: FloatArray  # (k, n) joints there [rad or m].
 
 
 def correct_program(
@@ -166,7 +167,9 @@ def correct_program(
         else:
             uses.append(each[0])
     if not uses:
-        return CorrectedProgram(dict(texts), (), tuple(left), np.zeros(0))
+        return CorrectedProgram(
+            dict(texts), (), tuple(left), np.zeros(0), np.zeros((0, arm.real.joint_count))
+        )
     wanted, seeds = zip(*(_wanted(dialect, use, arm) for use in uses), strict=True)
     starts = np.array(seeds)
     if seed is not None and np.isnan(starts[0]).any():
@@ -181,7 +184,7 @@ def correct_program(
         loads=Loads.alike(len(uses), kg, centre, (0.0, 0.0, 0.0)),
     )
     edits: dict[str, list[tuple[int, int, str]]] = {}
-    changed, moved = list[str](), list[float]()
+    changed, moved, at_q = list[str](), list[float](), list[FloatArray]()
     for at, use in enumerate(uses):
         literal = use.literal
         if fault := _fault(literal, found_q, at, arm):
@@ -197,8 +200,10 @@ def correct_program(
             )
         changed.append(literal.name)
         moved.append(1e3 * float(found_q.moved_m[at]))
+        at_q.append(found_q.q[at])
     new = {name: _edited(text, edits.get(name, [])) for name, text in texts.items()}
-    return CorrectedProgram(new, tuple(changed), tuple(left), np.array(moved))
+    joints = np.array(at_q).reshape(-1, arm.real.joint_count)
+    return CorrectedProgram(new, tuple(changed), tuple(left), np.array(moved), joints)
 
 
 def _edited(text: str, edits: list[tuple[int, int, str]]) -> str:

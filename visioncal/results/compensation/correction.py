@@ -1,6 +1,6 @@
 """Nominal and calibrated model of an arm, and correction of its targets."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self, TypeAlias
 
@@ -11,10 +11,11 @@ from visioncal.core.arguments import typed
 from visioncal.core.choices import WIDEST_RAD as WIDEST_RAD
 from visioncal.core.errors import DataError
 from visioncal.core.limits import FAR_M, WIDE_RAD
+from visioncal.core.number_format import figure
 from visioncal.core.transforms import compose, invert, nearest_rotation, rigid_fault, rotation_angle
 from visioncal.core.types import FloatArray, Mask
 from visioncal.results import Calibration
-from visioncal.results.arm import WorkspacePlace
+from visioncal.results.arm import ArmResult, WorkspacePlace
 from visioncal.robot import Loads, Robot
 from visioncal.robot.elasticity import joint_deflections
 from visioncal.robot.inverse import Inverse, Posture
@@ -25,6 +26,9 @@ Poses: TypeAlias = FloatArray | RigidTransform
 
 # Smallest number of joints that reach any position.
 _LEAST_JOINTS = 3
+# Beyond half as much again as was seen, loads and rises of temperature are extrapolated: postures
+# of targets differ from those of stops by less. Ten times as much is no load of the same arm.
+_BEYOND, _ABSURD = 1.5, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +98,12 @@ class CalibratedArm:
 
 
 def predicted_sigma_mm(
-    calibration: Calibration, p_base: FloatArray, q: FloatArray | None = None
+    calibration: Calibration,
+    p_base: FloatArray,
+    q: FloatArray | None = None,
+    *,
+    loads: Loads | None = None,
+    links_c: FloatArray | None = None,
 ) -> FloatArray:
     """Predicted sigma of the calibrated arm at positions of the flange.
 
@@ -102,13 +111,79 @@ def predicted_sigma_mm(
         calibration: Of a calibrated arm.
         p_base: (m, 3) positions of the flange [m].
         q: (m, n) joints [rad or m]; None where unknown.
+        loads: Loads there: by their torques, uncertain compliances add to the sigma.
+        links_c: (n,) temperatures of the links [deg C], by whose rise uncertain drift adds.
 
     Returns:
         (m,) root of the trace of a position's covariance [mm], interpolated from the map of
         measured postures where `q` is within their joint ranges, else from the workspace's map;
         without maps the workspace's median, or NaN.
     """
-    arm = calibration.arm
+    squares = _of_map_mm(calibration.arm, p_base, q) ** 2
+    real = calibration.calibrated_robot
+    if q is not None and real is not None and loads is not None and calibration.elastic is not None:
+        tool_m = next(
+            (
+                edge.matrix[:3, 3]
+                for name, edge in calibration.edges.items()
+                if name.startswith("flange_from_")
+            ),
+            np.zeros(3),
+        )
+        turning, shifting = np.split(np.swapaxes(real.axis_jacobian(q), 1, 2), 2, axis=2)
+        moves = shifting + np.cross(turning, tool_m)
+        added = real.load_torques(q, loads) - real.load_torques(q)
+        turns = 1e3 * added * calibration.elastic.sigmas
+        squares += np.sum((moves * turns[:, :, None]) ** 2, axis=(1, 2))
+    if q is not None and links_c is not None:
+        squares += (1e3 * calibration.drift.sigma_m(q, links_c)) ** 2
+    return np.asarray(np.sqrt(squares))
+
+
+def unseen(
+    calibration: Calibration,
+    q: FloatArray,
+    loads: Loads | None = None,
+    links_c: FloatArray | None = None,
+) -> Iterator[str]:
+    """Loads and temperatures at (m, n) joints that are far from all of the calibration, in words.
+
+    See `predicted_sigma_mm`.
+    """
+    elastic, real = calibration.elastic, calibration.calibrated_robot
+    if elastic is not None and real is not None and loads is not None and loads.any:
+        borne = np.abs(real.load_torques(q, loads)).max(axis=0)
+        seen = np.array([max(map(abs, joint.torque_nm)) for joint in elastic.joints])
+        over = (borne - _BEYOND * seen) * (elastic.compliance + elastic.sigmas)
+        at = int(np.argmax(over))
+        if over[at] > 0.0 and len(over):
+            unit = "kilograms, and the centre in metres? " * bool(
+                borne.max() > _ABSURD * elastic.most_nm
+            )
+            yield (
+                f"The payload is beyond what the calibration has seen: {elastic.joints[at].joint} "
+                f"bears up to {figure(borne[at])} N m at the targets, and bore up to "
+                f"{figure(seen[at])} N m at the stops. {unit[:1].upper()}{unit[1:]}How it yields "
+                "there is extrapolated: calibrate under the load of the work."
+            )
+    if links_c is not None and calibration.thermal is not None:
+        least, most = calibration.thermal.seen_c
+        margin = (_BEYOND - 1.0) * (most - least)
+        far = max(links_c.tolist(), key=lambda at: abs(at - 0.5 * (least + most)))
+        if not least - margin <= far <= most + margin:
+            celsius = (far - 32.0) / 1.8
+            unit = f"Fahrenheit ({figure(celsius)} deg C)? " * bool(
+                least - margin <= celsius <= most + margin
+            )
+            yield (
+                f"{figure(far)} deg C is beyond what the calibration has seen: links at "
+                f"{figure(least)} to {figure(most)} deg C. {unit}Their drift there is "
+                "extrapolated: calibrate up to the temperatures of the work."
+            )
+
+
+def _of_map_mm(arm: ArmResult | None, p_base: FloatArray, q: FloatArray | None) -> FloatArray:
+    """(m,) sigmas [mm] without loads, at the temperatures of the calibration."""
     if arm is None or not arm.workspace_map:
         sigma = None if arm is None else arm.workspace_sigma_mm
         return np.full(len(p_base), np.nan if sigma is None else sigma.median)
