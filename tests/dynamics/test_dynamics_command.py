@@ -6,12 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.commands import visioncal
+from support.refusals import raised
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.dynamics import ArmDynamics, Identified
 from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.differences import (
+    difference_of,
+    scale_difference,
+    stream_differences,
+)
 from visioncal.dynamics.identified import Lag, judge
-from visioncal.dynamics.identify import Options
+from visioncal.dynamics.identify import Options, identify
 from visioncal.dynamics.model import FrictionTerms
 from visioncal.dynamics.payload import estimate_payload
 from visioncal.dynamics.run import IdentificationRequest, conditioned_streams, identify_session
@@ -109,6 +115,7 @@ def test_a_session_without_torques_or_robot_is_named(folder, tmp_path):
 
 # The rotors of the simulated arm are not among what the maker tells.
 TERMS = FrictionTerms(motor_inertia=True, slow_rad_s=3e-4)
+QUICK = Options(TERMS, stribeck=False, consistent=False, checked=False)
 LOAD = LinkBody(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
 
 
@@ -180,6 +187,12 @@ def test_what_a_result_is_doubted_for_is_named(run):
             "check",
             "this motion was too slow, too small or too short",
         ),
+        (
+            {"validation": replace(checked, rms_nm=checked.torque_nm * [0.0, 0, 0, 0, 0, 0.6])},
+            "bad",
+            "predicted to 0, 0, 0, 0, 0, 60 %",
+        ),
+        ({"differences": ("Dry friction was 2 times.",)}, "check", "Dry friction was 2 times."),
     ):
         verdict = judge(replace(known, **changes))
         assert verdict.status == status
@@ -235,6 +248,43 @@ def test_no_payload_is_none(world, run):
         estimate_payload(run.identified, loaded_streams(run.identified, same))
 
 
+SCALES = {"mN m": 1000.0, "the other sign": -1.0, "torques seem 1.4": 1.4}
+
+
+@pytest.mark.parametrize("words", SCALES)
+def test_torques_that_no_payload_makes_are_refused(run, world, words):
+    streams = [item.scaled(SCALES[words]) for item in loaded_streams(run.identified, world.full)]
+    raised(DataError, words, estimate_payload, run.identified, streams)
+
+
+def test_how_a_stream_differs_is_named(world, run):
+    """Gears of another temperature, and a body that nobody stated."""
+    (loaded,) = loaded_streams(run.identified, world.full)
+    assert difference_of(run.identified, loaded) == "2.8 kg more were on the flange"
+    gears = world.built.gears
+    colder = replace(gears, coulomb=1.5 * gears.coulomb, viscous=1.5 * gears.viscous)
+    rng = np.random.default_rng(8)
+    cold = record(replace(world.built, gears=colder), world.done["exercise"], rng)
+    (sweeps,) = loaded_streams(run.identified, exercise_session("ur10e", {"cold": cold}))
+    assert difference_of(run.identified, sweeps).startswith("dry friction was 1.")
+    (alike,) = loaded_streams(
+        run.identified, exercise_session("ur10e", {"check": world.empty.streams["check"]})
+    )
+    assert not difference_of(run.identified, alike)
+    first = run.identification.streams[0]
+    found = list(stream_differences(run.identified.robot, [first, alike, sweeps], QUICK))
+    assert len(found) == 1
+    assert "streams/cold.csv was recorded otherwise than streams/exercise.csv" in found[0]
+
+
+def test_the_joint_of_another_gain_is_named(run):
+    first = run.identification.streams[0]
+    assert not scale_difference(identify(run.identified.robot, [first], QUICK))
+    wrong = first.scaled(np.array([1.0, 1.0, 1.3, 1.0, 1.0, 1.0]))
+    words = scale_difference(identify(run.identified.robot, [wrong], QUICK))
+    assert words.startswith("The torques of joint 3 are 1.3")
+
+
 @pytest.fixture(scope="module")
 def written(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("dynamics")
@@ -279,6 +329,10 @@ def test_the_command_weighs(written, world, tmp_path):
     told = json.loads(visioncal(*arguments, "--json").out)
     assert told["mass_kg"] == pytest.approx(2.8, abs=0.05)
     assert "on a UR: set_target_payload(2." in visioncal(*arguments).out
+    arguments = ("dynamics", "validate", tmp_path / "loaded", "--against", written)
+    predicted = visioncal(*arguments)
+    assert predicted.status == 3
+    assert "loaded.csv was recorded otherwise: 2.8 kg more were on the flange" in predicted.out
     assert Identified.load(written).base.rank == 58
 
 
@@ -293,6 +347,11 @@ def test_the_command_finds_gains(tmp_path):
     rows = json.loads(visioncal(*arguments, "--json").out)
     assert [row["nm_per_a"] for row in rows] == pytest.approx(gains, rel=0.02)
     assert visioncal(*arguments).out.startswith("--gains ")
+    again = ("dynamics", "gains", tmp_path / "loaded", "--loaded", tmp_path / "empty", *known)
+    visioncal(*again).refused("Name the run without the body first")
+    visioncal(*arguments, "--com-mm", "0.08,-0.03,0.08").refused("It is in mm, not in m.")
+    visioncal(*arguments, "--com-mm", "80,-30,-80").refused("the body is another one")
+    visioncal(*arguments, "--mass-kg", "8000").refused("mN m, or mA for A")
     visioncal(*arguments, "--inertia", "0.1,0,0.01,0,0,0.01").refused("are those of no body")
 
 

@@ -28,6 +28,7 @@ from visioncal.robot.torques import joint_torques, torque_regressor
 from visioncal.robot.writing import small_urdf, urdf_with_inertias, with_inertias
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import (
+    LinkBody,
     Senses,
     drive_torques,
     multi_sine,
@@ -592,8 +593,8 @@ TORQUE, ANGLE, SPEED = "tau{}_nm", "q{}_rad", "dq{}_rad_s"
 ALL = range(1, 7)
 
 
-def check(stream, name="ur5e", *, with_inertias=True):
-    robot = robot_with_bodies(nominal_dynamics(name))
+def check(stream, name="ur5e", *, with_inertias=True, gravity=(0.0, 0.0, -9.81)):
+    robot = replace(robot_with_bodies(nominal_dynamics(name)), gravity=np.array(gravity))
     robot = robot if with_inertias else replace(robot, inertias=None)
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms()))
     check_recording(base, [condition(read_recorded(stream, "streams/robot.csv", 6))])
@@ -637,6 +638,28 @@ def test_mistakes_are_named(stream, change, words):
     # Without inertias only a scale of all torques is open.
     if "degrees" in words:
         raised(DataError, words, check, wrong, with_inertias=False)
+
+
+@pytest.mark.parametrize("gravity", [(9.81, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 6.94, -6.94)])
+def test_a_base_that_is_mounted_otherwise_is_named(stream, gravity):
+    words = r"has gravity along \[(0|-?0.\d+), (0|-?0.\d+), -9.8\d?\]"
+    raised(DataError, words, check, stream, gravity=gravity)
+    # Without inertias, links of negative masses would fall upwards.
+    if gravity[2] <= 0.0:
+        raised(
+            DataError,
+            "is not mounted as stated",
+            check,
+            stream,
+            gravity=gravity,
+            with_inertias=False,
+        )
+
+
+def test_a_heavy_tool_is_no_mistake():
+    rng = np.random.default_rng(3)
+    tool = LinkBody(8.0, np.array([0.08, -0.03, 0.08]), np.zeros((3, 3)))
+    check(record(real_dynamics("ur10e", rng).carrying(tool), multi_sine(6, rng), rng), "ur10e")
 
 
 @pytest.mark.parametrize(

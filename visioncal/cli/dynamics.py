@@ -8,7 +8,15 @@ from dataclasses import replace
 import numpy as np
 import typer
 
-from visioncal.cli.console import answer, exit_status, print_json, print_table, report_written, say
+from visioncal.cli.console import (
+    EXIT_BAD,
+    answer,
+    exit_status,
+    print_json,
+    print_table,
+    report_written,
+    say,
+)
 from visioncal.cli.dynamics_options import (
     FRICTION,
     PLANNED_FRICTION,
@@ -26,15 +34,17 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.summary import print_verdict
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
+from visioncal.core.limits import DynamicsLimits
 from visioncal.core.number_format import figure, matched, significant, some_of
 from visioncal.core.threads import signals_as_interrupts
 from visioncal.dynamics.base import BaseModel
+from visioncal.dynamics.differences import check_as_identified, difference_of
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.identified import CLASSES, UNKNOWN, Identified, judge, to_document
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, predict, validate
 from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
-from visioncal.dynamics.payload import drive_gains, estimate_payload
+from visioncal.dynamics.payload import check_gains, drive_gains, estimate_payload
 from visioncal.dynamics.plan_files import MotionPlan, motion_document
 from visioncal.dynamics.run import (
     IdentificationRequest,
@@ -79,6 +89,7 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
                 f"--payload is of {kg:g} kg, but must have a mass of 0 kg or more.",
                 culprits=["--payload"],
             )
+        _check_centre("--payload", centre_mm)
         # A point mass, in the flange's frame.
         centre_m, no_extent = 1e-3 * np.array([centre_mm]), np.zeros((1, 3, 3))
         payload = np.asarray(Inertias.of_bodies(np.array([kg]), centre_m, no_extent).values[0])
@@ -130,6 +141,16 @@ def dynamics_plan_command(options: DynamicsPlanOptions) -> None:
         for words in warnings:
             answer(words, "warning: ", "bold yellow")
     report_written(written, quiet=options.as_json)
+
+
+def _check_centre(name: str, centre_mm: Sequence[float]) -> None:
+    """Refuses a centre of mass within 1 mm of the flange, which no body on it has."""
+    if 0.0 < max(abs(value) for value in centre_mm) < 1.0:
+        raise DataError(
+            f"{name} is {list(centre_mm)}: a centre of mass within 1 mm of the flange's origin.",
+            culprits=[name],
+            next_step="It is in mm, not in m.",
+        )
 
 
 def _friction_terms(words: str, known: Sequence[str]) -> FrictionTerms:
@@ -211,6 +232,9 @@ def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
     identified = Identified.load(options.against)
     streams = conditioned_streams(Session.load(options.session), identified, _requested(options))
     predictions = [predict(identified, stream) for stream in streams]
+    validations = [validate(identified, prediction) for prediction in predictions]
+    worst = max(float(validation.shares.max()) for validation in validations)
+    status = EXIT_BAD if worst > DynamicsLimits().range_share[1] else 0
     if options.as_json:
         documents = []
         for prediction in predictions:
@@ -224,10 +248,9 @@ def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
                 document["consistent_rms_nm"] = rms_nm.tolist()
             documents.append(document)
         print_json(documents)
-        return
-    for prediction in predictions:
+        raise typer.Exit(status)
+    for prediction, validation in zip(predictions, validations, strict=True):
         answer("\n".join([prediction.label, *prediction.notes]))
-        validation = validate(identified, prediction)
         # Of the worst stream.
         fitted = np.max([stream.rms_nm for stream in identified.streams], axis=0)
         print_table(
@@ -243,6 +266,13 @@ def dynamics_validate_command(options: DynamicsValidateOptions) -> None:
                 )
             ],
         )
+
+    if worst > DynamicsLimits().range_share[0]:
+        check_as_identified(identified, streams)
+        for stream in streams:
+            if words := difference_of(identified, stream):
+                answer(f"{stream.label} was recorded otherwise: {words}.", "warning: ", "yellow")
+    raise typer.Exit(status)
 
 
 def _report(identified: Identified, validation_notes: Sequence[str]) -> None:
@@ -315,6 +345,7 @@ def dynamics_payload_command(options: DynamicsPayloadOptions) -> None:
 
 def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
     """Estimates the torque constants of an arm's drives from a known body on its flange."""
+    _check_centre("--com-mm", options.com_mm)
     centre, about = 1e-3 * np.array(options.com_mm), symmetric_matrices(np.array(options.inertia))
     body = Inertias.of_bodies(np.array([options.mass_kg]), centre[None], about[None])
     if not (options.mass_kg > 0.0 and body.consistent):
@@ -334,6 +365,8 @@ def dynamics_gains_command(options: DynamicsGainsOptions) -> None:
     )
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
     gains = drive_gains(base, empty, full, np.asarray(body.values[0]))
+    if not options.unchecked:
+        check_gains(gains, base, empty)
     if options.as_json:
         rows: list[dict[str, str | float]] = [{"joint": name} for name in robot.joint_names]
         # Only the joint where its gain is not determined.

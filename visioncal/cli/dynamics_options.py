@@ -173,4 +173,5 @@ class DynamicsGainsOptions:
     )
     cutoff_hz: float | None = cutoff_option()
     named: str | None = robot_name()
+    unchecked: bool = flag("Take gains that contradict the currents or the robot's inertias.")
     as_json: bool = json_flag()

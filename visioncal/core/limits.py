@@ -117,7 +117,11 @@ class DynamicsLimits:
     bodies_worse: float = 1.3
     # Share of a torque's range below which an error is no reason for doubt.
     slight_share: float = 0.02
-    range_share: Pair = (0.2, 0.6)  # Prediction error over the torque's range.
+    # Prediction error over the torque's range: a reason for doubt, and more error than prediction.
+    range_share: Pair = (0.2, 0.5)
+    # The same, from which on differences between streams are searched for.
+    differs_share: float = 0.1
+    own_torques: float = 0.2  # Change of an arm's own torques under load, as wrong units make it.
     # Change of torques by their lag over the range, below which it is only a note.
     lag_share: float = 0.1
 

@@ -39,6 +39,8 @@ _NEXT = (
 # Standard deviation of the prior in each log-Cholesky coordinate: 30 % of a link's extent, twice
 # that of its mass.
 PRIOR_SIGMA = 0.3
+# Bound of the coordinates, in prior sigmas: extents of 90 times the known ones, short of overflow.
+_FARTHEST = 15.0
 # Prefixes of the joint parameters that cannot be negative.
 _POSITIVE = ("Fc", "Fv", "Ia")
 
@@ -289,7 +291,9 @@ def fit_consistent(
         prior = np.eye(count, len(unknowns))
         return np.concatenate([whitened(base.dependence @ jacobian(unknowns)), prior])
 
-    lower = np.full(count + len(names), -np.inf)
+    upper = np.full(count + len(names), np.inf)
+    upper[:count] = _FARTHEST
+    lower = -upper
     # Where they would be negative they are noise, or the model does not fit.
     lower[count:][[name.startswith(_POSITIVE) for name in names]] = 0.0
     start = np.zeros(len(lower))
@@ -298,9 +302,17 @@ def fit_consistent(
     # An export of what was identified waits for no optimiser.
     from scipy.optimize import least_squares
 
-    fit = least_squares(
-        residuals, np.maximum(start, lower), slopes, (lower, np.inf), x_scale="jac", ftol=1e-9
-    )
+    # Good fits take 200 to 500 evaluations; where no bodies fit, more of them change nothing.
+    with np.errstate(over="ignore"):
+        fit = least_squares(
+            residuals,
+            np.maximum(start, lower),
+            slopes,
+            (lower, upper),
+            x_scale="jac",
+            ftol=1e-9,
+            max_nfev=1000,
+        )
     free = fit.active_mask == 0
     estimate = np.where(free, fit.x, 0.0)
     rows = slopes(estimate)[:, free]

@@ -279,6 +279,14 @@ class Conditioned:
         parts = [piece.filtered(columns) for piece in self.pieces]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
+    def scaled(self, factors: FloatArray) -> Self:
+        """The same with each joint's torques times one of (n,) factors."""
+        pieces = []
+        for piece in self.pieces:
+            torques_nm = factors * piece.measured.torques_nm
+            pieces.append(replace(piece, measured=replace(piece.measured, torques_nm=torques_nm)))
+        return replace(self, pieces=tuple(pieces))
+
     def lag_corrected(self, lag_s: float) -> Self:
         """The same with the torques shifted earlier by a lag [s]."""
         return replace(self, pieces=tuple(piece.advanced(lag_s) for piece in self.pieces))

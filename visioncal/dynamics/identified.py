@@ -103,6 +103,7 @@ class Identified:
     validation: TorqueValidation | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)  # Provenance: session, digest, date.
     lag: Lag | None = None  # Delay of the torques, which was corrected; None where not significant.
+    differences: tuple[str, ...] = ()  # How streams differ that are predicted badly from another.
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -179,12 +180,26 @@ def _plan(identified: Identified, words: str) -> Remedy:
 
 def judge(identified: Identified) -> Verdict:
     """Judges identified dynamics by their predictions, and by what the motion determined."""
-    judged = [*_of_lag(identified), *_of_prediction(identified), *_of_range(identified)]
+    judged = [
+        *_of_differences(identified),
+        *_of_lag(identified),
+        *_of_prediction(identified),
+        *_of_range(identified),
+    ]
     statuses = {status for status, _ in judged}
     worst: VerdictStatus = (
         "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
     )
     return Verdict(worst, tuple(finding for _, finding in judged))
+
+
+def _of_differences(identified: Identified) -> Iterator[_Judged]:
+    step = Remedy(
+        "Fit streams that were recorded alike: warmed up, with the same on the flange, and with "
+        "the gains of all drives (--gains; visioncal dynamics gains finds them)."
+    )
+    for words in identified.differences:
+        yield _check("differs", words, step)
 
 
 def _of_lag(identified: Identified) -> Iterator[_Judged]:
@@ -217,7 +232,10 @@ def _of_prediction(identified: Identified) -> Iterator[_Judged]:
     percents = ", ".join(figure(100.0 * float(share)) for share in shares)
     status: VerdictStatus = "good"
     if shares[worst] > _LIMITS.range_share[0]:
-        status = "bad" if shares.min() > _LIMITS.range_share[1] else "check"
+        # A joint whose torque hardly changes in these samples has its range in the fitted ones.
+        ranges_nm = np.max([stream.torque_nm for stream in identified.streams], axis=0)
+        true = validation.rms_nm / np.maximum(np.maximum(ranges_nm, validation.torque_nm), 1e-12)
+        status = "bad" if true.max() > _LIMITS.range_share[1] else "check"
     yield (
         status,
         Finding(
@@ -243,6 +261,10 @@ def _of_prediction(identified: Identified) -> Iterator[_Judged]:
 
 def _of_range(identified: Identified) -> Iterator[_Judged]:
     """Checks the predicted uncertainty of the torques of fast motions of all joints."""
+    # The uncertainty is that of the motion only where the model explains what was fitted.
+    fits = [stream.rms_nm / np.maximum(stream.torque_nm, 1e-12) for stream in identified.streams]
+    if identified.differences or np.max(fits) > _LIMITS.range_share[0]:
+        return
     base = identified.base
     motion = random_motion(base.model, np.random.default_rng(0))
     x = base.regressor(motion)
@@ -300,6 +322,8 @@ def to_document(identified: Identified) -> dict[str, Any]:
             "covariance": identified.consistent.covariance.tolist(),
             "misfit": identified.consistent.misfit,
         }
+    if identified.differences:
+        document["differences"] = list(identified.differences)
     if identified.lag is not None:
         document["lag"] = write(Lag, identified.lag)
     if identified.validation is not None:
@@ -342,7 +366,7 @@ def stribeck_rows(identified: Identified) -> list[dict[str, Any]]:
 
 _OWN_KEYS = frozenset(
     {"schema", "visioncal", "robot", "friction", "base", "covariance", "stribeck", "streams"}
-    | {"standard", "lag", "validation", "verdict"}
+    | {"standard", "lag", "validation", "verdict", "differences"}
 )
 
 
@@ -403,6 +427,7 @@ class _Figures:
     streams: tuple[StreamStatistics, ...]
     validation: TorqueValidation | None = None
     lag: Lag | None = None
+    differences: tuple[str, ...] = ()
 
 
 def _column(rows: Sequence[Mapping[str, Any]], name: str) -> FloatArray:

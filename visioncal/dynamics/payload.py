@@ -6,28 +6,32 @@ Estimation of inertial parameters of manipulator loads and links).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
 
 from visioncal.core.choices import GAIN_SIGMA
-from visioncal.core.errors import DegenerateError
+from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.limits import DynamicsLimits
 from visioncal.core.number_format import figure
 from visioncal.core.threads import on_one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
+from visioncal.dynamics.convention_hypotheses import check_recording
+from visioncal.dynamics.differences import check_as_identified, excess_block
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import FrictionTerms, JointMotion
-from visioncal.dynamics.regression import NoiseBlock, regress, rms_of
+from visioncal.dynamics.regression import Regression, regress, rms_of, std_of
 from visioncal.robot.inertia import Inertias, symmetric_entries
 from visioncal.robot.torques import body_regressor
 
 # Correlation of the gain errors of an arm's drives: of the 12 % of GAIN_SIGMA about 11 % are common
 # to all joints [-].
 _GAIN_CORRELATION = 0.8
+_LIMITS = DynamicsLimits()
 _HOW = "Drive the exciting trajectory of visioncal dynamics plan with the payload on the flange."
 
 
@@ -119,6 +123,7 @@ def estimate_payload(
             times gains.
 
     Raises:
+        DataError: The recording shows no payload, but a mistake.
         DegenerateError: The motion does not determine a mass, or there is none.
     """
     terms = FrictionTerms(
@@ -128,7 +133,7 @@ def estimate_payload(
         slow_rad_s=identified.base.model.terms.slow_rad_s,
     )
     try:
-        fit = regress([_block(identified, terms, conditioned) for conditioned in loaded])
+        fit = regress([excess_block(identified, item, terms, body=True) for item in loaded])
     except np.linalg.LinAlgError as error:
         raise DegenerateError(
             "payload: the motion does not determine all of its inertia.", next_step=_HOW
@@ -167,6 +172,7 @@ def estimate_payload(
         rms_of(np.concatenate(fit.residuals), np.concatenate([block.used for block in fit.blocks])),
         float(np.sqrt(gains_covariance[0, 0])),
     )
+    _check_plausible(identified, loaded, fit, payload)
     # A mass so uncertain does not differ from none.
     if not payload.mass_sigma_kg < 0.5 * payload.mass_kg:
         raise DegenerateError(
@@ -177,16 +183,43 @@ def estimate_payload(
     return payload
 
 
-def _block(identified: Identified, terms: FrictionTerms, stream: Conditioned) -> NoiseBlock:
-    """Torques in excess of the arm's own, and their regressor."""
-    robot = identified.robot
+def _check_plausible(
+    identified: Identified, loaded: Sequence[Conditioned], fit: Regression, payload: Payload
+) -> None:
+    """Refuses a payload that only a mistaken recording shows, by its cause.
 
-    def columns(motion: JointMotion) -> FloatArray:
-        body = body_regressor(robot, motion.q, motion.dq, motion.ddq)
-        return np.concatenate([body, terms.columns(motion)], axis=2)
-
-    excess = stream.torques_nm - stream.filtered(identified.torques)
-    return NoiseBlock(stream.filtered(columns), excess, stream.used, stream.correlation)
+    Units, signs and mounts change the arm's own torques, too, which a payload and friction leave
+    as they are.
+    """
+    base, n = identified.base, identified.robot.joint_count
+    of_links = np.where(base.independent < 10 * n, identified.values, 0.0)
+    blocks = []
+    for stream, block in zip(loaded, fit.blocks, strict=True):
+        own = stream.filtered(lambda motion: base.regressor(motion) @ of_links)
+        blocks.append(replace(block, x=np.concatenate([block.x, own[:, :, None]], axis=2)))
+    scaled = regress(blocks)
+    change, sigma = float(scaled.values[-1]), float(np.sqrt(scaled.covariance[-1, -1]))
+    torques = np.concatenate([stream.torques_nm for stream in loaded])
+    used = np.concatenate([block.used for block in fit.blocks])
+    left = float(np.max(payload.rms_nm / np.maximum(std_of(torques, used), 1e-12)))
+    inertias = identified.inertias
+    if (
+        abs(change) < max(_LIMITS.own_torques, 5.0 * sigma)
+        and left < _LIMITS.range_share[1]
+        and payload.mass_kg > -5.0 * payload.mass_sigma_kg
+        # No arm carries more than it weighs.
+        and (inertias is None or payload.mass_kg < inertias.masses.kg.sum())
+    ):
+        return
+    check_as_identified(identified, loaded)
+    raise DataError(
+        f"payload: {figure(payload.mass_kg)} kg are none: with them the arm's own torques seem "
+        f"{figure(1.0 + change)} times those it was identified with, and up to "
+        f"{figure(100.0 * left)} % of a joint's range stays unexplained.",
+        culprits=[stream.label for stream in loaded],
+        next_step="Record it as without payload: the same arm, mounted alike, with torques in N m "
+        "of the joints, or currents of the same --gains.",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +229,7 @@ class Gains:
     nm_per_a: FloatArray  # (n,) joint torque per current [N m/A].
     # (n,) standard deviations [N m/A]; inf where the payload does not act on the joint.
     sigma: FloatArray
+    misfit: FloatArray  # (n,) root mean square of unexplained currents, over the currents' range.
 
     @property
     def determined(self) -> FloatArray:
@@ -240,7 +274,7 @@ def drive_gains(
             for joint, rows in enumerate(used.T)
         ]
     )
-    gains = Gains(estimates[:, 0], estimates[:, 1])
+    gains = Gains(*estimates.T)
     if not gains.determined.any():
         raise DegenerateError(
             "drive gains: the payload's torques stand out at no joint.",
@@ -249,8 +283,42 @@ def drive_gains(
     return gains
 
 
-def _gain(own: FloatArray, load: FloatArray, currents: FloatArray) -> tuple[float, float]:
-    """A joint's gain and its sigma, from its regressor (m, b), payload torques and currents."""
+def check_gains(gains: Gains, base: BaseModel, empty: Sequence[Conditioned]) -> None:
+    """Refuses gains that no drives have, by the likeliest cause.
+
+    Raises:
+        DataError: They are negative, explain the currents badly, or make torques of another unit.
+    """
+    sure = gains.determined
+    sizes = np.where(sure, np.abs(gains.nm_per_a), np.median(np.abs(gains.nm_per_a[sure])))
+    check_recording(base, [stream.scaled(sizes) for stream in empty])
+    found = ", ".join(f"{value:.3g}" for value in gains.nm_per_a)
+    backward = gains.nm_per_a[sure] < 0.0
+    if backward.any():
+        cause = "turn the signs of the currents of these joints"
+        if backward.all():
+            cause = "name the run without the body first, and that with it by --loaded"
+        else:
+            cause = f"give the body's centre in the flange's frame, or {cause}"
+        raise DataError(
+            f"drive gains: {found} N m/A, but no drive brakes what it drives.",
+            culprits=["--loaded" if backward.all() else "--com-mm"],
+            next_step=f"{cause[0].upper()}{cause[1:]}.",
+        )
+    if gains.misfit[sure].max() > _LIMITS.range_share[0] or np.ptp(np.log10(sizes)) > 2.0:
+        worst = int(np.argmax(np.where(sure, gains.misfit, 0.0)))
+        raise DataError(
+            f"drive gains: {found} N m/A leave {figure(100.0 * float(gains.misfit[worst]))} % of "
+            f"the range of joint {worst + 1}'s currents unexplained: the body is another one.",
+            culprits=["--com-mm", "--mass-kg", "--inertia"],
+            next_step="Give its centre in the flange's frame in mm, and its inertia about that "
+            "centre; and record both runs warmed up.",
+        )
+
+
+def _gain(own: FloatArray, load: FloatArray, currents: FloatArray) -> tuple[float, float, float]:
+    """A joint's gain, its sigma and misfit, by regressor (m, b), payload torques and currents."""
+    size = max(float(np.std(currents)), 1e-12)
     effective = own.any(axis=0)
     lengths = np.linalg.norm(own[:, effective], axis=0)
     directions, upper, _ = qr(own[:, effective] / lengths, mode="economic", pivoting=True)
@@ -260,11 +328,12 @@ def _gain(own: FloatArray, load: FloatArray, currents: FloatArray) -> tuple[floa
     currents = currents - directions @ (directions.T @ currents)
     square = float(load @ load)
     if square <= 0.0:
-        return 0.0, np.inf
+        return 0.0, np.inf, 0.0
     inverse_gain = float(load @ currents) / square
     residual = currents - inverse_gain * load
     freedom = max(len(residual) - directions.shape[1] - 1, 1)
     sigma = float(np.sqrt(residual @ residual / freedom / square))
+    misfit = float(np.sqrt(np.mean(residual**2))) / size
     if inverse_gain == 0.0:
-        return 0.0, np.inf
-    return 1.0 / inverse_gain, sigma / inverse_gain**2
+        return 0.0, np.inf, misfit
+    return 1.0 / inverse_gain, sigma / inverse_gain**2, misfit

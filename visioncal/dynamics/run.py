@@ -7,9 +7,11 @@ from datetime import UTC, datetime
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.limits import DynamicsLimits
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.threads import on_one_blas_thread
 from visioncal.dynamics.conditioning import Conditioned, condition
+from visioncal.dynamics.differences import scale_difference, stream_differences
 from visioncal.dynamics.identified import Identified, Lag
 from visioncal.dynamics.identify import (
     Identification,
@@ -117,12 +119,14 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
         rotors = bool(np.min(errors[1] / np.maximum(errors[0], 1e-12)) < 0.75)
     options = replace(options, terms=replace(options.terms, motor_inertia=bool(rotors)))
     identification = identify(robot, streams, options)
-    predicted, validation = None, None
+    predicted, validation, compared = None, None, list(streams)
+    compared.insert(0, compared.pop(_fastest(streams)))
     if request.validate_on:
         validation_samples = _read(session, robot, request.validate_on, request)
         fresh = _conditioned(robot, validation_samples, request)
         predicted = predict(identification.identified, fresh)
         validation = validate(identification.identified, predicted)
+        compared.append(fresh)
     elif split is not None:
         without_end = identify(robot, split.fitted, replace(options, checked=False))
         predicted = predict(without_end.identified, split.held_out)
@@ -130,8 +134,14 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
         # In a part of a motion a joint's torque may be constant.
         ranges_nm = identification.identified.streams[split.fastest].torque_nm
         validation = replace(validate(identification.identified, predicted), torque_nm=ranges_nm)
+    differences: tuple[str, ...] = ()
+    if validation is not None and validation.shares.max() > DynamicsLimits().differs_share:
+        differences = tuple(stream_differences(robot, compared, options))
+        if not differences and (words := scale_difference(identification)):
+            differences = (words,)
     identified = replace(
         identification.identified,
+        differences=differences,
         validation=validation,
         lag=lag,
         facts={
@@ -271,12 +281,7 @@ def _split(
     request: IdentificationRequest,
 ) -> _Split | None:
     """Holds out the end of the fastest motion; None where the rest determines too little."""
-    # Sweeps move one joint after the other: no part of them is representative.
-    speeds = [
-        np.concatenate([piece.measured.motion.dq for piece in stream.pieces]) for stream in streams
-    ]
-    # By the root mean square speed of the slowest joint.
-    fastest = int(np.argmax([np.sqrt(np.mean(dq**2, axis=0)).min() for dq in speeds]))
+    fastest = _fastest(streams)
     filtered = replace(request, cutoff_hz=streams[fastest].cutoff_hz)
     begin = recorded[fastest].part(0.0, 1.0 - HELD_OUT)
     end = recorded[fastest].part(1.0 - HELD_OUT, 1.0)
@@ -288,6 +293,15 @@ def _split(
     except (DataError, DegenerateError):
         return None
     return split
+
+
+def _fastest(streams: Sequence[Conditioned]) -> int:
+    """Index of the stream with the greatest root mean square speed of its slowest joint."""
+    # Sweeps move one joint after the other: no part of them is representative.
+    speeds = [
+        np.concatenate([piece.measured.motion.dq for piece in stream.pieces]) for stream in streams
+    ]
+    return int(np.argmax([np.sqrt(np.mean(dq**2, axis=0)).min() for dq in speeds]))
 
 
 def _quick(options: Options, rotors: bool) -> Options:
