@@ -411,7 +411,9 @@ def test_a_payload_that_is_not_as_stated_is_told(carrying):
     assert abs(factor.value - 1.0) < 3.0 * factor.sigma
     light = tuple(replace(load, kg=load.kg / 2.0) for load in cell.robot.loads)
     lied = calibrated(reporting(cell, loads=light))
-    assert arm_found(lied).sections.elastic.payload_factor.value > 1.3
+    factor = arm_found(lied).sections.elastic.payload_factor
+    # Compliances by the wrong load are no part of it: it was once 1.6.
+    assert abs(factor.value - 2.0) < 3.0 * factor.sigma < 1.2
     assert any("Load and bend do not fit" in reason for reason in lied.verdict.reasons)
     assert lied.verdict.status != "good"
 

@@ -87,6 +87,28 @@ def test_loads_alone_show_the_stiffness_of_an_arm_whose_weight_is_compensated():
     assert other.verdict.status == "bad"
 
 
+@pytest.mark.slow
+def test_half_of_a_load_is_named_and_hidden_joints_have_no_bounds(unloaded):
+    heavy = tuple(Payload(force_n=(0.0, 0.0, -newtons)) for newtons in (200.0, 500.0, 800.0))
+    session = loaded(*heavy)
+    sound = calibrate_loaded(session, unloaded)
+    assert sound.verdict.status != "bad"
+    springs = dict(zip(sound.elastic.joints, 1.0 / STIFF, strict=True))
+    for spring, true in springs.items():
+        words = sound.verdict.findings[0].words.partition(f"{spring.joint} (over ")[2]
+        assert not words or 1e3 * float(words.split()[0]) < 1.0 / true
+    half = [
+        replace(view, numbers=dict(view.numbers) | {"force_z_n": 0.5 * view.numbers["force_z_n"]})
+        for view in session.views
+    ]
+    result = calibrate_loaded(replace(session, views=tuple(half)), unloaded)
+    finding = next(at for at in result.verdict.findings if at.kind == "loads_misfit")
+    factor = float(finding.words.partition("Loads about ")[2].split()[0])
+    # The unloaded arm's own weight shows its compliances to a tenth.
+    assert factor == pytest.approx(2.0, rel=0.1)
+    assert "Weigh the loads" in finding.do.words
+
+
 def test_what_is_no_load_is_said(unloaded):
     moved = tracked(replace(SHOP, payloads=FORCES, seed=4), np.repeat(FLAT, 3, axis=0))
     rows = []
@@ -143,4 +165,6 @@ def test_the_command_writes_beside_and_never_over_the_unloaded_arm(tmp_path, unl
     command(*asked, tmp_path / "out").refused("is the calibration of the unloaded arm itself")
     told = command(*asked, tmp_path / "stiff").good()
     assert "joint_2" in told.out
+    # Steps are taken with the stiffness just found.
+    assert f"correct targets.csv --against {tmp_path / 'stiff'}" in told.out
     assert "10 to 50 N" in (tmp_path / "stiff" / "report.html").read_text()

@@ -1,5 +1,6 @@
 """`visioncal calibrate`."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import typer
@@ -13,7 +14,7 @@ from visioncal.cli.result_options import CalibrateOptions
 from visioncal.cli.summary import print_summary
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import ranges
-from visioncal.core.verdict import need_options
+from visioncal.core.verdict import Finding, need_options
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import frames_to_keep, load_calibration
 from visioncal.results.history import entries_of
@@ -79,7 +80,16 @@ def _calibrate_loaded(options: CalibrateOptions, loaded: Session, against: Path)
             culprits=["-o", "--against"],
             next_step="Name another folder with -o: the unloaded one stays for further loads.",
         )
-    result = Run(calibrate_loaded(loaded, load_calibration(against)), ())
+    folder = (against if against.is_dir() else against.parent).absolute()
+    stiff, findings = calibrate_loaded(loaded, load_calibration(against)), list[Finding]()
+    for finding in stiff.verdict.findings:
+        # Steps with the unloaded result are taken with this one.
+        parts = finding.do.command.split(" ") if finding.do is not None else []
+        command = " ".join("OUT" if Path(at).absolute() == folder else at for at in parts)
+        do = finding.do and replace(finding.do, command=command)
+        findings.append(replace(finding, do=do))
+    verdict = replace(stiff.verdict, findings=tuple(findings))
+    result = Run(replace(stiff, verdict=verdict), ())
     result = result.with_paths(options.session, options.out)
     written = write_outputs(options.out, None, result)
     enter(options, options.session, entries_of(result.calibration), options.out)

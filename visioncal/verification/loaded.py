@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from visioncal.calibration.stages.elastic import load_ranges, weight_words
+from visioncal.calibration.stages.elastic import BENDS, load_ranges, weight_words
 from visioncal.calibration.stages.readings import read_instrument, stops_of_views
 from visioncal.core.errors import DataError
-from visioncal.core.limits import CONTRADICTION
+from visioncal.core.limits import CONTRADICTION, DETERMINED
 from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import FALSE_ALARM, chi2_limit
 from visioncal.core.transforms import adjoint, invert, log
@@ -31,6 +31,7 @@ _MISFIT = Remedy(
     "Read some unloaded stops again: instrument, probe or base may have moved since.",
     "visioncal verify SESSION --against OUT",
 )
+_WEIGH = Remedy("Weigh the loads, and correct payload_kg and its centre in views.csv.")
 # Prior of a compliance of which nothing is known: a gear of 10 kN m/rad [rad/(N m)].
 _SOFTEST = 1e-4
 
@@ -160,6 +161,12 @@ def calibrate_loaded(session: Session, unloaded: Calibration) -> Calibration:
     if model is not None and COMPLIANCE in model.weights:
         first = len(covariance) - len(model.values) + model.columns_of(COMPLIANCE).start
         springs, unit = slice(first, first + count), model.weights[COMPLIANCE] / model.torque_nm
+        if unloaded.elastic is not None:
+            # Its own weight did not bend them: what the others yield is no bound of theirs.
+            stored = np.array([at.sigma_rad_per_nm for at in unloaded.elastic.joints])
+            wider = np.zeros(len(covariance))
+            wider[springs] = (unloaded.elastic.sigmas**2 - stored**2) / unit**2
+            covariance = covariance + np.diag(wider)
     else:
         jacobian = np.concatenate([jacobian, bends], axis=2)
         covariance = block_diag(covariance, np.eye(count) * _SOFTEST**2)
@@ -172,10 +179,18 @@ def calibrate_loaded(session: Session, unloaded: Calibration) -> Calibration:
     values = np.maximum(found, 0.0)
     after = unit**2 * (covariance - gain @ rows @ covariance)[springs, springs]
     misfit = float(residuals @ np.linalg.solve(innovation, residuals))
+    before = unit * np.sqrt(np.diag(covariance)[springs])
     off_mm = 1e3 * np.linalg.norm(bends[:, 3:] @ found, axis=1)
     tip = bends[int(off_mm.argmax()), 3:]
     elastic = ElasticResult(
-        joints=tuple(_springs(arm.joint_names, values, np.sqrt(np.diag(after)), torques)),
+        joints=tuple(
+            _springs(
+                arm.joint_names,
+                values,
+                np.sqrt(np.diag(after)),
+                torques + arm.load_torques(seen.q),
+            )
+        ),
         not_determined=(),
         weight=weight_words(arm),
         sag_mm=Sag(float(np.median(off_mm)), float(off_mm.max())),
@@ -185,20 +200,24 @@ def calibrate_loaded(session: Session, unloaded: Calibration) -> Calibration:
     open_joints = tuple(row.joint for row in elastic.joints if not row.determined)
     elastic = replace(elastic, not_determined=open_joints)
     sigma_mm = 1e3 * float(np.sqrt(np.trace(tip @ after @ tip.T)))
-    findings = [Finding(NOTE, _words(elastic, sigma_mm, len(seen.views), unloaded))]
+    begin = f"By {counted(len(seen.views), 'reading')} against {unloaded.session_name!r}"
+    words = _words(elastic, sigma_mm, before, np.abs(torques).max(axis=0))
+    findings = [Finding(NOTE, f"{begin}, {words}")]
     status = unloaded.verdict.status
     if misfit > chi2_limit(FALSE_ALARM, len(residuals)):
         status = "bad"
-        findings.append(
-            Finding(
-                "loads_misfit",
-                f"No stiffness explains the readings: chi-square {figure(misfit)} for "
-                f"{len(residuals)} numbers. Something else than the load differs from the unloaded "
-                "arm.",
-                _MISFIT,
-                is_fatal=True,
-            )
-        )
+        # Loads in proportion to those stated, of any size.
+        by_load = (bends @ unloaded.compliance)[:, seen.axes].ravel()
+        weighed = np.linalg.solve(innovation, np.column_stack([by_load, residuals]))
+        (square, cross), (_, all_of) = np.column_stack([by_load, residuals]).T @ weighed
+        over = cross / square if square > 0.0 else 0.0
+        is_load = all_of - over * cross < chi2_limit(FALSE_ALARM, len(residuals) - 1)
+        words, do = "Load, instrument, probe or base differ from what was stated.", _MISFIT
+        if is_load:
+            words, do = f"Loads about {1.0 + over:.2g} times as large as stated do.", _WEIGH
+        begin = f"No stiffness explains the readings: chi-square {figure(misfit)} for "
+        words = f"{begin}{len(residuals)} numbers. {words}"
+        findings.append(Finding("loads_misfit", words, do, is_fatal=True))
     robot = unloaded.arm if unloaded.arm is None else replace(unloaded.arm, robot=arm)
     return replace(
         unloaded,
@@ -206,7 +225,12 @@ def calibrate_loaded(session: Session, unloaded: Calibration) -> Calibration:
         arm=robot,
         elastic=elastic,
         verdict=replace(
-            unloaded.verdict, status=status, findings=(*findings, *unloaded.verdict.findings)
+            unloaded.verdict,
+            status=status,
+            findings=(
+                *findings,
+                *(at for at in unloaded.verdict.findings if not at.words.startswith(BENDS)),
+            ),
         ),
     )
 
@@ -230,20 +254,30 @@ def _springs(
         )
 
 
-def _words(elastic: ElasticResult, sigma_mm: float, readings: int, unloaded: Calibration) -> str:
-    """Findings about the loads, joint by joint."""
+def _words(
+    elastic: ElasticResult, sigma_mm: float, before: FloatArray, loads_nm: FloatArray
+) -> str:
+    """Findings about the loads, joint by joint.
+
+    Args:
+        elastic: The joints' springs.
+        sigma_mm: Standard deviation of the tip's largest motion [mm].
+        before: (n,) prior standard deviations of the compliances [rad/(N m)].
+        loads_nm: (n,) largest torques by the loads alone [N m].
+    """
     shown, bounds = [], []
-    for row in elastic.joints:
+    for row, prior, load_nm in zip(elastic.joints, before, loads_nm, strict=True):
         if row.stiffness_nm_per_rad is not None and row.stiffness_sigma_nm_per_rad is not None:
             sigma = figure(1e-3 * row.stiffness_sigma_nm_per_rad)
             shown.append(f"{row.joint} {1e-3 * row.stiffness_nm_per_rad:.4g} +- {sigma} kN m/rad")
-        elif max(map(abs, row.torque_nm)) < 0.01 * elastic.most_nm:
+        elif load_nm < 0.01 * loads_nm.max():
             bounds.append(f"{row.joint} (no moment reaches it)")
+        elif row.sigma_rad_per_nm > DETERMINED * prior:
+            bounds.append(f"{row.joint} (its moment is too small)")
         else:
             least = 1.0 / (row.compliance_rad_per_nm + 2.0 * row.sigma_rad_per_nm)
             bounds.append(f"{row.joint} (over {figure(1e-3 * least)} kN m/rad)")
-    begin = f"{elastic.loads_words} move the tip by {figure(elastic.sag_mm.most)} +- "
-    words = f"By {counted(readings, 'reading')} against {unloaded.session_name!r}, {begin}"
+    words = f"{elastic.loads_words} move the tip by {figure(elastic.sag_mm.most)} +- "
     words += f"{figure(sigma_mm)} mm at most: the stiffness is {', '.join(shown) or 'open'}."
     if bounds:
         words += f" Not determined one by one: {', '.join(bounds)}."

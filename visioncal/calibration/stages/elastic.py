@@ -83,6 +83,9 @@ def load_ranges(loads: Loads) -> dict[str, Any]:
     return {"payload_kg": kg, **stated}
 
 
+# Prior of a joint's bend by a load beyond that as stated: a gear of 10 kN m/rad [rad/(N m)]; and
+# rounds of a fit in factor and compliances, which are near.
+_SOFT, _ROUNDS = 1e-4, 20
 # Play of which half turns the flange by thrice an industrial arm's repeatability [rad].
 _PLAY_RAD = 1e-3
 # Loads from which on gears are tried for two slopes [N], torques among which their knees are, as
@@ -167,24 +170,41 @@ def slopes_of(arm: ArmData) -> dict[int, TwoSlopes]:
 def _payload_factor(arm: ArmData) -> Factor | None:
     """Ratio of the actual to the predicted bending under the stated payload and force.
 
-    One more unknown beside all others, tested at the solution (Rao's score test). The compliances
-    are determined by the arm's own weight, and by the loads' differences between postures. None
-    where there were no loads or they bend nothing.
+    It is bilinear in factor and compliances, which a wrong load falsifies: beside all unknowns,
+    each joint has its bend by the load alone, linear as its compliance is; both are then fitted by
+    compliances and one factor, with their joint covariance (Gauss-Newton). None where there were
+    no loads, they bend nothing, or the arm's own weight does not tell load from compliance.
     """
     model, loads, reported = arm.model, arm.loads, arm.fit.problem.poses[arm.robot]
     if not loads.any or not model.compliance.any():
         return None
-    bent, robot = model.bent(arm.q, loads), model.robot
+    bent, robot, count = model.bent(arm.q, loads), model.robot, len(model.compliance)
     load_torques = robot.load_torques(bent, loads) - robot.load_torques(bent)
-    flange_jacobian = np.zeros((len(reported), 6, 1))
-    twists = np.einsum("mij,mj->mi", robot.axis_jacobian(bent), model.compliance * load_torques)
-    flange_jacobian[arm.stops] = twists[:, :, None]
-    flanges = {arm.robot: flange_jacobian}
-    payload = Effect.free("payload", PriorInformation.flat(1), flange_jacobian=flanges)
-    widened = arm.fit.with_columns(payload)
+    flange_jacobian = np.zeros((len(reported), 6, count))
+    flange_jacobian[arm.stops] = _SOFT * robot.axis_jacobian(bent) * load_torques[:, None]
+    flanges, prior = {arm.robot: flange_jacobian}, PriorInformation(np.eye(count), np.zeros(count))
+    widened = arm.fit.with_columns(Effect.free("payload", prior, flange_jacobian=flanges))
     covariance, (_, gradient) = widened.absorbed, widened.equations
-    sigma = float(np.sqrt(covariance[-1, -1]))
-    return Factor(1.0 - float(covariance[-1] @ gradient), sigma)
+    own = np.append(arm.columns[model.columns_of(COMPLIANCE)], np.arange(-count, 0))
+    units = np.repeat([model.weights[COMPLIANCE] / model.torque_nm / _SOFT, 1.0], count)
+    found = -units * (covariance @ gradient)[own]
+    found[:count] += model.compliance / _SOFT
+    information = np.linalg.inv(np.outer(units, units) * covariance[np.ix_(own, own)])
+    compliance, by_load = np.split(found, 2)
+    values = np.append(compliance, compliance @ by_load / (compliance @ compliance))
+    for _ in range(_ROUNDS):
+        compliance, over = values[:-1], values[-1]
+        predicted = np.append(compliance, over * compliance)
+        jacobian = np.eye(2 * count, count + 1)
+        jacobian[count:, :count] = over * np.eye(count)
+        jacobian[count:, count] = compliance
+        normal = jacobian.T @ information @ jacobian
+        values = values + np.linalg.solve(normal, jacobian.T @ information @ (found - predicted))
+    sigma = float(np.sqrt(np.linalg.inv(normal)[-1, -1]))
+    return Factor(1.0 + float(values[-1]), sigma) if sigma < 1.0 else None
+
+
+BENDS = "The joints bend under load"
 
 
 def remarks(elastic: ElasticResult) -> Iterator[str]:
@@ -196,8 +216,10 @@ def remarks(elastic: ElasticResult) -> Iterator[str]:
         if spring.stiffness_nm_per_rad is not None and spring.stiffness_sigma_nm_per_rad is not None
     )
     if words:
+        is_off = any(doubts(elastic))
+        by = ", by the load as stated, which does not fit," * is_off
         yield (
-            f"The joints bend under load: their stiffness is {words}. At these stops that moves "
+            f"{BENDS}: their stiffness is{by} {words}. At these stops that moves "
             f"the flange by up to {figure(elastic.sag_mm.most)} mm."
         )
     for spring in elastic.joints:
