@@ -14,7 +14,7 @@ from support.refusals import raised
 from support.slopes import twists
 
 from visioncal.calibration.run import calibrate
-from visioncal.calibration.stages.thermal import inputs_of
+from visioncal.calibration.stages.thermal import ThermalFit, doubts, inputs_of
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert, log
 from visioncal.present.report.page import render
@@ -281,6 +281,56 @@ def of_the_first_hour(session):
 )
 def test_a_session_without_temperatures_is_refused_by_what_it_needs(learnt, change, words):
     raised(DataError, words, calibrate, change(learnt("temperatures").session), level="thermal")
+
+
+def warming(change=lambda temperatures: temperatures, from_s=0.0):
+    """Words on temperatures of joints that warm up by 12 to 24 K in air of 21 deg C."""
+    at_s = np.arange(0.0, 6000.0, 10.0)[:, None]
+    rises = np.array([18.0, 24.0, 20.0, 16.0, 14.0, 12.0])
+    joints = 21.0 + rises * (1.0 - np.exp(-at_s / 1800.0))
+    told = change(np.column_stack([joints, np.full(len(at_s), 21.0)]))[at_s[:, 0] >= from_s]
+    heat = Inputs("temperatures", at_s[at_s[:, 0] >= from_s, 0], told[:, :6], told[:, 6])
+    return [
+        each.words for each in doubts(replace(ThermalFit.expected(ROBOT, ROBOT, heat), gain=1e3))
+    ]
+
+
+def with_dead_sensor(temperatures):
+    return np.column_stack(
+        [temperatures[:, :1], np.full(len(temperatures), 21.0), temperatures[:, 2:]]
+    )
+
+
+def test_temperatures_that_no_arm_begins_with_or_no_sensor_has_are_named():
+    assert warming() == []
+    (fahrenheit,) = warming(lambda temperatures: 1.8 * temperatures + 32.0)
+    assert "begin at 69.8 deg C" in fahrenheit or "begin at 70 deg C" in fahrenheit
+    assert "degrees Fahrenheit, of 21 deg C?" in fahrenheit
+    (dead,) = warming(with_dead_sensor)
+    assert dead.startswith("temp2_c stays at 21 deg C while the other joints warm up by up to 19 K")
+    (late,) = warming(from_s=2000.0)
+    assert late.startswith("The arm was warm when its temperatures begin: joints 8")
+    # Where they begin at work for a few minutes, links are nearly as the air.
+    assert warming(from_s=200.0) == []
+
+
+def in_milliseconds(session):
+    heat = session.streams["heat"]
+    stamps = np.array(heat.columns) == "stamp_s"
+    return session.with_streams(
+        {"heat": Stream(heat.columns, np.where(stamps, 1e3, 1.0) * heat.values)}
+    )
+
+
+@pytest.mark.slow
+def test_temperatures_of_another_clock_are_named_before_a_base_that_drifts(learnt):
+    sound = learnt("temperatures").calibration.verdict
+    assert not any(each.kind == "temperatures" for each in sound.findings)
+    result = calibrate(in_milliseconds(learnt("temperatures").session))
+    assert result.thermal is None
+    named = [each for each in result.verdict.findings if "were read from" in each.words]
+    assert "milliseconds? No drift" in named[0].words
+    assert not any("Fasten base" in str(each.do) for each in result.verdict.findings)
 
 
 @pytest.mark.slow

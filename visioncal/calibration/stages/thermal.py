@@ -18,6 +18,7 @@ from visioncal.core.linalg import covariance_among
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.mixed import PriorInformation
@@ -44,6 +45,14 @@ from visioncal.session.observations import APART_RAD
 LEVEL = "thermal"
 # Step at convergence [prior sigmas].
 _SETTLED = 1e-3
+# Kind of findings about what was recorded.
+TEMPERATURES = "temperatures"
+# Neither joints nor air have as much at a start [deg C]; a sensor that moves by so small a part of
+# what others do is dead, where these warm up by so much [K]; an arm that begins with so much of its
+# whole rise has been at work.
+_HOT_C, _DEAD, _WARM_K, _STARTED = 60.0, 1e-3, 10.0, 0.4
+# In so long a time at the start, joints at rest change by less [s, K].
+_EARLY_S, _EVEN_K = 300.0, 0.25
 # Points of the reported course.
 _COURSE_POINTS = 200
 
@@ -273,6 +282,76 @@ def findings(fit: ThermalFit) -> Iterator[str]:
         f"The arm drifts with its temperature: residuals of {figure(1e3 * fit.before_m)} mm become "
         f"{figure(1e3 * fit.after_m)} mm. Its transforms are those of the arm as it was at the "
         "start; give temperatures to calibration.base_from_flange and to visioncal correct."
+    )
+
+
+def doubts(fit: ThermalFit) -> Iterator[Finding]:
+    """Findings about recorded temperatures that contradict what arms are like."""
+    inputs = fit.inputs
+    if inputs.kind != "temperatures" or not fit.is_found:
+        return
+    names, signal = fit.model.robot.joint_names, inputs.signal
+    first, rises = np.append(signal[0], inputs.ambient_c[0]), np.ptp(signal, axis=0)
+    if (hottest := float(first.max())) >= _HOT_C:
+        yield Finding(
+            TEMPERATURES,
+            f"The temperatures begin at {figure(hottest)} deg C, and joints or air at the start "
+            f"have less than {_HOT_C:g}: degrees Fahrenheit, of {figure((hottest - 32.0) / 1.8)} "
+            "deg C? Growth per kelvin is then 1.8 times too small.",
+            Remedy("Write temp1_c ... and ambient_c in degrees Celsius: (F - 32) / 1.8."),
+        )
+    dead = (rises <= _DEAD * rises.max()) & (np.median(rises) >= _WARM_K)
+    for at in np.flatnonzero(dead).tolist():
+        yield Finding(
+            TEMPERATURES,
+            f"temp{at + 1}_c stays at {figure(float(signal[0, at]))} deg C while the other joints "
+            f"warm up by up to {figure(float(rises.max()))} K: the sensor of {names[at]} is dead, "
+            "or its column is another. The drift of that joint is taken for that of others.",
+            Remedy(
+                f"Record temp{at + 1}_c again; or delete the temperatures, and record currents."
+            ),
+        )
+    above = signal[0] - inputs.ambient_c[0]
+    early = signal[inputs.stamps_s <= inputs.stamps_s[0] + _EARLY_S]
+    halves = early[: len(early) // 2], early[len(early) // 2 :]
+    is_changing = (
+        len(early) > 1 and abs(np.subtract(*(at.mean(axis=0) for at in halves))).max() > _EVEN_K
+    )
+    started = max(_WARM_K, _STARTED * float(signal.max() - inputs.ambient_c[0]))
+    if inputs.ambient_c.any() and is_changing and above.max() > started:
+        yield Finding(
+            TEMPERATURES,
+            f"The arm was warm when its temperatures begin: joints {figure(float(above.min()))} to "
+            f"{figure(float(above.max()))} K above the air. Links lag behind their joints by "
+            "minutes to half an hour, and are taken to be as warm: drift and its sigma are wrong "
+            "by what they were not.",
+            Remedy(
+                "Begin with an arm that stood still for hours; or let the stream of temperatures "
+                "begin some minutes before it moves, before the views."
+            ),
+        )
+
+
+def unrecorded(heat: HeatedStops) -> str:
+    """Words where heat sources were recorded, and not during the views; else empty."""
+    inputs = recorded_inputs(heat.session, heat.q.shape[1], heat.robot)
+    at_s = heat.stamps_s
+    if inputs is None or np.isnan(at_s).any():
+        return ""
+    first_s, last_s = inputs.stamps_s[[0, -1]].tolist()
+    millis = replace(inputs, stamps_s=1e-3 * inputs.stamps_s)
+    is_in_millis = is_recorded(millis, at_s)
+    if is_recorded(inputs, at_s):
+        # Of a thousandth of their time, joints that warm up show nothing.
+        links = usual_heating(inputs).links_c(inputs, at_s)
+        is_even = np.ptp(links, axis=0).max() < LEAST_RISE_K < _WARM_K < np.ptp(inputs.signal)
+        if not (is_even and is_in_millis):
+            return ""
+    cause = "milliseconds?" if is_in_millis else "another clock, or a part of it?"
+    return (
+        f"{inputs.kind} were read from {first_s:.10g} to {last_s:.10g} s, and views were taken "
+        f"from {at_s.min():.10g} to {at_s.max():.10g} s: {cause} No drift with temperature was "
+        "estimated."
     )
 
 

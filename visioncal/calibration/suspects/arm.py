@@ -8,11 +8,12 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages import thermal
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.kinematics import findings
-from visioncal.calibration.suspects.suspect import ARM_ERRORS, Suspect
+from visioncal.calibration.suspects.suspect import ARM_ERRORS, REMARK, Suspect
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.verdict import NOTE, PLAN, Finding, Remedy, remarks
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, stops_of
+from visioncal.estimation.steps import DRIFT
 
 _LIMITS = CalibrationLimits()
 # Remedy for errors of an arm whose joints are not known.
@@ -75,4 +76,21 @@ def _of(arm: RobotArm, level: str, stops: int) -> Iterator[Finding]:
     yield Finding(ARM_ERRORS, words, do, until_mm=0.0, mahalanobis_sq=errors.gain)
 
 
+def _heat(run: RunState) -> Iterator[Finding]:
+    arms, steps = run.cell_fit.arms, run.assessment.steps
+    is_late = bool(steps) and steps[0].kind == DRIFT
+    for name, arm in arms.items():
+        found = [] if arm.thermal is None else [*thermal.doubts(arm.thermal)]
+        is_open = arm.thermal is None and arm.heat is not None and run.cell_fit.level == "auto"
+        if is_open and arm.heat is not None and (words := thermal.unrecorded(arm.heat)):
+            # Without drift of the residuals they are of no use.
+            kind = thermal.TEMPERATURES if is_late else NOTE
+            step = Remedy("Write stamp_s of streams and views.csv in seconds of one clock.")
+            found.append(Finding(kind, f"{words[0].upper()}{words[1:]}", step if is_late else None))
+        for finding in found:
+            yield finding.of("" if len(arms) == 1 else f"Robot {name}")
+
+
 ERRORS = Suspect(ARM_ERRORS, _found, 1e-4, True, order=1)
+# Drift of an arm that warms up looks like that of its base.
+HEAT = Suspect(thermal.TEMPERATURES, _heat, REMARK, hides=("moved_slowly",))

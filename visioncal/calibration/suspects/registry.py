@@ -78,6 +78,7 @@ _ENTRIES: tuple[Suspect, ...] = (
     Suspect("holdout", chance=1e-3),
     # Arms, steps, lenses and boards.
     arm.ERRORS,
+    arm.HEAT,
     steps.MOVED_AT_ONCE,
     steps.JOINT_SLIPPED,
     steps.BOARD_CHANGED,
